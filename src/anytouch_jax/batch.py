@@ -1,0 +1,52 @@
+"""The batches that travel from the loader to the device: NamedTuples of arrays, nothing static inside.
+
+The shape is the data type: T is 1 for stills, 3 for clips, 4 for clips with their next frame. Pixels are uint8,
+channel last (RGB); normalisation happens on the device. B batch, V image slots, L text slots, S text length.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+Array = Any  # a numpy or a jax array
+
+
+class TouchBatch(NamedTuple):
+    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table."""
+
+    clip: Array
+    sensor: Array
+
+
+class AlignBatch(NamedTuple):
+    """Stage 2, alignment. Images and texts are packed into V and L slots; an unused slot has row B.
+
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `image` u8 (V, H, W, 3), `image_row` i32 (V,) the row of the
+    batch each image belongs to, `text` i32 (L, S), `text_mask` bool (L, S), `text_row` i32 (L,).
+    """
+
+    clip: Array
+    sensor: Array
+    image: Array
+    image_row: Array
+    text: Array
+    text_mask: Array
+    text_row: Array
+
+
+class MatchBatch(NamedTuple):
+    """Stage 2, matching triples: three times (clip u8 (B, T, H, W, 3), sensor i32 (B,))."""
+
+    clip: Array
+    sensor: Array
+    positive: Array
+    positive_sensor: Array
+    negative: Array
+    negative_sensor: Array
+
+
+class Stage2Batch(NamedTuple):
+    """One stage-2 step: both parts (recipe paper) or one of them (recipe release)."""
+
+    align: AlignBatch | None
+    match: MatchBatch | None

@@ -1,0 +1,382 @@
+"""The configuration of a model and of a run: frozen dataclasses, presets, recipes, strict JSON.
+
+What is static lives here; arrays never do. A preset fixes sizes, a recipe fixes the points on which the
+paper's text and the authors' released code differ. Nothing in this module imports jax.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+import typing
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+Recipe = Literal["paper", "release"]
+Towers = Literal["none", "scratch", "pretrained"]
+PresetName = Literal["tiny", "small", "base", "large"]
+
+UNIVERSAL = "universal"
+SENSORS = (
+    "gelsight",
+    "digit",
+    "gelslim",
+    "gelsight_mini",
+    "duragel",
+    "9dtact",
+    "allsight",
+    "tacto",
+    "taxim",
+    UNIVERSAL,
+)
+FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+
+# Mean and spread of RGB in 0..1, for touch images (ImageNet) and for ordinary images (CLIP), as the release.
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+
+
+class UserError(ValueError):
+    """A mistake that its user can mend. The message is one clear sentence that says what to do."""
+
+
+class ConfigError(UserError):
+    """A configuration that cannot be read or makes no sense; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A stack of transformer blocks: `width` channels, `depth` blocks, `heads`, `mlp` hidden channels."""
+
+    width: int
+    depth: int
+    heads: int
+    mlp: int
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ConfigError(f"width {self.width} must be a multiple of heads {self.heads}")
+
+
+@dataclass(frozen=True)
+class TextTower:
+    """CLIP's text tower. `end_token` None pools at the largest id (CLIP), else at its first occurrence."""
+
+    stack: Stack
+    vocab: int = 49408
+    length: int = 77
+    end_token: int | None = None
+
+
+@dataclass(frozen=True)
+class Model:
+    """Everything that decides the shapes and the arithmetic of the network.
+
+    `image` and `text` None leave the towers out (stage 1). `lora_rank` 0 means no LoRA. `sensors` names the
+    rows of the sensor-token table (Sec. 3.5); the row named "universal" serves sensors never seen.
+    """
+
+    image_size: int
+    patch: int
+    embed: int
+    touch: Stack
+    decoder: Stack
+    image: Stack | None = None
+    text: TextTower | None = None
+    frames: int = 3
+    sensors: tuple[str, ...] = SENSORS
+    sensor_tokens: int = 5
+    activation: Literal["gelu", "quick_gelu"] = "gelu"
+    norm_eps: float = 1e-5
+    decoder_norm_eps: float = 1e-12
+    decoder_sensor_tokens: bool = False
+    match_head: Literal["mlp", "linear", "none"] = "none"
+    lora_rank: int = 0
+    lora_alpha: float = 16.0
+    temperature: float = 0.07
+    dtype: Literal["float32", "bfloat16", "float64"] = "float32"
+    attention: Literal["xla", "cudnn"] = "xla"
+    remat: bool = False
+
+    def __post_init__(self) -> None:
+        if self.image_size % self.patch:
+            raise ConfigError(f"image_size {self.image_size} must be a multiple of patch {self.patch}")
+        if len(set(self.sensors)) != len(self.sensors):
+            raise ConfigError(f"a sensor is named twice in {self.sensors}")
+        if UNIVERSAL not in self.sensors:
+            raise ConfigError(f"the sensor table needs a row named {UNIVERSAL!r}")
+
+    @property
+    def patches(self) -> int:
+        """Number of patch positions N = (image_size / patch)^2."""
+        return (self.image_size // self.patch) ** 2
+
+    @property
+    def universal_row(self) -> int:
+        """Row of the universal sensor tokens."""
+        return self.sensors.index(UNIVERSAL)
+
+    def sensor_row(self, name: str) -> int:
+        """Row of the sensor called `name`. Raises ConfigError when the table does not have it."""
+        if name in FIELD_SENSORS:
+            raise ConfigError(f"sensor {name!r} measures a force field and has no images; leave it out of training")
+        if name not in self.sensors:
+            known = ", ".join(self.sensors)
+            raise ConfigError(f"unknown sensor {name!r}; known: {known}. Add it at the end of --model.sensors")
+        return self.sensors.index(name)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix).
+
+    `touch_text_sum`: weigh the touch-text pair by alpha (the release) instead of alpha / 2 (Eq. 4).
+    `reconstruct`: keep the stage-1 loss on the align batches of stage 2 (the release).
+    `groups`: the batch is cut in that many shares and negatives stay within a share (1: the whole batch).
+    """
+
+    mask_ratio: float = 0.75
+    norm_pix_loss: bool = False
+    next_frame: bool = True
+    alpha_tv: float = 1.0
+    alpha_tl: float = 1.0
+    alpha_vl: float = 0.2
+    touch_text_sum: bool = False
+    match_weight: float = 0.1
+    reconstruct: bool = False
+    groups: int = 1
+    universal_start: float = 0.0
+    universal_end: float = 0.75
+    universal_shared: bool = False
+
+    @property
+    def keep_ratio(self) -> float:
+        """Share of the patches that stays visible."""
+        return 1.0 - self.mask_ratio
+
+    @property
+    def pair_weights(self) -> tuple[float, float, float]:
+        """Factors of (TV, TL, VL) on the sum of both directions of InfoNCE (Eq. 4)."""
+        text = self.alpha_tl if self.touch_text_sum else self.alpha_tl / 2
+        return self.alpha_tv / 2, text, self.alpha_vl / 2
+
+
+@dataclass(frozen=True)
+class Optim:
+    """AdamW and its schedule (appendix "Implementation details"). `warmup` is in steps; None: see `Run`."""
+
+    learning_rate: float = 2e-4
+    min_rate: float = 0.0
+    warmup: int | None = None
+    decay: Literal["linear", "cosine"] = "linear"
+    beta1: float = 0.9
+    beta2: float = 0.99
+    eps: float = 1e-8
+    weight_decay: float = 0.1
+    clip_norm: float | None = None
+    ema: float | None = None
+    accumulate: int = 1
+
+
+@dataclass(frozen=True)
+class Data:
+    """What is read and how it is augmented. `jitter` is (brightness, contrast, saturation, hue).
+
+    `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the
+    release). `split_steps`: stage 2 takes align and match batches in separate steps (the release).
+    `window`: frames of a stage-2 align clip, 4 when it is reconstructed as well, else 3.
+    """
+
+    manifests: tuple[str, ...] = ()
+    split: str = "train"
+    batch_size: int = 64
+    clip_share: float = 0.5
+    order: Literal["alternate", "random"] = "alternate"
+    split_steps: bool = False
+    flip: float = 0.5
+    jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)
+    rotation: float = 20.0
+    tokenizer: str | None = None
+    threads: int = 2
+    prefetch: int = 4
+    on_bad_sample: Literal["error", "skip"] = "error"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run: length, saving, reporting, devices."""
+
+    seed: int = 0
+    steps: int = 1000
+    save_every: int = 200
+    keep: int = 3
+    figure_every: int = 200
+    max_skipped: int = 20
+    tensorboard: bool = False
+    fsdp: int = 1
+
+
+@dataclass(frozen=True)
+class Config:
+    """A whole run. Build one with `preset(...)`, change it with `dataclasses.replace`."""
+
+    model: Model
+    stage: Literal[1, 2] = 1
+    recipe: Recipe = "paper"
+    towers: Towers = "none"
+    preset: str = "custom"
+    objective: Objective = field(default_factory=Objective)
+    optim: Optim = field(default_factory=Optim)
+    data: Data = field(default_factory=Data)
+    run: Run = field(default_factory=Run)
+
+    @property
+    def warmup(self) -> int:
+        """Warm-up steps: as set, else a twentieth (stage 1) or a twelfth (stage 2) of the run."""
+        if self.optim.warmup is not None:
+            return self.optim.warmup
+        return max(1, self.run.steps // (20 if self.stage == 1 else 12))
+
+    @property
+    def frozen(self) -> tuple[tuple[str, bool], ...]:
+        """(regex over parameter names, frozen?) rules; the first match decides."""
+        rules: list[tuple[str, bool]] = [(r"decoder/position$", True)]
+        if self.towers == "pretrained":
+            rules += [(r"text/", True), (r"image/blocks/" if self.recipe == "release" else r"image/", True)]
+        return (*rules, (r"", False))
+
+    @property
+    def weight_decay(self) -> tuple[tuple[str, float], ...]:
+        """(regex over parameter names, weight decay) rules: none for vectors (golden Q8)."""
+        return ((r"(bias|scale|class_token)$", 0.0), (r"", self.optim.weight_decay))
+
+
+def _stack(width: int, depth: int, heads: int) -> Stack:
+    return Stack(width, depth, heads, 4 * width)
+
+
+_PRESETS: dict[str, tuple[Model, Stack, int]] = {
+    "tiny": (
+        Model(112, 14, 128, _stack(192, 6, 6), _stack(128, 2, 4), text=TextTower(_stack(128, 4, 4))),
+        _stack(192, 6, 6),
+        64,
+    ),
+    "small": (
+        Model(224, 14, 512, _stack(384, 6, 6), _stack(512, 8, 16), text=TextTower(_stack(384, 6, 6))),
+        _stack(384, 6, 6),
+        64,
+    ),
+    "base": (
+        Model(224, 16, 512, _stack(768, 12, 12), _stack(512, 8, 16), text=TextTower(_stack(512, 12, 8))),
+        _stack(768, 12, 12),
+        256,
+    ),
+    "large": (
+        Model(224, 14, 768, _stack(1024, 24, 16), _stack(512, 8, 16), text=TextTower(_stack(768, 12, 12))),
+        _stack(1024, 24, 16),
+        256,
+    ),
+}
+
+
+def preset(
+    name: PresetName | str,
+    *,
+    stage: Literal[1, 2] = 1,
+    recipe: Recipe = "paper",
+    towers: Towers = "scratch",
+) -> Config:
+    """The configuration called `name` (tiny, small, base, large = the paper's) for a stage and a recipe.
+
+    `towers` matters in stage 2 only: "scratch" trains small image and text towers whole, "pretrained" expects
+    CLIP weights, freezes the text tower and adapts the image tower by LoRA. Raises ConfigError.
+    """
+    if name not in _PRESETS:
+        raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(_PRESETS)}")
+    full, image, batch = _PRESETS[name]
+    config = Config(
+        model=replace(full, text=None),
+        stage=stage,
+        recipe=recipe,
+        preset=name,
+        data=Data(batch_size=batch),
+    )
+    if stage == 2:
+        if towers == "none":
+            raise ConfigError("stage 2 needs towers: choose towers=scratch or towers=pretrained")
+        model = replace(
+            full,
+            image=image,
+            match_head="linear" if recipe == "release" else "mlp",
+            lora_rank=16 if towers == "pretrained" else 0,
+        )
+        config = replace(config, model=model, towers=towers)
+    if recipe == "release":
+        config = replace(
+            config,
+            objective=replace(
+                config.objective, touch_text_sum=True, reconstruct=stage == 2, universal_shared=stage == 2
+            ),
+            optim=replace(config.optim, decay="cosine"),
+            data=replace(config.data, order="random", split_steps=stage == 2),
+        )
+    elif recipe != "paper":
+        raise ConfigError(f"unknown recipe {recipe!r}; choose paper or release")
+    return config
+
+
+def to_json(config: Any) -> str:
+    """A config dataclass as indented JSON; `from_json` reads it back to an equal value."""
+    return json.dumps(dataclasses.asdict(config), indent=2)
+
+
+def from_json(text: str, cls: type = Config) -> Any:
+    """Read a config written by `to_json`. An unknown, missing or mistyped key is a ConfigError that names it."""
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"not a JSON configuration: {error}") from None
+    return _build(cls, data, cls.__name__.lower())
+
+
+def _build(kind: Any, value: Any, where: str) -> Any:
+    """`value` (from JSON) as an instance of the annotation `kind`; `where` names the place in errors."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        if not isinstance(value, dict):
+            raise ConfigError(f"{where} must be an object, not {value!r}")
+        hints = typing.get_type_hints(kind)
+        unknown = sorted(set(value) - set(hints))
+        if unknown:
+            raise ConfigError(f"{where} has no setting called {', '.join(unknown)}; it has {', '.join(hints)}")
+        required = [f.name for f in dataclasses.fields(kind) if _required(f)]
+        missing = [name for name in required if name not in value]
+        if missing:
+            raise ConfigError(f"{where} lacks {', '.join(missing)}")
+        return kind(**{name: _build(hints[name], item, f"{where}.{name}") for name, item in value.items()})
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        (inner,) = [arg for arg in args if arg is not type(None)]
+        return _build(inner, value, where)
+    if origin is Literal:
+        if value not in args:
+            raise ConfigError(f"{where} must be one of {', '.join(map(str, args))}, not {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where} must be a list, not {value!r}")
+        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        if len(kinds) != len(value):
+            raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
+        return tuple(_build(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ConfigError(f"{where} must be {kind.__name__}, not {value!r}")
+    return value
+
+
+def _required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING

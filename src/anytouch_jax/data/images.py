@@ -1,0 +1,185 @@
+"""Pictures and videos from disk as RGB uint8 arrays, refused when they are broken, odd or too large."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from anytouch_jax.config import UserError
+
+MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
+
+cv2.setNumThreads(1)  # the loader has its own threads
+
+
+class ImageError(UserError):
+    """A picture or a video that cannot be used; the message names the file."""
+
+
+def decode(path: str | Path) -> np.ndarray:
+    """The picture in `path` as RGB u8 (h, w, 3).
+
+    Grey becomes RGB, an alpha channel is dropped, 16 bits are scaled to 8, floats are taken as 0..1. PNG, JPEG, TIFF,
+    BMP, WebP and .npy are read; orientation tags are ignored. Raises ImageError for a missing, broken or too large
+    file and for pixels that are NaN or outside 0..1.
+    """
+    path = Path(path)
+    try:
+        pixels = np.load(path, "r", allow_pickle=False) if path.suffix.lower() == ".npy" else _read(path)
+    except FileNotFoundError:
+        raise ImageError(f"there is no file {path}") from None
+    except (OSError, ValueError, EOFError, MemoryError) as error:
+        raise ImageError(f"{path} cannot be read: {error}") from None
+    return _to_rgb(pixels, path)
+
+
+def _read(path: Path) -> np.ndarray:
+    data = path.read_bytes()
+    size = _declared_size(data)
+    if size is None:
+        raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise ValueError(f"it declares {size[0]} x {size[1]} pixels, more than the limit of {MAX_PIXELS}")
+    # OpenCV fills the lost part of some cut JPEG files with grey; in a whole one an end marker follows the last scan.
+    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        raise ValueError("the file is cut short")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(error.err) from None
+    if pixels is None:
+        raise ValueError("the picture is corrupt or cut short")
+    if pixels.ndim == 3 and pixels.shape[2] in (3, 4):
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+    return pixels
+
+
+def _to_rgb(pixels: np.ndarray, path: Path) -> np.ndarray:
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or 0 in pixels.shape:
+        raise ImageError(f"{path} has shape {pixels.shape}; a picture is (height, width) with 1, 3 or 4 channels")
+    if pixels.shape[0] * pixels.shape[1] > MAX_PIXELS:
+        raise ImageError(
+            f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels, more than the limit of {MAX_PIXELS}"
+        )
+    pixels = pixels[..., :3]
+    if pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    elif np.issubdtype(pixels.dtype, np.floating):
+        low, high = float(pixels.min()), float(pixels.max())
+        if np.isnan(low):
+            raise ImageError(f"{path} has NaN pixels")
+        if low < 0 or high > 1:
+            raise ImageError(f"{path} has float pixels in {low:g}..{high:g}; floats must lie in 0..1")
+        pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
+    elif pixels.dtype != np.uint8:
+        raise ImageError(f"{path} has pixels of type {pixels.dtype}; use uint8, uint16 or floats in 0..1")
+    if pixels.shape[2] == 1:
+        pixels = np.repeat(pixels, 3, axis=2)
+    return np.ascontiguousarray(pixels)
+
+
+def _declared_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) that the header declares, before anything is unpacked; None for another kind of file."""
+    try:
+        if data[:8] == b"\x89PNG\r\n\x1a\n":
+            return struct.unpack(">II", data[16:24])
+        if data[:2] == b"\xff\xd8":
+            return _jpeg_size(data)
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            return _tiff_size(data)
+        if data[:2] == b"BM":
+            width, height = struct.unpack("<ii", data[18:26])
+            return abs(width), abs(height)
+        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            return _webp_size(data)
+    except struct.error:
+        raise ValueError("the file is cut short") from None
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    at = 2
+    while True:
+        marker, length = struct.unpack(">2sH", data[at : at + 4])
+        if marker[0] != 0xFF:
+            raise ValueError("the picture is corrupt")
+        if marker[1] == 0xFF:  # a fill byte
+            at += 1
+        elif 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        else:
+            at += 2 + length
+
+
+def _tiff_size(data: bytes) -> tuple[int, int]:
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = struct.unpack(order + "I", data[4:8])
+    (count,) = struct.unpack(order + "H", data[at : at + 2])
+    found = {}
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind = struct.unpack(order + "HH", data[entry : entry + 4])
+        if tag in (256, 257):
+            (found[tag],) = struct.unpack(order + ("H2x" if kind == 3 else "I"), data[entry + 8 : entry + 12])
+    if len(found) != 2:
+        raise ValueError("the picture is corrupt")
+    return found[256], found[257]
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    if data[12:16] == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+    elif data[12:16] == b"VP8L":
+        (bits,) = struct.unpack("<I", data[21:25])
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        width, height = (side & 0x3FFF for side in struct.unpack("<HH", data[26:30]))
+    return width, height
+
+
+def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
+    """The frames of a video, one by one, as RGB u8 (h, w, 3). Raises ImageError when there is none to be had."""
+    path = Path(path)
+    if not path.is_file():
+        raise ImageError(f"there is no video {path}")
+    video = cv2.VideoCapture(str(path))
+    try:
+        count = 0
+        while True:
+            there, frame = video.read()
+            if not there:
+                break
+            count += 1
+            yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        if not count:
+            raise ImageError(f"{path} is not a video that can be read, or has no frame")
+    finally:
+        video.release()
+
+
+def pictures_in(folder: str | Path) -> list[Path]:
+    """The picture files of a folder in natural order (2 before 10). Raises ImageError when there are none."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ImageError(f"there is no folder {folder}")
+    files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
+    if not files:
+        raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)})")
+    return sorted(files, key=lambda file: _natural(file.name))
+
+
+def frames_from_folder(folder: str | Path) -> Iterator[np.ndarray]:
+    """The pictures of a folder in natural order as RGB u8 (h, w, 3). Raises ImageError."""
+    return map(decode, pictures_in(folder))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

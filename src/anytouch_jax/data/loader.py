@@ -1,0 +1,210 @@
+"""From a manifest to batches: what a step holds is a function of (manifest, config, step) alone.
+
+Stills and clips have a stream of epochs each; an epoch is a seeded permutation, and a batch takes the next B of it.
+Where a batch reaches over the end of an epoch (always, where there are fewer rows than B) a row can be in it twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.config import Config, UserError
+from anytouch_jax.data.evaluation import evaluation
+from anytouch_jax.data.images import frames_from_folder, frames_from_video
+from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.samples import Reader, SampleError, fill_slot
+from anytouch_jax.data.sampling import BOTH, TEXT, VISION, Strata, Turns, uniform
+from anytouch_jax.data.sources import CLIP, STILL, Pairs, Pool, find_sources
+from anytouch_jax.data.text import Tokenizer
+from anytouch_jax.data.workers import Work, do, pump
+
+__all__ = ["Loader", "SampleError", "evaluation", "frames_from_folder", "frames_from_video"]
+
+Batch = TouchBatch | Stage2Batch
+Info = dict[str, int]
+_KINDS: tuple[Literal["still"], Literal["clip"]] = ("still", "clip")
+_NEVER = -1
+_KIND, _PART, _ORDER, _TRIPLE = 1, 2, 3, 4  # tags that keep the random streams of one seed apart
+
+
+class Loader:
+    """Batches for `config.stage` from the split `config.data.split` of a manifest.
+
+    `notes` are sentences to tell the user once (rows left out, no clips, no pairs); `tokenizer` is the one in use, or
+    None; `steps_per_epoch` is how many batches hold every still and every clip once. `devices`: image and text slots
+    are a multiple of it. Raises UserError: ManifestError for an empty split or an unknown sensor, SampleError (from
+    `batch` and `stream`) for a bad sample.
+    """
+
+    def __init__(
+        self, manifest: Manifest, config: Config, *, tokenizer: Tokenizer | None = None, devices: int = 1
+    ) -> None:
+        if config.data.batch_size < 1 or devices < 1:
+            raise UserError(f"batch_size {config.data.batch_size} and devices {devices} must be at least 1")
+        self.manifest, self.config = manifest, config
+        self._reader = Reader(manifest, config)
+        found = find_sources(manifest, config, tokenizer, devices)
+        self._pools, self._pairs, self._sensor, self.tokenizer, self.notes = found
+        self._align_share = self._share_of_align()
+        self._align, self._match = Turns(self._align_kinds), Turns(self._match_kinds)
+
+    # What a step holds ------------------------------------------------------------------------------------------
+
+    def kind(self, step: int) -> Literal["still", "clip"]:
+        """Whether the batch of `step` holds stills or clips."""
+        align, match = self._align.at(step)[0], self._match.at(step)[0]
+        return _KINDS[match if align == _NEVER else align]
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Batches that hold every still and every clip once (and every anchor, where matching has its own steps)."""
+        size = self.config.data.batch_size
+        steps = sum(-(-len(pool.windows) // size) for pool in self._pools)
+        if self.config.data.split_steps:
+            steps += sum(-(-pairs.anchors.size // self._match_size) for pairs in self._pairs if pairs)
+        return steps
+
+    def batch(self, step: int) -> Batch:
+        """The batch of `step`, made in this thread: TouchBatch in stage 1, Stage2Batch in stage 2."""
+        return do(self._plan(step))[0]
+
+    def stream(self, start: int, stop: int) -> Iterator[tuple[int, Batch, Info]]:
+        """(step, batch, info) for steps start .. stop - 1, made ahead by `data.threads` threads.
+
+        The bytes do not depend on the threads. `info` counts `skipped` bad samples, `images` and `texts`. Close the
+        iterator to stop early; its threads end with it.
+        """
+        return pump(self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch)
+
+    def _plan(self, step: int) -> Work[Batch]:
+        align_kind, align_rank = self._align.at(step)
+        match_kind, match_rank = self._match.at(step)
+        align = self._plan_align(step, self._pools[align_kind], align_rank) if align_kind != _NEVER else None
+        if self.config.stage == 1:
+            assert align is not None
+            return Work(TouchBatch(align.batch.clip, align.batch.sensor), align.jobs, align.info)
+        match = self._plan_match(step, match_kind, match_rank) if match_kind != _NEVER else None
+        batch = Stage2Batch(align.batch if align else None, match.batch if match else None)
+        jobs = [*(align.jobs if align else ()), *(match.jobs if match else ())]
+        return Work(batch, jobs, align.info if align else {"images": 0, "texts": 0})
+
+    # Which kind a step takes ------------------------------------------------------------------------------------
+
+    def _kinds(self, steps: np.ndarray) -> np.ndarray:
+        share = self.config.data.clip_share if len(self._pools) > 1 else 0.0
+        if self.config.data.order == "alternate":
+            return (np.floor((steps + 1) * share) > np.floor(steps * share)).astype(np.int8)
+        return (uniform(self.config.run.seed, _KIND, steps) < share).astype(np.int8)
+
+    def _aligns(self, steps: np.ndarray) -> np.ndarray:
+        return uniform(self.config.run.seed, _PART, steps) < self._align_share
+
+    def _align_kinds(self, steps: np.ndarray) -> np.ndarray:
+        return np.where(self._aligns(steps), self._kinds(steps), _NEVER)
+
+    def _match_kinds(self, steps: np.ndarray) -> np.ndarray:
+        if self._pairs[STILL] is None:
+            return np.full(len(steps), _NEVER)
+        kinds = self._kinds(steps) if self._pairs[CLIP] is not None else np.full(len(steps), STILL)
+        return np.where(self._aligns(steps), _NEVER, kinds) if self.config.data.split_steps else kinds
+
+    def _share_of_align(self) -> float:
+        """Share of the steps that align: all, or as many as align batches there are to match batches (release)."""
+        pairs = [pair for pair in self._pairs if pair is not None]
+        if not self.config.data.split_steps or not pairs:
+            return 1.0
+        align = sum(len(pool.windows) for pool in self._pools) / self.config.data.batch_size
+        return align / (align + sum(pair.anchors.size for pair in pairs) / self._match_size)
+
+    @property
+    def _match_size(self) -> int:
+        size = self.config.data.batch_size
+        return max(1, size // 2) if self.config.data.split_steps else size
+
+    # Filling a batch --------------------------------------------------------------------------------------------
+
+    def _empty(self, rows: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        size = self.config.model.image_size
+        return np.zeros((rows, frames, size, size, 3), np.uint8), np.zeros(rows, np.int32)
+
+    def _plan_align(self, step: int, pool: Pool, rank: int) -> Work[AlignBatch]:
+        """Rows of all strata in a seeded order; images and texts are packed into the slots in that order."""
+        before, now = pool.strata.at(rank)
+        draws = [
+            (stratum, *draw)
+            for stratum, stream in enumerate(pool.streams)
+            for draw in stream.take(int(before[stratum]), int(now[stratum]))
+        ]  # fmt: skip
+        seed, rows = self.config.run.seed % 2**63, self.config.data.batch_size
+        order = np.random.default_rng([seed, _ORDER, step]).permutation(rows)
+        clip, sensor = self._empty(rows, pool.windows.shape[1])
+        batch = AlignBatch(clip, sensor, *self._slots(rows, pool.strata))
+        jobs, images, texts = [], 0, 0
+        for slot, at in enumerate(order):
+            stratum, index, epoch = draws[at]
+            image = text = None
+            if stratum in (VISION, BOTH):
+                image, images = images, images + 1
+                batch.image_row[image] = slot
+            if stratum in (BOTH, TEXT):
+                text, texts = texts, texts + 1
+                batch.text_row[text] = slot
+            write = partial(self._write_align, batch, pool, stratum, slot, image, text)
+            size = len(pool.members[stratum])
+            jobs.append(partial(fill_slot, write, size, step, slot, self.config, index, epoch))
+        return Work(batch, jobs, {"images": images, "texts": texts})
+
+    def _slots(self, rows: int, strata: Strata) -> tuple[np.ndarray, ...]:
+        """Empty image and text slots. An unused text slot is an empty caption, so that no tower meets a text of
+        nothing but padding (its gradient could be NaN even where its value is dropped)."""
+        size, tower = self.config.model.image_size, self.config.model.text
+        image = np.zeros((strata.images, size, size, 3), np.uint8)
+        image_row = np.full(strata.images, rows, np.int32)
+        length = tower.length if tower else 0
+        if self.tokenizer is None or not strata.texts:
+            text, mask = np.zeros((0, length), np.int32), np.zeros((0, length), bool)
+        else:
+            text, mask = self.tokenizer.encode([""] * strata.texts, length)
+        return image, image_row, text, mask, np.full(len(text), rows, np.int32)
+
+    def _write_align(
+        self, batch: AlignBatch, pool: Pool, stratum: int, slot: int, image: int | None, text: int | None,
+        index: int, epoch: int,
+    ) -> None:  # fmt: skip
+        rows = pool.windows[pool.members[stratum][index]]
+        batch.clip[slot] = self._reader.touch(rows, epoch)
+        batch.sensor[slot] = self._sensor[rows[-1]]
+        if image is not None:
+            batch.image[image] = self._reader.vision(rows[-1], epoch)
+        if text is not None and self.tokenizer is not None:
+            ids, mask = self.tokenizer.encode([self._reader.caption(rows[-1])], batch.text.shape[1])
+            batch.text[text], batch.text_mask[text] = ids[0], mask[0]
+
+    def _plan_match(self, step: int, kind: int, rank: int) -> Work[MatchBatch]:
+        pairs, rows = self._pairs[kind], self._match_size
+        assert pairs is not None
+        parts = [self._empty(rows, pairs.windows.shape[1]) for _ in range(3)]
+        batch = MatchBatch(*(array for part in parts for array in part))
+        jobs: list[Any] = []
+        for slot, (index, epoch) in enumerate(pairs.anchors.take(rank * rows, rows)):
+            write = partial(self._write_match, parts, pairs, slot)
+            # Slots of matching come after those of alignment, so that a replacement is drawn apart from theirs.
+            place = self.config.data.batch_size + slot
+            jobs.append(partial(fill_slot, write, pairs.anchors.size, step, place, self.config, index, epoch))
+        return Work(batch, jobs)
+
+    def _write_match(
+        self, parts: list[tuple[np.ndarray, np.ndarray]], pairs: Pairs, slot: int, index: int, epoch: int
+    ) -> None:
+        anchor = int(pairs.matches.anchors[index])
+        row = int(pairs.windows[anchor, -1])
+        rng = np.random.default_rng([self.config.run.seed % 2**63, _TRIPLE, epoch, row])
+        for (clip, sensor), chosen in zip(parts, (anchor, *pairs.matches.draw(anchor, rng)), strict=True):
+            rows = pairs.windows[chosen]
+            clip[slot] = self._reader.touch(rows, epoch)
+            sensor[slot] = self._sensor[rows[-1]]

@@ -1,0 +1,301 @@
+"""The table of touch frames: read, join, write, and look up rows, clips and files.
+
+One row is one tactile frame (the schema is in `table.py`). Row numbers count from 0. The keys of a manifest
+(`sequence`, `touch`) are its own: two joined manifests never share a sequence or a touch by accident.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+import pyarrow.parquet
+
+from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model
+from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, load_table, typed
+from anytouch_jax.data.windows import windows
+
+__all__ = [
+    "PATHS", "REQUIRED", "SCHEMA", "SPLITS", "Manifest", "ManifestError",
+    "from_columns", "read", "resolve", "sensor_rows", "write",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """A checked table of touch frames, from one file or several joined ones.
+
+    `table` typed columns; `files` the absolute manifest files; `source` i32 (rows,) which file a row is from;
+    `number` i64 (rows,) its row number in that file.
+    """
+
+    table: pa.Table
+    files: tuple[Path, ...]
+    source: np.ndarray
+    number: np.ndarray
+
+    def __len__(self) -> int:
+        return int(self.table.num_rows)
+
+    def where(self, row: int) -> str:
+        """ "row 3 of /data/manifest.csv", for errors."""
+        return f"row {self.number[row]} of {self.files[self.source[row]]}"
+
+    def column(self, name: str) -> pa.ChunkedArray:
+        """The column `name`; all null where an optional one is absent. Raises ManifestError for any other name."""
+        if name in self.table.column_names:
+            return self.table[name]
+        if name in SCHEMA:
+            fill = 1 if name == "stride" else None
+            return pa.chunked_array([pa.array([fill] * len(self), SCHEMA[name])])
+        raise ManifestError(f"{self._name} has no column {name!r}; it has {', '.join(self.table.column_names)}")
+
+    def value(self, row: int, name: str) -> Any:
+        """One cell as a Python value, None where it is null or the column is absent."""
+        return self.table[name][int(row)].as_py() if name in self.table.column_names else None
+
+    def present(self, name: str) -> np.ndarray:
+        """Which rows have a value in column `name`: bool (rows,)."""
+        return np.asarray(pc.is_valid(self.column(name)))
+
+    def codes(self, name: str, *, own: bool = False) -> np.ndarray:
+        """A text column as i64 (rows,): equal numbers for equal values, -1 for null.
+
+        `own`: values of different files are different (see the module's docstring).
+        """
+        indices = self.column(name).combine_chunks().dictionary_encode().indices
+        codes = np.asarray(pc.fill_null(indices, -1)).astype(np.int64)
+        if own and len(self.files) > 1:
+            codes = np.where(codes < 0, -1, codes * len(self.files) + self.source)
+        return codes
+
+    def file(self, row: int, name: str = "path") -> Path:
+        """The absolute file in a path column. Raises ManifestError when the path leaves the manifest's folder."""
+        return resolve(self.files[self.source[row]].parent, self.value(row, name))
+
+    def rows_of(self, split: str) -> np.ndarray:
+        """Row ids i64 of one split, in order. Raises ManifestError when it is unknown or empty."""
+        if split not in SPLITS:
+            raise ManifestError(f"unknown split {split!r}; use one of {', '.join(SPLITS)}")
+        rows = np.flatnonzero(np.asarray(pc.equal(self.table["split"], split)))
+        if not rows.size:
+            there = ", ".join(sorted(pc.unique(self.table["split"]).to_pylist()))
+            raise ManifestError(f"{self._name}: column 'split' has no row {split!r}; it has {there}")
+        return rows
+
+    def clips(self, length: int, split: str | None = None) -> np.ndarray:
+        """All clips of `length` frames: row ids i64 (clips, length), oldest first, ordered by their last row.
+
+        A clip is rows of one sequence and one split whose frame_index lie exactly `stride` (of the last row)
+        apart. `split` keeps only clips of that split. Raises ManifestError when a sequence repeats a frame.
+        """
+        found = windows(self._sequence, self._frame, self._stride, length, self._say_repeat)
+        if split is not None:
+            wanted = np.zeros(len(self), bool)
+            wanted[self.rows_of(split)] = True
+            found = found[wanted[found[:, -1]]]
+        return found
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 over every column's name and values: equal tables in CSV and Parquet have equal hashes."""
+        digest = hashlib.sha256()
+        for name in sorted(self.table.column_names):
+            column = self.table[name].combine_chunks()
+            text = pc.fill_null(column.cast(pa.large_string()), "")
+            ends = np.frombuffer(text.buffers()[1], np.int64)[text.offset : text.offset + len(text) + 1]
+            digest.update(name.encode() + b"\0")
+            digest.update(np.packbits(np.asarray(pc.is_valid(column))).tobytes())
+            digest.update((ends - ends[0]).astype("<i8").tobytes())
+            digest.update(memoryview(text.buffers()[2] or b"")[ends[0] : ends[-1]])
+        return digest.hexdigest()
+
+    @property
+    def _name(self) -> str:
+        return ", ".join(map(str, self.files))
+
+    @cached_property
+    def _sequence(self) -> np.ndarray:
+        return self.codes("sequence", own=True) * len(SPLITS) + self.codes("split")
+
+    @cached_property
+    def _frame(self) -> np.ndarray:
+        return np.asarray(self.table["frame_index"])
+
+    @cached_property
+    def _stride(self) -> np.ndarray:
+        return np.asarray(self.column("stride"))
+
+    def _say_repeat(self, first: int, second: int) -> ManifestError:
+        sequence, frame = self.value(second, "sequence"), self.value(second, "frame_index")
+        return ManifestError(
+            f"{self.where(second)} repeats frame_index {frame} of sequence {sequence!r} (row {self.number[first]}); "
+            "a sequence has one row a frame"
+        )
+
+
+def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
+    """Read one manifest (.csv or .parquet), or several joined in the order given.
+
+    Every row keeps its own file, and its paths are relative to the folder of that file. Raises ManifestError.
+    """
+    several = [paths] if isinstance(paths, str | Path) else list(paths)
+    if not several:
+        raise ManifestError("no manifest is given; name a .csv or .parquet file")
+    files = tuple(Path(path).expanduser().resolve() for path in several)
+    if len(set(files)) != len(files):
+        raise ManifestError(f"a manifest is given twice: {', '.join(map(str, files))}")
+    return _join([load_table(file) for file in files], files)
+
+
+def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
+    """A manifest from columns in memory, as if read from the file `path`, which need not exist yet.
+
+    `columns` maps names to sequences of equal length (None is null). Raises ManifestError as `read` does.
+    """
+    file = Path(path).expanduser().resolve()
+    try:
+        table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    except (pa.ArrowException, ValueError) as error:
+        raise ManifestError(f"{file}: the columns make no table: {error}") from None
+    return _join([typed(table, str(file))], (file,))
+
+
+def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
+    clash = {name for name, kinds in _kinds(tables).items() if len(kinds) > 1}
+    # A label that is a number in one manifest and text in another becomes text in all of them.
+    same = [
+        pa.table({n: t[n].cast(pa.string()) if n in clash else t[n] for n in t.column_names}) if clash else t
+        for t in tables
+    ]
+    try:
+        table = pa.concat_tables(same, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise ManifestError(f"{', '.join(map(str, files))} cannot be joined: {error}") from None
+    if "stride" in table.column_names:
+        table = table.set_column(table.column_names.index("stride"), "stride", pc.fill_null(table["stride"], 1))
+    sizes = [t.num_rows for t in tables]
+    source = np.repeat(np.arange(len(files), dtype=np.int32), sizes)
+    number = np.concatenate([np.arange(size, dtype=np.int64) for size in sizes])
+    return Manifest(table.combine_chunks(), files, source, number)
+
+
+def _kinds(tables: list[pa.Table]) -> dict[str, set[bool]]:
+    """For every column, whether it is text, in all the tables that have it with a value."""
+    kinds: dict[str, set[bool]] = {}
+    for table in tables:
+        for column in table.schema:
+            if not pa.types.is_null(column.type):
+                text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
+                kinds.setdefault(column.name, set()).add(text)
+    return kinds
+
+
+def write(manifest: Manifest, path: str | Path) -> None:
+    """Write a manifest as .csv or .parquet, whole or not at all; its paths are made relative to the new folder.
+
+    Raises ManifestError for another ending and for a file that would lie outside the new folder.
+    """
+    target = Path(path).expanduser().resolve()
+    if target.suffix.lower() not in (".csv", ".parquet"):
+        raise ManifestError(f"{target}: a manifest ends in .csv or .parquet")
+    table = _rebase(manifest, target.parent)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            if target.suffix.lower() == ".csv":
+                pa.csv.write_csv(table, file, pa.csv.WriteOptions(quoting_style="needed"))
+            else:
+                pa.parquet.write_table(table, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)  # mkstemp gives a file that only its owner may read
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _rebase(manifest: Manifest, folder: Path) -> pa.Table:
+    table = manifest.table
+    if all(file.parent == folder for file in manifest.files):
+        return table
+    for name in set(PATHS) & set(table.column_names):
+        cells = [None if cell is None else _relative(manifest, row, cell, folder)
+                 for row, cell in enumerate(table[name].to_pylist())]  # fmt: skip
+        table = table.set_column(table.column_names.index(name), name, pa.array(cells, pa.string()))
+    return table
+
+
+def _relative(manifest: Manifest, row: int, cell: str, folder: Path) -> str:
+    file = os.path.normpath(manifest.files[manifest.source[row]].parent / cell)
+    if not Path(file).is_relative_to(folder):
+        raise ManifestError(
+            f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to be written"
+        )
+    return Path(file).relative_to(folder).as_posix()
+
+
+def resolve(root: Path, relative: str | None) -> Path:
+    """The file `relative` inside the folder `root` (absolute, resolved).
+
+    Raises ManifestError when the path is empty, absolute, or leaves the folder by "..", or by a symbolic link.
+    """
+    if not relative:
+        raise ManifestError("the path is empty")
+    try:
+        path = os.path.realpath(os.path.join(root, relative))
+    except ValueError:
+        raise ManifestError(f"the path {relative!r} is not a file name") from None
+    if os.path.isabs(relative) or not path.startswith(os.path.join(root, "")):
+        raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}")
+    return Path(path)
+
+
+def sensor_rows(
+    manifest: Manifest,
+    model: Model,
+    rows: np.ndarray | None = None,
+    *,
+    unknown: Literal["error", "skip", "universal"] = "error",
+) -> tuple[np.ndarray, list[str]]:
+    """The sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out; and notes to say aloud.
+
+    Only `rows` (default: all) are looked at; the others are -1. Force-field sensors have no images and are left out.
+    A sensor that `model.sensors` lacks is an error that names its first row, is left out (`skip`), or is served by
+    the universal tokens (`universal`). Raises ManifestError.
+    """
+    ids = np.full(len(manifest), -1, np.int32)
+    codes = manifest.codes("sensor")
+    if rows is not None:
+        inside = np.zeros(len(manifest), bool)
+        inside[rows] = True
+        codes = np.where(inside, codes, -1)
+    notes = []
+    for code in np.unique(codes[codes >= 0]):
+        here = np.flatnonzero(codes == code)
+        name = manifest.value(here[0], "sensor")
+        try:
+            ids[here] = model.sensor_row(name)
+        except ConfigError as error:
+            if name in FIELD_SENSORS:
+                notes.append(f"left out {len(here)} rows of {name}: it measures a force field and has no images")
+            elif unknown == "error":
+                raise ManifestError(f"{manifest.where(here[0])}, column 'sensor': {error}") from None
+            elif unknown == "skip":
+                notes.append(f"left out {len(here)} rows of the unknown sensor {name!r}")
+            else:
+                ids[here] = model.universal_row
+                notes.append(f"sensor {name!r} is unknown: its {len(here)} rows use the universal sensor tokens")
+    return ids, notes

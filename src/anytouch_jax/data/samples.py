@@ -1,0 +1,88 @@
+"""One sample at a time: a row's frames, picture and caption, augmented; bad ones named, or replaced and counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from anytouch_jax.config import Config, UserError
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.transforms import (
+    TOUCH,
+    VISION,
+    augmentation_rng,
+    touch_evaluation,
+    touch_transform,
+    vision_evaluation,
+    vision_transform,
+)
+
+TRIES = 20  # bad samples in a row before a slot gives up
+_REPLACE = 51
+
+
+class SampleError(UserError):
+    """A sample that cannot be used; the message names the row, its manifest, the file and the reason."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads samples of `manifest` at the model's size, augmented as `config` says."""
+
+    manifest: Manifest
+    config: Config
+
+    def touch(self, rows: np.ndarray, epoch: int | None) -> np.ndarray:
+        """The frames of a window of rows as u8 (T, size, size, 3); `epoch` None means no augmentation.
+
+        The last row decides the augmentation of the whole clip. Raises SampleError.
+        """
+        size = self.config.model.image_size
+        frames = [self._decode(row, "path") for row in rows]
+        if epoch is None:
+            return touch_evaluation(frames, size)
+        rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
+        return touch_transform(frames, size, rng, self.config.data)
+
+    def vision(self, row: int, epoch: int | None) -> np.ndarray:
+        """The picture of a row's object as u8 (size, size, 3); `epoch` None means no augmentation."""
+        size = self.config.model.image_size
+        picture = self._decode(row, "image_path")
+        if epoch is None:
+            return vision_evaluation(picture, size)
+        rng = augmentation_rng(self.config.run.seed, epoch, int(row), VISION)
+        return vision_transform(picture, size, rng, self.config.data.rotation)
+
+    def caption(self, row: int) -> str:
+        """The caption of a row."""
+        return str(self.manifest.value(row, "text"))
+
+    def _decode(self, row: int, column: str) -> np.ndarray:
+        try:
+            return decode(self.manifest.file(row, column))
+        except UserError as error:
+            raise SampleError(f"{self.manifest.where(row)}, column {column!r}: {error}") from None
+
+
+def fill_slot(
+    write: Callable[[int, int], None], size: int, step: int, slot: int, config: Config, index: int, epoch: int
+) -> int:
+    """Write sample `index` of `size` into a slot by `write(index, epoch)`; gives back how many were skipped.
+
+    With `data.on_bad_sample` "skip" a bad sample is replaced by another of the same `size` ones, drawn from
+    (seed, step, slot, attempt). Raises SampleError: at once with "error", else after TRIES bad ones in a row.
+    """
+    for attempt in range(TRIES):
+        try:
+            write(index, epoch)
+            return attempt
+        except SampleError as error:
+            if config.data.on_bad_sample == "error":
+                raise
+            last = error
+        rng = np.random.default_rng([config.run.seed % 2**63, _REPLACE, step, slot, attempt])
+        index = int(rng.integers(size))
+    raise SampleError(f"{TRIES} samples in a row cannot be read at step {step}; the last one is {last}")

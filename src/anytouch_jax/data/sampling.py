@@ -1,0 +1,131 @@
+"""Stateless sampling: what step k draws is a function of (data, seed, k); nothing is carried from step to step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from math import gcd, lcm
+
+import numpy as np
+
+VISION, BOTH, TEXT, NEITHER = range(4)  # the strata of alignment, in this order along the line (see `Strata`)
+
+
+def uniform(seed: int, tag: int, steps: np.ndarray) -> np.ndarray:
+    """A number in [0, 1) for every step, f64 of the shape of `steps`: splitmix64 of (seed, tag, step)."""
+    state = np.array([(seed ^ tag * 0xD1342543DE82EF95) % 2**64], np.uint64)  # an array, so that it may overflow
+    x = _mix(state) + (steps.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    return np.asarray((_mix(x) >> np.uint64(11)) * 2.0**-53)
+
+
+def _mix(x: np.ndarray) -> np.ndarray:
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+class Turns:
+    """Which kind of batch each step takes, and how many earlier steps took the same kind.
+
+    `choose` maps step numbers i64 (n,) to small codes (n,); it must depend on the step alone.
+    """
+
+    def __init__(self, choose: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._choose = choose
+        self._known = (np.empty(0, np.int8), np.empty(0, np.int64))
+
+    def at(self, step: int) -> tuple[int, int]:
+        """(kind of `step`, number of earlier steps of that kind)."""
+        if step < 0:
+            raise ValueError(f"a step is counted from 0, not {step}")
+        if step >= len(self._known[0]):
+            kinds = self._choose(np.arange(max(1024, 2 * step))).astype(np.int8)
+            rank = np.empty(len(kinds), np.int64)
+            for kind in np.unique(kinds):
+                here = kinds == kind
+                rank[here] = np.arange(np.count_nonzero(here))
+            self._known = (kinds, rank)
+        kinds, rank = self._known
+        return int(kinds[step]), int(rank[step])
+
+
+class Stream:
+    """An endless stream over `size` things: epoch after epoch, each a seeded permutation of all of them."""
+
+    def __init__(self, size: int, seed: int, tag: int) -> None:
+        self.size = size
+        self._seed = (seed % 2**63, tag)
+        self._epochs: dict[int, np.ndarray] = {}
+
+    def take(self, start: int, count: int) -> list[tuple[int, int]]:
+        """(thing, epoch) at places start .. start + count - 1 of the stream; fewer things than `count` come again."""
+        if not count:
+            return []
+        places = [divmod(place, self.size) for place in range(start, start + count)]
+        return [(int(self._epoch(epoch)[place]), epoch) for epoch, place in places]
+
+    def _epoch(self, epoch: int) -> np.ndarray:
+        if epoch not in self._epochs:
+            while len(self._epochs) > 2:
+                self._epochs.pop(next(iter(self._epochs)))
+            self._epochs[epoch] = np.random.default_rng([*self._seed, epoch]).permutation(self.size)
+        return self._epochs[epoch]
+
+
+class Strata:
+    """How many rows of each stratum (vision, both, text, neither) a batch takes, so that its slots are full.
+
+    `sizes` (4,) rows in each stratum; `images`, `texts` are the slots of a batch: the share of each modality, rounded
+    up to a multiple of `multiple`, at most `batch`. The strata lie on a line of length `batch`, each as long as the
+    rows it gives on average; a batch takes the points u, u + 1, ... of that line, so every count is its average
+    rounded down or up, and so is the number of images (vision + both) and of texts (both + text), which lie together
+    on the line. u moves by the golden section from batch to batch, in whole units of the line's common denominator:
+    every stratum is visited, in its exact share.
+    """
+
+    def __init__(self, sizes: Sequence[int], batch: int, multiple: int = 1) -> None:
+        rows = sum(sizes)
+        shares = [Fraction(batch * size, rows) for size in sizes]
+        self.images = _slots(shares[VISION] + shares[BOTH], batch, multiple)
+        self.texts = _slots(shares[TEXT] + shares[BOTH], batch, multiple)
+        shares = _fill(shares, self.images, self.texts)
+        edges = [sum(shares[:end], Fraction(0)) for end in range(5)]
+        self._unit = lcm(*(edge.denominator for edge in edges))
+        self._edges = np.array([int(edge * self._unit) for edge in edges], np.int64)
+        self._step = max(1, round(0.6180339887 * self._unit))
+        while gcd(self._step, self._unit) > 1:
+            self._step += 1
+        self._known = np.zeros((1, 4), np.int64)
+
+    def at(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """(rows taken from each stratum before batch `k`, rows that batch `k` takes): i64 (4,), i64 (4,)."""
+        if k + 1 >= len(self._known):
+            u = np.cumsum(np.full(max(1024, 2 * k + 2), self._step) % self._unit) % self._unit
+            upto = -((u[:, None] - self._edges) // self._unit)  # points below each edge: ceil((edge - u) / unit)
+            self._known = np.concatenate([np.zeros((1, 4), np.int64), np.cumsum(np.diff(upto, axis=1), axis=0)])
+        return self._known[k], self._known[k + 1] - self._known[k]
+
+
+def _slots(share: Fraction, batch: int, multiple: int) -> int:
+    return min(batch, -(-share // multiple) * multiple)
+
+
+def _fill(shares: list[Fraction], images: int, texts: int) -> list[Fraction]:
+    """Move rows towards the strata that fill the slots; no stratum loses more than half of its natural share."""
+    shares, floor = list(shares), [share / 2 for share in shares]
+
+    def move(source: int, target: int, wanted: Fraction) -> Fraction:
+        if not shares[target]:
+            return wanted
+        amount = min(wanted, shares[source] - floor[source])
+        shares[source] -= amount
+        shares[target] += amount
+        return wanted - amount
+
+    no_image = images - shares[VISION] - shares[BOTH]
+    no_text = texts - shares[TEXT] - shares[BOTH]
+    no_image = move(NEITHER, VISION, no_image)
+    no_text = move(NEITHER, TEXT, no_text)
+    move(TEXT, BOTH, no_image)
+    move(VISION, BOTH, no_text)
+    return shares

@@ -1,0 +1,186 @@
+"""The columns of a manifest: their types, and CSV or Parquet files read into a checked table."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+import pyarrow.parquet
+
+from anytouch_jax.config import UserError
+
+SPLITS = ("train", "val", "test", "background", "unused")
+REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
+PATHS = ("path", "image_path", "background_path", "field_path")
+
+_TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
+SCHEMA: dict[str, pa.DataType] = {
+    "path": _TEXT,
+    "sensor": _TEXT,
+    "sequence": _TEXT,
+    "frame_index": _WHOLE,
+    "split": _TEXT,
+    "dataset": _TEXT,
+    "unit": _TEXT,
+    "stride": _WHOLE,
+    "touch": _TEXT,
+    "object": _TEXT,
+    "image_path": _TEXT,
+    "text": _TEXT,
+    "background_path": _TEXT,
+    "field_path": _TEXT,
+    "license": _TEXT,
+    "commercial": _FLAG,
+}
+
+
+class ManifestError(UserError):
+    """A manifest that cannot be used; the message names the file, the column and the row (counted from 0)."""
+
+
+def load_table(path: Path) -> pa.Table:
+    """The table in `path` (.csv or .parquet), checked and typed by `typed`. Raises ManifestError."""
+    if path.is_dir():
+        raise ManifestError(f"{path} is a folder; give the .csv or .parquet file in it")
+    if not path.is_file():
+        raise ManifestError(f"there is no manifest {path}")
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise ManifestError(f"{path}: a manifest ends in .csv or .parquet")
+    try:
+        table = _read_csv(path) if kind == ".csv" else pa.parquet.read_table(path, partitioning=None)
+    except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ManifestError(f"{path} cannot be read as a {kind[1:]} table: {reason}") from None
+    return typed(table, str(path))
+
+
+def typed(table: pa.Table, where: str) -> pa.Table:
+    """`table` with the types of SCHEMA, blank text as null, and every value checked.
+
+    Columns outside SCHEMA are carried through. `where` names the file in errors. Raises ManifestError when a
+    required column or value is missing, a type is wrong, a split is unknown, a stride is below 1, or no row is there.
+    """
+    names = table.column_names
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ManifestError(f"{where}: column {twice[0]!r} is there twice")
+    missing = [name for name in REQUIRED if name not in names]
+    if missing:
+        raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {', '.join(names)}")
+    if not table.num_rows:
+        raise ManifestError(f"{where} has no rows")
+    columns = {name: _convert(name, table[name], where) for name in names}
+    for name in REQUIRED:
+        _refuse(pc.is_null(columns[name]), where, name, lambda _: "is empty")
+    split = columns["split"]
+    unknown = pc.invert(pc.is_in(split, value_set=pa.array(SPLITS)))
+    choices = ", ".join(SPLITS)
+    _refuse(unknown, where, "split", lambda row: f"must be one of {choices}, is the unknown split {split[row]}")
+    if "stride" in columns:
+        stride = columns["stride"] = pc.fill_null(columns["stride"], 1)
+        _refuse(pc.less(stride, 1), where, "stride", lambda row: f"must be at least 1, is {stride[row]}")
+    return pa.table(columns).combine_chunks()
+
+
+def _read_csv(path: Path) -> pa.Table:
+    """A CSV file as text columns (an empty cell is null), `label.*` columns as numbers where all of them are."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        names = next(csv.reader(file), [])
+    convert = pa.csv.ConvertOptions(
+        column_types=dict.fromkeys(names, _TEXT), strings_can_be_null=True, null_values=[""]
+    )
+    table = pa.csv.read_csv(path, convert_options=convert, parse_options=pa.csv.ParseOptions(newlines_in_values=True))
+    for position, name in enumerate(table.column_names):
+        if name.startswith("label."):
+            table = table.set_column(position, name, _numbers(table[name]))
+    return table
+
+
+def _numbers(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    for kind in (pa.int64(), pa.float64()):
+        try:
+            return column.cast(kind)
+        except pa.ArrowInvalid:
+            continue
+    return column
+
+
+def _convert(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    wanted = SCHEMA.get(name)
+    if wanted is None:
+        return column
+    if pa.types.is_null(column.type):
+        return column.cast(wanted)
+    is_text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
+    if is_text:
+        column = column.cast(_TEXT)
+        bare = pc.utf8_trim_whitespace(column)
+        column = pc.if_else(pc.equal(bare, ""), pa.scalar(None, _TEXT), column if wanted == _TEXT else bare)
+    if wanted == _TEXT:
+        if not is_text:
+            raise ManifestError(f"{where}: column {name!r} must be text, is {column.type}")
+        return column
+    number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_boolean(column.type)
+    if not (is_text or number):
+        raise ManifestError(f"{where}: column {name!r} must be a {_plain(wanted)}, is {column.type}")
+    try:
+        # A column of whole numbers with gaps is often stored as floats ("130.0"), so a plain cast is not enough.
+        return _whole(column) if wanted == _WHOLE else _flag(column, is_text)
+    except pa.ArrowInvalid:
+        parse = _parse_whole if wanted == _WHOLE else _parse_flag
+        row, value = _first_bad(column, parse)
+        what = _plain(wanted)
+        raise ManifestError(f"{where}, row {row}: column {name!r} must be a {what}, is {value!r}") from None
+
+
+def _whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    try:
+        return column.cast(_WHOLE)
+    except pa.ArrowInvalid:
+        return column.cast(pa.float64()).cast(_WHOLE)
+
+
+def _flag(column: pa.ChunkedArray, is_text: bool) -> pa.ChunkedArray:
+    if not is_text and not pa.types.is_boolean(column.type):
+        column = _whole(column).cast(_TEXT)  # a number other than 0 and 1 is a mistake, not "true"
+    return column.cast(pa.bool_())
+
+
+def _plain(kind: pa.DataType) -> str:
+    return "whole number" if kind == _WHOLE else "0 or 1"
+
+
+def _parse_whole(value: Any) -> None:
+    if float(value) != int(float(value)):
+        raise ValueError
+
+
+def _parse_flag(value: Any) -> None:
+    if str(value).lower() not in ("0", "1", "true", "false"):
+        raise ValueError
+
+
+def _first_bad(column: pa.ChunkedArray, parse: Callable[[Any], None]) -> tuple[int, Any]:
+    """Row and value of the first entry that `parse` refuses; only walked when the fast cast has failed."""
+    for row, value in enumerate(column.to_pylist()):
+        if value is None:
+            continue
+        try:
+            parse(value)
+        except (ValueError, OverflowError):
+            return row, value
+    return 0, column[0].as_py()
+
+
+def _refuse(bad: pa.ChunkedArray, where: str, name: str, say: Callable[[int], str]) -> None:
+    row = pc.index(bad, True).as_py()
+    if row >= 0:
+        raise ManifestError(f"{where}, row {row}: column {name!r} {say(row)}")

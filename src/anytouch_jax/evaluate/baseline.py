@@ -1,0 +1,67 @@
+"""The reference point without any learning: raw pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from sklearn.decomposition import PCA
+
+from ..config import UserError
+
+Array = npt.NDArray[Any]
+GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R 601, on RGB
+
+
+def raw_pixels(
+    frames: Array, backgrounds: Array, has_background: Array | None = None, *, size: tuple[int, int] = (24, 32)
+) -> Array:
+    """Grey pixels and their difference from the background, both averaged down to `size` (rows, columns).
+
+    `frames`, `backgrounds`: u8 RGB (n, h, w, 3) -> f32 (n, 2 * rows * columns), pixels in 0..1. The difference is 0
+    where `has_background` (n,) is false. It may be called in pieces. Raises UserError when shapes do not match.
+    """
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.shape != backgrounds.shape:
+        raise UserError(f"frames {frames.shape} and backgrounds {backgrounds.shape} must both be (n, h, w, 3)")
+    small = _shrink(frames, size)
+    change = small - _shrink(backgrounds, size)
+    if has_background is not None:
+        change[~np.asarray(has_background, bool)] = 0.0
+    return np.concatenate([small, change], axis=1)
+
+
+def raw_pixel_features(
+    frames: Array, backgrounds: Array, train: Array, has_background: Array | None = None, *, components: int = 200
+) -> Array:
+    """`raw_pixels` reduced to f32 (n, components) by a PCA fitted on the rows where `train` (n,) is true.
+
+    With fewer train rows than `components`, as many as there are.
+    """
+    return reduce(raw_pixels(frames, backgrounds, has_background), train, components)
+
+
+def reduce(features: Array, train: Array, components: int = 200) -> Array:
+    """`features` (n, d) on the first principal components of its `train` (n,) rows, largest variance first."""
+    train = np.asarray(train, bool)
+    if not train.any():
+        raise UserError("no row is marked as train; the principal components need some")
+    count = min(components, int(train.sum()), features.shape[1])
+    projection = PCA(count, svd_solver="full").fit(features[train])
+    return projection.transform(features).astype(np.float32)
+
+
+def _shrink(images: Array, size: tuple[int, int]) -> Array:
+    """Grey area averages (n, rows * columns) in 0..1 of u8 images (n, h, w, 3)."""
+    rows, columns = _area(images.shape[1], size[0]), _area(images.shape[2], size[1])
+    grey = [rows @ (image.astype(np.float32) @ GREY) @ columns.T for image in images]
+    return np.stack(grey).reshape(len(images), -1) / 255.0 if grey else np.zeros((0, size[0] * size[1]), np.float32)
+
+
+def _area(fine: int, coarse: int) -> Array:
+    """(coarse, fine) weights of area averaging: the overlap of each coarse cell with each fine one; rows sum to 1."""
+    edges = np.arange(coarse + 1) * (fine / coarse)
+    left, right = edges[:-1, None], edges[1:, None]
+    cells = np.arange(fine)[None]
+    overlap = np.clip(np.minimum(right, cells + 1) - np.maximum(left, cells), 0, None)
+    return (overlap / overlap.sum(1, keepdims=True)).astype(np.float32)

@@ -1,0 +1,155 @@
+"""Touch features from a trained encoder: of arrays, manifests, folders of frames and videos (`anytouch embed`)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from anytouch_jax.config import UNIVERSAL, Config, UserError, from_json
+from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.objectives import normalise_touch
+
+Pooling = Literal["class", "mean", "both"]
+Join = Literal["mean", "sum", "concat"]
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A touch encoder with its parameters. `source` says where they came from."""
+
+    config: Config
+    params: dict[str, Any] = field(repr=False)
+    source: str
+
+    @cached_property
+    def net(self) -> Net:
+        return build(self.config.model)
+
+    def sensor_row(self, name: str, say: Callable[[str], None] = lambda _: None) -> int:
+        """Row of a sensor's tokens; the universal ones for a sensor that the table does not have, said aloud."""
+        model = self.config.model
+        if name in model.sensors:
+            return model.sensors.index(name)
+        say(f"sensor {name!r} is not in this model's table ({', '.join(model.sensors)}): using the universal tokens")
+        return model.universal_row
+
+    def embed(
+        self, clips: Any, sensor: str | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class", join: Join = "mean"
+    ) -> np.ndarray:
+        """Features (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or one (H, W, 3), at the model's size.
+
+        `sensor` is a name for all, or rows i32 (B,). T is 1 (a still), 3 (a clip) or more: segments joined by `join`.
+        `pooling`: the class token's embedding (what alignment trains), the mean over patch tokens, or both (B, 2E).
+        Raises UserError for another shape or type.
+        """
+        clips = np.asarray(clips)
+        clips = clips[None, None] if clips.ndim == 3 else clips[:, None] if clips.ndim == 4 else clips
+        side = self.config.model.image_size
+        if clips.dtype != np.uint8 or clips.ndim != 5 or clips.shape[2:] != (side, side, 3):
+            raise UserError(
+                f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {clips.dtype} "
+                f"{clips.shape}; data.transforms.touch_evaluation resizes them"
+            )
+        if 1 < clips.shape[1] < self.config.model.frames:
+            raise UserError(
+                f"a clip needs {self.config.model.frames} frames or more (or 1, a still), not {clips.shape[1]}"
+            )
+        rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
+        if rows.min(initial=0) < 0 or rows.max(initial=0) >= len(self.config.model.sensors):
+            raise UserError(f"sensor rows must be 0 to {len(self.config.model.sensors) - 1}")
+        return np.asarray(self._run(pooling, join)(self.params, clips, rows.astype(np.int32)))
+
+    def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
+        key = (pooling, join)
+        if key not in self._compiled:
+            self._compiled[key] = jax.jit(partial(_features, net=self.net, pooling=pooling, join=join))
+        return self._compiled[key]
+
+    @cached_property
+    def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
+        return {}
+
+
+def _features(params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join) -> jax.Array:
+    clips = normalise_touch(clips)
+    parts = []
+    if pooling in ("class", "both"):
+        parts.append(net.apply(params, "encode", clips, sensor, join))
+    if pooling in ("mean", "both"):
+        parts.append(net.apply(params, "encode_patches", clips, sensor, join))
+    return jnp.concatenate([part.astype(jnp.float32) for part in parts], axis=-1)
+
+
+def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
+    """The encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
+
+    Only the touch encoder is kept. Raises UserError when there is none.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UserError(f"no run folder or weights file at {path}")
+    if path.is_dir():
+        params, config_json, _ = checkpoint.load_params(path, step)
+        config = from_json(config_json)
+    else:
+        weights = release.read_weights(path)
+        model = release.detect_model(weights)
+        params, config = release.to_params(weights, model), Config(model)
+    if "touch" not in params:
+        raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
+    return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path))
+
+
+def random_encoder(config: Config, seed: int = 0) -> Encoder:
+    """An untrained encoder: the control of every probe."""
+    config = _touch_only(config)
+    return Encoder(config, {"touch": build(config.model).init(jax.random.key(seed))["touch"]}, f"random({seed})")
+
+
+def _touch_only(config: Config) -> Config:
+    return replace(config, model=replace(config.model, image=None, text=None, match_head="none", lora_rank=0))
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features (n, d) f32 with the keys of their rows: manifest row numbers, or frame numbers of a video or folder."""
+
+    values: np.ndarray
+    rows: np.ndarray
+    keys: dict[str, np.ndarray]
+    skipped: int = 0
+
+
+def embed_batches(
+    encoder: Encoder, batches: Iterator[tuple[np.ndarray, Any, int]], *, pooling: Pooling = "class", join: Join = "mean"
+) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, features) over batches of (row ids, TouchBatch, number of valid rows); each frame is encoded once."""
+    rows, values = [], []
+    for ids, batch, valid in batches:
+        rows.append(np.asarray(ids[:valid]))
+        values.append(encoder.embed(batch.clip, batch.sensor, pooling=pooling, join=join)[:valid])
+    return np.concatenate(rows), np.concatenate(values)
+
+
+def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:
+    """Write features, row numbers, keys and a description as one `.npz`, atomically. Raises UserError."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with open(part, "wb") as file:
+            described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
+            keys = {f"key/{k}": v for k, v in features.keys.items()}
+            np.savez(file, features=features.values, rows=features.rows, **keys, **described)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UserError(f"cannot write {path}: {error.strerror}") from None

@@ -1,0 +1,102 @@
+"""Pictures of what a model does: originals, masks, reconstructions and predicted next frames."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config, UserError
+from anytouch_jax.nn.functional import Net
+from anytouch_jax.objectives import normalise_touch, reconstruct
+from anytouch_jax.ops import losses, tokens
+
+_GREY, _GAP, _SCALE = 128, 4, 1
+
+
+def reconstruction_panels(
+    params: Any, clip: Any, sensor: Any, *, net: Net, config: Config, seed: int = 0
+) -> np.ndarray:
+    """Rows of samples as one RGB image u8: original frames, masked input, reconstruction, (next frame, prediction).
+
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). Visible patches are shown as they were; with `norm_pix_loss` the
+    prediction is brought back by the true mean and spread of each patch.
+    """
+    noise = jax.random.uniform(jax.random.key(seed), (len(sensor), net.model.patches))
+    pred, hidden = _predict(net, config)(params, jnp.asarray(clip), jnp.asarray(sensor), noise)
+    return _panels(np.asarray(clip), np.asarray(pred), np.asarray(hidden), net, config)
+
+
+def _predict(net: Net, config: Config) -> Any:
+    @partial(jax.jit)
+    def run(params: Any, clip: Any, sensor: Any, noise: Any) -> Any:
+        return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
+
+    return run
+
+
+def _panels(clip: np.ndarray, pred: np.ndarray, hidden: np.ndarray, net: Net, config: Config) -> np.ndarray:
+    patch, size, frames = net.model.patch, net.model.image_size, net.model.frames
+    if config.objective.norm_pix_loss:
+        target = np.asarray(tokens.patchify(normalise_touch(jnp.asarray(clip)), patch))
+        spread = np.sqrt(target.var(axis=-1, ddof=1, keepdims=True) + 1e-6)
+        pred = pred * spread + target.mean(axis=-1, keepdims=True)
+    painted = _to_pixels(np.asarray(tokens.unpatchify(jnp.asarray(pred), patch, size)))
+    cover = (
+        np.asarray(tokens.unpatchify(jnp.asarray(hidden)[:, :, None, None].repeat(patch**2 * 3, 3), patch, size)) > 0
+    )
+    shown = min(clip.shape[1], frames)
+    masked = np.where(cover, _GREY, clip[:, :shown])
+    filled = np.where(cover, painted[:, :shown], clip[:, :shown])
+    blocks = [clip[:, :shown], masked, filled]
+    if clip.shape[1] > frames:
+        blocks += [clip[:, frames : frames + 1], painted[:, frames : frames + 1]]
+    rows = [np.concatenate([_strip(block[i]) for block in blocks], axis=1) for i in range(len(clip))]
+    return np.concatenate(rows, axis=0)
+
+
+def _strip(frames: np.ndarray) -> np.ndarray:
+    """Frames (T, H, W, 3) side by side, with a white edge."""
+    return np.concatenate([np.pad(f, ((0, _GAP), (0, _GAP), (0, 0)), constant_values=255) for f in frames], axis=1)
+
+
+def _to_pixels(normalised: np.ndarray) -> np.ndarray:
+    pixels = (normalised * np.asarray(IMAGENET_STD) + np.asarray(IMAGENET_MEAN)) * 255
+    return np.clip(np.nan_to_num(pixels), 0, 255).astype(np.uint8)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write an RGB image u8 (H, W, 3) atomically. Raises UserError when the disk does not take it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    good, data = cv2.imencode(".png", image[..., ::-1])
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_bytes(data.tobytes() if good else b"")
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UserError(f"cannot write the figure {path}: {error.strerror}") from None
+
+
+def pixel_baselines(clip: np.ndarray, hidden: np.ndarray, *, patch: int, frames: int) -> dict[str, float]:
+    """What a guess without a model scores in the units of the loss (normalised pixels, mean squared error).
+
+    `reconstruction`: every hidden patch is the mean of the sample's visible ones; `next_frame`: a copy of the last
+    frame that the encoder sees. `clip` u8 (B, T, H, W, 3), `hidden` bool (B, N).
+    """
+    target = np.asarray(tokens.patchify(normalise_touch(jnp.asarray(clip)), patch))
+    visible = ~hidden[:, :, None, None]
+    mean = (target * visible).sum(axis=1, keepdims=True) / visible.sum(axis=1, keepdims=True)
+    guess = np.broadcast_to(mean, target.shape).copy()
+    if target.shape[2] > frames:
+        guess[:, :, frames] = target[:, :, frames - 1]
+    _, metrics = losses.reconstruction_loss(
+        jnp.asarray(guess), jnp.asarray(target), jnp.asarray(hidden), next_frame=target.shape[2] > frames
+    )
+    return {name: float(value) for name, value in metrics.items()}

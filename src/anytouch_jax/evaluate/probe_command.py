@@ -1,0 +1,166 @@
+"""`anytouch probe`: from a manifest and runs to probe results, each frame encoded once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anytouch_jax.config import Config, UserError, preset
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.transforms import touch_evaluation
+from anytouch_jax.evaluate import baseline, probe
+from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
+
+if TYPE_CHECKING:
+    from anytouch_jax import cli
+
+Say = Callable[[str], None]
+_RAW_SIZE = (240, 320)
+
+
+@dataclass(frozen=True)
+class Task:
+    """The rows of a manifest that take part in a probe, with what the probes need to know of each."""
+
+    manifest: Any
+    rows: np.ndarray
+    labels: np.ndarray
+    groups: np.ndarray
+    split: np.ndarray
+    subsets: dict[str, np.ndarray]
+
+    def only(self, rows: np.ndarray) -> Task:
+        """The task on those of its rows that are in `rows`."""
+        keep = np.isin(self.rows, rows)
+        subsets = {name: mask[keep] for name, mask in self.subsets.items()}
+        return replace(
+            self, rows=self.rows[keep], labels=self.labels[keep], groups=self.groups[keep], split=self.split[keep],
+            subsets=subsets,
+        )  # fmt: skip
+
+
+def run_probes(options: cli.Probe, say: Say) -> list[Any]:
+    """All results: for each encoder (and the controls) a linear probe and kNN, or the groups left out."""
+    task = read_task(options, say)
+    found: list[Any] = []
+    for name, values in _features(options, task, say):
+        found += probe_features(options, task, values, name)
+        say(f"probed {name}")
+    if not found:
+        raise UserError("nothing to probe: give --run, or keep the controls")
+    if options.leave_out is None:
+        found.append(probe.majority(task.labels, task.groups, task.split, subsets=task.subsets))
+    return found
+
+
+def probe_features(options: cli.Probe, task: Task, values: np.ndarray, name: str) -> list[Any]:
+    """Linear and kNN results of one set of features (n, d) on a task."""
+    if options.leave_out is not None:
+        return [
+            probe.leave_groups_out(
+                values, task.labels, task.groups, name=f"{name}: linear, {options.leave_out} left out"
+            )
+        ]
+    shared: dict[str, Any] = {"protocol": options.protocol, "seeds": options.seeds, "subsets": task.subsets}
+    return [
+        probe.linear_probe(values, task.labels, task.groups, task.split, name=f"{name}: linear", **shared),
+        probe.knn_probe(values, task.labels, task.groups, task.split, name=f"{name}: kNN", **shared),
+    ]
+
+
+def read_task(options: cli.Probe, say: Say) -> Task:
+    """Rows with a label that pass the filters. Raises UserError on a column that is not there."""
+    manifest = manifests.read([str(path) for path in options.data])
+    table = manifest.table
+    label = _column(table, options.label)
+    kept = np.array([value not in (None, "") for value in label])
+    if options.where is not None:
+        name, least = options.where
+        number = np.array([np.nan if v in (None, "") else float(v) for v in _column(table, name)])
+        kept &= number > least
+    if options.sensor is not None:
+        kept &= np.array(_column(table, "sensor")) == options.sensor
+    split = np.array(_column(table, "split"))
+    kept &= np.isin(split, ("train", "val", "test"))
+    if options.frames > 1:
+        kept &= np.isin(np.arange(len(manifest)), manifest.clips(options.frames)[:, -1])
+    rows = np.flatnonzero(kept)
+    if not rows.size:
+        raise UserError(f"no row has a label in {options.label!r} after the filters")
+    say(f"{len(rows)} of {len(manifest)} rows take part")
+    groups = _groups(manifest, options, rows)
+    subsets = _subsets(manifest, label, split, rows)
+    return Task(manifest, rows, np.array([label[r] for r in rows]), groups, split[rows], subsets)
+
+
+def _column(table: Any, name: str) -> list[Any]:
+    for candidate in (f"label.{name}", name):
+        if candidate in table.column_names:
+            values: list[Any] = table[candidate].to_pylist()
+            return values
+    raise UserError(f"the manifest has no column {name!r} or 'label.{name}'; it has {', '.join(table.column_names)}")
+
+
+def _groups(manifest: Any, options: cli.Probe, rows: np.ndarray) -> np.ndarray:
+    """The column asked for, the sequence where it is empty; with leave_out that column alone."""
+    sequence = _column(manifest.table, "sequence")
+    name = options.leave_out or options.group
+    if options.leave_out is None and name not in manifest.table.column_names:
+        return np.array([sequence[r] for r in rows])
+    column = _column(manifest.table, name)
+    return np.array([str(column[r]) if column[r] not in (None, "") else f"sequence {sequence[r]}" for r in rows])
+
+
+def _subsets(manifest: Any, label: list[Any], split: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Rows of classes that have a photograph or a caption in train, and the others: alignment may have named them."""
+    described = manifest.present("image_path") | manifest.present("text")
+    named = {label[r] for r in np.flatnonzero(described & (split == "train"))}
+    mask = np.array([label[r] in named for r in rows])
+    if mask.all() or not mask.any():
+        return {}
+    return {"classes with a photograph or caption": mask, "classes without": ~mask}
+
+
+def _features(options: cli.Probe, task: Task, say: Say) -> Any:
+    """(name, features) of every encoder asked for, then of the controls."""
+    from anytouch_jax.commands import embed_rows
+
+    encoders: list[tuple[str, Encoder]] = [(str(path), load_encoder(path)) for path in options.run]
+    if options.controls:
+        config: Config = encoders[0][1].config if encoders else preset("tiny")
+        encoders.append(("random encoder", random_encoder(config)))
+    for name, encoder in encoders:
+        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames, options.pooling)
+        if not np.array_equal(rows, task.rows):
+            raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
+        yield name, values
+    if options.controls:
+        yield "raw pixels", raw_features(task)
+
+
+def raw_features(task: Task) -> np.ndarray:
+    """Grey pixels and their difference from the background, reduced by a PCA fitted on train."""
+    pieces = []
+    for row in task.rows:
+        frame = _small(task.manifest.file(int(row)))
+        has = task.manifest.value(int(row), "background_path") is not None
+        ground = _small(task.manifest.file(int(row), "background_path")) if has else np.zeros_like(frame)
+        pieces.append(baseline.raw_pixels(frame[None], ground[None], np.array([has]))[0])
+    train = task.split == "train"
+    return baseline.reduce(np.stack(pieces), train if train.any() else np.ones(len(pieces), bool))
+
+
+def _small(path: Any) -> np.ndarray:
+    import cv2
+
+    image = decode(path)
+    if image.shape[:2] == _RAW_SIZE:
+        return image
+    return np.asarray(cv2.resize(image, _RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
+
+
+__all__ = ["Task", "probe_features", "raw_features", "read_task", "run_probes", "touch_evaluation"]

@@ -1,0 +1,298 @@
+"""Checkpoints of a run: the one file that knows Orbax (its v1 API), and a flat safetensors export.
+
+A checkpoint is a folder `<checkpoints>/<step>` that appears whole or not at all: everything is written under another
+name, then renamed. It describes itself (io/record.py): the run's config as JSON, the caller's metadata (sensors by
+name, preprocessing, source) and the metrics. Arrays are stored by name, so that parameters can be read without the
+optimiser that trained them, and on another number of devices.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import math
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from orbax.checkpoint import v1 as ocp
+
+from anytouch_jax.io.record import CheckpointError, checked, read_record, resolve, steps, write_record
+from anytouch_jax.io.tensors import read_safetensors, write_safetensors
+from anytouch_jax.io.tree import flatten, nest
+
+__all__ = [
+    "CheckpointError",
+    "Checkpoints",
+    "export_safetensors",
+    "import_safetensors",
+    "load_params",
+    "read_metadata",
+    "steps",
+]
+
+Tree = Any
+
+_UNFINISHED = re.compile(r"\d{8,}\..+")  # being written or removed, by us or by Orbax
+_SHOWN = 5  # names listed in one error message
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return "_SignalingThread" not in record.getMessage()
+
+
+# Orbax logs the traceback of every error of its threads although it also raises it; a full disk is one sentence here.
+logging.getLogger("absl").addFilter(_is_news)
+
+
+class Checkpoints:
+    """The checkpoints of one run: asynchronous saves; the last `keep` and the best (lowest `loss`) are kept.
+
+    `config_json` and `metadata` (JSON values) are stored with every checkpoint. Leftovers of a killed run in `folder`
+    are removed. Every process of a multi-process run makes one; process 0 does the housekeeping.
+    """
+
+    def __init__(self, folder: str | Path, *, keep: int, config_json: str, metadata: dict[str, Any]) -> None:
+        if keep < 1:
+            raise CheckpointError(f"a run must keep at least one checkpoint, not {keep}")
+        self.folder = Path(folder).absolute()
+        self._keep = keep
+        try:
+            json.dumps(metadata, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise CheckpointError(f"the metadata of a checkpoint must be plain JSON values: {error}") from None
+        self._described = {"config": config_json, "metadata": metadata}
+        self._worker = ThreadPoolExecutor(1, "checkpoint")
+        self._pending: tuple[Path, Future[None]] | None = None
+        self._saved: set[int] = set()
+        self._losses: dict[int, float] = {}
+        with self._sentence(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        self._sweep()
+
+    def save(self, step: int, state: Tree, metrics: Mapping[str, Any]) -> None:
+        """Start saving `state`, a pytree of arrays; it may be donated or changed as soon as this returns.
+
+        Waits for the previous save first, and raises its CheckpointError. A step that this object has saved already
+        is left alone; one from an earlier life of the run is replaced when the new one is complete.
+        """
+        self.wait()
+        if step in self._saved:
+            return
+        target = self.folder / f"{step:08d}"
+        leaves = {name: _owned(leaf) for name, leaf in flatten(state).items()}
+        numbers = {name: float(value) for name, value in metrics.items()}
+        content = {
+            **self._described,
+            "step": int(step),
+            "metrics": {name: value if math.isfinite(value) else None for name, value in numbers.items()},
+            "arrays": {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in leaves.items()},
+        }
+        arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
+        with self._sentence(target):
+            response = ocp.save_async(_writing(target), nest(arrays))
+        self._pending = target, self._worker.submit(self._finish, target, response, content)
+
+    def wait(self) -> None:
+        """Block until the running save is on disk. Raises CheckpointError when it failed (a full disk)."""
+        if self._pending is None:
+            return
+        (target, future), self._pending = self._pending, None
+        with self._sentence(target):
+            try:
+                future.result()
+            finally:  # also after a failure: the other processes are waiting
+                _barrier(f"saved {target.name}")
+        self._saved.add(int(target.name))
+
+    def latest(self) -> int | None:
+        """The last complete step on disk, or None."""
+        return max(steps(self.folder), default=None)
+
+    def restore(self, abstract_state: Tree, step: int | None = None) -> Tree:
+        """The state of `step` (None: the latest), with the structure and shardings of `abstract_state`.
+
+        `abstract_state` is a tree of `jax.ShapeDtypeStruct` (or arrays); a leaf without sharding goes to the first
+        device. Raises CheckpointError when there is no such checkpoint, when it is damaged, or when names, shapes
+        or types differ from those wanted.
+        """
+        self.wait()
+        folder = resolve(self.folder, step)
+        record = checked(folder)
+        wanted = {name: _abstract(leaf) for name, leaf in flatten(abstract_state).items()}
+        _compare(folder, wanted, _forms(record))
+        found = _load(folder, {name: like for name, like in wanted.items() if math.prod(like.shape)})
+        leaves = [
+            found[name] if name in found else jax.device_put(np.zeros(like.shape, like.dtype), like.sharding)
+            for name, like in wanted.items()
+        ]
+        return jax.tree.unflatten(jax.tree.structure(abstract_state), leaves)
+
+    def close(self) -> None:
+        """Finish the running save and its housekeeping. Raises CheckpointError when the save failed."""
+        self.wait()
+        self._worker.shutdown()
+
+    def _finish(self, target: Path, response: Any, content: dict[str, Any]) -> None:
+        """On the worker thread: when the arrays are on disk, write the record, rename, remove what is not kept."""
+        response.result()
+        if jax.process_index() != 0:
+            return
+        writing = _writing(target)
+        write_record(writing, content)
+        if target.exists():
+            _discard(target)
+        writing.rename(target)
+        self._losses[int(target.name)] = _loss(target)
+        self._prune()
+
+    def _prune(self) -> None:
+        present = steps(self.folder)
+        for step in set(present) - set(self._losses):
+            self._losses[step] = _loss(self.folder / f"{step:08d}")
+        best = min(present, key=lambda step: (self._losses[step], -step))
+        kept = {best, *present[-self._keep :]} if math.isfinite(self._losses[best]) else set(present[-self._keep :])
+        for step in set(present) - kept:
+            _discard(self.folder / f"{step:08d}")
+
+    def _sweep(self) -> None:
+        if jax.process_index() == 0 and self.folder.is_dir():
+            for entry in self.folder.iterdir():
+                if entry.is_dir() and _UNFINISHED.fullmatch(entry.name):
+                    shutil.rmtree(entry, ignore_errors=True)
+
+    @contextmanager
+    def _sentence(self, path: Path) -> Iterator[None]:
+        """Turn an error of the storage layers while writing into a CheckpointError; the debris is removed."""
+        try:
+            yield
+        except Exception as error:  # Orbax and tensorstore wrap OSError in several kinds
+            self._sweep()
+            reason = " ".join(str(error).split())[:300]
+            full = getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error)
+            advice = "the disk is full, free some space and run the same command again" if full else reason
+            raise CheckpointError(f"could not write checkpoint {path}: {advice}; older ones are untouched") from error
+
+
+def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]:
+    """What a checkpoint says of itself: `step`, `config` (JSON), `metrics` and the metadata given when it was saved.
+
+    `folder` is a run, its checkpoints folder, or one checkpoint. Raises CheckpointError.
+    """
+    return _description(read_record(resolve(Path(folder), step)))
+
+
+def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """(parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
+
+    `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen`
+    of the state together; the optimiser's arrays are not read. Raises CheckpointError.
+    """
+    target = resolve(Path(folder), step)
+    record = checked(target)
+    chosen = {
+        name: np.zeros(like.shape, like.dtype)
+        for name, like in _forms(record).items()
+        if name.split("/")[0] in ("trainable", "frozen")
+    }
+    if not chosen:
+        raise CheckpointError(f"checkpoint {target} holds no parameters (nothing under trainable/ or frozen/)")
+    found = chosen | _load(target, {name: like for name, like in chosen.items() if like.size})
+    return nest({name.split("/", 1)[1]: leaf for name, leaf in found.items()}), record["config"], _description(record)
+
+
+def export_safetensors(path: str | Path, params: Tree, metadata: Mapping[str, str]) -> None:
+    """Write a parameter tree to one safetensors file, names joined with "/"; whole or not at all."""
+    write_safetensors(path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata)
+
+
+def import_safetensors(path: str | Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """(parameter tree of numpy arrays, metadata) of a file by `export_safetensors`. Raises WeightsError."""
+    arrays, metadata = read_safetensors(path)
+    return nest(arrays), metadata
+
+
+def _owned(leaf: Any) -> Any:
+    """The leaf, safe against later changes: a numpy array may be written to while the save runs."""
+    return leaf if isinstance(leaf, jax.Array) else np.array(leaf)
+
+
+def _writing(target: Path) -> Path:
+    return target.with_name(f"{target.name}.writing")
+
+
+def _discard(target: Path) -> None:
+    """Remove a checkpoint: renamed first, so that a kill halfway leaves nothing that looks complete."""
+    doomed = target.with_name(f"{target.name}.deleted")
+    shutil.rmtree(doomed, ignore_errors=True)
+    target.rename(doomed)
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _barrier(name: str) -> None:
+    """In a multi-process run: no process goes on before process 0 has renamed the folder."""
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices(name)
+
+
+def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
+    """The named arrays; any others in the checkpoint are not read. The kind of the abstract leaf decides the kind."""
+    if not abstract:
+        return {}
+    context = ocp.Context()
+    context.pytree.loading.partial_load = True
+    try:
+        with context:
+            return flatten(ocp.load(folder, nest(abstract)))
+    except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"could not read checkpoint {folder} ({type(error).__name__}: {reason})") from error
+
+
+def _forms(record: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
+    return {n: jax.ShapeDtypeStruct(tuple(shape), np.dtype(kind)) for n, (shape, kind) in record["arrays"].items()}
+
+
+def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
+    """Raise CheckpointError that names up to five entries when a checkpoint is not of the wanted form."""
+
+    def form(like: Any) -> str:
+        return "nothing" if like is None else f"{tuple(like.shape)} {np.dtype(like.dtype)}"
+
+    differing = [
+        f"{name}: {form(stored.get(name))} stored, {form(wanted.get(name))} wanted"
+        for name in sorted({*wanted, *stored})
+        if form(wanted.get(name)) != form(stored.get(name))
+    ]
+    if differing:
+        raise CheckpointError(
+            f"checkpoint {folder} does not fit this configuration, use the preset and settings it was trained with; "
+            f"{len(differing)} entries differ ({'; '.join(differing[:_SHOWN])}{'; ...' * (len(differing) > _SHOWN)})"
+        )
+
+
+def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
+    sharding = getattr(leaf, "sharding", None) or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.ShapeDtypeStruct(tuple(leaf.shape), leaf.dtype, sharding=sharding)
+
+
+def _description(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {**record["metadata"], "step": record["step"], "config": record["config"], "metrics": record["metrics"]}
+
+
+def _loss(folder: Path) -> float:
+    """The loss a checkpoint was saved with; infinite when unknown, so that it is never the best."""
+    try:
+        loss = read_record(folder)["metrics"].get("loss")
+    except CheckpointError:  # a damaged one is left for `restore` to report
+        return math.inf
+    return math.inf if loss is None else loss

@@ -1,0 +1,43 @@
+"""Nested dicts of arrays and their flat form, a dict from "touch/blocks/norm1/scale" to the array."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+
+from anytouch_jax.config import UserError
+
+
+def flatten(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
+    """Leaves of a pytree by name, the path joined with "/" (keys, field names, indices).
+
+    Raises UserError when two leaves get the same name.
+    """
+    flat: dict[str, Any] = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        if name in flat:
+            raise UserError(f"two arrays of the tree are called {name!r}; rename one of them")
+        flat[name] = leaf
+    return flat
+
+
+def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """The nested dict whose leaves have these names; the inverse of `flatten` for nested dicts.
+
+    Raises UserError when one name is the beginning of another.
+    """
+    tree: dict[str, Any] = {}
+    for name, leaf in flat.items():
+        *parents, last = name.split("/")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                break
+        if not isinstance(node, dict) or last in node:
+            raise UserError(f"the name {name!r} is also the beginning of another array's name; rename one of them")
+        node[last] = leaf
+    return tree

@@ -1,0 +1,1 @@
+"""The networks. `functional.build` is the way in; nothing outside this folder meets a Flax module."""

@@ -1,0 +1,130 @@
+"""AnyTouch: touch encoder and decoder, image and text towers, matching head, under the names that others call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from flax import nnx
+from jax import Array
+
+from anytouch_jax.config import Model
+from anytouch_jax.nn.clip import ImageTower, TextEncoder
+from anytouch_jax.nn.layers import Dense, Mlp, gelu, table
+from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
+from anytouch_jax.ops import tokens
+
+Features = Callable[[Array, Array], Array]
+
+
+class Lora(nnx.Module):
+    """Low-rank factors of one projection in every block: a (depth, D, r), b (depth, r, D)."""
+
+    def __init__(self, depth: int, width: int, rank: int) -> None:
+        self.a, self.b = table(depth, width, rank), table(depth, rank, width)
+
+
+class AnyTouch(nnx.Module):
+    """The whole network. Parts that the config leaves out do not exist and cost nothing."""
+
+    def __init__(self, model: Model) -> None:
+        self.touch = TouchEncoder(model)
+        self.decoder = TouchDecoder(model)
+        self.frames, self.embed = model.frames, model.embed
+        if model.image is not None:
+            self.image = ImageTower(model, model.image)
+            if model.lora_rank:
+                size = (model.image.depth, model.image.width, model.lora_rank)
+                self.lora = nnx.Dict({n: Lora(*size) for n in ("query", "key", "value", "out")})
+        if model.text is not None:
+            self.text = TextEncoder(model, model.text)
+        if model.image is not None or model.text is not None:
+            self.logit_scale = table()
+        if model.match_head == "mlp":
+            self.matcher = Mlp(model.embed, model.embed, model, gelu, outputs=1)
+        elif model.match_head == "linear":
+            self.matcher = Dense(model.embed, 1, model)
+
+    def encode(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
+        """Touch embeddings (B, E) of stills (T = 1) or clips, from the class token, not normalised.
+
+        A clip of more than three frames is cut into three-frame segments whose features are averaged
+        (join="mean"), summed ("sum") or concatenated ("concat": (B, S*E)) (App. "Discussion on frame number").
+        """
+        return self._over_segments(self.touch.features, clip, sensor, join)
+
+    def encode_patches(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
+        """As `encode`, from the mean over the projected patch tokens (the release's "global" pooling)."""
+        special = 1 + self.touch.sensor_tokens[...].shape[1]
+        mean = lambda c, s: jnp.mean(self.encode_tokens(c, s)[:, special:], axis=1)  # noqa: E731
+        return self._over_segments(mean, clip, sensor, join)
+
+    def _over_segments(self, features: Features, clip: Array, sensor: Array, join: str) -> Array:
+        if clip.shape[1] in (1, self.frames):
+            return features(clip, sensor)
+        parts = tokens.segments(clip, self.frames)
+        b, s = parts.shape[:2]
+        z = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s)).reshape(b, s, -1)
+        return {"mean": lambda: z.mean(1), "sum": lambda: z.sum(1), "concat": lambda: z.reshape(b, -1)}[join]()
+
+    def encode_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        """The projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches]: the decoder's input."""
+        return self.touch.projection(self.touch.hidden(clip, sensor, keep_ids))
+
+    def reconstruct(
+        self,
+        clip: Array,
+        sensor: Array,
+        keep_ids: Array,
+        restore_ids: Array,
+        frames: int,
+        decoder_sensor: Array | None = None,
+    ) -> Array:
+        """Pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B, T, H, W, 3)."""
+        own = None
+        if hasattr(self.decoder, "sensor_projection"):
+            own = self.touch.sensor_tokens[...][sensor if decoder_sensor is None else decoder_sensor]
+        return self.decoder(self.encode_tokens(clip, sensor, keep_ids), restore_ids, frames, own)
+
+    def touch_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        """The encoder's input sequence (B, 1 + S + K, D)."""
+        return self.touch.tokens(clip, sensor, keep_ids)
+
+    def touch_hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        """The encoder's last hidden states (B, 1 + S + K, D)."""
+        return self.touch.hidden(clip, sensor, keep_ids)
+
+    def embed_image(self, image: Array) -> Array:
+        """Image embeddings (V, E), not normalised."""
+        return self.image(image)
+
+    def embed_text(self, ids: Array, mask: Array | None = None) -> Array:
+        """Text embeddings (L, E), not normalised."""
+        return self.text(ids, mask)
+
+    def image_hidden(self, image: Array) -> Array:
+        """The image tower's last hidden states (V, 1 + N, D)."""
+        return self.image.hidden(image)
+
+    def image_pooled(self, image: Array) -> Array:
+        """The image tower's normed class token (V, D)."""
+        return self.image.pooled(image)
+
+    def text_hidden(self, ids: Array, mask: Array | None = None) -> Array:
+        """The text tower's normed hidden states (L, S, W)."""
+        return self.text.hidden(ids, mask)
+
+    def text_pooled(self, ids: Array, mask: Array | None = None) -> Array:
+        """The text tower's state at the end token (L, W)."""
+        return self.text.pooled(ids, mask)
+
+    def match(self, z_first: Array, z_second: Array) -> Array:
+        """Matching logits (B,) of two unit-norm touch embeddings (Eq. 5): a head on their element-wise product."""
+        product = z_first * z_second
+        if isinstance(self.matcher, Mlp):
+            product = product * self.embed  # entries of a product of unit vectors are about 1 / E: to order one
+        return self.matcher(product)[:, 0]
+
+    def scale(self) -> Array:
+        """1 / tau, the factor on cosine similarities."""
+        return jnp.exp(self.logit_scale[...])

@@ -1,0 +1,103 @@
+"""The touch encoder with its sensor tokens (Sec. 3.1, 3.5) and the pixel decoder (Sec. 3.2)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import nnx
+from jax import Array
+
+from anytouch_jax.config import Model
+from anytouch_jax.nn.layers import Dense, LayerNorm, activation, run_blocks, stacked_blocks, table
+from anytouch_jax.ops import masking, tokens
+
+
+class TouchPatch(nnx.Module):
+    """The shared patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias."""
+
+    def __init__(self, model: Model) -> None:
+        self.kernel = table(model.frames, model.patch**2 * 3, model.touch.width)
+        self.dtype = jnp.dtype(model.dtype)
+
+    def __call__(self, patches: Array) -> Array:
+        """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
+        kernel = self.kernel[...]
+        if patches.shape[2] == 1:
+            kernel = jnp.sum(kernel, axis=0, keepdims=True)
+        return jnp.einsum("bktc,tcd->bkd", patches.astype(self.dtype), kernel.astype(self.dtype))
+
+
+class TouchEncoder(nnx.Module):
+    """ViT over [class, sensor tokens, visible patches]; the architecture of CLIP's image tower."""
+
+    def __init__(self, model: Model) -> None:
+        width = model.touch.width
+        self.patch = TouchPatch(model)
+        self.class_token = table(width)
+        self.position = table(model.patches + 1, width)
+        self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)
+        self.pre_norm = LayerNorm(width, model.norm_eps, model.dtype)
+        self.blocks = stacked_blocks(model.touch, model, model.norm_eps, activation(model.activation))
+        self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
+        self.projection = Dense(width, model.embed, model, bias=False)
+        self.patch_size, self.remat = model.patch, model.remat
+
+    def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None) -> Array:
+        """The input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
+        patches = tokens.patchify(clip, self.patch_size)
+        position = jnp.broadcast_to(self.position[...][None, 1:], (len(clip), *self.position[...][1:].shape))
+        if keep_ids is not None:
+            patches, position = masking.keep(patches, keep_ids), masking.keep(position, keep_ids)
+        x = self.patch(patches)
+        start = jnp.broadcast_to(
+            (self.class_token[...] + self.position[...][0])[None, None], (len(clip), 1, x.shape[-1])
+        )
+        # An id outside the table gives NaN, which the step reports; JAX would clamp it silently.
+        own = self.sensor_tokens[...].at[sensor].get(mode="fill", fill_value=jnp.nan)
+        return jnp.concatenate([start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1)
+
+    def hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        """Last hidden states (B, 1 + S + K, D), without the final norm (golden Q5)."""
+        x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
+        return run_blocks(self.blocks, x, remat=self.remat)
+
+    def features(self, clip: Array, sensor: Array) -> Array:
+        """Touch embedding (B, E) from the class token of the unmasked pass, not normalised."""
+        return self.projection(self.post_norm(self.hidden(clip, sensor)[:, 0]))
+
+
+class TouchDecoder(nnx.Module):
+    """Light ViT that paints every position from the visible ones; heads for a still and for a clip."""
+
+    def __init__(self, model: Model) -> None:
+        width, pixels = model.decoder.width, model.patch**2 * 3
+        self.embed = Dense(model.embed, width, model)
+        self.mask_token = table(width)
+        self.position = table(model.patches + 1, width)
+        self.blocks = stacked_blocks(model.decoder, model, model.decoder_norm_eps, activation("gelu"))
+        self.norm = LayerNorm(width, model.decoder_norm_eps, model.dtype)
+        self.still_head = Dense(width, pixels, model)
+        self.clip_head = Dense(width, pixels * (model.frames + 1), model)
+        if model.decoder_sensor_tokens:
+            self.sensor_projection = Dense(model.touch.width, width, model, bias=False)
+        self.special, self.remat = 1 + model.sensor_tokens, model.remat
+
+    def __call__(self, latent: Array, restore_ids: Array, frames: int, sensor_tokens: Array | None = None) -> Array:
+        """(B, 1 + S + K, E) -> pixels (B, N, frames, P*P*3); `sensor_tokens` (B, S, D) replace the encoded ones."""
+        x = self.embed(latent)
+        position = self.position[...].astype(x.dtype)
+        start = x[:, :1] + position[None, :1]
+        own = x[:, 1 : self.special] if sensor_tokens is None else self.sensor_projection(sensor_tokens)
+        grid = masking.restore(x[:, self.special :], self.mask_token[...], restore_ids) + position[None, 1:]
+        x = jnp.concatenate([start, own, grid], axis=1)
+        x = self.norm(run_blocks(self.blocks, x, remat=self.remat))[:, self.special :]
+        return self.pixels(x, frames)
+
+    def pixels(self, x: Array, frames: int) -> Array:
+        """(B, N, Dd) -> (B, N, frames, P*P*3). Only the frames that the loss reads are computed."""
+        if frames == 1:
+            return self.still_head(x)[:, :, None]
+        size = self.still_head.kernel.shape[1]
+        kernel, bias = (
+            p[..., : frames * size].astype(x.dtype) for p in (self.clip_head.kernel[...], self.clip_head.bias[...])
+        )
+        return (x @ kernel + bias[None, None]).reshape(*x.shape[:2], frames, size)

@@ -1,0 +1,213 @@
+"""The paper's two sums, Eq. 8 (stage 1) and Eq. 9 (stage 2), assembled from `ops` over a network.
+
+`*_terms` are deterministic (every draw is an argument): what the parity check runs. `*_loss` normalise the pixels,
+draw masks and sensor tokens from a key, then call the terms: what training runs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.nn.functional import Net
+from anytouch_jax.ops import losses, masking, tokens, universal
+
+Params = dict[str, Any]
+Metrics = dict[str, Array]
+
+
+def normalise_touch(clip: Array) -> Array:
+    """uint8 RGB (..., 3) -> float32, ImageNet statistics (the release's choice for touch)."""
+    return _normalise(clip, IMAGENET_MEAN, IMAGENET_STD)
+
+
+def normalise_image(image: Array) -> Array:
+    """uint8 RGB (..., 3) -> float32, CLIP statistics (for photographs)."""
+    return _normalise(image, CLIP_MEAN, CLIP_STD)
+
+
+def _normalise(pixels: Array, mean: tuple[float, ...], std: tuple[float, ...]) -> Array:
+    shape = (1,) * (pixels.ndim - 1) + (3,)
+    return (pixels.astype(jnp.float32) / 255.0 - jnp.asarray(mean).reshape(shape)) / jnp.asarray(std).reshape(shape)
+
+
+def stage1_terms(
+    params: Params,
+    clip: Array,
+    sensor: Array,
+    noise: Array,
+    *,
+    net: Net,
+    config: Config,
+    decoder_sensor: Array | None = None,
+) -> tuple[Array, Metrics]:
+    """Masked reconstruction, and next-frame prediction where there is a next frame (Eq. 8).
+
+    `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame. `sensor` i32 (B,)
+    rows of the token table, already drawn; `noise` (B, N) decides the masks. Returns the loss and its terms.
+    """
+    frames = net.model.frames
+    if not config.objective.next_frame:
+        clip = clip[:, :frames]
+    pred, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor)
+    target = tokens.patchify(clip, net.model.patch)
+    if config.objective.norm_pix_loss:
+        target = losses.normalise_patches(target)
+    return losses.reconstruction_loss(pred, target, hidden, next_frame=clip.shape[1] > frames)
+
+
+def reconstruct(
+    params: Params,
+    clip: Array,
+    sensor: Array,
+    noise: Array,
+    *,
+    net: Net,
+    config: Config,
+    decoder_sensor: Array | None = None,
+) -> tuple[Array, Array]:
+    """Pixels (B, N, T, P*P*3) of all positions from the visible ones, and hidden (B, N); see `stage1_terms`.
+
+    The encoder sees the first three frames only, whatever T is.
+    """
+    visible = masking.kept(net.model.patches, config.objective.keep_ratio)
+    keep_ids, restore_ids, hidden = masking.random_mask(noise, visible)
+    seen = clip[:, : net.model.frames]
+    pred = net.apply(params, "reconstruct", seen, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
+    return pred, hidden
+
+
+def stage1_loss(
+    params: Params, batch: TouchBatch, key: Array, progress: Array, *, net: Net, config: Config
+) -> tuple[Array, Metrics]:
+    """`stage1_terms` of a uint8 batch, masks and sensor tokens drawn from `key`; `progress` in [0, 1] drives p_u."""
+    key_noise, key_universal = jax.random.split(key)
+    noise = jax.random.uniform(key_noise, (len(batch.sensor), net.model.patches))
+    p_u, sensor = _draw(batch.sensor, key_universal, progress, net, config)
+    loss, metrics = stage1_terms(
+        params, normalise_touch(batch.clip), sensor, noise, net=net, config=config, decoder_sensor=batch.sensor
+    )
+    return loss, metrics | {"p_u": p_u}
+
+
+class Embeddings(NamedTuple):
+    """Unit-norm embeddings of a batch: touch (B, E); image, text (B, E) with rows that may be absent, or None."""
+
+    touch: Array
+    image: Array | None
+    text: Array | None
+    has_image: Array | None
+    has_text: Array | None
+
+
+def align_embeddings(params: Params, batch: AlignBatch, *, net: Net) -> Embeddings:
+    """Embed the touches and the packed images and texts, scattered back to the rows they belong to.
+
+    A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats.
+    """
+    touch = losses.normalise(net.apply(params, "encode", batch.clip[:, : net.model.frames], batch.sensor))
+    image = text = has_image = has_text = None
+    if batch.image.shape[0]:
+        packed = losses.normalise(net.apply(params, "embed_image", batch.image))
+        image, has_image = _scatter(packed, batch.image_row, len(touch))
+    if batch.text.shape[0]:
+        packed = losses.normalise(net.apply(params, "embed_text", batch.text, batch.text_mask))
+        text, has_text = _scatter(packed, batch.text_row, len(touch))
+    return Embeddings(touch, image, text, has_image, has_text)
+
+
+def _scatter(packed: Array, row: Array, rows: int) -> tuple[Array, Array]:
+    """Slots (V, E) to their rows (B, E), and which rows were filled; a slot of row B is unused and dropped."""
+    full = jnp.zeros((rows, packed.shape[1]), packed.dtype).at[row].set(packed, mode="drop")
+    return full, jnp.zeros(rows, bool).at[row].set(True, mode="drop")
+
+
+def match_logits(params: Params, batch: MatchBatch, *, net: Net) -> tuple[Array, Array]:
+    """Matching logits (B,) of anchor with positive and of anchor with negative (Eq. 5), in one pass over 3B touches."""
+    clips = jnp.concatenate([batch.clip, batch.positive, batch.negative])
+    sensors = jnp.concatenate([batch.sensor, batch.positive_sensor, batch.negative_sensor])
+    anchor, positive, negative = jnp.split(losses.normalise(net.apply(params, "encode", clips, sensors)), 3)
+    return net.apply(params, "match", anchor, positive), net.apply(params, "match", anchor, negative)
+
+
+def stage2_terms(
+    params: Params,
+    batch: Stage2Batch,
+    noise: Array | None,
+    *,
+    net: Net,
+    config: Config,
+    decoder_sensor: Array | None = None,
+) -> tuple[Array, Metrics]:
+    """L_align + lambda L_match (Eq. 9), plus the stage-1 loss on the align batch where the recipe keeps it.
+
+    Pixels are normalised floats, sensor rows are already drawn; a part of `batch` that is None is not computed.
+    `noise` (B, N) is read only for the reconstruction. Returns the sum and every term, unweighted.
+    """
+    objective = config.objective
+    total, metrics = jnp.zeros(()), {}
+    if batch.align is not None:
+        z = align_embeddings(params, batch.align, net=net)
+        scale = net.apply(params, "scale")
+        align, terms = losses.alignment_loss(
+            z.touch, z.image, z.text, z.has_image, z.has_text, scale, objective.pair_weights, groups=objective.groups
+        )
+        total, metrics = total + align, metrics | terms | {"align": align, "temperature": 1 / scale}
+        if objective.reconstruct:
+            pixels, terms = stage1_terms(
+                params,
+                batch.align.clip,
+                batch.align.sensor,
+                noise,
+                net=net,
+                config=config,
+                decoder_sensor=decoder_sensor,
+            )
+            total, metrics = total + pixels, metrics | terms
+    if batch.match is not None:
+        positive, negative = match_logits(params, batch.match, net=net)
+        match = losses.matching_loss(positive, negative)
+        total = total + objective.match_weight * match
+        right = jnp.concatenate([positive > 0, negative < 0])
+        metrics |= {"match": match, "match_accuracy": jnp.mean(right.astype(jnp.float32))}
+    return total, metrics
+
+
+def stage2_loss(
+    params: Params, batch: Stage2Batch, key: Array, progress: Array, *, net: Net, config: Config
+) -> tuple[Array, Metrics]:
+    """`stage2_terms` of a uint8 batch, masks and sensor tokens drawn from `key`; `progress` drives p_u."""
+    key_noise, key_align, key_match = jax.random.split(key, 3)
+    align, match, noise, own, metrics = batch.align, batch.match, None, None, {}
+    if align is not None:
+        own = align.sensor
+        noise = jax.random.uniform(key_noise, (len(own), net.model.patches))
+        metrics["p_u"], sensor = _draw(own, key_align, progress, net, config)
+        align = align._replace(clip=normalise_touch(align.clip), sensor=sensor, image=normalise_image(align.image))
+    if match is not None:
+        metrics["p_u"], match = _draw_match(match, key_match, progress, net, config)
+    loss, terms = stage2_terms(params, Stage2Batch(align, match), noise, net=net, config=config, decoder_sensor=own)
+    return loss, terms | metrics
+
+
+def _draw(sensor: Array, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, Array]:
+    """p_u at `progress`, and the sensor rows after the draw (Eq. 7), one draw a sample."""
+    p_u = universal.universal_probability(progress, config.objective.universal_start, config.objective.universal_end)
+    uniform = jax.random.uniform(key, sensor.shape)
+    return p_u, universal.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
+
+
+def _draw_match(batch: MatchBatch, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, MatchBatch]:
+    """The matching triple with normalised pixels and drawn tokens; the release shares one draw a triple."""
+    keys = [key] * 3 if config.objective.universal_shared else list(jax.random.split(key, 3))
+    p_u, sensor = _draw(batch.sensor, keys[0], progress, net, config)
+    _, positive = _draw(batch.positive_sensor, keys[1], progress, net, config)
+    _, negative = _draw(batch.negative_sensor, keys[2], progress, net, config)
+    clips = (normalise_touch(c) for c in (batch.clip, batch.positive, batch.negative))
+    clip, clip_positive, clip_negative = clips
+    return p_u, MatchBatch(clip, sensor, clip_positive, positive, clip_negative, negative)

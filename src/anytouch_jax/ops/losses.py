@@ -1,0 +1,111 @@
+"""The paper's losses as pure functions. All arithmetic is in float32 or wider, whatever comes in.
+
+B batch, N positions, T frames, C values of a patch, E embedding width.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+Metrics = dict[str, Array]
+
+
+def _wide(x: Array) -> Array:
+    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+
+
+def normalise(x: Array, eps: float = 1e-12) -> Array:
+    """Scale the last axis to unit length; the gradient at exactly zero is finite."""
+    x = _wide(x)
+    return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), eps))
+
+
+def normalise_patches(patches: Array, eps: float = 1e-6) -> Array:
+    """Each patch of each frame (..., C) to zero mean and unit *unbiased* variance (`norm_pix_loss`, golden Q6)."""
+    patches = _wide(patches)
+    centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
+    variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
+    return centred * jax.lax.rsqrt(variance + eps)
+
+
+def reconstruction_loss(pred: Array, target: Array, hidden: Array, *, next_frame: bool) -> tuple[Array, Metrics]:
+    """Masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in Eq. 8.
+
+    `pred`, `target` (B, N, T, C); `hidden` (B, N) True on masked positions. With `next_frame` the last of the T
+    frames is the future one: it counts on every position, the others on the hidden positions only.
+    Returns the sum and {"reconstruction", "next_frame"}; a batch with nothing hidden reconstructs at no cost.
+    """
+    error = jnp.mean((_wide(pred) - _wide(target)) ** 2, axis=-1)  # (B, N, T)
+    shown, future = (error[..., :-1], error[..., -1]) if next_frame else (error, None)
+    weight = hidden.astype(error.dtype)
+    loss = jnp.sum(jnp.mean(shown, axis=-1) * weight) / jnp.maximum(jnp.sum(weight), 1)
+    metrics = {"reconstruction": loss}
+    if future is not None:
+        metrics["next_frame"] = jnp.mean(future)
+        loss = loss + metrics["next_frame"]
+    return loss, metrics
+
+
+def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 1) -> Array:
+    """InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
+
+    `scale` is 1 / tau. Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair
+    gives 0. With `groups` > 1 the batch is cut in that many shares and negatives come from a row's own share.
+    """
+    e = a.shape[-1]
+    present = present.reshape(groups, -1)
+    a = jnp.where(present[..., None], _wide(a).reshape(groups, -1, e), 0.0)
+    b = jnp.where(present[..., None], _wide(b).reshape(groups, -1, e), 0.0)
+    logits = _wide(scale) * jnp.einsum("gie,gje->gij", a, b)
+    logits = jnp.where(present[:, None, :], logits, jnp.finfo(logits.dtype).min)
+    own = jnp.diagonal(logits, axis1=1, axis2=2)
+    loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)
+    pairs = jnp.sum(present, axis=1)
+    shares = jnp.sum(loss, axis=1) / jnp.maximum(pairs, 1)
+    return jnp.sum(shares) / jnp.maximum(jnp.sum(pairs > 0), 1)
+
+
+def alignment_loss(
+    touch: Array,
+    image: Array | None,
+    text: Array | None,
+    has_image: Array | None,
+    has_text: Array | None,
+    scale: Array,
+    weights: tuple[float, float, float],
+    *,
+    groups: int = 1,
+) -> tuple[Array, Metrics]:
+    """The joint alignment of touch, vision and text with missing modalities (Eq. 4).
+
+    `touch`, `image`, `text` (B, E) of unit length; `has_image`, `has_text` (B,) bool; `weights` are the factors of
+    the pairs (touch-vision, touch-text, vision-text) on the sum of both directions. A modality that is None is
+    absent from the whole batch. Returns the loss, its six terms and the number of pairs of each kind.
+    """
+    have = {"touch": jnp.ones(touch.shape[0], bool), "vision": has_image, "text": has_text}
+    z = {"touch": touch, "vision": image, "text": text}
+    total = jnp.zeros((), jnp.promote_types(touch.dtype, jnp.float32))
+    metrics: Metrics = {}
+    for (first, second), weight in zip(
+        (("touch", "vision"), ("touch", "text"), ("vision", "text")), weights, strict=True
+    ):
+        if z[first] is None or z[second] is None:
+            continue
+        both = have[first] & have[second]
+        forth = info_nce(z[first], z[second], scale, both, groups=groups)
+        back = info_nce(z[second], z[first], scale, both, groups=groups)
+        total = total + weight * (forth + back)
+        metrics |= {
+            f"{first}_to_{second}": forth,
+            f"{second}_to_{first}": back,
+            f"{first}_{second}_pairs": jnp.sum(both),
+        }
+    return total, metrics
+
+
+def matching_loss(positive_logit: Array, negative_logit: Array) -> Array:
+    """Binary cross-entropy of cross-sensor matching from logits (B,), each kind averaged over the batch (Eq. 6)."""
+    positive, negative = _wide(positive_logit), _wide(negative_logit)
+    return jnp.mean(jax.nn.softplus(-positive)) + jnp.mean(jax.nn.softplus(negative))

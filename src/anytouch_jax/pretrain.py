@@ -1,0 +1,168 @@
+"""A training run, assembled: config -> data, network, first parameters, loss -> `train.loop.fit` in a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from anytouch_jax import objectives
+from anytouch_jax.batch import Stage2Batch
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, Model, UserError, from_json
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data import text as texts
+from anytouch_jax.data.loader import Loader
+from anytouch_jax.evaluate import figures
+from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.train.loop import FitResult, fit
+
+Params = dict[str, Any]
+Say = Callable[[str], None]
+SCRATCH_VOCABULARY = 2048
+_NO_CLIP = "towers=pretrained needs CLIP weights: --clip <folder or file>, with tokenizer.json beside them"
+
+
+def pretrain(
+    config: Config,
+    run: str | Path,
+    *,
+    init: str | Path | None = None,
+    clip: str | Path | None = None,
+    stop_after: int | None = None,
+    say: Say = print,
+) -> FitResult:
+    """Train stage 1 or stage 2 in the folder `run`, or go on with it (Sec. 3.6).
+
+    `init`: a stage-1 run (or AnyTouch weights) that stage 2 starts from, or weights for the touch encoder of stage 1.
+    `clip`: CLIP weights for the towers; stage 1 starts the touch encoder from their image tower, as the paper does.
+    Raises UserError for a mistake in the settings, the data or the folder.
+    """
+    run = Path(run)
+    manifest = manifests.read(config.data.manifests)
+    config, tokenizer = _with_tokenizer(config, run, manifest, clip)
+    net = build(config.model)
+    params = _first_params(config, net, init, clip, say)
+    loader = Loader(manifest, config, tokenizer=tokenizer, devices=jax.local_device_count())
+    for note in loader.notes:
+        say(note)
+    loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
+    return fit(
+        config,
+        params=params,
+        loss_fn=partial(loss, net=net, config=config),
+        batches=loader.stream,
+        run_dir=run,
+        stop_after=stop_after,
+        on_report=partial(_report, run=run, net=net, config=config),
+        metadata=_describe(config, init, clip, manifest),
+        say=say,
+    )
+
+
+def _describe(config: Config, init: Any, clip: Any, manifest: Any) -> dict[str, Any]:
+    """What a checkpoint says of itself beside its config."""
+    return {
+        "sensors": list(config.model.sensors),
+        "preprocessing": {
+            "touch": {"size": config.model.image_size, "mean": IMAGENET_MEAN, "std": IMAGENET_STD, "channels": "RGB"},
+            "image": {"size": config.model.image_size, "mean": CLIP_MEAN, "std": CLIP_STD, "channels": "RGB"},
+        },
+        "source": {"init": None if init is None else str(init), "clip": None if clip is None else str(clip)},
+        "data": manifest.content_hash(),
+    }
+
+
+def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tuple[Config, Any]:
+    """The tokenizer of stage 2: the run's own, the one asked for, CLIP's, or one trained on the captions."""
+    if config.model.text is None:
+        return config, None
+    own = run / "tokenizer.json"
+    if own.exists():
+        tokenizer = texts.load(own)
+    elif config.data.tokenizer is not None:
+        tokenizer = texts.load(config.data.tokenizer)
+    elif config.towers == "pretrained":
+        tokenizer = texts.load(_beside(clip, "tokenizer.json"))
+    else:
+        rows = manifest.rows_of(config.data.split)
+        captions = [manifest.value(int(row), "text") for row in rows[manifest.present("text")[rows]]]
+        if not captions:
+            return config, None
+        tokenizer = texts.train(sorted(set(captions)), SCRATCH_VOCABULARY)
+    if not own.exists():
+        run.mkdir(parents=True, exist_ok=True)
+        tokenizer.save(own)
+    text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
+    if config.towers == "pretrained":
+        text = config.model.text
+    return replace(config, model=replace(config.model, text=text)), tokenizer
+
+
+def _beside(weights: Any, name: str) -> Path:
+    if weights is None:
+        raise UserError(_NO_CLIP)
+    path = Path(weights)
+    return (path if path.is_dir() else path.parent) / name
+
+
+def _weights_file(path: Path) -> Path:
+    """The weights in a folder as it is downloaded, or the file itself."""
+    if not path.is_dir():
+        return path
+    for pattern in ("*.safetensors", "*.bin", "*.pth", "*.pt"):
+        found = sorted(path.glob(pattern))
+        if found:
+            return found[0]
+    raise UserError(f"no weights (*.safetensors, *.bin, *.pth) in {path}")
+
+
+def _first_params(config: Config, net: Net, init: Any, clip: Any, say: Say) -> Params:
+    """Fresh parameters, with CLIP's and those of `init` in their places (golden K_weight_loading_map)."""
+    if config.towers == "pretrained" and clip is None:
+        raise UserError(_NO_CLIP)
+    params = net.init(jax.random.key(config.run.seed))
+    first = None if init is None else _load(Path(init), config.model)
+    weights = None if clip is None else release.read_weights(_weights_file(Path(clip)))
+    if config.stage == 2:
+        if init is None:
+            say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
+        towers = None if weights is None else release.to_params(weights, config.model)
+        return release.merge_stage2(params, stage1=first, clip=towers)
+    if weights is not None:
+        params = release.clip_to_stage1(weights, config.model, params)
+    return params if first is None else release.merge_stage2(params, stage1=first)
+
+
+def _load(path: Path, model: Model) -> Params:
+    """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of `model`."""
+    if not path.exists():
+        raise UserError(f"no run folder or weights file at {path}; train stage 1 first, or give another --init")
+    if path.is_dir() and not any(path.glob("*.pth")):
+        params, text, _ = checkpoint.load_params(path)
+        stored = from_json(text).model.sensors
+    else:
+        weights = release.read_weights(_weights_file(path))
+        detected = release.detect_model(weights)
+        params, stored = release.to_params(weights, detected), detected.sensors
+    if "touch" not in params or "decoder" not in params:
+        raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
+    rows = release.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), stored, model.sensors)
+    return {"touch": params["touch"] | {"sensor_tokens": rows}, "decoder": params["decoder"]}
+
+
+def _report(step: int, params: Params, batch: Any, *, run: Path, net: Net, config: Config) -> None:
+    """Draw the first samples of the batch: reconstructions wherever the batch holds touches to reconstruct."""
+    if isinstance(batch, Stage2Batch):
+        batch = batch.align
+        if batch is None or not config.objective.reconstruct:
+            return
+    clip, sensor = (np.asarray(jax.device_get(x[:6])) for x in (batch.clip, batch.sensor))
+    params = {name: params[name] for name in ("touch", "decoder")}
+    image = figures.reconstruction_panels(params, clip, sensor, net=net, config=config)
+    figures.write_png(run / "figures" / f"reconstruction_{step:06d}.png", image)

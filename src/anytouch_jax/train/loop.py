@@ -1,0 +1,258 @@
+"""fit(): jit, feed, log, save, resume. Every side effect of training lives here and in `record.py`."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import signal
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from anytouch_jax.config import Config, UserError, to_json
+from anytouch_jax.io.checkpoint import Checkpoints
+from anytouch_jax.train.mesh import batch_sharding, make_mesh, put_batch, replicated, state_sharding
+from anytouch_jax.train.optim import optimizer
+from anytouch_jax.train.record import Record, open_run, writing
+from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
+from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
+
+Tree = Any
+# batches(start, stop) -> (step, batch, what the loader wants in the log) for each step of the range
+Item = tuple[int, Any, Mapping[str, Any]]
+Batches = Callable[[int, int], Iterator[Item]]
+Report = Callable[[int, Tree, Any], None]
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """How a run, or its part, ended: the state after `step` steps and the last line of metrics.
+
+    `traces` counts how often the step was traced (once a batch structure); `interrupted` is the signal that ended the
+    run early, `resumed` the step it went on from.
+    """
+
+    state: TrainState
+    step: int
+    metrics: dict[str, Any] = field(default_factory=dict)
+    traces: int = 0
+    resumed: int = 0
+    interrupted: signal.Signals | None = None
+
+    @property
+    def params(self) -> Tree:
+        """All parameters, trained and frozen, as one nested dict."""
+        return merge(self.state.trainable, self.state.frozen)
+
+
+def fit(
+    config: Config,
+    *,
+    params: Tree,
+    loss_fn: LossFn,
+    batches: Batches,
+    run_dir: Path | str,
+    stop_after: int | None = None,
+    on_report: Report | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    say: Say | None = None,
+    mesh: Mesh | None = None,
+) -> FitResult:
+    """Train `config.run.steps` steps in a run folder, or go on from its latest complete checkpoint.
+
+    `params` are the first parameters (shapes only matter on resume); `stop_after` ends early, after that many steps in
+    all, without changing the schedule. `on_report(step, params, batch)` draws figures; it must not keep the arrays.
+    SIGTERM and Ctrl-C finish the step, save and return. Raises UserError: other settings than the run was started
+    with, too many skipped steps in a row, a full disk, a checkpoint that cannot be read.
+    """
+    run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
+    say = say or to_stderr
+    lead = jax.process_index() == 0
+    if lead:
+        open_run(run_dir, config)
+    else:
+        say = silent
+    stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
+    with contextlib.ExitStack() as stack:
+        with writing(run_dir / "checkpoints"):
+            checkpoints = Checkpoints(
+                run_dir / "checkpoints",
+                keep=config.run.keep,
+                config_json=to_json(config),
+                metadata=dict(metadata or {}),
+            )
+        stack.callback(checkpoints.close)
+        state, start = _first_state(config, params, checkpoints, mesh)
+        if start:
+            say(f"going on from the checkpoint of step {start}")
+        if start >= stop:
+            say(f"nothing to do: {start} of {config.run.steps} steps are done")
+            return FitResult(state, start, resumed=start)
+        record = stack.enter_context(
+            contextlib.closing(Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead))
+        )
+        bar = stack.enter_context(progress(start, stop, say))
+        loop = _Loop(config, mesh, checkpoints, record, bar, on_report)
+        interrupt = stack.enter_context(signals())
+        return loop.run(state, start, stop, batches, loss_fn, interrupt)
+
+
+class _Loop:
+    """The loop itself; what is mutable between steps."""
+
+    def __init__(
+        self,
+        config: Config,
+        mesh: Mesh,
+        checkpoints: Checkpoints,
+        record: Record,
+        bar: Bar,
+        on_report: Report | None,
+    ) -> None:
+        self.config, self.mesh, self.checkpoints = config, mesh, checkpoints
+        self.record, self.bar, self.on_report = record, bar, on_report
+        self.pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
+        self.row: dict[str, Any] = {}
+        self.losses: list[float] = []  # since the last checkpoint: its mean decides which one is the best
+        self.traces = 0
+        self.clock = time.perf_counter()
+
+    def run(
+        self,
+        state: TrainState,
+        start: int,
+        stop: int,
+        batches: Batches,
+        loss_fn: LossFn,
+        interrupt: list[signal.Signals],
+    ) -> FitResult:
+        """Steps `start` to `stop`, or until a signal has been seen."""
+        every, figures = self.config.run.save_every, self.config.run.figure_every
+        step_fn, sharding = self.compile(state, loss_fn), batch_sharding(self.mesh)
+        # Under jit, for the devices of other processes too; and without a transfer of the seed.
+        seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
+        done, saved, reported, placed = start, start, start, None
+        with contextlib.closing(_checked(batches, start, stop)) as feed:
+            for step, batch, info in feed:
+                placed = put_batch(batch, sharding)
+                state, metrics = step_fn(state, placed, seed_key)
+                self.log()  # of the step before, while this one runs
+                self.pending = (step, metrics, {"samples": _rows(batch)} | dict(info))
+                done = step + 1
+                if every > 0 and done % every == 0:
+                    saved = self.save(done, state)
+                if figures > 0 and done % figures == 0:
+                    reported = self.report(done, state, placed)
+                if interrupt:
+                    break
+        if saved < done:
+            self.save(done, state)
+        with writing(self.record.path.parent / "checkpoints"):
+            self.checkpoints.wait()
+        if figures > 0 and reported < done and not interrupt:
+            self.report(done, state, placed)
+        if interrupt:
+            self.bar.say(f"stopped by {interrupt[0].name} after step {done}; saved, the same command goes on from here")
+        signalled = interrupt[0] if interrupt else None
+        return FitResult(state, done, self.row, self.traces, start, signalled)
+
+    def compile(self, state: TrainState, loss_fn: LossFn) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
+        """The step under jit: the state is donated and keeps its place; each structure of a batch is traced once."""
+        config = self.config
+        step = make_step(loss_fn, optimizer(config), total_steps=config.run.steps, accumulate=config.optim.accumulate)
+
+        @functools.wraps(step)
+        def counted(*args: Any) -> Any:
+            self.traces += 1
+            return step(*args)
+
+        places = jax.tree.map(lambda x: x.sharding, state)
+        return jax.jit(counted, donate_argnums=0, out_shardings=(places, replicated(self.mesh)))
+
+    def log(self) -> None:
+        """Fetch and write the metrics of the pending step; stop the run when too many were skipped in a row."""
+        if self.pending is None:
+            return
+        (step, metrics, info), self.pending = self.pending, None
+        numbers = jax.device_get(metrics)
+        now = time.perf_counter()
+        rate = {"samples_per_second": info["samples"] / max(now - self.clock, 1e-9)}
+        self.clock = now
+        front = {"loss": numbers["loss"]}
+        self.row = self.record.write(step, front | numbers | info | rate)
+        if self.row["loss"] is not None:
+            self.losses.append(self.row["loss"])
+        self.bar.advance(self.row)
+        skipped, most = self.record.in_a_row, max(1, self.config.run.max_skipped)
+        if skipped >= most:
+            raise UserError(
+                f"{skipped} steps in a row, up to step {step}, had a loss or a gradient that is not finite and were "
+                "skipped; lower optim.learning_rate, set optim.clip_norm, or look for NaN in the data"
+            )
+
+    def save(self, done: int, state: TrainState) -> int:
+        """Write a checkpoint in the background, after the metrics of all its steps."""
+        self.log()
+        self.record.sync()
+        metrics = {name: value for name, value in self.row.items() if isinstance(value, int | float)}
+        if self.losses:
+            metrics["loss"] = sum(self.losses) / len(self.losses)
+        with writing(self.record.path.parent / "checkpoints"):
+            self.checkpoints.save(done, state, metrics)
+        self.losses = []
+        return done
+
+    def report(self, done: int, state: TrainState, batch: Any) -> int:
+        """Draw figures; a fault in that must not end the run."""
+        if self.on_report is not None:
+            self.log()
+            try:
+                self.on_report(done, merge(state.trainable, state.frozen), batch)
+            except Exception as error:
+                self.bar.say(f"no figures at step {done}: {type(error).__name__}: {error}")
+        return done
+
+
+def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: Mesh) -> tuple[TrainState, int]:
+    """The state of the latest complete checkpoint and its step, or a new one, laid out on the mesh."""
+    init = functools.partial(init_state, config=config)
+    shapes = jax.eval_shape(init, params)
+    places = state_sharding(shapes, mesh)
+    latest = checkpoints.latest()
+    if latest is not None:
+        shaped = [
+            jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)
+            for x, place in zip(jax.tree.leaves(shapes), jax.tree.leaves(places), strict=True)
+        ]
+        return checkpoints.restore(jax.tree.unflatten(jax.tree.structure(shapes), shaped), latest), latest
+    # Without a copy the first step would donate, and so delete, the caller's own parameters.
+    held = jax.device_put(params, state_sharding(params, mesh), may_alias=False)
+    return jax.jit(init, out_shardings=places)(held), 0
+
+
+def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
+    """The batches of steps `start` to `stop`, each once and in order; closes their source in the end."""
+    source, expected = batches(start, stop), start
+    try:
+        for step, batch, info in source:
+            if step != expected:
+                raise ValueError(f"the batches gave step {step} where step {expected} was due")
+            yield step, batch, info
+            expected += 1
+            if expected == stop:
+                return
+        raise UserError(f"the data ended after {expected} of {stop} steps; its source must serve every step")
+    finally:
+        close = getattr(source, "close", None)
+        if close is not None:
+            close()
+
+
+def _rows(batch: Any) -> int:
+    """Samples in a batch, over all processes."""
+    return jax.tree.leaves(batch)[0].shape[0] * jax.process_count()

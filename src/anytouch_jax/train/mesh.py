@@ -1,0 +1,113 @@
+"""Devices: the mesh, how batches and parameters are laid out on it, and runs of several processes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from anytouch_jax.config import ConfigError
+
+Tree = Any
+BATCH_AXES = ("data", "fsdp")
+SMALL = 2**14  # elements; a smaller array is cheaper to copy than to gather
+
+
+def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """A mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError when there are too few.
+
+    Axes are of type Auto, so that jit places the computation; `jax.make_mesh` would choose explicit ones.
+    """
+    devices = list(jax.devices() if devices is None else devices)
+    if fsdp < 1 or (data is None and len(devices) % fsdp):
+        raise ConfigError(f"run.fsdp={fsdp} must be a divisor of the {len(devices)} devices")
+    data = len(devices) // fsdp if data is None else data
+    if not 0 < data * fsdp <= len(devices):
+        raise ConfigError(f"a mesh of {data} x {fsdp} needs {data * fsdp} devices, but there are {len(devices)}")
+    return jax.make_mesh(
+        (data, fsdp), BATCH_AXES, axis_types=(AxisType.Auto, AxisType.Auto), devices=devices[: data * fsdp]
+    )
+
+
+def batch_sharding(mesh: Mesh) -> NamedSharding:
+    """Rows of a batch over all devices."""
+    return NamedSharding(mesh, PartitionSpec(BATCH_AXES))
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """A whole copy on each device."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> Tree:
+    """A sharding for each array of a state: over "fsdp" on its largest divisible axis; copies where that axis is 1.
+
+    Arrays of fewer than `small` elements, or without a divisible axis, are copied to each device.
+    """
+    parts = mesh.shape["fsdp"]
+
+    def place(leaf: Any) -> NamedSharding:
+        divisible = [(size, axis) for axis, size in enumerate(leaf.shape) if size % parts == 0]
+        if parts == 1 or not divisible or np.prod(leaf.shape) < small:
+            return replicated(mesh)
+        _, axis = max(divisible)
+        return NamedSharding(mesh, PartitionSpec(*[None] * axis, "fsdp"))
+
+    return jax.tree.map(place, abstract_state)
+
+
+def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
+    """Send a host batch to the devices; with several processes each gives its own share of the rows.
+
+    Raises ConfigError when the rows cannot be shared out evenly.
+    """
+    devices, processes = sharding.num_devices, jax.process_count()
+    for leaf in jax.tree.leaves(batch):
+        rows = leaf.shape[0] * processes
+        if rows % devices:
+            raise ConfigError(f"a batch axis of {rows} rows cannot be shared by {devices} devices; choose a multiple")
+    if processes == 1:
+        return jax.device_put(batch, sharding)
+    return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch)
+
+
+def initialize_distributed(environ: Mapping[str, str] = os.environ) -> bool:
+    """Join the processes of a run when JAX_COORDINATOR_ADDRESS (host:port) is set, and tell whether it was.
+
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID go with it. Raises ConfigError when one lacks or is not a number. Must run
+    before anything asks for a device.
+    """
+    address = environ.get("JAX_COORDINATOR_ADDRESS")
+    if not address:
+        return False
+    numbers = {}
+    for name in ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID"):
+        value = environ.get(name, "")
+        if not value.isdigit():
+            raise ConfigError(f"JAX_COORDINATOR_ADDRESS is set, so {name} must be a number, not {value!r}")
+        numbers[name] = int(value)
+    jax.distributed.initialize(address, numbers["JAX_NUM_PROCESSES"], numbers["JAX_PROCESS_ID"])
+    return True
+
+
+def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
+    """Keep compiled programs on disk, so that the next start of the same run need not compile again.
+
+    The default folder is anytouch_jax under $XDG_CACHE_HOME or ~/.cache. Returns it, or None where it cannot be made.
+    """
+    if folder is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "anytouch_jax"
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    compilation_cache.reset_cache()  # else a program compiled before would have switched it off for good
+    return folder

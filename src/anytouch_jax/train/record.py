@@ -1,0 +1,179 @@
+"""What a run leaves on disk beside its checkpoints: config.json, and metrics.jsonl with one line a step."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+from anytouch_jax.config import Config, ConfigError, UserError, from_json, to_json
+
+# Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
+HARMLESS = {
+    "data.on_bad_sample",
+    "data.prefetch",
+    "data.threads",
+    "run.figure_every",
+    "run.fsdp",
+    "run.keep",
+    "run.max_skipped",
+    "run.save_every",
+    "run.tensorboard",
+}
+TIMING = ("samples_per_second",)  # the fields of a line that differ between equal runs
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn a failed write (disk full, no permission) into one sentence."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(
+            f"cannot write {path}: {reason}; free some space or mend the folder, then run the same command again: "
+            "it goes on from the last complete checkpoint"
+        ) from error
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Replace a file in one move, so that a reader or a crash never sees half of it."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def open_run(run_dir: Path, config: Config) -> None:
+    """Make a run folder with its config.json, or check that the one there was started with the same settings.
+
+    Settings in `HARMLESS` may differ. Raises UserError that names each other setting with both values.
+    """
+    path = run_dir / "config.json"
+    with writing(path):
+        (run_dir / "figures").mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            write_atomic(path, to_json(config) + "\n")
+            return
+        text = path.read_text(encoding="utf-8")
+    try:
+        before = _flat(dataclasses.asdict(from_json(text)))
+    except ConfigError as error:
+        raise UserError(f"{path} cannot be read ({error}); choose another run folder, or mend it") from None
+    now = _flat(dataclasses.asdict(config))
+    changed = [
+        f"{name} was {before.get(name)!r} and is now {now.get(name)!r}"
+        for name in sorted(before.keys() | now.keys())
+        if name not in HARMLESS and before.get(name) != now.get(name)
+    ]
+    if changed:
+        raise UserError(
+            f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. "
+            "Use the same settings to go on with it, or choose another run folder"
+        )
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested dict as {dotted name: value}; sequences compare as tuples."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = tuple(value) if isinstance(value, list) else value
+    return flat
+
+
+class Record:
+    """metrics.jsonl from step `start` on: earlier lines stay, later ones (of a killed run) and torn ones are cut off.
+
+    `skipped` counts the skipped steps so far and `in_a_row` those without a break at the end, as the lines tell.
+    With `tensorboard` the numbers also go to an event file. Without `lead` (all processes of a run but the first)
+    it counts and writes nothing. Raises UserError when the disk is full.
+    """
+
+    def __init__(self, run_dir: Path, start: int, *, tensorboard: bool = False, lead: bool = True) -> None:
+        self.path = run_dir / "metrics.jsonl"
+        self.skipped = self.in_a_row = 0
+        self._board = _tensorboard(run_dir, start) if tensorboard and lead else None
+        with writing(self.path):
+            for row in _cut(self.path, start, rewrite=lead):
+                self._count(row)
+            place = self.path if lead else Path(os.devnull)
+            self._file: TextIO = place.open("a", encoding="utf-8")
+
+    def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Append the line of a step and return it; what is not finite becomes null, as JSON has no NaN."""
+        row = {"step": step} | {name: _plain(value) for name, value in numbers.items()}
+        self._count(row)
+        row["skipped_batches"] = self.skipped
+        with writing(self.path):
+            self._file.write(json.dumps(row, allow_nan=False) + "\n")
+            self._file.flush()
+        if self._board is not None:
+            for name, value in row.items():
+                if name != "step" and isinstance(value, int | float):
+                    self._board.add_scalar(name, value, step)
+        return row
+
+    def sync(self) -> None:
+        """Put the lines on the disk itself, before a checkpoint that follows them."""
+        if self._file.name == str(self.path):  # the null device has no disk below it
+            with writing(self.path):
+                os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the files; what could not be written was reported by `write`."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        if self._board is not None:
+            self._board.close()
+
+    def _count(self, row: Mapping[str, Any]) -> None:
+        self.in_a_row = self.in_a_row + 1 if row.get("skipped") else 0
+        self.skipped += bool(row.get("skipped"))
+
+
+def _plain(value: Any) -> Any:
+    """A number as JSON can hold it."""
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
+    """Drop the lines of step `start` and later, and torn ones; return the rest."""
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+    rows: list[dict[str, Any]] = []
+    kept: list[str] = []
+    for line in lines:
+        with contextlib.suppress(ValueError):
+            row = json.loads(line)
+            if line.endswith("\n") and isinstance(row, dict) and row.get("step", start) < start:
+                rows.append(row)
+                kept.append(line)
+    if rewrite and len(kept) < len(lines):
+        write_atomic(path, "".join(kept))
+    return rows
+
+
+def _tensorboard(run_dir: Path, start: int) -> Any:
+    """A writer of TensorBoard events, from step `start` on."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise UserError(
+            "run.tensorboard needs tensorboardX: pip install 'anytouch-jax[tensorboard]', or leave it off"
+        ) from None
+    return SummaryWriter(str(run_dir / "tensorboard"), purge_step=start)

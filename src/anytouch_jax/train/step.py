@@ -1,0 +1,159 @@
+"""One training step as a pure function: loss and gradients, accumulation, the update, its metrics. No jit inside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from anytouch_jax.batch import AlignBatch
+from anytouch_jax.config import Config, ConfigError
+from anytouch_jax.train.optim import flatten_names, match_rules, optimizer
+from anytouch_jax.train.usage import used_parameters
+
+__all__ = ["TrainState", "init_state", "make_step", "merge", "split", "used_parameters"]
+
+Array = jax.Array
+Tree = Any
+# (params, batch, key, progress) -> scalar loss and a dict of scalar metrics
+LossAndMetrics = tuple[Array, dict[str, Array]]
+LossFn = Callable[[Tree, Any, Array, Array], LossAndMetrics]
+StepFn = Callable[["TrainState", Any, Array], tuple["TrainState", dict[str, Array]]]
+
+
+class TrainState(NamedTuple):
+    """What a step carries on: `step` i32 (), two disjoint nested dicts of parameters, the optimiser's state."""
+
+    step: Array
+    trainable: Tree
+    frozen: Tree
+    opt_state: Any
+
+
+def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
+    """Cut nested parameters in (trainable, frozen) by (regex, frozen?) rules; the first match decides."""
+    parts: tuple[dict[str, Any], dict[str, Any]] = ({}, {})
+    leaves = flatten_names(params)
+    for name, frozen in match_rules(rules, leaves).items():
+        *folders, last = name.split("/")
+        node = parts[int(frozen)]
+        for folder in folders:
+            node = node.setdefault(folder, {})
+        node[last] = leaves[name]
+    return parts
+
+
+def merge(trainable: Tree, frozen: Tree) -> Tree:
+    """The nested parameters that `split` cut. Raises ValueError when a parameter is in both."""
+    merged = dict(trainable)
+    for name, value in frozen.items():
+        if name not in merged:
+            merged[name] = value
+        elif isinstance(merged[name], dict) and isinstance(value, dict):
+            merged[name] = merge(merged[name], value)
+        else:
+            raise ValueError(f"the parameter {name} is both trainable and frozen")
+    return merged
+
+
+def init_state(params: Tree, config: Config) -> TrainState:
+    """The state before the first step: parameters split by `config.frozen`, moments zero."""
+    trainable, frozen = split(params, config.frozen)
+    return TrainState(jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable))
+
+
+def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps: int, accumulate: int = 1) -> StepFn:
+    """Build `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
+
+    The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
+    differentiated, and those that the batch does not use are skipped (golden H_mixed). When the loss or the gradient
+    norm is not finite the update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: the
+    loss's own, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
+
+    `accumulate` micro-batches (rows m, m + accumulate, ...) run one after the other and their losses, gradients and
+    metrics are averaged. That equals the large batch for a mean over rows; InfoNCE negatives stay within a
+    micro-batch. Raises ConfigError for rows that do not divide, and for packed image or text slots.
+    """
+    tx = optax.with_extra_args_support(tx)
+
+    def step(state: TrainState, batch: Any, seed_key: Array) -> tuple[TrainState, dict[str, Array]]:
+        key = jax.random.fold_in(seed_key, state.step)
+        progress = state.step.astype(jnp.float32) / total_steps
+
+        def loss(trainable: Tree, frozen: Tree, part: Any, key: Array, progress: Array) -> LossAndMetrics:
+            value, metrics = loss_fn(merge(trainable, frozen), part, key, progress)
+            return value.astype(jnp.float32), {k: jnp.asarray(v, jnp.float32) for k, v in metrics.items()}
+
+        parts = batch if accumulate == 1 else micro_batches(batch, accumulate)
+        one = batch if accumulate == 1 else jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), parts)
+        used = used_parameters(loss, state.trainable, state.frozen, one, key, progress)
+
+        def gradients(part: Any, key: Array) -> tuple[Array, dict[str, Array], Tree]:
+            function = jax.value_and_grad(loss, has_aux=True)
+            (value, metrics), grads = function(state.trainable, state.frozen, part, key, progress)
+            return value, metrics, grads
+
+        value, metrics, grads = gradients(parts, key) if accumulate == 1 else _mean_over(gradients, parts, key)
+        updates, opt_state = tx.update(grads, state.opt_state, state.trainable, used=used, step=state.step)
+        return _finish(state, value, metrics, grads, updates, opt_state)
+
+    return step
+
+
+def _finish(
+    state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
+) -> tuple[TrainState, dict[str, Array]]:
+    """Apply the update where loss and gradient are finite, and report."""
+    norm = optax.tree.norm(grads)
+    good = jnp.isfinite(loss) & jnp.isfinite(norm)
+    rate = getattr(opt_state, "learning_rate", jnp.nan)
+    metrics = metrics | {
+        "loss": loss,
+        "grad_norm": norm,
+        "param_norm": optax.tree.norm(state.trainable),
+        "update_norm": jnp.where(good, optax.tree.norm(updates), 0.0),
+        "learning_rate": jnp.asarray(rate),
+        "skipped": jnp.where(good, 0.0, 1.0),
+    }
+    new = (optax.apply_updates(state.trainable, updates), opt_state)
+    old = (state.trainable, state.opt_state)
+    trainable, opt_state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+    metrics = {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()}
+    return TrainState(state.step + 1, trainable, state.frozen, opt_state), metrics
+
+
+def micro_batches(batch: Any, accumulate: int) -> Any:
+    """Cut every leading axis B into (accumulate, B / accumulate): micro-batch m has the rows m, m + accumulate, ...
+
+    Rows are dealt out, not cut in runs, so that a batch sharded over devices stays where it is. Raises ConfigError.
+    """
+    for part in jax.tree.leaves(batch, is_leaf=lambda x: isinstance(x, AlignBatch)):
+        if isinstance(part, AlignBatch) and part.image.shape[0] + part.text.shape[0] > 0:
+            raise ConfigError(
+                "optim.accumulate must be 1 for batches with images or texts, whose slots belong to rows of the whole "
+                "batch; lower data.batch_size instead"
+            )
+
+    def deal(x: Array) -> Array:
+        if x.shape[0] % accumulate:
+            raise ConfigError(f"a batch of {x.shape[0]} rows does not divide by optim.accumulate={accumulate}")
+        return jnp.swapaxes(x.reshape(x.shape[0] // accumulate, accumulate, *x.shape[1:]), 0, 1)
+
+    return jax.tree.map(deal, batch)
+
+
+def _mean_over(gradients: Callable[[Any, Array], Any], parts: Any, key: Array) -> Any:
+    """Mean of (loss, metrics, gradients) over micro-batches, one at a time; each has its own key."""
+    count = jax.tree.leaves(parts)[0].shape[0]
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(count))
+    first = jax.tree.map(lambda x: x[0], (parts, keys))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(gradients, *first))
+
+    def add(total: Any, part: tuple[Any, Array]) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, gradients(*part)), None
+
+    total, _ = jax.lax.scan(add, zeros, (parts, keys))
+    return jax.tree.map(lambda x: x / count, total)

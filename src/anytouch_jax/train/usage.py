@@ -1,0 +1,96 @@
+"""Which parameters a loss really uses: the loss's jaxpr, walked backwards from its value.
+
+A parameter counts as used when a gradient can flow from the loss to it, as in PyTorch, where the gradient of any
+other parameter is None. Dead code, integers and `stop_gradient` carry none. Metrics do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Literal
+
+Tree = Any
+# Primitives whose inputs and outputs are, one by one, those of the program inside.
+_CALLS = {
+    "jit",
+    "pjit",
+    "closed_call",
+    "core_call",
+    "checkpoint",
+    "remat",
+    "remat2",
+    "custom_jvp_call",
+    "custom_vjp_call",
+    "custom_vjp_call_jaxpr",
+    "shard_map",
+}
+
+
+def used_parameters(loss_fn: Callable[..., Any], params: Tree, *args: Any) -> Tree:
+    """A tree like `params` of Python bools: does the value of `loss_fn(params, *args)` depend on that leaf?
+
+    `loss_fn` returns a scalar, or a scalar and anything else. Arrays, tracers and shapes will do; nothing is computed.
+    A loop, a branch, a call or a custom derivative is entered: a leaf that the program inside ignores is unused.
+    """
+    jaxpr = jax.make_jaxpr(loss_fn)(*jax.tree.map(_abstract, (params, *args))).jaxpr
+    live = _live_inputs(jaxpr, [i == 0 for i in range(len(jaxpr.outvars))])
+    treedef: Any = jax.tree.structure(params)
+    return treedef.unflatten(live[: treedef.num_leaves])
+
+
+def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
+    leaf = leaf if hasattr(leaf, "dtype") else jnp.asarray(leaf)
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+
+
+def _live_inputs(jaxpr: Any, live_outputs: list[bool]) -> list[bool]:
+    """Which inputs of a jaxpr reach one of its live outputs through differentiable values."""
+    live = {var for var, on in zip(jaxpr.outvars, live_outputs, strict=True) if on and _carries_gradient(var)}
+    for eqn in reversed(jaxpr.eqns):
+        outputs = [var in live for var in eqn.outvars]
+        if any(outputs):
+            inputs = zip(eqn.invars, _live_operands(eqn, outputs), strict=True)
+            live.update(var for var, on in inputs if on and _carries_gradient(var))
+    return [var in live for var in jaxpr.invars]
+
+
+def _carries_gradient(var: Any) -> bool:
+    return not isinstance(var, Literal) and jnp.issubdtype(getattr(var.aval, "dtype", jnp.int32), jnp.inexact)
+
+
+def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
+    """Which operands of an equation reach its live outputs; all of them where the primitive is not known."""
+    name, params, everything = eqn.primitive.name, eqn.params, [True] * len(eqn.invars)
+    if name == "stop_gradient":
+        return [False] * len(eqn.invars)
+    if name == "scan":
+        consts, carry = params["num_consts"], params["num_carry"]
+        return _live_loop(params["jaxpr"].jaxpr, outputs, consts, carry)
+    if name == "while":
+        # The predicate is a bool: nothing flows through the condition.
+        skip, consts = params["cond_nconsts"], params["body_nconsts"]
+        return [False] * skip + _live_loop(params["body_jaxpr"].jaxpr, outputs, consts, len(outputs))
+    if name == "cond":
+        branches = [_live_inputs(branch.jaxpr, outputs) for branch in params["branches"]]
+        return [False] + [any(lives) for lives in zip(*branches, strict=True)]
+    if name in _CALLS:
+        inner = params.get("jaxpr", params.get("call_jaxpr"))
+        inner = getattr(inner, "jaxpr", inner)
+        if inner is not None and len(inner.invars) == len(eqn.invars):
+            return _live_inputs(inner, outputs)
+    return everything
+
+
+def _live_loop(body: Any, outputs: list[bool], consts: int, carry: int) -> list[bool]:
+    """Live operands [constants, carry, scanned] of a loop: a round must give what the next one needs of the carry."""
+    needed = outputs[:carry]
+    while True:
+        inputs = _live_inputs(body, needed + outputs[carry:])
+        more = [a or b for a, b in zip(needed, inputs[consts : consts + carry], strict=True)]
+        if more == needed:
+            return inputs[:consts] + needed + inputs[consts + carry :]
+        needed = more

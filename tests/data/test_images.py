@@ -1,0 +1,200 @@
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.config import UserError
+from anytouch_jax.data import images
+
+RNG = np.random.default_rng(0)
+RGB = RNG.integers(0, 256, (9, 13, 3), np.uint8)
+
+
+def _encoded(suffix, image=RGB):
+    there, data = cv2.imencode(suffix, image[..., ::-1] if image.ndim == 3 and image.shape[2] == 3 else image)
+    assert there
+    return data.tobytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff"])
+def test_lossless_formats_give_the_exact_rgb(tmp_path, suffix):
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(_encoded(suffix))
+    got = images.decode(path)
+    assert got.dtype == np.uint8 and got.flags.c_contiguous
+    np.testing.assert_array_equal(got, RGB)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
+def test_lossy_formats_are_close(tmp_path, suffix):
+    smooth = np.stack([np.add.outer(np.arange(40), np.arange(60)) * 2, *[np.full((40, 60), 90)] * 2], -1).astype(
+        np.uint8
+    )
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(_encoded(suffix, smooth))
+    assert np.abs(images.decode(path).astype(int) - smooth).mean() < 3
+
+
+def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
+    grey = RGB[..., 0]
+    (tmp_path / "grey.png").write_bytes(_encoded(".png", grey))
+    np.testing.assert_array_equal(images.decode(tmp_path / "grey.png"), np.stack([grey] * 3, -1))
+    alpha = np.concatenate([RGB[..., ::-1], grey[..., None]], -1)
+    (tmp_path / "alpha.png").write_bytes(cv2.imencode(".png", alpha)[1].tobytes())
+    np.testing.assert_array_equal(images.decode(tmp_path / "alpha.png"), RGB)
+    (tmp_path / "deep.png").write_bytes(_encoded(".png", RGB.astype(np.uint16) * 257))
+    np.testing.assert_array_equal(images.decode(tmp_path / "deep.png"), RGB)
+    floats = RGB.astype(np.float32) / 255
+    (tmp_path / "float.tiff").write_bytes(_encoded(".tiff", floats))
+    np.testing.assert_array_equal(images.decode(tmp_path / "float.tiff"), RGB)
+    for name, array in (("f", floats.astype(np.float64)), ("u", RGB), ("g", grey), ("d", RGB.astype(np.uint16) * 257)):
+        np.save(tmp_path / f"{name}.npy", array)
+        np.testing.assert_array_equal(
+            images.decode(tmp_path / f"{name}.npy"), RGB if name != "g" else np.stack([grey] * 3, -1)
+        )
+
+
+def _nan():
+    array = np.full((4, 5, 3), 0.5, np.float32)
+    array[2, 3, 1] = np.nan
+    return array
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (_nan(), "NaN"),
+        (np.full((4, 5, 3), 2.0, np.float32), r"0\.\.1"),
+        (np.full((4, 5, 3), -np.inf, np.float32), r"0\.\.1"),
+        (np.zeros((4, 5, 2), np.uint8), "shape"),
+        (np.zeros((0, 5, 3), np.uint8), "shape"),
+        (np.zeros((4, 5, 3), np.int64), "int64"),
+        (np.zeros((4, 5, 3), object), "cannot be read"),
+    ],
+)
+def test_bad_arrays_are_named(tmp_path, array, words):
+    path = tmp_path / "bad.npy"
+    np.save(path, array, allow_pickle=True)
+    with pytest.raises(images.ImageError, match=words) as error:
+        images.decode(path)
+    assert str(path) in str(error.value) and isinstance(error.value, UserError)
+
+
+def test_nan_in_a_tiff_is_named(tmp_path):
+    path = tmp_path / "nan.tiff"
+    path.write_bytes(cv2.imencode(".tiff", _nan())[1].tobytes())
+    with pytest.raises(images.ImageError, match=r"nan\.tiff has NaN pixels"):
+        images.decode(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".npy"])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.95])
+def test_cut_files_are_named(tmp_path, suffix, share):
+    image = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8)
+    path = tmp_path / f"cut{suffix}"
+    if suffix == ".npy":
+        np.save(path, image)
+        data = path.read_bytes()
+    else:
+        data = _encoded(suffix, image)
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(images.ImageError, match=f"cut{suffix}"):
+        images.decode(path)
+
+
+def test_files_that_are_no_pictures_are_named(tmp_path):
+    (tmp_path / "text.jpg").write_text("not a picture at all")
+    corrupt = bytearray(_encoded(".png"))
+    corrupt[len(corrupt) // 2] ^= 0xFF
+    (tmp_path / "corrupt.png").write_bytes(bytes(corrupt))
+    for name, words in (("text.jpg", "not a PNG"), ("corrupt.png", "corrupt"), ("none.png", "there is no file")):
+        with pytest.raises(images.ImageError, match=words) as error:
+            images.decode(tmp_path / name)
+        assert name in str(error.value)
+    with pytest.raises(images.ImageError, match="cannot be read"):
+        images.decode(tmp_path)
+
+
+def _bombs():
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    head = struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+    jpeg = bytearray(_encoded(".jpg"))
+    at = jpeg.index(b"\xff\xc0")
+    jpeg[at + 5 : at + 9] = struct.pack(">HH", 60000, 60000)
+    bmp = bytearray(_encoded(".bmp"))
+    bmp[18:26] = struct.pack("<ii", 60000, -60000)
+    tiff = (
+        b"II*\0"
+        + struct.pack("<IH", 8, 2)
+        + struct.pack("<HHII", 256, 4, 1, 60000)
+        + struct.pack("<HHII", 257, 4, 1, 60000)
+    )
+    webp = b"RIFF\0\0\0\0WEBPVP8X" + bytes(8) + (59999).to_bytes(3, "little") * 2
+    return {"png": png, "jpg": bytes(jpeg), "bmp": bytes(bmp), "tiff": tiff, "webp": webp}
+
+
+@pytest.mark.parametrize("suffix", list(_bombs()))
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, suffix, monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
+    path = tmp_path / f"bomb.{suffix}"
+    path.write_bytes(_bombs()[suffix])
+    with pytest.raises(images.ImageError, match="60000 x 60000"):
+        images.decode(path)
+
+
+def test_declared_sizes_are_those_of_the_picture(tmp_path):
+    for suffix in (".png", ".jpg", ".bmp", ".tiff", ".webp"):
+        assert images._declared_size(_encoded(suffix)) == (13, 9), suffix
+    lossless = cv2.imencode(".webp", RGB, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+    assert images._declared_size(lossless) == (13, 9)
+
+
+def test_an_npy_that_declares_too_much_is_refused(tmp_path):
+    path = tmp_path / "bomb.npy"
+    np.save(path, np.zeros((4, 4, 3), np.uint8))
+    path.write_bytes(path.read_bytes().replace(b"(4, 4, 3)", b"(9999999, 9999999, 3)"))
+    with pytest.raises(images.ImageError, match="cannot be read"):
+        images.decode(path)
+
+
+def test_a_folder_comes_in_natural_order(tmp_path):
+    for number in (10, 9, 1):
+        image = np.full((4, 4, 3), number, np.uint8)
+        cv2.imwrite(str(tmp_path / f"img{number}.png"), image)
+    (tmp_path / "notes.txt").write_text("no picture")
+    assert [frame[0, 0, 0] for frame in images.frames_from_folder(tmp_path)] == [1, 9, 10]
+    (tmp_path / "empty").mkdir()
+    for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
+        with pytest.raises(images.ImageError, match=words):
+            images.frames_from_folder(folder)
+
+
+def test_a_video_gives_its_frames_in_rgb(tmp_path):
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 24))
+    for level in (0, 100, 200):
+        writer.write(np.full((24, 32, 3), (0, 0, level), np.uint8))  # BGR: red
+    writer.release()
+    frames = list(images.frames_from_video(path))
+    assert [frame.shape for frame in frames] == [(24, 32, 3)] * 3
+    assert [round(float(frame[..., 0].mean()) / 100) for frame in frames] == [0, 1, 2]
+    assert max(frame[..., 2].mean() for frame in frames) < 10
+    (tmp_path / "bad.avi").write_bytes(b"not a video")
+    for name, words in (("bad.avi", "not a video"), ("none.avi", "there is no video")):
+        with pytest.raises(images.ImageError, match=words):
+            list(images.frames_from_video(tmp_path / name))
+
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "real_touch"
+
+
+@pytest.mark.parametrize("path", sorted(SHARED.glob("*/**/videos/*.avi"))[:1] if SHARED.is_dir() else [])
+def test_a_real_video(path):
+    frame = next(images.frames_from_video(path))
+    assert frame.shape == (240, 320, 3) and frame.std() > 5

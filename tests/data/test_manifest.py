@@ -1,0 +1,236 @@
+import os
+import time
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from anytouch_jax.config import UserError, preset
+from anytouch_jax.data import manifest as m
+
+HEAD = "path,sensor,sequence,frame_index,split"
+GOOD = f"{HEAD},stride,touch,commercial,label.slip,label.name,other\n" + (
+    'a.png,digit,s,0,train,2,,1,0,x,7\nb.png,digit,s,2,train,2,t,0,1,"y, z",\nc.png,gelslim,r,5,test,,t,,,,q\n'
+)
+
+
+def _file(tmp_path, text, name="manifest.csv"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_csv_is_typed_and_empty_cells_are_null(tmp_path):
+    got = m.read(_file(tmp_path, "\ufeff" + GOOD))
+    assert len(got) == 3
+    assert got.column("frame_index").to_pylist() == [0, 2, 5]
+    assert got.column("stride").to_pylist() == [2, 2, 1]
+    assert got.column("touch").to_pylist() == [None, "t", "t"]
+    assert got.column("commercial").to_pylist() == [True, False, None]
+    assert got.column("label.slip").to_pylist() == [0, 1, None]
+    assert got.column("label.name").to_pylist() == ["x", "y, z", None]
+    assert got.column("other").to_pylist() == ["7", None, "q"]
+    assert got.column("image_path").to_pylist() == [None] * 3
+    assert got.present("touch").tolist() == [False, True, True]
+    assert got.codes("touch").tolist() == [-1, 0, 0]
+    assert got.file(1) == tmp_path / "b.png"
+
+
+def test_csv_and_parquet_round_trip_with_one_hash(tmp_path):
+    first = m.read(_file(tmp_path, GOOD))
+    for name in ("again.csv", "again.parquet"):
+        m.write(first, tmp_path / name)
+        again = m.read(tmp_path / name)
+        assert again.table.equals(first.table)
+        assert again.content_hash == first.content_hash
+    other = m.read(_file(tmp_path, GOOD.replace("c.png", "d.png"), "other.csv"))
+    assert other.content_hash != first.content_hash
+    moved = m.read(_file(tmp_path, GOOD.replace("2,,1", "2,q,1"), "moved.csv"))
+    assert moved.content_hash != first.content_hash
+    assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    first = m.read(_file(tmp_path, GOOD))
+    before = (tmp_path / "manifest.csv").read_bytes()
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        m.write(first, tmp_path / "manifest.csv")
+    assert (tmp_path / "manifest.csv").read_bytes() == before
+    assert os.listdir(tmp_path) == ["manifest.csv"]
+
+
+def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
+    (tmp_path / "deep").mkdir()
+    first = m.read(_file(tmp_path / "deep", GOOD))
+    m.write(first, tmp_path / "up.parquet")
+    up = m.read(tmp_path / "up.parquet")
+    assert up.value(0, "path") == "deep/a.png"
+    assert up.file(0) == first.file(0)
+    with pytest.raises(m.ManifestError, match=r"row 0 of .*manifest\.csv.*is not inside .*elsewhere"):
+        m.write(first, tmp_path / "elsewhere" / "x.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD.replace(",split", ",slit"), ["lacks the column 'split'", "slit"]),
+        (GOOD.replace("s,2,train", "s,two,train"), ["row 1", "'frame_index'", "whole number", "'two'"]),
+        (GOOD.replace("s,2,train", "s,2.5,train"), ["row 1", "'frame_index'", "'2.5'"]),
+        (GOOD.replace("s,2,train", "s,,train"), ["row 1", "'frame_index' is empty"]),
+        (GOOD.replace("c.png", "  "), ["row 2", "'path' is empty"]),
+        (GOOD.replace("test", "tset"), ["row 2", "'split'", "tset", "background"]),
+        (GOOD.replace("train,2,t,0", "train,0,t,0"), ["row 1", "'stride'", "at least 1, is 0"]),
+        (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["row 0", "'commercial'", "0 or 1", "'yes'"]),
+        (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["cannot be read as a csv", "Expected 11 columns"]),
+        (GOOD.replace("other\n", "path\n"), ["'path' is there twice"]),
+        (HEAD + "\n", ["has no rows"]),
+        ("", ["cannot be read as a csv"]),
+    ],
+)
+def test_a_bad_table_is_named_by_file_column_and_row(tmp_path, text, words):
+    path = _file(tmp_path, text)
+    with pytest.raises(m.ManifestError) as error:
+        m.read(path)
+    assert isinstance(error.value, UserError)
+    for word in [str(path), *words]:
+        assert word in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_other_ways_to_give_no_manifest(tmp_path):
+    (tmp_path / "x.parquet").write_bytes(b"PAR1 this is not one")
+    (tmp_path / "latin.csv").write_bytes(f"{HEAD}\nf\xfcr.png,digit,s,0,train\n".encode("latin-1"))
+    for path, words in [
+        (tmp_path, "is a folder"),
+        (tmp_path / "none.csv", "there is no manifest"),
+        (tmp_path / "x.parquet", "cannot be read as a parquet"),
+        (tmp_path / "latin.csv", "cannot be read as a csv"),
+        (_file(tmp_path, GOOD, "x.txt"), "ends in .csv or .parquet"),
+        ([], "no manifest is given"),
+    ]:
+        with pytest.raises(m.ManifestError, match=words):
+            m.read(path)
+
+
+def test_types_in_memory_are_enforced(tmp_path):
+    good = {"path": ["a"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
+    gaps = m.from_columns({**good, "stride": [3.0], "sensor": pa.array(["digit"]).dictionary_encode()}, tmp_path / "x")
+    assert gaps.table["stride"].type == pa.int64() and gaps.value(0, "sensor") == "digit"
+    for bad in ({"sequence": [3]}, {"frame_index": [0.5]}, {"frame_index": [[1]]}, {"commercial": [2]}, {"text": [1]}):
+        with pytest.raises(m.ManifestError, match=f"column {next(iter(bad))!r}"):
+            m.from_columns({**good, **bad}, tmp_path / "x.csv")
+    with pytest.raises(m.ManifestError, match="make no table"):
+        m.from_columns({**good, "split": ["train", "val"]}, tmp_path / "x.csv")
+
+
+def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    one = _file(tmp_path / "one", GOOD)
+    two = _file(tmp_path / "two", GOOD.replace("label.slip", "label.grip").replace(",x,", ",3,").replace("y, z", "4"))
+    both = m.read([one, two])
+    assert len(both) == 6
+    assert both.file(4) == tmp_path / "two" / "b.png"
+    assert both.where(4) == f"row 1 of {two}"
+    assert both.column("label.grip").to_pylist() == [None, None, None, 0, 1, None]
+    assert both.column("label.name").to_pylist() == ["x", "y, z", None, "3", "4", None]
+    touch = both.codes("touch", own=True)
+    assert touch[1] == touch[2] != touch[4] == touch[5] and touch[0] == touch[3] == -1
+    assert both.clips(2).tolist() == [[0, 1], [3, 4]]
+    with pytest.raises(m.ManifestError, match="given twice"):
+        m.read([one, one])
+
+
+def test_rows_of_names_the_file_of_an_empty_split(tmp_path):
+    got = m.read(_file(tmp_path, GOOD))
+    assert got.rows_of("train").tolist() == [0, 1]
+    with pytest.raises(m.ManifestError, match=r"manifest\.csv: column 'split' has no row 'val'; it has test, train"):
+        got.rows_of("val")
+    with pytest.raises(m.ManifestError, match="unknown split 'trian'"):
+        got.rows_of("trian")
+
+
+def test_resolve_keeps_inside_the_folder(tmp_path):
+    root = tmp_path / "data"
+    (root / "in").mkdir(parents=True)
+    (tmp_path / "data2").mkdir()
+    (tmp_path / "secret.png").write_bytes(b"x")
+    (root / "link.png").symlink_to(tmp_path / "secret.png")
+    (root / "out").symlink_to(tmp_path / "data2")
+    (root / "inside.png").symlink_to(root / "in" / "a.png")
+    assert m.resolve(root, "in/../in/a.png") == root / "in" / "a.png"
+    assert m.resolve(root, "inside.png") == root / "in" / "a.png"
+    for bad in ("../secret.png", "in/../../secret.png", "../data2/x", str(root / "a.png"), "link.png", "out/x.png"):
+        with pytest.raises(m.ManifestError, match="leaves the folder"):
+            m.resolve(root, bad)
+    for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name")):
+        with pytest.raises(m.ManifestError, match=words):
+            m.resolve(root, bad)
+
+
+def test_sensor_rows(tmp_path):
+    text = f"{HEAD}\na,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
+    got, model = m.read(_file(tmp_path, text)), preset("tiny").model
+    with pytest.raises(m.ManifestError, match=r"row 2 of .*manifest\.csv.*unknown sensor 'newfinger'"):
+        m.sensor_rows(got, model)
+    ids, notes = m.sensor_rows(got, model, unknown="skip")
+    assert ids.tolist() == [1, -1, -1, 6] and ids.dtype == np.int32
+    assert any("1 rows of tac3d" in note for note in notes) and any("newfinger" in note for note in notes)
+    ids, notes = m.sensor_rows(got, model, unknown="universal")
+    assert ids.tolist() == [1, -1, 9, 6] and any("universal" in note for note in notes)
+    ids, notes = m.sensor_rows(got, model, np.array([0, 3]))
+    assert ids.tolist() == [1, -1, -1, 6] and notes == []
+
+
+def _brute(rows, length):
+    """Clips by dictionary: the plain meaning of the words."""
+    at = {(row["sequence"], row["split"], row["frame_index"]): i for i, row in enumerate(rows)}
+    found = []
+    for row in rows:
+        keys = [
+            (row["sequence"], row["split"], row["frame_index"] - back * row["stride"])
+            for back in range(length - 1, -1, -1)
+        ]
+        if all(key in at for key in keys):
+            found.append([at[key] for key in keys])
+    return found
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4])
+@pytest.mark.parametrize("scale", [1, 10**15])
+def test_clips_are_what_the_words_say(tmp_path, length, scale):
+    rng = np.random.default_rng(length)
+    taken, rows = set(), []
+    while len(rows) < 300:
+        sequence, frame = f"s{rng.integers(6)}", int(rng.integers(-40, 40)) * scale
+        if (sequence, frame) not in taken:
+            taken.add((sequence, frame))
+            stride, split = int(rng.integers(1, 4)) * scale, str(rng.choice(["train", "train", "val"]))
+            rows.append({"path": "x", "sensor": "digit", "sequence": sequence, "frame_index": frame,
+                         "split": split, "stride": stride})  # fmt: skip
+    got = m.from_columns({name: [row[name] for row in rows] for name in rows[0]}, tmp_path / "m.csv")
+    want = _brute(rows, length)
+    assert got.clips(length).tolist() == want and len(want) > 5
+    train = [clip for clip in want if rows[clip[-1]]["split"] == "train"]
+    assert got.clips(length, "train").tolist() == train
+
+
+def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
+    got = m.read(_file(tmp_path, f"{HEAD}\na,digit,s,0,train\nb,digit,r,7,train\nc,digit,r,7,train\n"))
+    assert len(got.clips(1)) == 3
+    with pytest.raises(m.ManifestError, match=r"row 2 of .* repeats frame_index 7 of sequence 'r' \(row 1\)"):
+        got.clips(2)
+
+
+def test_clips_need_no_python_loop_over_rows():
+    from anytouch_jax.data.windows import windows
+
+    n = 400_000
+    sequence, frame = np.repeat(np.arange(n // 100), 100), np.tile(np.arange(100), n // 100)
+    start = time.process_time()
+    found = windows(sequence, frame, np.ones(n, np.int64), 4)
+    assert found.shape == (n // 100 * 97, 4)
+    assert (np.diff(found, axis=1) == 1).all()
+    # Not a speed test: a loop over rows takes tens of seconds here, sorting takes a fraction of one.
+    assert time.process_time() - start < 10

@@ -1,0 +1,179 @@
+import colorsys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.config import Data
+from anytouch_jax.data import transforms as t
+
+PLAIN = Data(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0))
+RNG = np.random.default_rng(0)
+CLIP = RNG.integers(0, 256, (3, 24, 32, 3), np.uint8)
+
+
+def _rng(*key):
+    return np.random.default_rng(key or 0)
+
+
+def test_the_whole_image_is_resized_without_a_crop():
+    frame = np.zeros((1, 40, 80, 3), np.uint8)
+    frame[0, :20, :40] = 200  # the upper left quarter stays the upper left quarter
+    out = t.touch_transform(frame, 20, _rng(), PLAIN)
+    assert out.shape == (1, 20, 20, 3) and out.dtype == np.uint8
+    assert (out[0, :10, :10] == 200).all() and not out[0, 10:].any() and not out[0, :, 10:].any()
+    np.testing.assert_array_equal(out, t.touch_evaluation(frame, 20))
+
+
+def test_shrinking_averages_and_does_not_alias():
+    board = np.indices((64, 64)).sum(0) % 2 * 255
+    frame = np.stack([board] * 3, -1).astype(np.uint8)
+    assert np.abs(t.touch_evaluation([frame], 16).astype(int) - 127).max() <= 1
+    assert np.abs(t.vision_evaluation(frame, 16).astype(int) - 127).max() <= 12
+
+
+def test_frames_of_different_sizes_make_one_clip():
+    out = t.touch_evaluation([CLIP[0], CLIP[1, :12, :12]], 16)
+    assert out.shape == (2, 16, 16, 3)
+
+
+def test_flips_are_exact_mirrors_in_all_four_forms():
+    plain = t.touch_evaluation(CLIP, 16)
+    forms = {0: plain, 1: plain[:, :, ::-1], 2: plain[:, ::-1], 3: plain[:, ::-1, ::-1]}
+    seen = set()
+    for key in range(40):
+        out = t.touch_transform(CLIP, 16, _rng(key), replace(PLAIN, flip=0.5))
+        match = [name for name, form in forms.items() if np.array_equal(out, form)]
+        assert len(match) == 1
+        seen.add(match[0])
+    assert seen == {0, 1, 2, 3}
+    both = t.touch_transform(CLIP, 16, _rng(), replace(PLAIN, flip=1.0))
+    np.testing.assert_array_equal(both, forms[3])
+
+
+def _slow_jitter(frame, factors, order):
+    """torchvision's ColorJitter on floats, pixel by pixel."""
+    grey = np.array([0.2989, 0.587, 0.114])
+    x = frame.astype(np.float64) / 255
+    for operation in order:
+        f = factors[operation]
+        if operation == 0:
+            x = x * f
+        elif operation == 1:
+            x = f * x + (1 - f) * (x @ grey).mean()
+        elif operation == 2:
+            x = f * x + (1 - f) * (x @ grey)[..., None]
+        else:
+            turned = []
+            for pixel in x.reshape(-1, 3):
+                h, s, v = colorsys.rgb_to_hsv(*pixel)
+                turned.append(colorsys.hsv_to_rgb((h + f) % 1, s, v))
+            x = np.array(turned).reshape(x.shape)
+        x = np.clip(x, 0, 1)
+    return x * 255
+
+
+@pytest.mark.parametrize("key", range(12))
+def test_jitter_is_torchvisions_within_half_a_level(key):
+    jitter = (0.4, 0.4, 0.5, 0.3)
+    frame = RNG.integers(0, 256, (10, 10, 3), np.uint8)
+    frame[:3] = frame[:3, :, :1]  # grey pixels have no hue
+    rng = _rng(key)
+    draw, order = rng.random(4), rng.permutation(4)
+    low, high = np.array([0.6, 0.6, 0.5, -0.3]), np.array([1.4, 1.4, 1.5, 0.3])
+    want = _slow_jitter(frame, low + (high - low) * draw, order)
+    got = t.colour_jitter(frame[None], _rng(key), jitter)[0]
+    assert np.abs(got - want).max() <= 0.51
+
+
+def test_each_jitter_strength_is_its_own():
+    frame = CLIP[:1]
+    for place in range(4):
+        jitter = [0.0] * 4
+        jitter[place] = 0.3
+        assert not np.array_equal(t.colour_jitter(frame, _rng(3), tuple(jitter)), frame), place
+    np.testing.assert_array_equal(t.colour_jitter(frame, _rng(3), (0.0,) * 4), frame)
+    grey = np.full((1, 6, 6, 3), 77, np.uint8)  # saturation and hue leave grey alone, contrast leaves a flat image
+    assert np.abs(t.colour_jitter(grey, _rng(1), (0, 0.9, 0.9, 0.5)).astype(int) - 77).max() <= 1
+
+
+def test_all_frames_of_a_clip_share_one_draw():
+    same = np.stack([CLIP[0]] * 4)
+    out = t.touch_transform(same, 16, _rng(5), Data())
+    for frame in out[1:]:
+        np.testing.assert_array_equal(frame, out[0])
+    alone = t.touch_transform(CLIP[:1], 16, _rng(5), Data())
+    together = t.touch_transform(CLIP, 16, _rng(5), Data())
+    np.testing.assert_array_equal(alone[0], together[0])
+    assert not np.array_equal(out, t.touch_transform(same, 16, _rng(6), Data()))
+
+
+def test_augmentation_is_a_function_of_seed_epoch_and_row():
+    def draw(*key):
+        return t.touch_transform(CLIP, 16, t.augmentation_rng(*key), Data())
+
+    base = draw(1, 2, 3)
+    np.testing.assert_array_equal(base, draw(1, 2, 3))
+    for other in ((0, 2, 3), (1, 0, 3), (1, 2, 0), (3, 2, 1), (1, 2, 3, t.VISION)):
+        assert not np.array_equal(base, draw(*other)), other
+    draw(-1, 0, 0)  # a negative seed is a seed
+
+
+def test_inputs_are_not_touched():
+    before = CLIP.copy()
+    t.touch_transform(CLIP, 24, _rng(2), Data(flip=1.0))
+    t.vision_transform(CLIP[0], 24, _rng(2))
+    np.testing.assert_array_equal(CLIP, before)
+
+
+@pytest.mark.parametrize("shape", [(30, 50), (50, 30), (20, 20), (9, 14), (400, 300), (401, 30)])
+def test_vision_keeps_a_flat_picture_flat_at_any_size(shape):
+    out = t.vision_evaluation(np.full((*shape, 3), (10, 130, 250), np.uint8), 20)
+    assert out.shape == (20, 20, 3) and out.dtype == np.uint8
+    np.testing.assert_array_equal(out, np.broadcast_to(np.array([10, 130, 250]), out.shape))
+
+
+def test_vision_takes_the_centre_of_the_long_side():
+    picture = np.zeros((20, 60, 3), np.uint8)
+    picture[:, 20:40] = 255
+    np.testing.assert_array_equal(t.vision_evaluation(picture, 20), np.full((20, 20, 3), 255))
+    np.testing.assert_array_equal(t.vision_evaluation(picture.transpose(1, 0, 2).copy(), 20), np.full((20, 20, 3), 255))
+
+
+def test_vision_resize_is_bicubic():
+    # Twice as large: OpenCV's kernel differs (a = -0.75), so the weights are written out: a = -0.5 at +-1/4, +-3/4 ...
+    ramp = np.zeros((8, 8, 3), np.uint8)
+    ramp[:, 4] = 128
+    out = t.vision_evaluation(ramp, 16)[8, :, 0].astype(float)
+
+    def kernel(x):
+        x = abs(x)
+        return 1.5 * x**3 - 2.5 * x**2 + 1 if x < 1 else -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2 if x < 2 else 0.0
+
+    want = [128 * kernel((i + 0.5) / 2 - 4.5) for i in range(16)]
+    assert np.abs(out - np.clip(want, 0, 255)).max() <= 0.51
+    gradient = np.tile(np.arange(0, 240, 4, dtype=np.uint8)[None, :, None], (60, 1, 3))
+    line = t.vision_evaluation(gradient, 20)[10, 3:-3, 0].astype(float)
+    assert np.abs(np.diff(line) - 12).max() <= 1  # a straight line stays straight
+
+
+def test_vision_flip_is_an_exact_mirror_and_rotation_turns():
+    picture = RNG.integers(0, 256, (20, 20, 3), np.uint8)
+    mirrored = t.vision_transform(picture, 20, _rng(), rotation=0.0, flip=1.0)
+    np.testing.assert_array_equal(mirrored, t.vision_evaluation(picture[:, ::-1], 20))
+    np.testing.assert_array_equal(t.vision_transform(picture, 20, _rng(), 0.0, 0.0), picture)
+    bar = np.zeros((101, 101, 3), np.uint8)
+    bar[48:53] = 255
+    angles = []
+    for key in range(60):
+        out = t.vision_transform(bar, 101, _rng(key), rotation=20.0)
+        y, x = np.nonzero(out[..., 0] > 127)
+        angles.append(np.degrees(np.arctan(np.polyfit(x, y, 1)[0])))
+        assert out[50, 50, 0] == 255  # about the centre
+    assert 15 < max(angles) < 20.5 and -20.5 < min(angles) < -15
+
+
+def test_decode_is_to_be_had_here(tmp_path):
+    cv2.imwrite(str(tmp_path / "x.png"), CLIP[0][..., ::-1])
+    np.testing.assert_array_equal(t.decode(tmp_path / "x.png"), CLIP[0])

@@ -1,0 +1,66 @@
+"""Raw pixels: area averages, the difference from the background, principal components of train."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.config import UserError
+from anytouch_jax.evaluate.baseline import raw_pixel_features, raw_pixels, reduce
+
+
+def pictures(count: int, height: int = 48, width: int = 64, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, height, width, 3), np.uint8)
+
+
+def test_pixels_are_block_means_of_grey() -> None:
+    frames, backgrounds = pictures(3), pictures(3, seed=1)
+    features = raw_pixels(frames, backgrounds)
+    assert features.shape == (3, 2 * 24 * 32)
+    grey = (frames / 255) @ [0.299, 0.587, 0.114]
+    blocks = grey.reshape(3, 24, 2, 32, 2).mean((2, 4)).reshape(3, -1)
+    np.testing.assert_allclose(features[:, :768], blocks, atol=1e-6)
+    behind = (backgrounds / 255) @ [0.299, 0.587, 0.114]
+    np.testing.assert_allclose(
+        features[:, 768:], blocks - behind.reshape(3, 24, 2, 32, 2).mean((2, 4)).reshape(3, -1), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("shape", [(320, 240), (50, 77), (30, 33)])
+def test_any_size_is_averaged_by_area(shape: tuple[int, int]) -> None:
+    frame = pictures(1, *shape)
+    grey = ((frame[0] / 255) @ [0.299, 0.587, 0.114]).astype(np.float32)
+    expected = cv2.resize(grey, (32, 24), interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(raw_pixels(frame, frame)[0, :768], expected.ravel(), atol=2e-3)
+
+
+def test_a_frame_like_its_background_has_no_difference() -> None:
+    frames = pictures(4)
+    assert not raw_pixels(frames, frames)[:, 768:].any()
+    other = raw_pixels(frames, pictures(4, seed=2), np.array([True, False, True, False]))[:, 768:]
+    np.testing.assert_array_equal(other.any(axis=1), [True, False, True, False])
+
+
+def test_components_are_those_of_train() -> None:
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(60, 10)) * np.array([9, 5, *[0.1] * 8])
+    train = np.arange(60) < 40
+    kept = reduce(features, train, 2)
+    np.testing.assert_allclose(np.abs(np.corrcoef(kept[:, 0], features[:, 0])[0, 1]), 1, atol=0.02)
+    assert np.abs(kept[train].mean(0)).max() < 1e-5
+    wild = features.copy()
+    wild[~train] *= 100
+    np.testing.assert_allclose(reduce(wild, train, 2)[train], kept[train], atol=1e-5)
+
+
+def test_few_rows_give_few_components() -> None:
+    frames = pictures(12)
+    assert raw_pixel_features(frames, pictures(12, seed=1), np.arange(12) < 9).shape == (12, 9)
+
+
+def test_mistakes() -> None:
+    with pytest.raises(UserError, match=r"must both be \(n, h, w, 3\)"):
+        raw_pixels(pictures(2), pictures(3))
+    with pytest.raises(UserError, match="no row is marked as train"):
+        reduce(np.ones((3, 2)), np.zeros(3, bool))

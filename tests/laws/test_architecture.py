@@ -1,0 +1,201 @@
+"""The house of the design: who may import whom, how long a module may be, what starts fast."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "anytouch_jax"
+ROOT = Path(__file__).resolve().parents[2] / "src" / PACKAGE
+LONGEST = 350
+
+# room -> what of ours it may import; a dotted name is one module of a room. A room may always import itself.
+MAY_IMPORT: dict[str, set[str]] = {
+    "config": set(),
+    "batch": set(),
+    "ops": set(),
+    "nn": {"ops", "config"},
+    "objectives": {"ops", "batch", "config", "nn.functional"},
+    "train": {"batch", "config", "io"},
+    "data": {"config", "batch"},
+    "sim": {"data.manifest", "data.text", "config"},
+    "io": {"config"},
+    "evaluate": {"config", "batch", "ops", "nn", "objectives", "train", "data", "sim", "io"},
+}
+FREE = {"cli", "commands", "pretrain", "__init__", "__main__"}  # the command line: may import anything of ours
+
+# library -> the only rooms (or modules) that know it
+ONLY_IN: dict[str, set[str]] = {
+    "jax": {"ops", "nn", "objectives", "train", "io", "evaluate", "sim", "commands", "pretrain"},
+    "flax": {"nn"},
+    "optax": {"train", "evaluate"},
+    "orbax": {"io.checkpoint"},
+    "sklearn": {"evaluate"},
+    "matplotlib": {"evaluate"},
+    "tyro": {"cli"},
+    "torch": set(),
+    "tensorflow": set(),
+    "pickle": {"io.release"},
+    "importlib": {"__init__"},
+}
+HARMLESS = {"importlib.metadata", "importlib.resources"}
+HEAVY = ("jax", "flax", "optax", "orbax", "cv2", "sklearn", "scipy", "matplotlib", "pyarrow", "tokenizers")
+
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(ROOT.rglob("*.py"))
+}
+
+
+def imports(module: str, source: str) -> Iterator[tuple[str, int]]:
+    """(dotted name, line) of everything that `module` imports anywhere, relative imports resolved.
+
+    What stands under `if TYPE_CHECKING:` is left out: it is never imported.
+    """
+    package = [PACKAGE, *module.split(".")[:-1]]
+    tree = ast.parse(source)
+    typing_only = [node for node in ast.walk(tree) if isinstance(node, ast.If) and _is_type_checking(node.test)]
+    never = {id(inner) for node in typing_only for part in node.body for inner in ast.walk(part)}
+    for node in ast.walk(tree):
+        if id(node) in never:
+            continue
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((f"{origin}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def _is_type_checking(test: ast.expr) -> bool:
+    return ast.unparse(test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+
+
+def inside(name: str, allowed: set[str]) -> bool:
+    """Whether the dotted `name` is one of `allowed` or lies below one."""
+    return any(name == one or name.startswith(f"{one}.") for one in allowed)
+
+
+def faults(module: str, source: str) -> list[str]:
+    """Imports of `module` that the table does not allow, as sentences."""
+    room, found = module.split(".")[0], []
+    for name, line in imports(module, source):
+        if name == PACKAGE or name.startswith(f"{PACKAGE}."):
+            ours = name.removeprefix(PACKAGE).removeprefix(".")
+            if room not in FREE and not inside(ours, MAY_IMPORT[room] | {room}):
+                found.append(f"{module}:{line} imports {ours or PACKAGE}, which {room} may not")
+        else:
+            library = name.split(".")[0]
+            if library in ONLY_IN and not inside(module, ONLY_IN[library]) and not inside(name, HARMLESS):
+                found.append(f"{module}:{line} imports {library}, which only {sorted(ONLY_IN[library])} may")
+            if room == "ops" and library != "jax" and library not in sys.stdlib_module_names:
+                found.append(f"{module}:{line} imports {library}; ops knows jax alone")
+    return found
+
+
+def graph() -> dict[str, set[str]]:
+    """module -> modules of ours that it imports."""
+    edges: dict[str, set[str]] = {}
+    for module, path in MODULES.items():
+        names = {name.removeprefix(f"{PACKAGE}.") for name, _ in imports(module, path.read_text())}
+        reached = {name if name in MODULES else name.rpartition(".")[0] for name in names}
+        edges[module] = (reached & set(MODULES)) - {module}
+    return edges
+
+
+def cycle(edges: dict[str, set[str]]) -> list[str]:
+    """One cycle of the graph, or nothing: nodes without outgoing edges are taken away until none is left."""
+    edges = {node: set(targets) for node, targets in edges.items()}
+    while free := [node for node, targets in edges.items() if not targets]:
+        for node in free:
+            del edges[node]
+        for targets in edges.values():
+            targets.difference_update(free)
+    return sorted(edges)
+
+
+def test_every_module_has_a_room() -> None:
+    rooms = {module.split(".")[0] for module in MODULES}
+    assert rooms <= set(MAY_IMPORT) | FREE
+    assert {"cli", "__init__", "__main__", "objectives", "ops", "nn", "train", "data", "io", "evaluate"} <= rooms
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_follow_the_table(module: str) -> None:
+    assert faults(module, MODULES[module].read_text()) == []
+
+
+def test_no_import_cycles() -> None:
+    assert cycle(graph()) == []
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_is_too_long(module: str) -> None:
+    assert len(MODULES[module].read_text().splitlines()) <= LONGEST
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("data.loader", "import jax.numpy as jnp"),
+        ("data.loader", "def f():\n    from jax import random"),
+        ("data.loader", "from ..ops import tokens"),
+        ("train.loop", "from anytouch_jax.nn import functional"),
+        ("train.loop", "from .. import objectives"),
+        ("objectives", "from .nn.touch import Encoder"),
+        ("ops.losses", "import numpy as np"),
+        ("ops.losses", "from ..config import Model"),
+        ("train.loop", "import orbax.checkpoint"),
+        ("data.loader", "import pickle"),
+        ("evaluate.probe", "import importlib"),
+        ("evaluate.probe", "from ..cli import main"),
+        ("evaluate.probe", "if TYPE_CHECKING:\n    pass\nelse:\n    from .. import cli"),
+    ],
+)
+def test_the_table_catches(module: str, source: str) -> None:
+    assert len(faults(module, source)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("objectives", "from .nn.functional import Net"),
+        ("objectives", "from .ops import losses\nfrom .batch import TouchBatch"),
+        ("nn.touch", "from ..ops.tokens import patchify\nfrom flax import nnx\nfrom .layers import Block"),
+        ("ops.masking", "import math\nimport jax.numpy as jnp\nfrom . import tokens"),
+        ("evaluate.parity", "from ..objectives import stage1_terms"),
+        ("evaluate.parity", "if TYPE_CHECKING:\n    from .. import cli"),
+        ("io.release", "import pickle\nfrom importlib import resources"),
+    ],
+)
+def test_the_table_allows(module: str, source: str) -> None:
+    assert faults(module, source) == []
+
+
+def test_a_cycle_is_seen() -> None:
+    assert cycle({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["a", "b", "c"]
+    assert cycle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+@pytest.mark.parametrize("module", [PACKAGE, f"{PACKAGE}.cli", f"{PACKAGE}.config", f"{PACKAGE}.batch"])
+def test_imports_nothing_heavy(module: str) -> None:
+    loaded = _modules_after(f"import {module}")
+    assert loaded.isdisjoint(HEAVY), sorted(loaded & set(HEAVY))
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("data.")])
+def test_data_workers_never_load_jax(module: str) -> None:
+    assert _modules_after(f"import {PACKAGE}.{module}").isdisjoint({"jax", "flax", "optax"})
+
+
+def _modules_after(statement: str) -> set[str]:
+    """Top-level names in sys.modules of a fresh interpreter that ran `statement`."""
+    code = f"{statement}\nimport sys\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())

@@ -1,0 +1,116 @@
+"""What a user types after `make`: the commands it would run, its help, its one sentence on a mistake."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ("DATA", "RUN", "INIT", "PRESET", "STEPS", "STOP_AFTER", "SAVE", "LABEL", "GOLDEN", "PYTHON", "MAKEFLAGS")
+
+
+def make(*words: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run make without the variables of the outer make, which may be running this test."""
+    assert shutil.which("make") is not None
+    clean = {key: value for key, value in os.environ.items() if key not in (*NAMES, "MAKELEVEL", "MFLAGS")}
+    return subprocess.run(["make", *words], cwd=folder, env=clean, capture_output=True, text=True, check=False)
+
+
+def planned(*words: str) -> str:
+    """The last command that make would run, without its interpreter."""
+    done = make("-n", *words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip().splitlines()[-1].removeprefix(".venv/bin/python -m ")
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (
+            ["train-stage1", "DATA=../shared/real_touch/manifest.csv"],
+            "anytouch_jax train --stage 1 --data ../shared/real_touch/manifest.csv --run runs/stage1 --preset tiny",
+        ),
+        (
+            ["train-stage1", "DATA=a.parquet b.csv", "RUN=r", "PRESET=large", "STEPS=4", "STOP_AFTER=2", "SAVE=1"],
+            "anytouch_jax train --stage 1 --data a.parquet b.csv --run r --preset large"
+            " --steps 4 --stop-after 2 --save-every 1",
+        ),
+        (
+            ["train-stage2", "DATA=a.csv"],
+            "anytouch_jax train --stage 2 --data a.csv --run runs/stage2 --preset tiny --init runs/stage1",
+        ),
+        (
+            ["train-stage2", "DATA=a.csv", "INIT=w.pth", "RUN=r"],
+            "anytouch_jax train --stage 2 --data a.csv --run r --preset tiny --init w.pth",
+        ),
+        (
+            ["probe", "DATA=a.csv", "RUN=r", "LABEL=slip"],
+            "anytouch_jax probe --run r --data a.csv --label slip",
+        ),
+        (["parity"], "anytouch_jax parity ../shared/golden"),
+        (["parity", "GOLDEN=g"], "anytouch_jax parity g"),
+    ],
+)
+def test_targets_run_the_command_line(words: list[str], command: str) -> None:
+    assert planned(*words) == command
+
+
+def test_quick_and_whole_test_run() -> None:
+    assert planned("test").endswith('-m "not slow"')
+    assert "not slow" not in planned("test-all")
+
+
+def test_every_target_makes_the_environment_first() -> None:
+    text = (ROOT / "Makefile").read_text()
+    targets = re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE).group(1).split()
+    for target in set(targets) - {"help", "clean"}:
+        assert re.search(rf"^{target}: \$\(STAMP\) ## \S", text, re.MULTILINE), target
+
+
+def test_plain_make_lists_every_target() -> None:
+    done = make()
+    targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
+    assert done.returncode == 0
+    assert [line.split()[0] for line in done.stdout.splitlines() if re.match(r"  [a-z]", line)] == targets
+
+
+@pytest.mark.parametrize("target", ["train-stage1", "train-stage2", "probe"])
+def test_missing_data_is_one_sentence(target: str) -> None:
+    done = make("-n", target)
+    assert done.returncode != 0
+    assert f"`make {target}` needs DATA=, for example: make {target} DATA=touch.parquet" in done.stderr
+
+
+def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:
+    for name in ("Makefile", "requirements.txt", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    old = tmp_path / "python-old"
+    old.write_text("#!/bin/sh\nexit 1\n")  # what `sys.exit(version < 3.11)` answers there
+    old.chmod(0o755)
+    done = make("setup", f"PYTHON={old}", folder=tmp_path)
+    assert done.returncode != 0
+    assert done.stderr.startswith("This project needs Python 3.11 or newer")
+    assert not (tmp_path / ".venv").exists()
+
+
+def test_pins_cover_the_declared_dependencies() -> None:
+    import tomllib
+
+    from packaging.requirements import Requirement
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = [line for line in (ROOT / "requirements.txt").read_text().splitlines() if not line.startswith("#")]
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+]+", line) for line in lines)
+    pins = {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in (line.split("==") for line in lines)}
+    declared = [
+        *project["dependencies"],
+        *(one for extra in project["optional-dependencies"].values() for one in extra),
+    ]
+    for requirement in map(Requirement, declared):
+        assert "<" in str(requirement.specifier), f"{requirement} has no upper bound"
+        assert pins[re.sub(r"[-_.]+", "-", requirement.name).lower()] in requirement.specifier

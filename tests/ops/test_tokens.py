@@ -1,0 +1,58 @@
+"""Patches, positions and segments."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from anytouch_jax.ops.tokens import patchify, segments, sincos_table, unpatchify
+
+
+def test_patchify_orders_row_col_colour():
+    ramp = jnp.arange(1 * 1 * 4 * 4 * 3).reshape(1, 1, 4, 4, 3)
+    patches = patchify(ramp, 2)
+    assert patches.shape == (1, 4, 1, 12)
+    # The second patch is the top right one: pixels (0, 2), (0, 3), (1, 2), (1, 3), three colours each.
+    assert patches[0, 1, 0].tolist() == [6, 7, 8, 9, 10, 11, 18, 19, 20, 21, 22, 23]
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 6, 6, 3), (1, 4, 4, 8, 3), (3, 3, 2, 2, 1)])
+def test_unpatchify_is_the_exact_inverse(shape):
+    clip = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
+    patches = patchify(jnp.asarray(clip), 2)
+    assert patches.shape == (shape[0], shape[2] * shape[3] // 4, shape[1], 4 * shape[4])
+    np.testing.assert_array_equal(unpatchify(patches, 2, shape[2]), clip)
+
+
+def test_patchify_refuses_sizes_that_do_not_divide():
+    with pytest.raises(ValueError, match="5 x 4"):
+        patchify(jnp.zeros((1, 1, 5, 4, 3)), 2)
+
+
+def test_sincos_table_class_row_is_zero_and_positions_differ():
+    table = np.asarray(sincos_table(32, 4))
+    assert table.shape == (17, 32)
+    assert not table[0].any()
+    assert len(np.unique(table.round(5), axis=0)) == 17
+    # Position (row 0, col 0): all sines 0, all cosines 1. First half of the channels: the column.
+    np.testing.assert_allclose(table[1], np.tile(np.repeat([0.0, 1.0], 8), 2))
+    np.testing.assert_array_equal(table[1 + 1, 16:], table[1, 16:])  # one column on: the row half stays
+    np.testing.assert_array_equal(table[1 + 4, :16], table[1, :16])  # one row on: the column half stays
+
+
+def test_sincos_table_refuses_odd_widths():
+    with pytest.raises(ValueError, match="multiple of 4"):
+        sincos_table(30, 4)
+
+
+@pytest.mark.parametrize(("total", "starts"), [(3, [0]), (6, [0, 3]), (7, [0, 3, 4]), (10, [0, 3, 6, 7])])
+def test_segments_cover_every_frame_and_end_with_the_last(total, starts):
+    clip = jnp.arange(total).reshape(1, total, 1)
+    cut = segments(clip, 3)
+    assert cut.shape == (1, len(starts), 3, 1)
+    assert cut[0, :, 0, 0].tolist() == starts
+    assert set(np.asarray(cut).ravel().tolist()) == set(range(total))
+
+
+def test_segments_refuse_a_short_clip():
+    with pytest.raises(ValueError, match="2 frames"):
+        segments(jnp.zeros((1, 2, 1)), 3)

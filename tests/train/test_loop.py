@@ -1,0 +1,327 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from train_toy import ROWS, stopping_batches, toy_batch, toy_batches, toy_config, toy_loss, toy_params
+
+from anytouch_jax.config import ConfigError, UserError
+from anytouch_jax.train import loop
+from anytouch_jax.train.loop import fit
+from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.train.optim import ema_params
+from anytouch_jax.train.record import TIMING
+
+TOY = Path(__file__).parent / "train_toy.py"
+SRC = Path(__file__).parents[2] / "src"
+
+
+def run(run_dir, config=None, *, said=None, **more):
+    options = {"params": toy_params(), "loss_fn": toy_loss, "batches": toy_batches} | more
+    said = [] if said is None else said
+    return fit(config or toy_config(), run_dir=run_dir, say=said.append, **options)
+
+
+def clips(start, stop):
+    """Clips only, which makes one program instead of two."""
+    for step in range(start, stop):
+        yield step, toy_batch(2 * step + 1), {"samples": ROWS}
+
+
+def rows(run_dir):
+    found = [json.loads(line) for line in (Path(run_dir) / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in row.items() if name not in TIMING} for row in found]
+
+
+def assert_same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """Eight steps in one go: (folder, result)."""
+    run_dir = tmp_path_factory.mktemp("undisturbed")
+    return run_dir, run(run_dir)
+
+
+def test_a_run_leaves_its_folder_and_a_line_a_step(undisturbed):
+    run_dir, result = undisturbed
+    assert {entry.name for entry in run_dir.iterdir()} == {"config.json", "metrics.jsonl", "checkpoints", "figures"}
+    found = rows(run_dir)
+    assert [row["step"] for row in found] == list(range(8))
+    wanted = {"loss", "reconstruction", "grad_norm", "param_norm", "update_norm", "learning_rate", "p_u"}
+    wanted |= {"samples", "skipped_samples", "skipped", "skipped_batches"}
+    assert wanted <= set(found[0])
+    assert found[0]["learning_rate"] == 0 and found[4]["p_u"] == pytest.approx(0.375)
+    assert (result.step, result.resumed, result.interrupted) == (8, 0, None)
+    assert result.state.step == 8 and result.metrics["step"] == 7
+    assert all(value is not None for row in found for value in row.values())
+
+
+def test_each_kind_of_batch_is_traced_once(undisturbed):
+    assert undisturbed[1].traces == 2
+
+
+def test_the_callers_parameters_survive(tmp_path):
+    params = jax.tree.map(jnp.asarray, toy_params())
+    run(tmp_path, params=params, stop_after=2)
+    assert_same(params, toy_params())
+
+
+@pytest.mark.parametrize("stops", [(2, 4), (3,), (1, 2, 3, 7)])
+def test_parts_of_a_run_equal_the_whole_bit_for_bit(undisturbed, tmp_path, stops):
+    for done in stops:
+        part = run(tmp_path, stop_after=done)
+        assert part.step == done and part.state.step == done
+    result = run(tmp_path)
+    assert result.resumed == stops[-1]
+    assert_same(result.state, undisturbed[1].state)
+    assert rows(tmp_path) == rows(undisturbed[0])
+
+
+def test_a_finished_run_does_nothing(undisturbed, tmp_path):
+    def no_batches(start, stop):
+        raise AssertionError("no batch was needed")
+
+    said = []
+    again = run(undisturbed[0], batches=no_batches, said=said)
+    assert again.step == 8 and again.traces == 0
+    assert_same(again.state, undisturbed[1].state)
+    assert "nothing to do: 8 of 8 steps are done" in said
+
+
+def test_ema_and_clipping_go_on_too(tmp_path):
+    config = toy_config(steps=4, optim={"ema": 0.5, "clip_norm": 0.1, "accumulate": 2})
+    params = jax.tree.map(jnp.asarray, toy_params())
+    whole = run(tmp_path / "whole", config, params=params, batches=clips)
+    assert_same(params, toy_params())
+    run(tmp_path / "parts", config, batches=clips, stop_after=2)
+    parts = run(tmp_path / "parts", config, batches=clips)
+    assert_same(parts.state, whole.state)
+    mean = ema_params(whole.state.opt_state)["trunk"]["kernel"]
+    assert not np.array_equal(mean, whole.params["trunk"]["kernel"])
+
+
+def test_another_schedule_does_not_go_on(undisturbed):
+    with pytest.raises(UserError, match=r"run\.steps was 8 and is now 9"):
+        run(undisturbed[0], toy_config(steps=9))
+
+
+def test_another_number_of_devices_goes_on(tmp_path):
+    def part(name, fsdp, **more):
+        # A small rate: Adam makes a whole step of the sign of a gradient that is only noise.
+        config = toy_config(fsdp=fsdp, optim={"learning_rate": 1e-4})
+        return run(tmp_path / name, config, params=toy_params(4096), batches=clips, **more)
+
+    one = part("one", 1, mesh=make_mesh(1))
+    first = part("moving", 4, stop_after=4)
+    for array in (first.state.trainable["trunk"]["kernel"], first.state.opt_state.moments["trunk"]["kernel"].mu):
+        assert {shard.data.shape for shard in array.addressable_shards} == {(12, 1024)}
+    assert part("moving", 2, stop_after=6).resumed == 4
+    last = part("moving", 1, mesh=make_mesh(1))
+    assert last.resumed == 6
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), last.params, one.params)
+    losses = [[row["loss"] for row in rows(tmp_path / name)] for name in ("one", "moving")]
+    np.testing.assert_allclose(*losses, rtol=1e-5)
+    assert not np.array_equal(one.params["trunk"]["kernel"], toy_params(4096)["trunk"]["kernel"])
+
+
+def test_rows_that_do_not_divide_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="6 rows cannot be shared by 4 devices"):
+        run(tmp_path, batches=lambda start, stop: ((s, toy_batch(s, rows=6), {}) for s in range(start, stop)))
+
+
+def test_skipped_steps_are_counted_and_change_nothing(tmp_path):
+    config = toy_config(save_every=2)
+
+    def batches(start, stop):
+        return toy_batches(start, stop, bad=(2, 3, 5))
+
+    result = run(tmp_path, config, batches=batches, stop_after=6)
+    found = rows(tmp_path)
+    assert [row["skipped"] for row in found] == [0, 0, 1, 1, 0, 1]
+    assert [row["skipped_batches"] for row in found] == [0, 0, 1, 2, 2, 3]
+    assert found[2]["loss"] is None and found[2]["update_norm"] == 0
+    assert result.state.opt_state.moments["trunk"]["kernel"].count == 3
+
+
+def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
+    def batches(start, stop):
+        return toy_batches(start, stop, bad=range(2, 100))
+
+    config = toy_config(save_every=2, max_skipped=4)
+    with pytest.raises(UserError, match="4 steps in a row, up to step 5"):
+        run(tmp_path, config, batches=batches)
+    assert [row["step"] for row in rows(tmp_path)] == list(range(6))
+    with pytest.raises(UserError, match="4 steps in a row, up to step 5"):  # going on recalls those before
+        run(tmp_path, config, batches=batches)
+    good = run(tmp_path, config, stop_after=8)
+    assert good.step == 8 and good.resumed == 4
+
+
+def test_metrics_are_fetched_while_the_next_step_runs(tmp_path, monkeypatch):
+    events = []
+    fetch, put = jax.device_get, loop.put_batch
+    monkeypatch.setattr(jax, "device_get", lambda tree: events.append("fetch") or fetch(tree))
+    monkeypatch.setattr(loop, "put_batch", lambda *args: events.append("step") or put(*args))
+    run(tmp_path, toy_config(save_every=0), stop_after=6)
+    assert events[:8] == ["step", "step", "fetch", "step", "fetch", "step", "fetch", "step"]
+    assert events.count("fetch") == 6
+
+
+def test_nothing_is_transferred_unasked(tmp_path):
+    with jax.transfer_guard("disallow"):
+        run(tmp_path, toy_config(save_every=0), stop_after=4)
+
+
+def test_reports_come_every_so_often_and_at_the_end_and_cannot_end_the_run(tmp_path):
+    seen, said = [], []
+
+    def report(step, params, batch):
+        seen.append((step, batch.clip.shape[0], sorted(params["decoder"])))
+        np.testing.assert_array_equal(batch.clip, toy_batch(step - 1).clip)
+        if step == 3:
+            raise RuntimeError("no display")
+
+    run(tmp_path, toy_config(steps=8, figure_every=3), on_report=report, said=said)
+    assert seen == [(step, ROWS, ["clip_head", "position", "still_head"]) for step in (3, 6, 8)]
+    assert "no figures at step 3: RuntimeError: no display" in said
+
+
+def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, monkeypatch):
+    saved = {}
+
+    class Watched(loop.Checkpoints):
+        def save(self, step, state, metrics):
+            saved[step] = metrics["loss"]
+            super().save(step, state, metrics)
+
+    monkeypatch.setattr(loop, "Checkpoints", Watched)
+    run(tmp_path)
+    losses = [row["loss"] for row in rows(tmp_path)]
+    assert saved == {
+        3: pytest.approx(np.mean(losses[:3])),
+        6: pytest.approx(np.mean(losses[3:6])),
+        8: pytest.approx(np.mean(losses[6:])),
+    }
+
+
+def test_a_saved_state_is_not_touched_by_the_steps_after_it(undisturbed, tmp_path):
+    run(tmp_path, stop_after=6)  # saved at 3 while 4 to 6 ran on donated buffers
+    for step in ("00000006", "00000008"):
+        for entry in [e for e in (tmp_path / "checkpoints").iterdir() if e.name == step]:
+            entry.rename(tmp_path / step)
+    again = run(tmp_path)
+    assert again.resumed == 3
+    assert_same(again.state, undisturbed[1].state)
+    assert rows(tmp_path) == rows(undisturbed[0])
+
+
+def test_batches_out_of_order_or_too_few_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="gave step 1 where step 0 was due"):
+        run(tmp_path / "a", batches=lambda start, stop: toy_batches(start + 1, stop))
+    with pytest.raises(UserError, match="the data ended after 3 of 8 steps"):
+        run(tmp_path / "b", batches=lambda start, stop: toy_batches(start, 3))
+
+
+def test_the_source_of_batches_is_closed(tmp_path):
+    closed = []
+
+    def batches(start, stop):
+        try:
+            yield from toy_batches(start, stop)
+        finally:
+            closed.append(threading.get_ident())
+
+    run(tmp_path, stop_after=2, batches=batches)
+    assert closed == [threading.get_ident()]
+
+
+def test_a_line_now_and_then_is_said(tmp_path):
+    said = []
+    run(tmp_path, stop_after=4, said=said)
+    assert [line.split("  ")[0] for line in said] == ["step 1/4", "step 2/4", "step 3/4", "step 4/4"]
+    assert "loss" in said[0] and "samples/s" in said[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_finishes_the_step_saves_and_restores_the_handlers(undisturbed, tmp_path, number):
+    before = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
+    said = []
+
+    def batches(start, stop):
+        return stopping_batches(start, stop, at=4, number=number)
+
+    result = run(tmp_path, batches=batches, said=said)
+    assert (result.interrupted, result.step) == (number, 5)
+    assert [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)] == before
+    assert any(f"stopped by {number.name} after step 5" in line for line in said)
+    result = run(tmp_path)
+    assert result.resumed == 5
+    assert_same(result.state, undisturbed[1].state)
+    assert rows(tmp_path) == rows(undisturbed[0])
+
+
+def test_a_second_interrupt_is_not_held_back(tmp_path):
+    def batches(start, stop):
+        for step, batch, info in toy_batches(start, stop):
+            if step == 2:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGINT)
+            yield step, batch, info
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, batches=batches)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_it_runs_outside_the_main_thread(tmp_path):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(run(tmp_path, stop_after=1)))
+    thread.start()
+    thread.join()
+    assert results[0].step == 1
+
+
+def child(run_dir, at, number):
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(SRC), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, str(TOY), str(run_dir), str(at), str(int(number))]
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
+
+
+def test_a_killed_run_goes_on_and_ends_as_if_undisturbed(undisturbed, tmp_path):
+    for at in (2, 5):  # before the first checkpoint, and right after it (the save may be under way)
+        assert child(tmp_path, at, signal.SIGKILL).returncode == -signal.SIGKILL
+    result = run(tmp_path)
+    assert result.resumed in (0, 3)
+    assert_same(result.state, undisturbed[1].state)
+    assert rows(tmp_path) == rows(undisturbed[0])
+
+
+def test_exit_code_of_a_terminated_process(tmp_path):
+    ended = child(tmp_path, 2, signal.SIGTERM)
+    assert ended.returncode == 0, ended.stderr
+    assert "stopped by SIGTERM after step 3; saved" in ended.stderr
+    assert [row["step"] for row in rows(tmp_path)] == [0, 1, 2]
+
+
+def test_a_failed_save_is_one_sentence_and_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    run(tmp_path, stop_after=3)
+
+    def full(self, step, state, metrics):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(UserError, match=r"checkpoints: No space left on device"):
+        patch.setattr(loop.Checkpoints, "save", full)
+        run(tmp_path)
+    assert run(tmp_path, stop_after=4).resumed == 3

@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from train_toy import toy_config, toy_params
+
+from anytouch_jax.config import ConfigError, preset
+from anytouch_jax.train.optim import ema_params, flatten_names, learning_rate, match_rules, optimizer, schedule
+
+PEAK, FLOOR = 2e-4, 1e-6
+
+
+def test_names_are_paths_in_the_order_of_the_tree():
+    tree = {"touch": {"blocks": {"kernel": 1}, "bias": 2}, "logit_scale": 3}
+    assert flatten_names(tree) == {"logit_scale": 3, "touch/bias": 2, "touch/blocks/kernel": 1}
+    assert list(flatten_names(tree).values()) == jax.tree.leaves(tree)
+
+
+def test_the_first_rule_wins_and_a_name_without_one_is_an_error():
+    rules = ((r"bias$", 0.0), (r"^a/", 0.5), (r"", 0.1))
+    assert match_rules(rules, ["a/bias", "a/kernel", "b/a/kernel"]) == {
+        "a/bias": 0.0,
+        "a/kernel": 0.5,
+        "b/a/kernel": 0.1,
+    }
+    with pytest.raises(ConfigError, match=r"no rule matches the parameter b/kernel"):
+        match_rules(rules[:2], ["b/kernel"])
+
+
+def test_no_vector_decays_and_every_matrix_or_token_does():
+    names = ["touch/pre_norm/scale", "touch/class_token", "logit_scale", "touch/blocks/attention/query/bias"]
+    decayed = ["touch/position", "touch/sensor_tokens", "decoder/mask_token", "lora/query/a", "touch/patch/kernel"]
+    found = match_rules(preset("tiny").weight_decay, names + decayed)
+    assert [found[name] for name in names] == [0.0] * 4
+    assert [found[name] for name in decayed] == [0.1] * 5
+
+
+@pytest.mark.parametrize("decay", ["linear", "cosine"])
+@pytest.mark.parametrize(("warmup", "total"), [(1.0, 20.0), (37, 1000), (0, 10), (5, 5)])
+def test_schedule_values(decay, warmup, total):
+    def by_hand(t):
+        if t < warmup:
+            return PEAK * t / warmup
+        share = min(1.0, (t - warmup) / (total - warmup)) if total > warmup else 0.0 if t == warmup else 1.0
+        height = 1 - share if decay == "linear" else 0.5 * (1 + math.cos(math.pi * share))
+        return FLOOR + (PEAK - FLOOR) * height
+
+    times = [0.0, warmup / 3, warmup, (warmup + total) / 2, 0.9 * total + 0.1 * warmup, total, total + 3]
+    got = [float(learning_rate(t, peak=PEAK, floor=FLOOR, warmup=warmup, total=total, decay=decay)) for t in times]
+    np.testing.assert_allclose(got, [by_hand(t) for t in times], rtol=2e-5, atol=1e-11)
+    assert warmup == 0 or got[0] == 0.0
+    assert total == warmup or got[-2] == pytest.approx(FLOOR)
+
+
+def test_the_schedule_of_a_run_is_the_same_in_epochs_and_in_steps():
+    config = toy_config(steps=200, optim={"warmup": 10, "decay": "cosine", "min_rate": 1e-3})
+    epochs = learning_rate(np.arange(201) / 10, peak=0.05, floor=1e-3, warmup=1, total=20, decay="cosine")
+    np.testing.assert_allclose(schedule(config)(np.arange(201)), epochs, rtol=1e-5, atol=1e-8)
+
+
+def test_an_unknown_decay_is_named():
+    with pytest.raises(ConfigError, match="unknown decay 'step'"):
+        learning_rate(0.0, peak=1.0, floor=0.0, warmup=1, total=2, decay="step")
+
+
+def adamw_by_hand(params, grads_of_steps, uses_of_steps, rates, *, b1=0.9, b2=0.99, eps=1e-8, decay):
+    """AdamW as PyTorch documents it, in float64; a gradient of None leaves its parameter alone."""
+    values = {name: np.asarray(v, np.float64) for name, v in params.items()}
+    m = {name: np.zeros_like(v) for name, v in values.items()}
+    v2 = {name: np.zeros_like(v) for name, v in values.items()}
+    count = dict.fromkeys(values, 0)
+    for grads, uses, lr in zip(grads_of_steps, uses_of_steps, rates, strict=True):
+        for name in values:
+            if not uses[name]:
+                continue
+            count[name] += 1
+            values[name] = values[name] * (1 - lr * decay[name])
+            m[name] = b1 * m[name] + (1 - b1) * grads[name]
+            v2[name] = b2 * v2[name] + (1 - b2) * grads[name] ** 2
+            m_hat, v_hat = m[name] / (1 - b1 ** count[name]), v2[name] / (1 - b2 ** count[name])
+            values[name] = values[name] - lr * m_hat / (np.sqrt(v_hat) + eps)
+    return values, count, m, v2
+
+
+def random_grads(params, steps):
+    rng = np.random.default_rng(3)
+    return [
+        jax.tree.map(lambda p: (rng.normal(size=p.shape) * 10.0 ** rng.integers(-9, 2)).astype(np.float32), params)
+        for _ in range(steps)
+    ]
+
+
+def run_updates(config, params, grads, uses=None, **more):
+    tx = optimizer(config)
+    state, update = tx.init(params), tx.update
+    for step, grad in enumerate(grads):
+        used = None if uses is None else uses[step]
+        updates, state = update(grad, state, params, used=used, step=step, **more)
+        params = jax.tree.map(jnp.add, params, updates)
+    return params, state
+
+
+def test_adamw_with_skipped_parameters_equals_plain_numpy():
+    config, params = toy_config(steps=9), toy_params()
+    grads = random_grads(params, 9)
+    uses = [
+        {
+            "trunk": {"kernel": True, "bias": True},
+            "decoder": {
+                "position": True,
+                "still_head": {"kernel": step % 3 == 0},
+                "clip_head": {"kernel": step % 3 != 0},
+            },
+            "idle": {"kernel": False},
+        }
+        for step in range(9)
+    ]
+    got, state = run_updates(config, params, grads, uses)
+    rates = [float(schedule(config)(step)) for step in range(9)]
+    expected, count, m, v2 = adamw_by_hand(
+        flatten_names(params),
+        [flatten_names(g) for g in grads],
+        [flatten_names(u) for u in uses],
+        rates,
+        decay=match_rules(config.weight_decay, flatten_names(params)),
+    )
+    assert count["decoder/still_head/kernel"] == 3 and count["idle/kernel"] == 0
+    moments = flatten_names(jax.tree.map(lambda s: s, state.moments))
+    for name, value in flatten_names(got).items():
+        np.testing.assert_allclose(value, expected[name], rtol=0, atol=2e-6, err_msg=name)
+        assert moments[f"{name}/count"] == count[name], name
+        np.testing.assert_allclose(moments[f"{name}/mu"], m[name], rtol=1e-5, atol=1e-7 * np.abs(m[name]).max())
+        np.testing.assert_allclose(moments[f"{name}/nu"], v2[name], rtol=1e-5, atol=1e-7 * np.abs(v2[name]).max())
+    np.testing.assert_array_equal(got["idle"]["kernel"], params["idle"]["kernel"])
+
+
+def test_a_zero_gradient_still_decays_but_an_unused_parameter_does_not():
+    config = toy_config(optim={"warmup": 0, "learning_rate": 0.5, "weight_decay": 0.1})
+    params = {"a": {"kernel": jnp.ones(3)}, "b": {"kernel": jnp.ones(3)}, "c": {"bias": jnp.ones(3)}}
+    zeros = jax.tree.map(jnp.zeros_like, params)
+    used = {"a": {"kernel": True}, "b": {"kernel": False}, "c": {"bias": True}}
+    got, _ = run_updates(config, params, [zeros], [used])
+    np.testing.assert_allclose(got["a"]["kernel"], 0.95, rtol=1e-6)
+    np.testing.assert_array_equal(got["b"]["kernel"], 1.0)
+    np.testing.assert_array_equal(got["c"]["bias"], 1.0)
+
+
+def test_eps_is_outside_the_root():
+    config = toy_config(optim={"warmup": 0, "learning_rate": 1.0, "weight_decay": 0.0, "eps": 1e-3})
+    got, _ = run_updates(config, {"w": jnp.zeros(1)}, [{"w": jnp.full(1, 1e-3)}])
+    np.testing.assert_allclose(got["w"], -0.5, rtol=1e-5)  # sqrt(g^2 + eps) would give -0.03
+
+
+def test_clipping_counts_the_used_parameters_only():
+    config = toy_config(optim={"clip_norm": 1.0, "beta1": 0.0, "weight_decay": 0.0})
+    params = {"a": jnp.zeros(2), "b": jnp.zeros(2)}
+    grads = {"a": jnp.asarray([3.0, 4.0]), "b": jnp.full(2, 1e6)}
+    tx = optimizer(config)
+    _, state = tx.update(grads, tx.init(params), params, used={"a": True, "b": False}, step=1)
+    np.testing.assert_allclose(state.moments["a"].mu, [0.6, 0.8], rtol=1e-6)
+    np.testing.assert_array_equal(state.moments["b"].mu, 0.0)
+    small = {"a": jnp.asarray([0.3, 0.4]), "b": jnp.zeros(2)}
+    _, state = tx.update(small, tx.init(params), params, step=1)
+    np.testing.assert_array_equal(state.moments["a"].mu, small["a"])
+
+
+def test_the_rate_is_given_or_follows_the_step_never_a_counter():
+    config, params = toy_config(steps=10), {"w": jnp.ones(2)}
+    tx = optimizer(config)
+    grads = {"w": jnp.ones(2)}
+    _, state = tx.update(grads, tx.init(params), params, step=7)
+    assert state.learning_rate == schedule(config)(7)
+    updates, state = tx.update(grads, tx.init(params), params, learning_rate=0.25)
+    assert state.learning_rate == 0.25
+    np.testing.assert_allclose(updates["w"], -0.25 * (1 + 0.1), rtol=1e-5)
+    with pytest.raises(TypeError, match="step or learning_rate"):
+        tx.update(grads, tx.init(params), params)
+
+
+def test_ema_follows_the_parameters_and_is_off_by_default():
+    params = {"w": jnp.ones(2), "b": jnp.ones(2)}
+    grads = random_grads(params, 6)
+    assert ema_params(run_updates(toy_config(), params, grads)[1]) is None
+    config = toy_config(optim={"ema": 0.9})
+    tx = optimizer(config)
+    state, mean = tx.init(params), jax.tree.map(np.asarray, params)
+    for step, grad in enumerate(grads):
+        updates, state = tx.update(grad, state, params, used={"w": True, "b": step > 2}, step=step)
+        params = jax.tree.map(jnp.add, params, updates)
+        mean = jax.tree.map(lambda m, p: 0.9 * m + 0.1 * np.asarray(p), mean, params)
+    for name, value in ema_params(state).items():
+        np.testing.assert_allclose(value, mean[name], rtol=1e-6)
+        assert not np.array_equal(value, params[name])
+
+
+def test_rules_come_from_the_config():
+    config = dataclasses.replace(toy_config(optim={"weight_decay": 0.0}))
+    params = {"w": jnp.ones(2)}
+    got, _ = run_updates(config, params, [{"w": jnp.zeros(2)}] * 5)
+    np.testing.assert_array_equal(got["w"], 1.0)

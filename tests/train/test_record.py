@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import resource
+import signal
+
+import numpy as np
+import pytest
+from train_toy import toy_config
+
+from anytouch_jax.config import UserError, from_json
+from anytouch_jax.train.record import Record, open_run, write_atomic
+
+
+def lines(run_dir):
+    return [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_lines_are_json_and_what_is_not_finite_is_null(tmp_path):
+    record = Record(tmp_path, 0)
+    row = record.write(0, {"loss": np.float32(0.1), "grad_norm": float("nan"), "skipped": 0.0, "images": np.int64(3)})
+    record.write(1, {"loss": np.float32("inf"), "skipped": 1.0})
+    record.close()
+    assert lines(tmp_path) == [
+        {
+            "step": 0,
+            "loss": float(np.float32(0.1)),
+            "grad_norm": None,
+            "skipped": 0.0,
+            "images": 3,
+            "skipped_batches": 0,
+        },
+        {"step": 1, "loss": None, "skipped": 1.0, "skipped_batches": 1},
+    ]
+    assert row == lines(tmp_path)[0]
+    assert (record.skipped, record.in_a_row) == (1, 1)
+
+
+def test_going_on_cuts_later_and_torn_lines_and_recalls_the_counts(tmp_path):
+    record = Record(tmp_path, 0)
+    for step in range(6):
+        record.write(step, {"loss": 1.0, "skipped": float(step in (1, 3, 4))})
+    record.close()
+    path = tmp_path / "metrics.jsonl"
+    before = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(before) + '{"step": 6, "lo')
+    record = Record(tmp_path, 5)
+    assert path.read_text() == "".join(before[:5])
+    assert (record.skipped, record.in_a_row) == (3, 2)
+    assert record.write(5, {"loss": 1.0, "skipped": 1.0})["skipped_batches"] == 4
+    record.close()
+    Record(tmp_path, 0).close()
+    assert path.read_text() == ""
+    assert [file.name for file in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+def test_a_torn_last_line_below_the_start_is_cut_too(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 0, "loss": 1.0, "skipped": 0.0}\n{"step": 1, "loss": 1.0}')
+    Record(tmp_path, 9).close()
+    assert [row["step"] for row in lines(tmp_path)] == [0]
+
+
+def test_a_full_disk_is_one_sentence(tmp_path):
+    record = Record(tmp_path, 0)
+    record.write(0, {"loss": 1.0, "skipped": 0.0})
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (record.path.stat().st_size + 10, limit[1]))
+        with pytest.raises(UserError, match=r"^cannot write .*metrics\.jsonl: .*run the same command again"):
+            record.write(1, {"loss": 1.0, "skipped": 0.0})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+        record.close()
+    assert [row["step"] for row in [json.loads(record.path.read_text().splitlines()[0])]] == [0]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "config.json"
+    write_atomic(path, "old")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomic(path, "new")
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_the_config_is_written_once_and_read_back(tmp_path):
+    config = toy_config(steps=30)
+    open_run(tmp_path / "run", config)
+    assert from_json((tmp_path / "run" / "config.json").read_text()) == config
+    open_run(tmp_path / "run", config)
+    harmless = dataclasses.replace(
+        config,
+        data=dataclasses.replace(config.data, threads=9, prefetch=9, on_bad_sample="skip"),
+        run=dataclasses.replace(
+            config.run, save_every=7, keep=9, figure_every=9, tensorboard=True, fsdp=2, max_skipped=9
+        ),
+    )
+    open_run(tmp_path / "run", harmless)
+    assert from_json((tmp_path / "run" / "config.json").read_text()) == config
+
+
+def test_other_settings_are_all_named_with_both_values(tmp_path):
+    config = toy_config(steps=30)
+    open_run(tmp_path, config)
+    other = dataclasses.replace(
+        toy_config(steps=31, optim={"learning_rate": 0.1}), model=dataclasses.replace(config.model, image_size=56)
+    )
+    with pytest.raises(UserError) as caught:
+        open_run(tmp_path, other)
+    message = str(caught.value)
+    for part in (
+        "run.steps was 30 and is now 31",
+        "optim.learning_rate was 0.05 and is now 0.1",
+        "model.image_size was 112 and is now 56",
+    ):
+        assert part in message
+    assert message.count(" was ") == 3 + 1  # "the run was started"
+    assert "choose another run folder" in message
+
+
+def test_a_broken_config_is_named(tmp_path):
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(UserError, match=r"config\.json cannot be read"):
+        open_run(tmp_path, toy_config())
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write .*Not a directory|cannot write .*File exists"):
+        open_run(tmp_path / "file" / "run", toy_config())
+
+
+def test_tensorboard_gets_the_numbers(tmp_path):
+    pytest.importorskip("tensorboardX")
+    record = Record(tmp_path, 0, tensorboard=True)
+    record.write(0, {"loss": 1.0, "skipped": 0.0, "grad_norm": float("nan")})
+    record.close()
+    (event,) = (tmp_path / "tensorboard").iterdir()
+    assert b"loss" in event.read_bytes() and b"grad_norm" not in event.read_bytes()
+
+
+def test_a_missing_tensorboard_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "tensorboardX", None)
+    with pytest.raises(UserError, match=r"pip install 'anytouch-jax\[tensorboard\]'"):
+        Record(tmp_path, 0, tensorboard=True)

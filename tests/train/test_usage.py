@@ -1,0 +1,144 @@
+"""Which parameters a loss uses, seen through every construct that hides a program inside another."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from anytouch_jax.train.usage import used_parameters
+
+X = np.ones(3, np.float32)
+
+
+def used(loss, **params):
+    found = used_parameters(loss, params)
+    assert all(type(value) is bool for value in jax.tree.leaves(found))
+    return {name for name, value in found.items() if value}
+
+
+def test_dead_code_and_metrics_do_not_count():
+    def loss(p):
+        dead = jnp.sum(p["dead"]) * 2  # noqa: F841
+        return jnp.sum(p["read"]), {"metric": jnp.sum(p["shown"]), "both": p["read"]}
+
+    assert used(loss, read=X, dead=X, shown=X, idle=X) == {"read"}
+
+
+def test_what_torch_gives_no_gradient_counts_as_unused():
+    def loss(p):
+        picked = p["picked"][jnp.argmax(p["index"])]
+        held = jax.lax.stop_gradient(p["held"])
+        return picked * jnp.sum(held) * jnp.sum(p["gate"] > 0)
+
+    assert used(loss, picked=X, index=X, held=X, gate=X) == {"picked"}
+
+
+def test_a_branch_on_data_uses_both_sides():
+    def loss(p):
+        chosen = jnp.where(p["a"] > 0, p["a"], p["b"])
+        return jnp.sum(jax.lax.cond(X[0] > 0, lambda c, d: c * 2, lambda c, d: jnp.sin(c), p["c"], p["d"]) + chosen)
+
+    assert used(loss, a=X, b=X, c=X, d=X) == {"a", "b", "c"}
+
+
+def test_the_arguments_that_a_call_ignores_are_unused():
+    @jax.jit
+    def inner(a, b, c):
+        return a * 2, c
+
+    def loss(p):
+        out, other = inner(p["a"], p["b"], p["c"])
+        return jnp.sum(jax.checkpoint(lambda x, y: jnp.sin(x))(out, p["d"])), other
+
+    assert used(loss, a=X, b=X, c=X, d=X) == {"a"}
+
+
+def test_a_scan_passes_on_what_its_carry_needs_rounds_later():
+    def loss(p):
+        def body(carry, x):
+            first, second, third, lost = carry
+            scanned, ignored = x
+            return (first + second, second + third, third * p["const"], lost + scanned), ignored * p["dead"]
+
+        init = (p["first"], p["second"], p["third"], p["lost"])
+        (first, *_), out = jax.lax.scan(body, init, (p["scanned"], p["ignored"]), length=3)
+        return jnp.sum(first), out
+
+    names = ["first", "second", "third", "lost", "const", "dead"]
+    many = {"scanned": np.ones((3, 3), np.float32), "ignored": np.ones((3, 3), np.float32)}
+    assert used(loss, **dict.fromkeys(names, X), **many) == {"first", "second", "third", "const"}
+
+
+def test_a_scan_reads_what_its_live_outputs_read():
+    def loss(p):
+        def body(carry, x):
+            return carry + x[0], (x[0] * p["a"], x[1] * p["b"])
+
+        _, (out, dead) = jax.lax.scan(body, p["carry"], (p["x"], p["y"]))
+        return jnp.sum(out), dead
+
+    many = np.ones((2, 3), np.float32)
+    assert used(loss, carry=X, a=X, b=X, x=many, y=many) == {"a", "x"}
+
+
+def test_a_while_loop():
+    def loss(p):
+        def body(state):
+            i, kept, lost = state
+            return i + 1, kept * p["factor"], lost + p["dead"]
+
+        def go_on(state):
+            return (state[0] < 3) & (p["limit"][0] > state[0])
+
+        return jnp.sum(jax.lax.while_loop(go_on, body, (0, p["kept"], p["lost"]))[1])
+
+    assert used(loss, factor=X, dead=X, limit=X, kept=X, lost=X) == {"factor", "kept"}
+
+
+def test_custom_derivatives_are_entered():
+    @jax.custom_vjp
+    def double(a, b):
+        return a * 2
+
+    double.defvjp(lambda a, b: (a * 2, b), lambda b, g: (g * 2, jnp.zeros_like(b)))
+
+    @jax.custom_jvp
+    def sine(a, b):
+        return jnp.sin(a)
+
+    sine.defjvp(lambda primals, tangents: (jnp.sin(primals[0]), jnp.cos(primals[0]) * tangents[0]))
+
+    def loss(p):
+        return jnp.sum(double(p["a"], p["b"]) + sine(p["c"], p["d"]) + jax.nn.relu(p["e"]))
+
+    assert used(loss, a=X, b=X, c=X, d=X, e=X) == {"a", "c", "e"}
+
+
+def test_a_primitive_that_is_not_known_uses_everything():
+    def loss(p):
+        solve = jax.lax.custom_linear_solve(lambda x: x * p["scale"], p["b"], lambda f, b: b, symmetric=True)
+        return jnp.sum(solve)
+
+    assert used(loss, scale=X, b=X, idle=X) == {"scale", "b"}
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.checkpoint, lambda f: f])
+def test_it_can_be_asked_while_tracing(transform):
+    seen = []
+
+    @transform
+    def outer(params, x):
+        seen.append(used_parameters(lambda p, y: jnp.sum(p["a"] * y), params, x))
+        return x
+
+    outer({"a": X, "b": X}, X)
+    assert seen[0] == {"a": True, "b": False}
+
+
+def test_a_nested_tree_keeps_its_form():
+    found = used_parameters(
+        lambda p, key: p["x"]["y"] * jax.random.normal(key), {"x": {"y": 1.0, "z": 2.0}}, jax.random.key(0)
+    )
+    assert found == {"x": {"y": True, "z": False}}

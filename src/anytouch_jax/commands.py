@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,33 +72,12 @@ def _embed_manifest(encoder: Encoder, options: cli.Embed) -> Any:
     usable = rows if options.frames == 1 else np.intersect1d(rows, manifest.clips(options.frames)[:, -1])
     if len(usable) < len(rows):
         say(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
-    rows, values = embed_rows(encoder, manifest, usable, options.frames, options.pooling, options.join, options.batch)
-    keys = {name: _text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
+    rows, values = features.embed_rows(
+        encoder, manifest, usable, options.frames, options.pooling, options.join, batch=options.batch, say=say
+    )
+    keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     return features.Features(values, rows, keys, len(usable) - len(rows))
-
-
-def _text_column(manifest: Any, name: str) -> np.ndarray:
-    return np.array(["" if v is None else str(v) for v in manifest.column(name).to_pylist()])
-
-
-def embed_rows(
-    encoder: Encoder, manifest: Any, rows: np.ndarray, frames: int, pooling: Any, join: Any = "mean", batch: int = 64
-) -> tuple[np.ndarray, np.ndarray]:
-    """(row numbers, features) of manifest rows; a sensor that the model does not know gets the universal tokens."""
-    from anytouch_jax.data.loader import evaluation
-    from anytouch_jax.evaluate.features import embed_batches
-
-    if not len(rows):
-        raise UserError("no rows are left to embed; check the split and the filters")
-    names = _text_column(manifest, "sensor")
-    for name in sorted(set(names[rows])):
-        encoder.sensor_row(name, say)
-    config = replace(encoder.config, data=replace(encoder.config.data, batch_size=min(batch, len(rows))))
-    kind = "still" if frames == 1 else "clip"
-    passes = evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")  # type: ignore[arg-type]
-    triples: Iterator[Any] = ((ids, part, len(ids)) for ids, part in passes)
-    return embed_batches(encoder, triples, pooling=pooling, join=join)
 
 
 def _embed_frames(encoder: Encoder, options: cli.Embed) -> Any:

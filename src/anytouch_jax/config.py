@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import types
-import typing
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
+
+from anytouch_jax.strict_json import ConfigError as ConfigError
+from anytouch_jax.strict_json import UserError as UserError
+from anytouch_jax.strict_json import build
 
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
@@ -35,14 +37,6 @@ FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 # Mean and spread of RGB in 0..1, for touch images (ImageNet) and for ordinary images (CLIP), as the release.
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-
-
-class UserError(ValueError):
-    """A mistake that its user can mend. The message is one clear sentence that says what to do."""
-
-
-class ConfigError(UserError):
-    """A configuration that cannot be read or makes no sense; the message says what to change."""
 
 
 @dataclass(frozen=True)
@@ -337,46 +331,4 @@ def from_json(text: str, cls: type = Config) -> Any:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ConfigError(f"not a JSON configuration: {error}") from None
-    return _build(cls, data, cls.__name__.lower())
-
-
-def _build(kind: Any, value: Any, where: str) -> Any:
-    """`value` (from JSON) as an instance of the annotation `kind`; `where` names the place in errors."""
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        if not isinstance(value, dict):
-            raise ConfigError(f"{where} must be an object, not {value!r}")
-        hints = typing.get_type_hints(kind)
-        unknown = sorted(set(value) - set(hints))
-        if unknown:
-            raise ConfigError(f"{where} has no setting called {', '.join(unknown)}; it has {', '.join(hints)}")
-        required = [f.name for f in dataclasses.fields(kind) if _required(f)]
-        missing = [name for name in required if name not in value]
-        if missing:
-            raise ConfigError(f"{where} lacks {', '.join(missing)}")
-        return kind(**{name: _build(hints[name], item, f"{where}.{name}") for name, item in value.items()})
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in args:
-            return None
-        (inner,) = [arg for arg in args if arg is not type(None)]
-        return _build(inner, value, where)
-    if origin is Literal:
-        if value not in args:
-            raise ConfigError(f"{where} must be one of {', '.join(map(str, args))}, not {value!r}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"{where} must be a list, not {value!r}")
-        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-        if len(kinds) != len(value):
-            raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
-        return tuple(_build(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ConfigError(f"{where} must be {kind.__name__}, not {value!r}")
-    return value
-
-
-def _required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+    return build(cls, data, cls.__name__.lower())

@@ -150,7 +150,8 @@ def stage2_terms(
     `noise` (B, N) is read only for the reconstruction. Returns the sum and every term, unweighted.
     """
     objective = config.objective
-    total, metrics = jnp.zeros(()), {}
+    total = jnp.zeros(())
+    metrics: Metrics = {}
     if batch.align is not None:
         z = align_embeddings(params, batch.align, net=net)
         scale = net.apply(params, "scale")
@@ -158,7 +159,7 @@ def stage2_terms(
             z.touch, z.image, z.text, z.has_image, z.has_text, scale, objective.pair_weights, groups=objective.groups
         )
         total, metrics = total + align, metrics | terms | {"align": align, "temperature": 1 / scale}
-        if objective.reconstruct:
+        if objective.reconstruct and noise is not None:
             pixels, terms = stage1_terms(
                 params,
                 batch.align.clip,

@@ -74,7 +74,7 @@ def _describe(config: Config, init: Any, clip: Any, manifest: Any) -> dict[str, 
             "image": {"size": config.model.image_size, "mean": CLIP_MEAN, "std": CLIP_STD, "channels": "RGB"},
         },
         "source": {"init": None if init is None else str(init), "clip": None if clip is None else str(clip)},
-        "data": manifest.content_hash(),
+        "data": manifest.content_hash,
     }
 
 

@@ -1,5 +1,6 @@
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from anytouch_jax.config import UserError
 from anytouch_jax.data import text
 from anytouch_jax.data.loader import Loader, SampleError
-from anytouch_jax.data.manifest import ManifestError
+from anytouch_jax.data.manifest import ManifestError, read, write
+from anytouch_jax.data.samples import fill_slot
 
 
 def _clips(sequences=3, length=7, stride=1, **extra):
@@ -177,6 +179,14 @@ def test_field_sensors_are_left_out_aloud(make, settings, read_back):
         Loader(make([{"sensor": "tac3d"}]), settings())
 
 
+def test_a_clip_holds_no_row_that_was_left_out(make, settings, read_back):
+    rows = _clips(1, 12)
+    rows[5]["sensor"] = "tac3d"
+    loader = Loader(make(rows), settings())
+    for step in range(1, 20, 2):
+        assert 5 not in read_back(loader.batch(step).clip)
+
+
 # Bad input -------------------------------------------------------------------------------------------------------
 
 
@@ -231,6 +241,25 @@ def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back,
     drawn = read_back(batch.clip)[:, 0]
     assert info["skipped"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
     _same(batch, Loader(manifest, skipping).batch(0))  # the replacement is deterministic
+
+
+def test_replacements_differ_by_step_slot_and_attempt(settings):
+    bad = {3}
+
+    def replaced(step, slot):
+        tried = []
+
+        def write(index, _):
+            tried.append(index)
+            if index in bad or len(tried) < 3:
+                raise SampleError("bad")
+
+        assert fill_slot(write, 1000, step, slot, settings(on_bad_sample="skip"), 3, 0) == len(tried) - 1
+        return tuple(tried[1:])
+
+    drawn = [replaced(step, slot) for step in range(4) for slot in range(4)]
+    assert drawn == [replaced(step, slot) for step in range(4) for slot in range(4)]
+    assert len({index for pair in drawn for index in pair}) > 25
 
 
 def test_only_bad_samples_end_in_an_error(make, settings):
@@ -315,10 +344,22 @@ def test_images_and_texts_sit_in_their_slots(make, settings, read_back, recipe, 
     assert steps >= 5 and set(shapes) == {"still", "clip"}
 
 
+def test_pictures_lie_anywhere_in_the_batch(make, settings):
+    rows = [{"image_path": f"v{i}.png"} if i % 4 == 0 else {} for i in range(16)]
+    loader = Loader(make(rows), settings(2, batch_size=8))
+    places = [tuple(loader.batch(step).align.image_row) for step in range(12)]
+    assert len(set(places)) > 5 and {slot for pair in places for slot in pair} >= {0, 7}  # not the first rows only
+
+
 def test_every_row_is_aligned_although_strata_are_uneven(make, settings, read_back):
     rows = [{"image_path": f"v{i}.png", "text": "t"} if i else {} for i in range(20)]
     loader = Loader(make(rows), settings(2, batch_size=4))
-    seen = [int(r) for step in range(40) for r in read_back(loader.batch(step).align.clip)[:, 0]]
+    seen, slots = [], set()
+    for step in range(40):
+        batch = loader.batch(step).align
+        slots.add(_check_align(batch, rows, read_back, loader.tokenizer))
+        seen += read_back(batch.clip)[:, 0].tolist()
+    assert slots == {(4, 4), (3, 3)}  # where the bare row is, a slot is unused
     assert set(seen) == set(range(20))
     assert seen.count(0) == pytest.approx(8, abs=1)  # the one bare row comes as often as the others
 
@@ -393,6 +434,14 @@ def test_matching_triples_in_both_recipes(make, settings, read_back):
     assert release.steps_per_epoch == 8 + 4 + 16 + 11
 
 
+def test_joined_manifests_share_no_touch_by_accident(make, settings):
+    one, two = make([{"touch": "1"}], "one"), make([{"touch": "1", "sensor": "gelslim"}, {"touch": "2"}], "two")
+    for manifest in (one, two):
+        write(manifest, manifest.files[0])
+    loader = Loader(read([one.files[0], two.files[0]]), settings(2))
+    assert any("no cross-sensor matching" in note for note in loader.notes)
+
+
 @pytest.mark.parametrize("recipe", ["paper", "release"])
 def test_without_pairs_there_is_no_matching_and_it_is_said(make, settings, recipe):
     loader = Loader(make([{"touch": f"p{i}"} for i in range(8)]), settings(2, recipe))
@@ -427,3 +476,17 @@ def test_a_bad_partner_replaces_the_triple(make, settings, read_back):
         if info["skipped"]:
             return
     pytest.fail("no bad partner was met")
+
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "real_touch" / "manifest.csv"
+
+
+@pytest.mark.parametrize("path", [SHARED] if SHARED.is_file() else [])
+def test_the_real_pack_loads_in_both_stages(settings, path):
+    manifest = read(path)
+    for stage, recipe in ((1, "paper"), (2, "paper"), (2, "release")):
+        loader = Loader(manifest, settings(stage, recipe, plain=False, batch_size=8))
+        assert all("tokenizer" in note for note in loader.notes)
+        for _, batch, info in loader.stream(0, 4):
+            assert info["skipped"] == 0
+            assert all(leaf.std() > 0 for leaf in _leaves(batch) if leaf.ndim == 5)

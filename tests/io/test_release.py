@@ -101,9 +101,32 @@ def test_every_value_is_in_its_place():
         np.testing.assert_array_equal(attention[ours]["bias"][1], weights[f"{base}.base_layer.bias"])
         np.testing.assert_array_equal(params["lora"][ours]["a"][1], weights[f"{base}.lora_A.default.weight"].T)
         np.testing.assert_array_equal(params["lora"][ours]["b"][1], weights[f"{base}.lora_B.default.weight"].T)
-    np.testing.assert_array_equal(
-        params["image"]["blocks"]["mlp"]["up"]["kernel"][1], weights[f"{layers}mlp.fc1.weight"].T
-    )
+    rest = {
+        "layer_norm1": "norm1/scale",
+        "layer_norm2": "norm2/scale",
+        "mlp.fc1": "mlp/up/kernel",
+        "mlp.fc2": "mlp/down/kernel",
+    }
+    for prefix, part in {
+        layers: "image",
+        f"touch_mae_model.{LAYER}": "touch",
+        "text_model.encoder.layers.1.": "text",
+    }.items():
+        blocks = flatten(params[part]["blocks"])
+        for theirs, ours in rest.items():
+            np.testing.assert_array_equal(blocks[ours][1], weights[f"{prefix}{theirs}.weight"].T)
+            np.testing.assert_array_equal(
+                blocks[f"{ours.rsplit('/', 1)[0]}/bias"][1], weights[f"{prefix}{theirs}.bias"]
+            )
+    for key, name in {"pre_layrnorm": "pre_norm", "post_layernorm": "post_norm"}.items():
+        np.testing.assert_array_equal(params["touch"][name]["bias"], weights[f"touch_mae_model.touch_model.{key}.bias"])
+        np.testing.assert_array_equal(params["image"][name]["scale"], weights[f"vision_model.{key}.weight"])
+    for key, name in {
+        "decoder_pred": "still_head",
+        "decoder_pred_video": "clip_head",
+        "decoder_embed": "embed",
+    }.items():
+        np.testing.assert_array_equal(params["decoder"][name]["kernel"], weights[f"touch_mae_model.{key}.weight"].T)
     block = "touch_mae_model.touch_decoder_blocks.2."
     decoder = params["decoder"]["blocks"]
     np.testing.assert_array_equal(

@@ -71,9 +71,10 @@ def test_each_kind_of_batch_is_traced_once(undisturbed):
     assert undisturbed[1].traces == 2
 
 
-def test_the_callers_parameters_survive(tmp_path):
+@pytest.mark.parametrize("devices", [1, 4])
+def test_the_callers_parameters_survive(tmp_path, devices):
     params = jax.tree.map(jnp.asarray, toy_params())
-    run(tmp_path, params=params, stop_after=2)
+    run(tmp_path, params=params, stop_after=1, mesh=make_mesh(devices))
     assert_same(params, toy_params())
 
 
@@ -170,12 +171,17 @@ def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
 
 def test_metrics_are_fetched_while_the_next_step_runs(tmp_path, monkeypatch):
     events = []
-    fetch, put = jax.device_get, loop.put_batch
+    fetch, compiled = jax.device_get, loop._Loop.compile
+
+    def watched(self, *args):
+        step = compiled(self, *args)
+        return lambda *operands: events.append("step") or step(*operands)
+
     monkeypatch.setattr(jax, "device_get", lambda tree: events.append("fetch") or fetch(tree))
-    monkeypatch.setattr(loop, "put_batch", lambda *args: events.append("step") or put(*args))
+    monkeypatch.setattr(loop._Loop, "compile", watched)
     run(tmp_path, toy_config(save_every=0), stop_after=6)
     assert events[:8] == ["step", "step", "fetch", "step", "fetch", "step", "fetch", "step"]
-    assert events.count("fetch") == 6
+    assert events.count("fetch") == events.count("step") == 6
 
 
 def test_nothing_is_transferred_unasked(tmp_path):

@@ -189,6 +189,7 @@ def test_ema_follows_the_parameters_and_is_off_by_default():
     config = toy_config(optim={"ema": 0.9})
     tx = optimizer(config)
     state, mean = tx.init(params), jax.tree.map(np.asarray, params)
+    assert all(ema_params(state)[name] is not params[name] for name in params)  # both are donated to the step
     for step, grad in enumerate(grads):
         updates, state = tx.update(grad, state, params, used={"w": True, "b": step > 2}, step=step)
         params = jax.tree.map(jnp.add, params, updates)

@@ -35,7 +35,7 @@ def touch_transform(
     """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), one draw for all frames.
 
     The whole image is resized (no crop), flipped in both directions with probability `config.flip` each, then
-    jittered in colour by `config.jitter` (the release's augmentation; the paper's Sec. 4.1 names none).
+    jittered in colour by `config.jitter` (the release's augmentation).
     """
     across, down = rng.random(2) < config.flip
     out = touch_evaluation(frames, size)

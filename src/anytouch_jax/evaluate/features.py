@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,12 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import UNIVERSAL, Config, UserError, from_json
+from anytouch_jax.data.evaluation import evaluation
+from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
 
 Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Encoder:
     def net(self) -> Net:
         return build(self.config.model)
 
-    def sensor_row(self, name: str, say: Callable[[str], None] = lambda _: None) -> int:
+    def sensor_row(self, name: str, say: Say = lambda _: None) -> int:
         """Row of a sensor's tokens; the universal ones for a sensor that the table does not have, said aloud."""
         model = self.config.model
         if name in model.sensors:
@@ -129,15 +132,37 @@ class Features:
     skipped: int = 0
 
 
-def embed_batches(
-    encoder: Encoder, batches: Iterator[tuple[np.ndarray, Any, int]], *, pooling: Pooling = "class", join: Join = "mean"
+def embed_rows(
+    encoder: Encoder,
+    manifest: Manifest,
+    rows: np.ndarray,
+    frames: int = 1,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    *,
+    batch: int = 64,
+    say: Say = lambda _: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(rows, features) over batches of (row ids, TouchBatch, number of valid rows); each frame is encoded once."""
-    rows, values = [], []
-    for ids, batch, valid in batches:
-        rows.append(np.asarray(ids[:valid]))
-        values.append(encoder.embed(batch.clip, batch.sensor, pooling=pooling, join=join)[:valid])
-    return np.concatenate(rows), np.concatenate(values)
+    """(row numbers, features) of manifest rows, each frame encoded once; `frames` is the length of a row's clip.
+
+    A sensor that the model does not know gets the universal tokens, said aloud. Raises UserError.
+    """
+    if not len(rows):
+        raise UserError("no rows are left to embed; check the split and the filters")
+    for name in sorted(set(text_column(manifest, "sensor")[rows])):
+        encoder.sensor_row(name, say)
+    config = replace(encoder.config, data=replace(encoder.config.data, batch_size=min(batch, len(rows))))
+    kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
+    ids, values = [], []
+    for found, part in evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"):
+        ids.append(found)
+        values.append(encoder.embed(part.clip, part.sensor, pooling=pooling, join=join)[: len(found)])
+    return np.concatenate(ids), np.concatenate(values)
+
+
+def text_column(manifest: Manifest, name: str) -> np.ndarray:
+    """A column of a manifest as strings, "" where it is null."""
+    return np.array(["" if value is None else str(value) for value in manifest.column(name).to_pylist()])
 
 
 def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:
@@ -148,7 +173,8 @@ def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> Non
         with open(part, "wb") as file:
             described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
             keys = {f"key/{k}": v for k, v in features.keys.items()}
-            np.savez(file, features=features.values, rows=features.rows, **keys, **described)
+            arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **keys, **described}
+            np.savez(file, **arrays)
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)

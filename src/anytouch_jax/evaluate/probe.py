@@ -108,7 +108,7 @@ def leave_groups_out(
     groups: Any,
     *,
     folds: int | None = 10,
-    penalties: Sequence[float] = PENALTIES,
+    penalties: Sequence[float] = (10.0, *PENALTIES),
     scaling: Scaling = "column",
     name: str = "linear, groups left out",
 ) -> ProbeResult:

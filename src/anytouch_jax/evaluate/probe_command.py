@@ -11,9 +11,8 @@ import numpy as np
 from anytouch_jax.config import Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.evaluate import baseline, probe
-from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
+from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder
 
 if TYPE_CHECKING:
     from anytouch_jax import cli
@@ -127,14 +126,12 @@ def _subsets(manifest: Any, label: list[Any], split: np.ndarray, rows: np.ndarra
 
 def _features(options: cli.Probe, task: Task, say: Say) -> Any:
     """(name, features) of every encoder asked for, then of the controls."""
-    from anytouch_jax.commands import embed_rows
-
     encoders: list[tuple[str, Encoder]] = [(str(path), load_encoder(path)) for path in options.run]
     if options.controls:
         config: Config = encoders[0][1].config if encoders else preset("tiny")
         encoders.append(("random encoder", random_encoder(config)))
     for name, encoder in encoders:
-        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames, options.pooling)
+        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames, options.pooling, say=say)
         if not np.array_equal(rows, task.rows):
             raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
         yield name, values
@@ -161,6 +158,3 @@ def _small(path: Any) -> np.ndarray:
     if image.shape[:2] == _RAW_SIZE:
         return image
     return np.asarray(cv2.resize(image, _RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
-
-
-__all__ = ["Task", "probe_features", "raw_features", "read_task", "run_probes", "touch_evaluation"]

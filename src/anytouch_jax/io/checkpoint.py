@@ -96,7 +96,9 @@ class Checkpoints:
             "arrays": {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in leaves.items()},
         }
         arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
-        with self._sentence(target):
+        context = ocp.Context()
+        context.array.saving.use_compression = False  # trained weights do not shrink, and a save takes twice as long
+        with self._sentence(target), context:
             response = ocp.save_async(_writing(target), nest(arrays))
         self._pending = target, self._worker.submit(self._finish, target, response, content)
 

@@ -198,8 +198,13 @@ def _third(array: np.ndarray, part: int | None) -> np.ndarray:
 
 
 def _assembled(value: Any) -> np.ndarray:
-    layers = [value[layer] for layer in sorted(value)] if isinstance(value, dict) else None
-    return np.array(value if layers is None else np.stack(layers), np.float32, order="C")
+    """One parameter, its layers stacked on axis 0; each number is copied once."""
+    if not isinstance(value, dict):
+        return np.array(value, np.float32, order="C")
+    stacked = np.empty((len(value), *value[0].shape), np.float32)
+    for layer, array in value.items():
+        stacked[layer] = array
+    return stacked
 
 
 def _file_shapes(wanted: Sequence[Entry], shapes: Mapping[str, Shape]) -> dict[str, Shape]:

@@ -24,6 +24,13 @@ class Lora(nnx.Module):
         self.a, self.b = table(depth, width, rank), table(depth, rank, width)
 
 
+def _matcher(model: Model) -> Mlp | Dense | None:
+    """The matching head of Eq. 5: an MLP (paper), one linear layer (release), or none."""
+    if model.match_head == "mlp":
+        return Mlp(model.embed, model.embed, model, gelu, outputs=1)
+    return Dense(model.embed, 1, model) if model.match_head == "linear" else None
+
+
 class AnyTouch(nnx.Module):
     """The whole network. Parts that the config leaves out do not exist and cost nothing."""
 
@@ -40,10 +47,7 @@ class AnyTouch(nnx.Module):
             self.text = TextEncoder(model, model.text)
         if model.image is not None or model.text is not None:
             self.logit_scale = table()
-        if model.match_head == "mlp":
-            self.matcher = Mlp(model.embed, model.embed, model, gelu, outputs=1)
-        elif model.match_head == "linear":
-            self.matcher = Dense(model.embed, 1, model)
+        self.matcher = _matcher(model)
 
     def encode(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
         """Touch embeddings (B, E) of stills (T = 1) or clips, from the class token, not normalised.
@@ -120,6 +124,8 @@ class AnyTouch(nnx.Module):
 
     def match(self, z_first: Array, z_second: Array) -> Array:
         """Matching logits (B,) of two unit-norm touch embeddings (Eq. 5): a head on their element-wise product."""
+        if self.matcher is None:
+            raise ValueError("this network has no matching head (model.match_head is none)")
         product = z_first * z_second
         if isinstance(self.matcher, Mlp):
             product = product * self.embed  # entries of a product of unit vectors are about 1 / E: to order one

@@ -46,7 +46,8 @@ def quick_gelu(x: Array) -> Array:
 
 def activation(name: str) -> Activation:
     """The activation called `name`: "gelu" or "quick_gelu"."""
-    return {"gelu": gelu, "quick_gelu": quick_gelu}[name]
+    known: dict[str, Activation] = {"gelu": gelu, "quick_gelu": quick_gelu}
+    return known[name]
 
 
 def table(*shape: int) -> nnx.Param:
@@ -62,9 +63,12 @@ class Dense(nnx.Module):
         self.bias = table(outputs) if bias else None
         self.dtype = jnp.dtype(model.dtype)
 
-    def __call__(self, x: Array) -> Array:
-        y = x.astype(self.dtype) @ self.kernel[...].astype(self.dtype)
-        return y if self.bias is None else y + jnp.expand_dims(self.bias[...].astype(self.dtype), range(y.ndim - 1))
+    def __call__(self, x: Array, outputs: int | None = None) -> Array:
+        """All outputs, or the first `outputs` of them: what nobody reads is not computed."""
+        y = x.astype(self.dtype) @ self.kernel[...][:, :outputs].astype(self.dtype)
+        if self.bias is None:
+            return y
+        return y + jnp.expand_dims(self.bias[...][:outputs].astype(self.dtype), range(y.ndim - 1))
 
 
 class LayerNorm(nnx.Module):

@@ -97,7 +97,4 @@ class TouchDecoder(nnx.Module):
         if frames == 1:
             return self.still_head(x)[:, :, None]
         size = self.still_head.kernel.shape[1]
-        kernel, bias = (
-            p[..., : frames * size].astype(x.dtype) for p in (self.clip_head.kernel[...], self.clip_head.bias[...])
-        )
-        return (x @ kernel + bias[None, None]).reshape(*x.shape[:2], frames, size)
+        return self.clip_head(x, outputs=frames * size).reshape(*x.shape[:2], frames, size)

@@ -84,18 +84,22 @@ def alignment_loss(
     the pairs (touch-vision, touch-text, vision-text) on the sum of both directions. A modality that is None is
     absent from the whole batch. Returns the loss, its six terms and the number of pairs of each kind.
     """
-    have = {"touch": jnp.ones(touch.shape[0], bool), "vision": has_image, "text": has_text}
-    z = {"touch": touch, "vision": image, "text": text}
+    everyone = jnp.ones(touch.shape[0], bool)
+    z = {"touch": (touch, everyone)}
+    if image is not None:
+        z["vision"] = (image, everyone if has_image is None else has_image)
+    if text is not None:
+        z["text"] = (text, everyone if has_text is None else has_text)
     total = jnp.zeros((), jnp.promote_types(touch.dtype, jnp.float32))
     metrics: Metrics = {}
-    for (first, second), weight in zip(
-        (("touch", "vision"), ("touch", "text"), ("vision", "text")), weights, strict=True
-    ):
-        if z[first] is None or z[second] is None:
+    pairs = (("touch", "vision"), ("touch", "text"), ("vision", "text"))
+    for (first, second), weight in zip(pairs, weights, strict=True):
+        if first not in z or second not in z:
             continue
-        both = have[first] & have[second]
-        forth = info_nce(z[first], z[second], scale, both, groups=groups)
-        back = info_nce(z[second], z[first], scale, both, groups=groups)
+        (a, has_a), (b, has_b) = z[first], z[second]
+        both = has_a & has_b
+        forth = info_nce(a, b, scale, both, groups=groups)
+        back = info_nce(b, a, scale, both, groups=groups)
         total = total + weight * (forth + back)
         metrics |= {
             f"{first}_to_{second}": forth,

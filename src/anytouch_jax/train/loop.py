@@ -230,7 +230,7 @@ def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: M
             for x, place in zip(jax.tree.leaves(shapes), jax.tree.leaves(places), strict=True)
         ]
         return checkpoints.restore(jax.tree.unflatten(jax.tree.structure(shapes), shaped), latest), latest
-    # Without a copy the first step would donate, and so delete, the caller's own parameters.
+    # A copy: the step donates its state, and must not delete the caller's own parameters.
     held = jax.device_put(params, state_sharding(params, mesh), may_alias=False)
     return jax.jit(init, out_shardings=places)(held), 0
 

@@ -1,0 +1,74 @@
+"""Layers against plain formulas, and the scanned stack against the loop."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tiny_models import STACK, touch_model
+
+from anytouch_jax.nn.functional import build
+from anytouch_jax.nn.layers import gelu, quick_gelu
+
+X = jnp.linspace(-6, 6, 241)
+
+
+def test_gelu_is_the_exact_form_in_value_and_derivative():
+    np.testing.assert_allclose(gelu(X), jax.nn.gelu(X, approximate=False), atol=1e-6)
+    ours, theirs = (jax.vmap(jax.grad(f))(X) for f in (gelu, lambda x: jax.nn.gelu(x, approximate=False)))
+    np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    assert np.abs(np.asarray(gelu(X) - jax.nn.gelu(X, approximate=True))).max() > 1e-4  # and not the tanh form
+
+
+def test_quick_gelu():
+    np.testing.assert_allclose(quick_gelu(X), X / (1 + np.exp(-1.702 * np.asarray(X))), rtol=1e-5, atol=1e-7)
+
+
+def reference_block(x, p, heads, eps):
+    """A pre-norm block in plain numpy."""
+
+    def norm(x, p):
+        return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + eps) * p["scale"] + p["bias"]
+
+    def dense(x, p):
+        return x @ p["kernel"] + p["bias"]
+
+    y = norm(x, p["norm1"])
+    b, s, d = y.shape
+    q, k, v = (dense(y, p["attention"][n]).reshape(b, s, heads, -1) for n in ("query", "key", "value"))
+    logits = np.einsum("bqhd,bkhd->bhqk", q, k) / np.sqrt(d // heads)
+    weights = np.exp(logits - logits.max(-1, keepdims=True))
+    weights /= weights.sum(-1, keepdims=True)
+    x = x + dense(np.einsum("bhqk,bkhd->bqhd", weights, v).reshape(b, s, d), p["attention"]["out"])
+    hidden = np.asarray(jax.nn.gelu(jnp.asarray(dense(norm(x, p["norm2"]), p["mlp"]["up"])), approximate=False))
+    return x + dense(hidden, p["mlp"]["down"])
+
+
+def test_the_stack_equals_a_loop_over_plain_blocks():
+    model = touch_model()
+    net = build(model)
+    params = net.init(jax.random.key(1))
+    clip, sensor = jax.random.normal(jax.random.key(2), (2, 1, 28, 28, 3)), jnp.asarray([0, 1])
+    x = np.asarray(net.apply(params, "touch_tokens", clip, sensor), np.float64)
+    x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + model.norm_eps)
+    for layer in range(STACK.depth):
+        x = reference_block(
+            x, jax.tree.map(lambda p, i=layer: np.asarray(p[i], np.float64), params["touch"]["blocks"]), 2, 1e-5
+        )
+    np.testing.assert_allclose(net.apply(params, "touch_hidden", clip, sensor), x, atol=2e-5)
+
+
+def test_rematerialisation_and_bfloat16_change_cost_not_meaning():
+    clip, sensor = jax.random.normal(jax.random.key(2), (2, 3, 28, 28, 3)), jnp.asarray([0, 1])
+    net = build(touch_model())
+    params = net.init(jax.random.key(1))
+    plain = net.apply(params, "encode", clip, sensor)
+    remat = build(touch_model(remat=True)).apply(params, "encode", clip, sensor)
+    np.testing.assert_allclose(plain, remat, atol=1e-6)
+    half = build(touch_model(dtype="bfloat16")).apply(params, "encode", clip, sensor)
+    assert half.dtype == jnp.bfloat16
+    error = np.abs(np.asarray(half, np.float32) - np.asarray(plain)).max() / np.abs(np.asarray(plain)).max()
+    assert 1e-5 < error < 0.05

@@ -12,6 +12,7 @@ INIT       ?= runs/stage1
 STEPS      ?=
 STOP_AFTER ?=
 SAVE       ?=
+BATCH      ?=
 LABEL      ?= object
 GOLDEN     ?= ../shared/golden
 WORKERS    ?= 2
@@ -22,7 +23,7 @@ train-stage2 probe: RUN ?= runs/stage2
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
 CHECKED  := src tests $(wildcard experiments)
-OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if $(STOP_AFTER), --stop-after $(STOP_AFTER))$(if $(SAVE), --save-every $(SAVE))
+OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if $(STOP_AFTER), --stop-after $(STOP_AFTER))$(if $(SAVE), --save-every $(SAVE))$(if $(BATCH), --batch $(BATCH))
 need      = $(if $($(1)),,$(error `make $@` needs $(1)=, for example: make $@ $(2)))
 
 .DEFAULT_GOAL := help
@@ -37,7 +38,7 @@ help: ## list the targets
 	@echo "  RUN=folder       where the run is kept and resumed from (runs/stage1, runs/stage2)"
 	@echo "  INIT=path        what stage 2 starts from: a stage-1 run or a weights file ($(INIT))"
 	@echo "  PRESET=name      tiny, small, base or large ($(PRESET))"
-	@echo "  STEPS=n  STOP_AFTER=n  SAVE=n   whole schedule; end early; steps between checkpoints"
+	@echo "  STEPS=n  STOP_AFTER=n  SAVE=n  BATCH=n   whole schedule; end early; steps between checkpoints; samples a step"
 	@echo "  LABEL=name       label column of probe ($(LABEL));  GOLDEN=folder  vectors of parity ($(GOLDEN))"
 
 setup: $(STAMP) ## make .venv with the pinned versions

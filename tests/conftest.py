@@ -3,11 +3,61 @@
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 
 # Set before jax is imported; child processes of the tests inherit it. The four devices below they do not.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
+import pytest
+
+# Tests compile far more than they compute: both together make compilation five times faster. The flag is of jax 0.10;
+# another version might not know it, and XLA ends the process for a flag that it does not know.
+if jax.__version_info__[:2] == (0, 10):
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
+jax.config.update("jax_disable_most_optimizations", True)
+
+sys.path.insert(0, str(Path(__file__).parent))  # runs.py, tiny_models.py
 
 jax.config.update("jax_num_cpu_devices", 4)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="session")
+def compiled_once(tmp_path_factory):
+    """Compile each program once for the whole session, the command line's own cache included; nothing in the home."""
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    settings = {
+        "jax_compilation_cache_dir": None,
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        for name, value in settings.items():
+            jax.config.update(name, value)
+        enable_compilation_cache()
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory):
+    """The manifest of a small world on disk (see runs.py)."""
+    from runs import make_world
+
+    return make_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory, world, compiled_once):
+    """A run folder of stage 1 after two steps: one of stills, one of clips."""
+    from runs import run_config, train
+
+    run = tmp_path_factory.mktemp("tiny") / "stage1"
+    train(run_config(world), run, stop_after=2)
+    return run

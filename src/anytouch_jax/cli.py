@@ -6,8 +6,9 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
+from anytouch_jax import __version__
 from anytouch_jax.config import Config, Data, Model, Objective, Optim, Run, UserError, preset
 
 Paths = tuple[Path, ...]
@@ -18,6 +19,7 @@ class Train:
     """Pre-train stage 1 (masked autoencoding, next frame) or stage 2 (alignment, matching), or go on with a run.
 
     Example: anytouch train --stage 1 --data manifest.csv --run runs/stage1 --preset tiny --steps 800
+
     The same command again goes on from the last checkpoint. `--help-all` lists every field of the configuration.
     """
 
@@ -54,6 +56,22 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Sections:
+    """Every field of the configuration, with the defaults of the preset, the recipe and the options of --help."""
+
+    model: Model
+    """Shapes and arithmetic of the network."""
+    objective: Objective
+    """Weights and choices of the losses."""
+    optim: Optim
+    """AdamW and its schedule."""
+    loader: Data
+    """How data are read and augmented (data in config.json)."""
+    loop: Run
+    """How the run goes (run in config.json)."""
+
+
+@dataclass(frozen=True)
 class Embed:
     """Embed a manifest, a folder of frames or a video with a trained encoder; writes an .npz of features.
 
@@ -85,6 +103,7 @@ class Probe:
     """Probe a label column with frozen features: linear and kNN, beside raw pixels and a random encoder.
 
     Example: anytouch probe --run runs/stage1 --data manifest.csv --label object --where label.contact_score 7
+
     The penalty is chosen on split val, or by cross-validation in groups inside train; the report is on split test.
     """
 
@@ -121,10 +140,11 @@ class Parity:
     """Compare this implementation with golden vectors of the authors' PyTorch code.
 
     Example: anytouch parity ../shared/golden
+
     Exits 1 when a case is out of tolerance or not understood.
     """
 
-    folder: Annotated[Path, "positional"]
+    folder: Path
     """Folder with A_*.json, A_*.npz, ..."""
     verbose: bool = False
     """Print every array, not only the worst of a case."""
@@ -137,9 +157,9 @@ class Convert:
     Example: anytouch convert runs/stage2 weights.safetensors
     """
 
-    source: Annotated[Path, "positional"]
+    source: Path
     """Run folder or weights file."""
-    target: Annotated[Path, "positional"]
+    target: Path
     """The .safetensors to write."""
     names: Literal["release", "own"] = "release"
     """Key names of the authors' files, or this package's parameter names."""
@@ -152,6 +172,7 @@ _COMMANDS: dict[str, tuple[type, str]] = {
     "parity": (Parity, "compare with golden vectors of the authors' code"),
     "convert": (Convert, "weights in and out"),
 }
+_POSITIONAL = (Parity, Convert)  # what these require is given by place, not by name
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -161,9 +182,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_usage())
         return 0 if args else 2
     if args[0] == "--version":
-        from importlib.metadata import version
-
-        print(version("anytouch-jax"))
+        print(__version__)
         return 0
     if args[0] not in _COMMANDS:
         from difflib import get_close_matches
@@ -207,13 +226,14 @@ def _parse(kind: Any, name: str, args: list[str], default: Any = None) -> Any:
     import tyro
 
     extra = {} if default is None else {"default": default}
-    return tyro.cli(kind, prog=f"anytouch {name}", args=args, config=(tyro.conf.AvoidSubcommands,), **extra)
+    config: list[Any] = [tyro.conf.AvoidSubcommands]
+    if kind in _POSITIONAL:
+        config.append(tyro.conf.PositionalRequiredArgs)
+    return tyro.cli(kind, prog=f"anytouch {name}", args=args, config=config, **extra)
 
 
 def _parse_train(args: list[str]) -> tuple[Train, Config]:
     """The options of `train`, and the configuration after the preset, the short flags and the long ones."""
-    import tyro
-
     if "--help" in args or "-h" in args:
         return _parse(Train, "train", args)
     sections = [a for a in args if a.startswith(("--model.", "--objective.", "--optim.", "--loader.", "--loop."))]
@@ -221,21 +241,14 @@ def _parse_train(args: list[str]) -> tuple[Train, Config]:
         options = _parse(Train, "train", args)
         return options, _configure(options)
 
-    first, rest = _split_sections(args)
-    options = _parse(Train, "train", first) if "--help-all" not in args else Train((), Path("runs/stage1"))
+    asked = "--help-all" in args
+    first, rest = _split_sections([arg for arg in args if arg != "--help-all"])
+    options = _parse(Train, "train", first, Train((), Path("runs/stage1")) if asked else None)
     config = _configure(options)
-
-    @dataclass(frozen=True)
-    class Sections:
-        model: Model = config.model
-        objective: Objective = config.objective
-        optim: Optim = config.optim
-        loader: Annotated[Data, tyro.conf.arg(help="how data are read")] = config.data
-        loop: Annotated[Run, tyro.conf.arg(help="how the run goes")] = config.run
-
-    if "--help-all" in args:
+    if asked:
         rest = ["--help"]
-    s = _parse(Sections, "train [the options of --help]", rest)
+    default = Sections(config.model, config.objective, config.optim, config.data, config.run)
+    s = _parse(Sections, "train [the options of --help]", rest, default)
     return options, replace(config, model=s.model, objective=s.objective, optim=s.optim, data=s.loader, run=s.loop)
 
 

@@ -154,7 +154,7 @@ def parity(options: cli.Parity) -> int:
 
 def convert(options: cli.Convert) -> int:
     """Write a run or a weights file as safetensors, by the authors' key names or by ours."""
-    from anytouch_jax.config import from_json
+    from anytouch_jax.config import from_json, to_json
     from anytouch_jax.io import checkpoint, release
 
     source: Path = options.source
@@ -163,12 +163,15 @@ def convert(options: cli.Convert) -> int:
         model = from_json(text).model
     else:
         weights = release.read_weights(source)
-        model = release.detect_model(weights)
+        model = release.model_of(source, weights)
         params = release.to_params(weights, model)
+    about = {"source": str(source), release.MODEL_KEY: to_json(model)}
     if options.names == "own":
-        checkpoint.export_safetensors(options.target, params, {"source": str(source)})
+        checkpoint.export_safetensors(options.target, params, about)
     else:
-        arrays = release.to_release(params, model)
-        release.write_safetensors(options.target, arrays, {"source": str(source), "format": "pt"})
+        if "matcher" in params and model.match_head == "mlp":
+            say("the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code does not read")
+        arrays = release.to_release(params, model, allow_extra=True)
+        release.write_safetensors(options.target, arrays, about | {"format": "pt"})
     print(f"{options.target}: written")
     return 0

@@ -108,15 +108,19 @@ class Embeddings(NamedTuple):
 def align_embeddings(params: Params, batch: AlignBatch, *, net: Net) -> Embeddings:
     """Embed the touches and the packed images and texts, scattered back to the rows they belong to.
 
-    A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats.
+    A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats. What an unused
+    slot holds is replaced first: NaN would pass into the gradients although the slot's value is dropped.
     """
     touch = losses.normalise(net.apply(params, "encode", batch.clip[:, : net.model.frames], batch.sensor))
     image = text = has_image = has_text = None
     if batch.image.shape[0]:
-        packed = losses.normalise(net.apply(params, "embed_image", batch.image))
+        used = (batch.image_row < len(touch))[:, None, None, None]
+        packed = losses.normalise(net.apply(params, "embed_image", jnp.where(used, batch.image, 0.0)))
         image, has_image = _scatter(packed, batch.image_row, len(touch))
     if batch.text.shape[0]:
-        packed = losses.normalise(net.apply(params, "embed_text", batch.text, batch.text_mask))
+        used = (batch.text_row < len(touch))[:, None]
+        ids, mask = jnp.where(used, batch.text, 0), batch.text_mask | ~used
+        packed = losses.normalise(net.apply(params, "embed_text", ids, mask))
         text, has_text = _scatter(packed, batch.text_row, len(touch))
     return Embeddings(touch, image, text, has_image, has_text)
 

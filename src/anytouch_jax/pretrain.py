@@ -147,8 +147,9 @@ def _load(path: Path, model: Model) -> Params:
         params, text, _ = checkpoint.load_params(path)
         stored = from_json(text).model.sensors
     else:
-        weights = release.read_weights(_weights_file(path))
-        detected = release.detect_model(weights)
+        file = _weights_file(path)
+        weights = release.read_weights(file)
+        detected = release.model_of(file, weights)
         params, stored = release.to_params(weights, detected), detected.sensors
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")

@@ -239,7 +239,7 @@ def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back,
     loader = Loader(manifest, skipping)
     ((_, batch, info),) = loader.stream(0, 1)
     drawn = read_back(batch.clip)[:, 0]
-    assert info["skipped"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
+    assert info["skipped_samples"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
     _same(batch, Loader(manifest, skipping).batch(0))  # the replacement is deterministic
 
 
@@ -288,7 +288,7 @@ def test_a_bad_picture_names_its_column(make, settings):
     with pytest.raises(SampleError, match=r"row 1 of .*column 'image_path': .*v1\.png"):
         Loader(manifest, settings(2)).batch(0)
     _, batch, info = next(Loader(manifest, settings(2, on_bad_sample="skip")).stream(0, 1))
-    assert info["skipped"] >= 1 and 1 not in batch.align.image[:, 14, 14, 0] - 1
+    assert info["skipped_samples"] >= 1 and 1 not in batch.align.image[:, 14, 14, 0] - 1
 
 
 def test_nonsense_sizes_are_refused(make, settings):
@@ -330,13 +330,13 @@ def test_images_and_texts_sit_in_their_slots(make, settings, read_back, recipe, 
     shapes, steps = {}, 0
     for step, batch, info in loader.stream(0, 24):
         if batch.align is None:
-            assert info == {"skipped": 0, "images": 0, "texts": 0}
+            assert info == {"skipped_samples": 0, "images": 0, "texts": 0}
             continue
         steps += 1
         assert batch.align.clip.shape[:2] == (8, frames[loader.kind(step)])
         assert (np.diff(read_back(batch.align.clip), axis=1) == 1).all()
         images, texts = _check_align(batch.align, rows, read_back, loader.tokenizer)
-        assert info == {"skipped": 0, "images": images, "texts": texts}
+        assert info == {"skipped_samples": 0, "images": images, "texts": texts}
         shape = (len(batch.align.image), len(batch.align.text))
         assert shapes.setdefault(loader.kind(step), shape) == shape  # fixed for a run
         assert (images, texts) == shape  # the slots are full
@@ -473,7 +473,7 @@ def test_a_bad_partner_replaces_the_triple(make, settings, read_back):
             Loader(manifest, settings(2, batch_size=6, on_bad_sample="skip")).stream(2 * step, 2 * step + 1)
         )
         _check_match(batch.match, rows, read_back, 6, 1)
-        if info["skipped"]:
+        if info["skipped_samples"]:
             return
     pytest.fail("no bad partner was met")
 
@@ -488,5 +488,5 @@ def test_the_real_pack_loads_in_both_stages(settings, path):
         loader = Loader(manifest, settings(stage, recipe, plain=False, batch_size=8))
         assert all("tokenizer" in note for note in loader.notes)
         for _, batch, info in loader.stream(0, 4):
-            assert info["skipped"] == 0
+            assert info["skipped_samples"] == 0
             assert all(leaf.std() > 0 for leaf in _leaves(batch) if leaf.ndim == 5)

@@ -27,7 +27,7 @@ def test_batches_come_whole_and_in_order(threads, prefetch):
     got = list(pump(_plan, range(3, 9), threads, prefetch))
     assert [step for step, _, _ in got] == list(range(3, 9))
     for step, batch, info in got:
-        assert batch == [(step, slot) for slot in range(10)] and info == {"skipped": 5, "n": step}
+        assert batch == [(step, slot) for slot in range(10)] and info == {"skipped_samples": 5, "n": step}
     assert not _ours()
     assert do(_plan(4)) == (got[1][1], got[1][2])
     assert list(pump(_plan, range(0), threads, prefetch)) == []

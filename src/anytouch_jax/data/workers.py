@@ -22,7 +22,7 @@ class Work(Generic[Batch]):
 
     def finish(self, skipped: int) -> tuple[Batch, dict[str, int]]:
         """The filled batch and its info, the count of skipped samples in it."""
-        return self.batch, {"skipped": skipped, **self.info}
+        return self.batch, {"skipped_samples": skipped, **self.info}
 
 
 def do(work: Work[Batch]) -> tuple[Batch, dict[str, int]]:

@@ -67,6 +67,8 @@ class Encoder:
                 f"a clip needs {self.config.model.frames} frames or more (or 1, a still), not {clips.shape[1]}"
             )
         rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
+        if rows.shape != (len(clips),):
+            raise UserError(f"sensor rows must be one for each of the {len(clips)} touches, not {rows.shape}")
         if rows.min(initial=0) < 0 or rows.max(initial=0) >= len(self.config.model.sensors):
             raise UserError(f"sensor rows must be 0 to {len(self.config.model.sensors) - 1}")
         return np.asarray(self._run(pooling, join)(self.params, clips, rows.astype(np.int32)))
@@ -105,7 +107,7 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
         config = from_json(config_json)
     else:
         weights = release.read_weights(path)
-        model = release.detect_model(weights)
+        model = release.model_of(path, weights)
         params, config = release.to_params(weights, model), Config(model)
     if "touch" not in params:
         raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")

@@ -17,7 +17,7 @@ from anytouch_jax.nn.functional import Net
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
 
-_GREY, _GAP, _SCALE = 128, 4, 1
+_GREY, _GAP = 128, 4
 
 
 def reconstruction_panels(
@@ -29,16 +29,13 @@ def reconstruction_panels(
     prediction is brought back by the true mean and spread of each patch.
     """
     noise = jax.random.uniform(jax.random.key(seed), (len(sensor), net.model.patches))
-    pred, hidden = _predict(net, config)(params, jnp.asarray(clip), jnp.asarray(sensor), noise)
+    pred, hidden = _predict(params, clip, sensor, noise, net=net, config=config)
     return _panels(np.asarray(clip), np.asarray(pred), np.asarray(hidden), net, config)
 
 
-def _predict(net: Net, config: Config) -> Any:
-    @partial(jax.jit)
-    def run(params: Any, clip: Any, sensor: Any, noise: Any) -> Any:
-        return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
-
-    return run
+@partial(jax.jit, static_argnames=("net", "config"))
+def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
+    return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
 
 
 def _panels(clip: np.ndarray, pred: np.ndarray, hidden: np.ndarray, net: Net, config: Config) -> np.ndarray:
@@ -54,11 +51,19 @@ def _panels(clip: np.ndarray, pred: np.ndarray, hidden: np.ndarray, net: Net, co
     shown = min(clip.shape[1], frames)
     masked = np.where(cover, _GREY, clip[:, :shown])
     filled = np.where(cover, painted[:, :shown], clip[:, :shown])
-    blocks = [clip[:, :shown], masked, filled]
+    blocks = {"original": clip[:, :shown], "visible": masked, "reconstructed": filled}
     if clip.shape[1] > frames:
-        blocks += [clip[:, frames : frames + 1], painted[:, frames : frames + 1]]
-    rows = [np.concatenate([_strip(block[i]) for block in blocks], axis=1) for i in range(len(clip))]
-    return np.concatenate(rows, axis=0)
+        blocks |= {"next frame": clip[:, frames : frames + 1], "predicted": painted[:, frames : frames + 1]}
+    rows = [np.concatenate([_strip(block[i]) for block in blocks.values()], axis=1) for i in range(len(clip))]
+    titles = [_title(name, block.shape[1] * (size + _GAP)) for name, block in blocks.items()]
+    return np.concatenate([np.concatenate(titles, axis=1), *rows], axis=0)
+
+
+def _title(name: str, width: int) -> np.ndarray:
+    """A white strip (16, width, 3) with a word on it."""
+    strip = np.full((16, width, 3), 255, np.uint8)
+    cv2.putText(strip, name, (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+    return strip
 
 
 def _strip(frames: np.ndarray) -> np.ndarray:

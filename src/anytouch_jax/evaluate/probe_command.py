@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from anytouch_jax import cli
 
 Say = Callable[[str], None]
+RAW = "raw pixels"
 _RAW_SIZE = (240, 320)
 
 
@@ -47,7 +48,8 @@ def run_probes(options: cli.Probe, say: Say) -> list[Any]:
     task = read_task(options, say)
     found: list[Any] = []
     for name, values in _features(options, task, say):
-        found += probe_features(options, task, values, name)
+        # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.
+        found += probe_features(options, task, values, name, "common" if name == RAW else "column")
         say(f"probed {name}")
     if not found:
         raise UserError("nothing to probe: give --run, or keep the controls")
@@ -56,17 +58,21 @@ def run_probes(options: cli.Probe, say: Say) -> list[Any]:
     return found
 
 
-def probe_features(options: cli.Probe, task: Task, values: np.ndarray, name: str) -> list[Any]:
-    """Linear and kNN results of one set of features (n, d) on a task."""
+def probe_features(
+    options: cli.Probe, task: Task, values: np.ndarray, name: str, scaling: Literal["column", "common"] = "column"
+) -> list[Any]:
+    """Linear and kNN results of one set of features (n, d) on a task; `scaling` as in `probe.linear_probe`."""
     if options.leave_out is not None:
         return [
             probe.leave_groups_out(
-                values, task.labels, task.groups, name=f"{name}: linear, {options.leave_out} left out"
+                values, task.labels, task.groups, name=f"{name}: linear, {options.leave_out} left out", scaling=scaling
             )
         ]
     shared: dict[str, Any] = {"protocol": options.protocol, "seeds": options.seeds, "subsets": task.subsets}
     return [
-        probe.linear_probe(values, task.labels, task.groups, task.split, name=f"{name}: linear", **shared),
+        probe.linear_probe(
+            values, task.labels, task.groups, task.split, name=f"{name}: linear", scaling=scaling, **shared
+        ),
         probe.knn_probe(values, task.labels, task.groups, task.split, name=f"{name}: kNN", **shared),
     ]
 
@@ -136,7 +142,7 @@ def _features(options: cli.Probe, task: Task, say: Say) -> Any:
             raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
         yield name, values
     if options.controls:
-        yield "raw pixels", raw_features(task)
+        yield RAW, raw_features(task)
 
 
 def raw_features(task: Task) -> np.ndarray:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, UNIVERSAL, Model, Stack, TextTower
+from anytouch_jax.config import SENSORS, UNIVERSAL, Model, Stack, TextTower, from_json
 from anytouch_jax.io.names import Layout
-from anytouch_jax.io.tensors import WeightsError
+from anytouch_jax.io.tensors import WeightsError, read_metadata
 
 Weights = Mapping[str, np.ndarray]
+MODEL_KEY = "anytouch_jax.model"  # metadata of our safetensors files: heads and activation leave no trace in shapes
 
 
 def detect_layout(weights: Weights) -> Layout:
@@ -50,6 +52,15 @@ def detect_model(weights: Weights, *, heads: int | None = None, decoder_heads: i
         return _detected(layout, weights, heads, decoder_heads)
     except (KeyError, IndexError, ValueError, TypeError) as error:  # an array absent, or of an odd shape
         raise WeightsError(f"the model cannot be told from these {layout} weights: {error} is absent or odd") from None
+
+
+def model_of(path: str | Path, weights: Weights) -> Model:
+    """The model of a weights file: as the file tells it under `MODEL_KEY`, as ours do, else `detect_model`."""
+    told = read_metadata(path).get(MODEL_KEY)
+    if told is None:
+        return detect_model(weights)
+    model: Model = from_json(told, Model)
+    return model
 
 
 def _detected(layout: Layout, weights: Weights, heads: int | None, decoder_heads: int | None) -> Model:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, Model
-from anytouch_jax.io.detect import detect_layout, detect_model
+from anytouch_jax.io.detect import MODEL_KEY, detect_layout, detect_model, model_of
 from anytouch_jax.io.names import Entry, Layout, entries, is_left_out, unused
 from anytouch_jax.io.resize import resize_position
 from anytouch_jax.io.shapes import Shape, param_shapes
@@ -24,12 +24,14 @@ from anytouch_jax.io.torch_file import read_torch
 from anytouch_jax.io.tree import flatten, nest
 
 __all__ = [
+    "MODEL_KEY",
     "WeightsError",
     "clip_to_stage1",
     "detect_layout",
     "detect_model",
     "match_sensors",
     "merge_stage2",
+    "model_of",
     "read_weights",
     "release_names",
     "release_shapes",

@@ -51,6 +51,20 @@ def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str,
         raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
 
 
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """The metadata of a safetensors file, without its arrays; nothing for a file of another kind."""
+    from safetensors import safe_open
+
+    if Path(path).suffix != ".safetensors":
+        return {}
+    path = existing(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return dict(file.metadata() or {})
+    except Exception as error:
+        raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
+
+
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     """Arrays of an npz file; pickled objects are refused. Raises WeightsError."""
     path = existing(path)

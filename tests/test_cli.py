@@ -1,0 +1,293 @@
+"""The command line: help, mistakes and their answers, and each subcommand on a small run."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from runs import read_rows, write_manifest
+
+from anytouch_jax.cli import _COMMANDS, main
+from anytouch_jax.evaluate.features import load_encoder
+
+SIZES = (
+    "--model.image-size 28 --model.patch 7 --model.embed 12 --model.touch.width 16 --model.touch.depth 2 "
+    "--model.touch.heads 2 --model.touch.mlp 32 --model.decoder.width 8 --model.decoder.depth 1 "
+    "--model.decoder.heads 2 --model.decoder.mlp 16"
+).split()
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(compiled_once):
+    """`anytouch train` keeps compiled programs: not in the home of whoever runs the tests."""
+
+
+def run(*args) -> int:
+    """The exit status of `anytouch ARGS`, also where the parser exits by itself."""
+    try:
+        return main([str(arg) for arg in args])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def mistake(capsys, *args) -> str:
+    """The one line that a user's mistake is answered with."""
+    capsys.readouterr()
+    assert run(*args) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"anytouch {args[0]}: ") and "Traceback" not in error
+    assert len(error.strip().splitlines()) == 1, error
+    return error
+
+
+# Help and usage -----------------------------------------------------------------------------------------------------
+
+
+def test_help_lists_every_command(capsys):
+    for args in (["--help"], ["-h"]):
+        assert run(*args) == 0
+        out = capsys.readouterr().out
+        assert all(f"\n  {name} " in out for name in _COMMANDS)
+    assert run() == 2
+    capsys.readouterr()
+    assert run("--version") == 0 and capsys.readouterr().out.strip()[0].isdigit()
+
+
+@pytest.mark.parametrize("name", list(_COMMANDS))
+def test_every_command_has_help_with_an_example(name, capsys):
+    assert run(name, "--help") == 0
+    out = capsys.readouterr().out
+    example = next(line for line in out.splitlines() if line.startswith("Example: "))
+    assert example.startswith(f"Example: anytouch {name} ")
+    assert "--help" in out
+
+
+def test_the_help_shows_what_is_given_by_place(capsys):
+    for name, places in (("parity", 1), ("convert", 2)):
+        run(name, "--help")
+        assert f"anytouch {name} [-h]" + " PATH" * places in capsys.readouterr().out
+
+
+def test_help_all_lists_the_configuration_with_the_defaults_of_the_preset(capsys):
+    assert run("train", "--help-all", "--preset", "small") == 0
+    out = capsys.readouterr().out
+    for option in ("--model.touch.width", "--objective.mask-ratio", "--optim.clip-norm", "--loader.threads"):
+        assert option in out
+    assert "(default: 384)" in out
+
+
+def test_help_needs_no_heavy_imports():
+    code = (
+        "import sys; from anytouch_jax.cli import main; assert main(['--help']) == 0\n"
+        "heavy = {'jax', 'tyro', 'numpy', 'flax', 'cv2', 'rich'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env={**os.environ}, timeout=60)
+
+
+def test_an_unknown_command_is_answered_with_the_nearest(capsys):
+    assert run("trin") == 2
+    assert "did you mean train?" in capsys.readouterr().err
+    assert run("xyzzy") == 2
+    error = capsys.readouterr().err
+    assert "no command 'xyzzy'" in error and "did you mean" not in error
+
+
+@pytest.mark.parametrize(
+    ("typo", "meant"),
+    [("--stps", "--steps"), ("--optim.clip-nrm", "--optim.clip-norm"), ("--objective.mask-ration", "mask-ratio")],
+)
+def test_a_mistyped_option_is_answered_with_the_nearest(typo, meant, capsys):
+    assert run("train", "--data", "m.csv", "--run", "r", typo, "5") == 2
+    error = capsys.readouterr().err
+    assert typo in error and "Perhaps you meant" in error and meant in error.split("Perhaps", 1)[1]
+
+
+def test_wrong_values_are_usage_errors(capsys):
+    train = ("train", "--data", "m.csv", "--run", "r")
+    for args in (("--stage", "3"), ("--steps", "many"), ("--objective.mask-ratio",), ("--model.patch", "13")):
+        assert run(*train, *args) == 2
+        assert "Traceback" not in capsys.readouterr().err
+    assert run("train", "--run", "r") == 2
+    assert "--data" in capsys.readouterr().err
+
+
+# Mistakes -----------------------------------------------------------------------------------------------------------
+
+
+def test_missing_files(capsys, tmp_path, tiny_run, world):
+    missing = tmp_path / "none.csv"
+    assert str(missing) in mistake(capsys, "train", "--data", missing, "--run", tmp_path / "r")
+    assert not (tmp_path / "r").exists()
+    assert "nowhere" in mistake(capsys, "embed", "--run", tmp_path / "nowhere", "--input", world, "--out", "f.npz")
+    assert "none.csv" in mistake(capsys, "embed", "--run", tiny_run, "--input", missing, "--out", tmp_path / "f.npz")
+    assert "none.csv" in mistake(capsys, "probe", "--data", missing)
+    assert "nowhere" in mistake(capsys, "parity", tmp_path / "nowhere")
+    assert "nowhere" in mistake(capsys, "convert", tmp_path / "nowhere.pth", tmp_path / "w.safetensors")
+    assert "--init" in mistake(capsys, "train", "--data", world, "--run", tmp_path / "r", "--init", tmp_path / "gone")
+
+
+def changed(world: Path, tmp_path: Path, change) -> Path:
+    """The world's manifest with its rows (dicts) changed, its pictures beside it."""
+    rows = read_rows(world)
+    change(rows)
+    shutil.copytree(world.parent, tmp_path, dirs_exist_ok=True)
+    columns = tuple(rows[0])
+    return write_manifest(tmp_path / "manifest.csv", [[row.get(c, "") for c in columns] for row in rows], columns)
+
+
+def drop_sensor(rows):
+    for row in rows:
+        del row["sensor"]
+
+
+def test_bad_manifests(capsys, tmp_path, world):
+    def told(change):
+        folder = tmp_path / change.__name__
+        manifest = changed(world, folder, change)
+        return mistake(capsys, "train", "--data", manifest, "--run", tmp_path / "r", "--stop-after", 1, *SIZES)
+
+    def unknown_sensor(rows):
+        rows[2]["sensor"] = "gelsightt"
+
+    def no_train_rows(rows):
+        for row in rows:
+            row["split"] = "test"
+
+    def way_out(rows):
+        rows[1]["path"] = "../a1.png"
+
+    assert "sensor" in told(drop_sensor)
+    assert "gelsightt" in told(unknown_sensor) and "row 2" in told(unknown_sensor)
+    assert "'train'" in told(no_train_rows)
+    assert "../a1.png" in told(way_out)
+
+
+def test_a_corrupt_picture_is_named_or_skipped_and_counted(capsys, tmp_path, world):
+    manifest = changed(world, tmp_path / "world", lambda rows: None)
+    (manifest.parent / "a1.png").write_bytes(b"not a picture")
+    args = ("train", "--data", manifest, "--batch", 8, "--steps", 4, "--save-every", 4, *SIZES)
+    error = mistake(capsys, *args, "--run", tmp_path / "strict", "--stop-after", 1)
+    assert "a1.png" in error and "row 1" in error
+    assert run(*args, "--run", tmp_path / "lenient", "--on-bad-sample", "skip", "--stop-after", 1) == 0
+    line = json.loads((tmp_path / "lenient" / "metrics.jsonl").read_text())
+    assert line["skipped"] == 0 and line["skipped_batches"] == 0
+    assert line["skipped_samples"] >= 1 and line["loss"] > 0
+
+
+def test_no_clip_weights_for_pretrained_towers(capsys, tmp_path, world):
+    told = mistake(
+        capsys, "train", "--data", world, "--run", tmp_path / "r", "--stage", 2, "--towers", "pretrained"
+    )
+    assert "--clip" in told
+
+
+# What the commands do -----------------------------------------------------------------------------------------------
+
+
+def test_train_takes_the_configuration_from_preset_recipe_and_options(tmp_path, world, capsys):
+    args = ["train", "--data", world, "--run", tmp_path / "r", "--recipe", "release", "--steps", 40, "--batch", 8]
+    args += ["--objective.mask-ratio", "0.5", "--optim.clip-norm", "1.0", "--seed", 3, "--loader.threads=1"]
+    assert run(*args, "--stop-after", 0, *SIZES) == 0
+    config = json.loads((tmp_path / "r" / "config.json").read_text())
+    assert config["objective"]["mask_ratio"] == 0.5 and config["optim"]["clip_norm"] == 1.0
+    assert config["recipe"] == "release" and config["optim"]["decay"] == "cosine"
+    assert config["data"]["manifests"] == [str(world)] and config["data"]["threads"] == 1
+    assert (config["data"]["batch_size"], config["run"]["steps"], config["run"]["seed"]) == (8, 40, 3)
+    assert config["model"]["touch"] == {"width": 16, "depth": 2, "heads": 2, "mlp": 32}
+    assert "0 of 40 steps" in capsys.readouterr().err
+
+
+def test_train_goes_on_and_refuses_other_settings(tmp_path, world, tiny_run, capsys):
+    shutil.copytree(tiny_run, tmp_path / "r")
+    args = ["train", "--data", world, "--run", tmp_path / "r", "--steps", 4, "--save-every", 4, "--batch", 8, *SIZES]
+    assert "run.steps" in mistake(capsys, *args, "--steps", 5)
+    # the run was started from Python with a configuration that no preset has: only its name differs
+    config = json.loads((tmp_path / "r" / "config.json").read_text())
+    assert config["preset"] == "tiny"
+    assert run(*args, "--stop-after", 3) == 0
+    error = capsys.readouterr().err
+    assert "going on from the checkpoint of step 2" in error and "3 of 4 steps" in error
+
+
+def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
+    out = tmp_path / "features.npz"
+    assert run("embed", "--run", tiny_run, "--input", world, "--split", "test", "--out", out, "--batch", 4) == 0
+    assert "2 features of 12 values" in capsys.readouterr().out
+    with np.load(out) as file:
+        assert file["features"].shape == (2, 12)
+        assert file["rows"].tolist() == [10, 11]
+        assert file["key/path"].tolist() == ["c2.png", "c3.png"] and set(file["key/split"]) == {"test"}
+        from_manifest = file["features"]
+
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for frame in (2, 3):
+        shutil.copy(world.parent / f"c{frame}.png", folder)
+    args = ("embed", "--run", tiny_run, "--input", folder, "--out", out, "--batch", 4)
+    assert run(*args, "--sensor", "digit") == 0
+    with np.load(out) as file:
+        np.testing.assert_allclose(file["features"], from_manifest, atol=1e-6)
+        assert file["key/frame_index"].tolist() == [0, 1] and str(file["about/input"]) == str(folder)
+    capsys.readouterr()
+    assert run(*args, "--sensor", "new_sensor") == 0
+    assert "'new_sensor'" in (error := capsys.readouterr().err) and "universal tokens" in error
+    with np.load(out) as file:
+        assert np.abs(file["features"] - from_manifest).max() > 1e-4
+
+
+def test_embed_clips_of_a_manifest_and_of_a_video(tmp_path, world, tiny_run, capsys):
+    out = tmp_path / "features.npz"
+    assert run("embed", "--run", tiny_run, "--input", world, "--frames", 3, "--out", out, "--batch", 4) == 0
+    assert "8 of 12 rows end no clip of 3 frames" in " ".join(capsys.readouterr().err.split())
+    with np.load(out) as file:
+        assert file["rows"].tolist() == [2, 3, 6, 7]
+
+    video = tmp_path / "touch.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
+    for frame in range(5):
+        writer.write(np.full((32, 32, 3), 40 * frame, np.uint8))
+    writer.release()
+    assert run("embed", "--run", tiny_run, "--input", video, "--frames", 3, "--out", out, "--batch", 4) == 0
+    with np.load(out) as file:
+        assert file["features"].shape == (3, 12) and file["key/frame_index"].tolist() == [2, 3, 4]
+    assert "too few" in mistake(capsys, "embed", "--run", tiny_run, "--input", video, "--frames", 6, "--out", out)
+
+
+def test_probe_reports_on_test_and_writes_json(tmp_path, world, tiny_run, capsys):
+    out = tmp_path / "probe.json"
+    args = ("probe", "--data", world, "--run", tiny_run, "--label", "object", "--seeds", 2)
+    assert run(*args, "--no-controls", "--out", out) == 0
+    table = capsys.readouterr().out
+    assert f"{tiny_run}: linear" in table and f"{tiny_run}: kNN" in table
+    assert "raw pixels" not in table and "random" not in table
+    assert json.loads(out.read_text())
+    assert "'taste'" in mistake(capsys, *args[:-4], "--label", "taste")
+    assert run("probe", "--data", world, "--no-controls") == 1
+    assert "nothing to probe" in capsys.readouterr().err
+
+
+def test_convert_to_the_authors_names_and_back(tmp_path, tiny_run, capsys):
+    theirs, ours, again = (tmp_path / name for name in ("release.safetensors", "own.safetensors", "again.safetensors"))
+    assert run("convert", tiny_run, theirs) == 0
+    assert run("convert", theirs, ours, "--names", "own") == 0
+    assert run("convert", ours, again) == 0
+    assert theirs.read_bytes()[-4096:] == again.read_bytes()[-4096:]
+    clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
+    expected = load_encoder(tiny_run).embed(clip, "digit")
+    for path in (theirs, ours, again):  # two heads of width 8: the shapes alone would tell one head
+        np.testing.assert_array_equal(load_encoder(path).embed(clip, "digit"), expected)
+
+
+def test_an_interrupt_is_no_traceback(monkeypatch, capsys, tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("anytouch_jax.evaluate.parity.run", interrupted)
+    assert run("parity", tmp_path) == 130
+    assert capsys.readouterr().err.strip() == "interrupted"

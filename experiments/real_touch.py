@@ -16,7 +16,7 @@
 # Before this script:
 #
 #     make train-stage1 DATA=../shared/real_touch/manifest.csv STEPS=1500
-#     make train-stage2 DATA=../shared/real_touch/manifest.csv STEPS=400 BATCH=32
+#     make train-stage2 DATA=../shared/real_touch/manifest.csv STEPS=200 BATCH=32
 #
 # Then `.venv/bin/python experiments/real_touch.py` prints the tables and writes `experiments/results/real_touch.md`
 # and `.json`. DATA=, STAGE1=, STAGE2=, OUT= and LABELLED_STEPS= in the environment change what it reads and writes.
@@ -53,7 +53,7 @@ DATA = Path(os.environ.get("DATA", "../shared/real_touch/manifest.csv"))
 STAGE1 = Path(os.environ.get("STAGE1", "runs/stage1"))
 STAGE2 = Path(os.environ.get("STAGE2", "runs/stage2"))
 LABELLED = Path(os.environ.get("LABELLED", "runs/labelled"))
-LABELLED_STEPS = int(os.environ.get("LABELLED_STEPS", "600"))
+LABELLED_STEPS = int(os.environ.get("LABELLED_STEPS", "200"))
 OUT = Path(os.environ.get("OUT", "experiments/results"))
 
 manifest = manifests.read(DATA)

@@ -181,9 +181,7 @@ def test_a_corrupt_picture_is_named_or_skipped_and_counted(capsys, tmp_path, wor
 
 
 def test_no_clip_weights_for_pretrained_towers(capsys, tmp_path, world):
-    told = mistake(
-        capsys, "train", "--data", world, "--run", tmp_path / "r", "--stage", 2, "--towers", "pretrained"
-    )
+    told = mistake(capsys, "train", "--data", world, "--run", tmp_path / "r", "--stage", 2, "--towers", "pretrained")
     assert "--clip" in told
 
 

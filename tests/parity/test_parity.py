@@ -1,0 +1,148 @@
+"""This implementation against outputs and gradients of the authors' PyTorch code; and that the check can fail."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anytouch_jax.cli import main
+from anytouch_jax.config import UserError
+from anytouch_jax.evaluate import parity
+from anytouch_jax.evaluate.golden import GRADIENT, OUTPUT, Case, Row, read_cases
+
+HERE = Path(__file__).parent / "golden"
+ALL = Path(__file__).resolve().parents[3] / "shared" / "golden"  # the whole set, where it lies beside the checkout
+CASES = {case.name: case for case in read_cases(HERE)}
+COMPARISONS = {  # at least so many: a case that compares nothing would be within tolerance too
+    "A_stage1_image": 70,
+    "A_stage1_image_small_scale": 8,
+    "F_stage2_match_image": 50,
+    "I_pos_embed": 2,
+    "stage1_params": 0,
+    "stage2_params": 0,
+}
+
+
+def copied(tmp_path: Path, name: str, info=None, **changes) -> Path:
+    """A folder with one case (and the parameters it needs), arrays changed by functions of the old ones."""
+    for file in (f"{name}.json", f"{name}.npz", *(p.name for p in HERE.glob("stage1_params.*"))):
+        shutil.copy(HERE / file, tmp_path)
+    with np.load(HERE / f"{name}.npz") as file:
+        arrays = dict(file)
+    for key, change in changes.items():
+        arrays[key] = change(arrays.get(key))
+    np.savez(tmp_path / f"{name}.npz", **arrays)
+    described = json.loads((HERE / f"{name}.json").read_text())
+    (tmp_path / f"{name}.json").write_text(json.dumps((info or (lambda x: x))(described)))
+    return tmp_path
+
+
+def bad(folder: Path) -> dict[str, Row]:
+    return {row.array: row for row in parity.run(folder) if not row.good}
+
+
+@pytest.mark.parametrize("name", sorted(COMPARISONS))
+def test_a_case_is_within_tolerance(name):
+    rows = parity.run_case(CASES[name])
+    assert {r.array: (r.error, r.tolerance, r.note) for r in rows if not r.good} == {}
+    assert len(rows) >= COMPARISONS[name]
+
+
+def test_every_case_of_the_folder_is_run():
+    assert set(CASES) == set(COMPARISONS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [case.name for case in read_cases(ALL)] if ALL.is_dir() else [])
+def test_a_case_of_the_whole_set_is_within_tolerance(name):
+    (case,) = [case for case in read_cases(ALL) if case.name == name]
+    assert {r.array: (r.error, r.tolerance, r.note) for r in parity.run_case(case) if not r.good} == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted(ALL.glob("*.pth")), ids=lambda path: path.name)
+def test_the_authors_checkpoints_give_the_parameters_beside_them(path, tmp_path):
+    stage = path.name.split("_")[0]
+    for file in (path, ALL / f"{stage}_params.npz", ALL / f"{stage}_params.json"):
+        shutil.copy(file, tmp_path)
+    rows = parity.run(tmp_path)
+    assert len(rows) == 1 and rows[0].good and rows[0].case == path.name
+
+
+def test_a_wrong_number_is_reported(tmp_path):
+    name = "pos_embed_32_4_cls"
+    folder = copied(tmp_path, "I_pos_embed", **{name: lambda x: x + 2e-5 * (np.arange(x.size).reshape(x.shape) == 77)})
+    found = bad(folder)
+    assert set(found) == {name}
+    assert found[name].error == pytest.approx(2e-5, rel=0.05) and found[name].tolerance == pytest.approx(OUTPUT)
+
+
+def test_a_nan_is_reported(tmp_path):
+    def spoil(x):
+        x = x.copy()
+        x.flat[0] = np.nan
+        return x
+
+    assert "out/latent" in bad(copied(tmp_path, "A_stage1_image_small_scale", **{"out/latent": spoil}))
+
+
+def test_another_shape_is_reported(tmp_path):
+    folder = copied(tmp_path, "I_pos_embed", pos_embed_32_4_cls=lambda x: x[:, :16])
+    assert "shape" in bad(folder)["pos_embed_32_4_cls"].note
+
+
+def test_an_array_that_nobody_compares_is_reported(tmp_path):
+    def listed(info):
+        return info | {"arrays": info["arrays"] | {"out/new": [[3], "float32"]}}
+
+    folder = copied(tmp_path, "I_pos_embed", listed, **{"out/new": lambda _: np.zeros(3, np.float32)})
+    assert "not understood" in bad(folder)["out/new"].note
+
+
+def test_an_unlisted_array_is_reported(tmp_path):
+    folder = copied(tmp_path, "I_pos_embed", **{"out/new": lambda _: np.zeros(3, np.float32)})
+    assert "not understood" in bad(folder)["out/new"].note
+
+
+def test_unknown_and_broken_cases_are_failures_not_tracebacks(tmp_path):
+    (tmp_path / "Z_new.json").write_text("{}")
+    (tmp_path / "A_broken.json").write_text("{}")
+    rows = parity.run(tmp_path)
+    assert [row.case for row in rows if not row.good] == ["A_broken", "Z_new"]
+    assert all("understand" in row.note or "understood" in row.note for row in rows)
+
+
+def test_a_folder_without_cases_is_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="no golden case"):
+        parity.run(tmp_path)
+    (tmp_path / "A_x.json").write_text("{")
+    with pytest.raises(UserError, match=r"A_x\.json is not JSON"):
+        parity.run(tmp_path)
+
+
+def test_tolerances_are_the_larger_of_relative_and_five_times_the_noise():
+    case = Case("c", HERE, {"float32_vs_float64": {"arrays": {"out/a": [3e-4, 10.0]}}})
+    case.arrays = {"out/a": np.array([10.0, 0.0]), "out/b": np.array([10.0, 0.0]), "out/c": np.zeros(2)}
+    case.compare("out/a", np.array([10.0, 1e-3]))
+    case.compare("out/b", np.array([10.0, 1e-3]), GRADIENT)
+    case.compare("out/c", np.array([0.0, 2e-5]))
+    a, b, c = case.rows
+    assert a.good and a.error == pytest.approx(1e-4) and a.tolerance == pytest.approx(1.5e-4)
+    assert not b.good and b.tolerance == pytest.approx(GRADIENT)
+    assert not c.good  # a recorded zero is compared in absolute terms, and not with a tolerance of its own size
+    assert not Row("c", "d", float("nan"), 1.0).good
+
+
+def test_exit_codes_and_table_of_the_command(tmp_path, capsys):
+    good, wrong = tmp_path / "good", tmp_path / "wrong"
+    for folder in (good, wrong):
+        folder.mkdir()
+    assert main(["parity", str(copied(good, "I_pos_embed"))]) == 0
+    assert "0 out of tolerance" in capsys.readouterr().out
+    assert main(["parity", str(copied(wrong, "I_pos_embed", pos_embed_32_4_cls=lambda x: x + 1)), "--verbose"]) == 1
+    out = capsys.readouterr().out
+    assert (
+        "1 out of tolerance" in out and "pos_embed_32_4_cls" in out and "OUT" in out and "pos_embed_512_16_cls" in out
+    )

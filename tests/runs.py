@@ -1,4 +1,4 @@
-"""A small world on disk (two sensors that felt the same places, one photograph, a few captions) and runs trained on it."""
+"""A small world on disk (two sensors at the same places, one photograph, a few captions) and runs trained on it."""
 
 from __future__ import annotations
 

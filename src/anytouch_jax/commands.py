@@ -170,7 +170,7 @@ def convert(options: cli.Convert) -> int:
         checkpoint.export_safetensors(options.target, params, about)
     else:
         if "matcher" in params and model.match_head == "mlp":
-            say("the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code does not read")
+            say("the matching MLP of recipe paper is stored as cross_sensor_mlp.*: the authors' code does not read it")
         arrays = release.to_release(params, model, allow_extra=True)
         release.write_safetensors(options.target, arrays, about | {"format": "pt"})
     print(f"{options.target}: written")

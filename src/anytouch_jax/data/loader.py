@@ -76,7 +76,7 @@ class Loader:
     def stream(self, start: int, stop: int) -> Iterator[tuple[int, Batch, Info]]:
         """(step, batch, info) for steps start .. stop - 1, made ahead by `data.threads` threads.
 
-        The bytes do not depend on the threads. `info` counts `skipped_samples` (bad ones), `images` and `texts`. Close the
+        The bytes do not depend on the threads. `info` counts `skipped_samples`, `images` and `texts`. Close the
         iterator to stop early; its threads end with it.
         """
         return pump(self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch)

@@ -62,7 +62,7 @@ class Encoder:
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {clips.dtype} "
                 f"{clips.shape}; data.transforms.touch_evaluation resizes them"
             )
-        if 1 < clips.shape[1] < self.config.model.frames:
+        if clips.shape[1] != 1 and clips.shape[1] < self.config.model.frames:
             raise UserError(
                 f"a clip needs {self.config.model.frames} frames or more (or 1, a still), not {clips.shape[1]}"
             )
@@ -71,7 +71,10 @@ class Encoder:
             raise UserError(f"sensor rows must be one for each of the {len(clips)} touches, not {rows.shape}")
         if rows.min(initial=0) < 0 or rows.max(initial=0) >= len(self.config.model.sensors):
             raise UserError(f"sensor rows must be 0 to {len(self.config.model.sensors) - 1}")
-        return np.asarray(self._run(pooling, join)(self.params, clips, rows.astype(np.int32)))
+        count, run = len(clips), self._run(pooling, join)
+        if not count:  # the network has no shape for nothing: embed one and give none
+            clips, rows = np.zeros((1, *clips.shape[1:]), np.uint8), np.zeros(1, np.int32)
+        return np.asarray(run(self.params, clips, rows.astype(np.int32)))[:count]
 
     def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
         key = (pooling, join)

@@ -1,0 +1,213 @@
+"""Encoders and the features they give: of arrays, of a manifest, from a run, from weights, at random."""
+
+import zipfile
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from runs import run_config
+from tiny_models import touch_model
+
+from anytouch_jax.config import Config, UserError, to_json
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.transforms import touch_evaluation
+from anytouch_jax.evaluate.features import (
+    Encoder,
+    Features,
+    embed_rows,
+    load_encoder,
+    random_encoder,
+    save_npz,
+    text_column,
+)
+from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.functional import build
+
+RNG = np.random.default_rng(0)
+CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def encoder(tiny_run):
+    return load_encoder(tiny_run)
+
+
+def test_shapes_of_what_is_embedded(encoder):
+    still = CLIPS[:, 0]
+    z = encoder.embed(still, "digit")
+    assert z.shape == (2, 12) and z.dtype == np.float32 and np.isfinite(z).all()
+    np.testing.assert_array_equal(encoder.embed(still[:, None], "digit"), z)
+    np.testing.assert_allclose(encoder.embed(still[0], "digit"), z[:1], atol=1e-5)
+    mean = encoder.embed(still, "digit", pooling="mean")
+    assert mean.shape == (2, 12) and np.abs(mean - z).max() > 1e-3
+    both = encoder.embed(still, "digit", pooling="both")
+    np.testing.assert_allclose(both, np.concatenate([z, mean], axis=1), atol=1e-6)
+    assert encoder.embed(still[:0], "digit").shape == (0, 12)
+
+
+def test_a_still_equals_the_clip_that_repeats_it(encoder):
+    still = CLIPS[:, :1]
+    clip = encoder.embed(np.repeat(still, 3, axis=1), np.asarray([1, 1]))
+    np.testing.assert_allclose(clip, encoder.embed(still, "digit"), atol=2e-5)
+
+
+@pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
+def test_long_clips_are_segments_of_three(encoder, join, width):
+    parts = [encoder.embed(CLIPS[:, s : s + 3], "digit") for s in (0, 3, 4)]  # the last one ends with the last frame
+    wanted = {"mean": np.mean(parts, 0), "sum": np.sum(parts, 0), "concat": np.concatenate(parts, 1)}[join]
+    z = encoder.embed(CLIPS, "digit", join=join)
+    assert z.shape == (2, width)
+    np.testing.assert_allclose(z, wanted, atol=2e-5)
+
+
+def test_what_cannot_be_embedded_is_one_sentence(encoder):
+    for clips, word in (
+        (CLIPS.astype(np.float32), "float32"),
+        (CLIPS[:, :, :27], "28 x 28"),
+        (CLIPS[..., :1], "28 x 28"),
+        (CLIPS[:, :0], "a clip needs 3 frames"),
+        (CLIPS[:, :2], "a clip needs 3 frames"),
+        (CLIPS[0, 0, 0], "28 x 28"),
+    ):
+        with pytest.raises(UserError, match=word):
+            encoder.embed(clips, "digit")
+    for ids, word in (([0, 10], "0 to 9"), ([-1, 0], "0 to 9"), ([0], "2 touches")):
+        with pytest.raises(UserError, match=word):
+            encoder.embed(CLIPS[:, 0], np.asarray(ids))
+
+
+def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
+    said = []
+    assert encoder.sensor_row("digit", said.append) == 1 and said == []
+    assert encoder.sensor_row("my_sensor", said.append) == 9
+    assert len(said) == 1 and "'my_sensor'" in said[0] and "universal tokens" in said[0]
+    still = CLIPS[:, 0]
+    np.testing.assert_array_equal(encoder.embed(still, "my_sensor"), encoder.embed(still))
+    assert np.abs(encoder.embed(still) - encoder.embed(still, "digit")).max() > 1e-4
+    np.testing.assert_allclose(
+        encoder.embed(still, np.asarray([9, 1])),
+        [encoder.embed(still)[0], encoder.embed(still, "digit")[1]],
+        atol=1e-6,
+    )
+
+
+# Where encoders come from -------------------------------------------------------------------------------------------
+
+
+def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
+    params, _, _ = checkpoint.load_params(tiny_run)
+    assert set(encoder.params) == {"touch"} and encoder.source == str(tiny_run)
+    np.testing.assert_array_equal(encoder.params["touch"]["sensor_tokens"], params["touch"]["sensor_tokens"])
+    assert "array" not in repr(encoder) and "kernel" not in repr(encoder)
+    wanted = load_encoder(tiny_run / "checkpoints", step=2).embed(CLIPS[:, 0], "digit")
+    np.testing.assert_array_equal(wanted, encoder.embed(CLIPS[:, 0], "digit"))
+
+
+def test_an_encoder_of_a_weights_file(tmp_path):
+    """The shapes of the authors' files tell heads of width 64, unless our own metadata tells the model."""
+    wide = replace(touch_model().touch, width=64, heads=1)
+    model = touch_model(touch=wide, decoder=replace(touch_model().decoder, width=32, heads=1))
+    for heads, about in ((1, False), (4, True)):
+        here = replace(model, touch=replace(wide, heads=heads))
+        made = random_encoder(Config(here), seed=3)
+        params = build(here).init(jax.random.key(1))
+        metadata = {release.MODEL_KEY: to_json(here)} if about else {}
+        path = tmp_path / f"{heads}.safetensors"
+        release.write_safetensors(path, release.to_release(params, here), metadata)
+        found = load_encoder(path)
+        np.testing.assert_array_equal(found.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
+        assert found.config.model.touch == here.touch
+        wanted = Encoder(made.config, {"touch": params["touch"]}, "").embed(CLIPS[:, 0], "digit")
+        np.testing.assert_allclose(found.embed(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
+
+
+def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
+    with pytest.raises(UserError, match="no run folder or weights file"):
+        load_encoder(tmp_path / "gone")
+    with pytest.raises(UserError, match="checkpoint"):
+        load_encoder(tmp_path)
+    with pytest.raises(UserError, match="unknown type"):
+        load_encoder(world)
+
+
+def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):
+    config = run_config(world, 2)
+    a, b, c = (random_encoder(config, seed).embed(CLIPS[:, 0], "digit") for seed in (0, 0, 1))
+    assert a.shape == encoder.embed(CLIPS[:, 0], "digit").shape
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 1e-3
+    model = random_encoder(config).config.model
+    assert model.image is None and model.text is None and model.match_head == "none"
+
+
+# Manifests ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_manifest_gives_what_its_pictures_give(encoder, world):
+    manifest, said = manifests.read(world), []
+    rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, say=said.append)
+    order = np.argsort(rows)
+    assert rows[order].tolist() == [0, 5, 9] and said == []
+    for row, value in zip(rows, values, strict=True):
+        image = touch_evaluation([decode(manifest.file(int(row)))], 28)
+        wanted = encoder.embed(image[None], manifest.value(int(row), "sensor"))
+        np.testing.assert_allclose(value, wanted[0], atol=1e-5)
+
+
+def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
+    manifest = manifests.read(world)
+    rows, values = embed_rows(encoder, manifest, np.asarray([3, 6]), 3, "both", batch=8)
+    assert rows.tolist() == [3, 6] and values.shape == (2, 24)
+    clip = touch_evaluation([decode(world.parent / f"a{i}.png") for i in (1, 2, 3)], 28)
+    np.testing.assert_allclose(values[0], encoder.embed(clip[None], "digit", pooling="both")[0], atol=1e-5)
+    with pytest.raises(UserError, match="clip of 3 frames"):
+        embed_rows(encoder, manifest, np.asarray([1]), 3)
+    with pytest.raises(UserError, match="no rows"):
+        embed_rows(encoder, manifest, np.asarray([], np.int64))
+
+
+def test_an_unknown_sensor_of_a_manifest_is_said_once(encoder, world):
+    known = replace(encoder.config.model, sensors=("gelsight", "digit", "universal"))
+    params = {"touch": encoder.params["touch"] | {"sensor_tokens": encoder.params["touch"]["sensor_tokens"][[0, 1, 9]]}}
+    small, said = Encoder(replace(encoder.config, model=known), params, "small"), []
+    manifest = manifests.read(world)
+    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, say=said.append)
+    assert len(said) == 1 and "'gelsight_mini'" in said[0]
+    image = touch_evaluation([decode(world.parent / "b0.png")], 28)[None]
+    np.testing.assert_allclose(values[0], encoder.embed(image)[0], atol=1e-5)
+
+
+def test_a_text_column_has_no_nulls(world):
+    manifest = manifests.read(world)
+    column = text_column(manifest, "text")
+    assert column.shape == (12,) and column[0] == "a round thing, a" and column[1] == ""
+
+
+# Files --------------------------------------------------------------------------------------------------------------
+
+
+def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    features = Features(np.ones((2, 3), np.float32), np.asarray([4, 7]), {"path": np.asarray(["a.png", "b.png"])})
+    path = tmp_path / "f.npz"
+    save_npz(path, features, {"encoder": "runs/one"})
+    with np.load(path) as file:
+        assert set(file.files) == {"features", "rows", "key/path", "about/encoder"}
+        np.testing.assert_array_equal(file["features"], features.values)
+        assert file["rows"].tolist() == [4, 7] and file["key/path"].tolist() == ["a.png", "b.png"]
+        assert str(file["about/encoder"]) == "runs/one"
+    assert zipfile.is_zipfile(path) and [p.name for p in tmp_path.iterdir()] == ["f.npz"]
+    before = path.read_bytes()
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(UserError, match=r"cannot write .*f\.npz: No space left"):
+        save_npz(path, features, {})
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["f.npz"]
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="cannot write"):
+        save_npz(tmp_path / "no" / "folder.npz", features, {})

@@ -1,0 +1,393 @@
+"""The two sums: what they see, what they weigh, what they cost, and that the real step makes them fall."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_models import tiny_config
+
+from anytouch_jax import objectives
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.nn.functional import build
+from anytouch_jax.train.mesh import batch_sharding, make_mesh, put_batch, replicated
+from anytouch_jax.train.optim import flatten_names, optimizer
+from anytouch_jax.train.step import init_state, make_step, merge
+
+RNG = np.random.default_rng(0)
+SENSOR = jnp.asarray([0, 3, 1, 9])
+CONFIG1, CONFIG2 = tiny_config(1), tiny_config(2)
+NET1, NET2 = build(CONFIG1.model), build(CONFIG2.model)
+PARAMS1, PARAMS2 = NET1.init(jax.random.key(0)), NET2.init(jax.random.key(1))
+NOISE = jnp.asarray(RNG.random((4, 16)), jnp.float32)
+CLIP4 = jnp.asarray(RNG.standard_normal((4, 4, 28, 28, 3)), jnp.float32)
+
+
+def pixels(*shape):
+    return RNG.integers(0, 256, (*shape, 28, 28, 3), np.uint8)
+
+
+def floats(*shape):
+    return jnp.asarray(RNG.standard_normal((*shape, 28, 28, 3)), jnp.float32)
+
+
+def flops(function, *args):
+    return jax.jit(function).lower(*args).compile().cost_analysis()["flops"]
+
+
+def changed(config, **objective):
+    return replace(config, objective=replace(config.objective, **objective))
+
+
+# Stage 1 ------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def stage1_terms(config=CONFIG1):
+    return jax.jit(jax.value_and_grad(partial(objectives.stage1_terms, net=NET1, config=config), has_aux=True))
+
+
+@jax.jit
+def reconstruct(params, clip):
+    def total(clip):
+        pred, hidden = objectives.reconstruct(params, clip, SENSOR, NOISE, net=NET1, config=CONFIG1)
+        return jnp.sum(pred**2), (pred, hidden)
+
+    return jax.value_and_grad(total, has_aux=True)(clip)
+
+
+def test_hidden_patches_and_the_future_frame_have_exactly_no_influence():
+    (_, (pred, hidden)), grad = reconstruct(PARAMS1, CLIP4)
+    grad, hidden = np.asarray(grad), np.asarray(hidden)
+    assert pred.shape == (4, 16, 4, 147) and hidden.sum(axis=1).tolist() == [12] * 4
+    assert len({tuple(row) for row in hidden.tolist()}) == 4  # a mask of its own for every sample
+    assert not grad[:, 3].any()
+    cells = grad[:, :3].reshape(4, 3, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(4, 16, -1)
+    assert not cells[hidden].any() and (np.abs(cells[~hidden]).max(axis=-1) > 0).all()
+    (_, (other, _)), _ = reconstruct(PARAMS1, CLIP4.at[:, 3].set(7.0))
+    np.testing.assert_array_equal(other, pred)
+
+
+def test_the_loss_is_hidden_patches_of_three_frames_and_all_of_the_next():
+    (_, (pred, hidden)), _ = reconstruct(PARAMS1, CLIP4)
+    cells = np.asarray(CLIP4).reshape(4, 4, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(4, 16, 4, 147)
+    error = ((np.asarray(pred) - cells) ** 2).mean(axis=-1)
+    (loss, metrics), _ = stage1_terms()(PARAMS1, CLIP4, SENSOR, NOISE)
+    np.testing.assert_allclose(metrics["reconstruction"], error[..., :3].mean(-1)[np.asarray(hidden)].mean(), rtol=1e-5)
+    np.testing.assert_allclose(metrics["next_frame"], error[..., 3].mean(), rtol=1e-5)
+    np.testing.assert_allclose(loss, metrics["reconstruction"] + metrics["next_frame"], rtol=1e-6)
+
+
+def test_without_next_frame_the_fourth_frame_is_as_if_it_were_not_there():
+    off = changed(CONFIG1, next_frame=False)
+    (four, metrics), grads = stage1_terms(off)(PARAMS1, CLIP4, SENSOR, NOISE)
+    (three, _), others = stage1_terms()(PARAMS1, CLIP4[:, :3], SENSOR, NOISE)
+    assert set(metrics) == {"reconstruction"}
+    np.testing.assert_array_equal(four, three)
+    jax.tree.map(np.testing.assert_array_equal, grads, others)
+
+
+def test_constant_patches_under_norm_pix_loss_are_finite():
+    flat = jnp.ones_like(CLIP4[:, :3])
+    (loss, _), grads = stage1_terms(changed(CONFIG1, norm_pix_loss=True))(PARAMS1, flat, SENSOR, NOISE)
+    assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
+
+
+def test_a_still_costs_no_clip_head_and_no_third_projection():
+    terms = lambda p, c: objectives.stage1_terms(p, c, SENSOR, NOISE, net=NET1, config=CONFIG1)[0]  # noqa: E731
+    decoder = {name: value for name, value in PARAMS1["decoder"].items() if name != "clip_head"}
+    still, clip = flops(terms, PARAMS1 | {"decoder": decoder}, CLIP4[:, :1]), flops(terms, PARAMS1, CLIP4)
+    heads, kernels = 2 * 4 * 16 * 8 * 147 * 3, 2 * 4 * 4 * 147 * 16 * 2  # what three more frames cost, at the least
+    assert clip - still > heads + kernels
+
+
+def test_bfloat16_stays_near_float32():
+    half = replace(CONFIG1, model=replace(CONFIG1.model, dtype="bfloat16"))
+    terms = partial(objectives.stage1_terms, net=build(half.model), config=half)
+    (value, _), grads = jax.jit(jax.value_and_grad(terms, has_aux=True))(PARAMS1, CLIP4, SENSOR, NOISE)
+    (exact, _), wanted = stage1_terms()(PARAMS1, CLIP4, SENSOR, NOISE)
+    assert value.dtype == jnp.float32
+    assert 0 < abs(float(value - exact)) < 5e-3 * float(exact)
+    norm = lambda tree: float(jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree))))  # noqa: E731
+    assert norm(jax.tree.map(jnp.subtract, grads, wanted)) < 0.03 * norm(wanted)
+
+
+def test_jit_equals_no_jit():
+    batch = TouchBatch(pixels(2, 1), np.asarray([0, 3], np.int32))
+    loss = partial(objectives.stage1_loss, net=NET1, config=CONFIG1)
+    args = (PARAMS1, batch, jax.random.key(5), jnp.float32(0.5))
+    (jitted, metrics), (plain, others) = jax.jit(loss)(*args), loss(*args)
+    np.testing.assert_allclose(jitted, plain, rtol=1e-6)
+    assert metrics.keys() == others.keys() and float(metrics["p_u"]) == 0.375
+
+
+# Stage 2 ------------------------------------------------------------------------------------------------------------
+
+
+def align_batch():
+    """Four touches; images of rows 2 and 0, texts of rows 3, 2 and 1... and one slot of each that is not used."""
+    text = jnp.asarray(RNG.integers(1, 40, (4, 8)), jnp.int32).at[:, 5:].set(49)
+    mask = jnp.asarray([[True] * 6 + [False] * 2] * 4)
+    rows = jnp.asarray([2, 0, 4]), jnp.asarray([3, 2, 4, 0])
+    return AlignBatch(floats(4, 3), SENSOR, floats(3), rows[0], text, mask, rows[1])
+
+
+def match_batch():
+    return MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR[::-1], floats(4, 1), SENSOR)
+
+
+ALIGN, MATCH = align_batch(), match_batch()
+FUNCTION2 = partial(objectives.stage2_terms, noise=None, net=NET2, config=CONFIG2)
+TERMS2 = jax.jit(jax.value_and_grad(FUNCTION2, has_aux=True))
+
+
+def terms2(align=ALIGN, params=PARAMS2):
+    return TERMS2(params, Stage2Batch(align, MATCH))
+
+
+def close(a, b):
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=1e-6), a, b)
+
+
+def test_packed_slots_reach_their_rows():
+    z = jax.jit(partial(objectives.align_embeddings, net=NET2))(PARAMS2, ALIGN)
+    assert z.has_image.tolist() == [True, False, True, False] and z.has_text.tolist() == [True, False, True, True]
+    unit = lambda x: np.asarray(x) / np.linalg.norm(x, axis=-1, keepdims=True)  # noqa: E731
+    image, text = unit(embed_image()), unit(embed_text())
+    for row, slot in ((2, 0), (0, 1)):
+        np.testing.assert_allclose(z.image[row], image[slot], atol=1e-5)
+    for row, slot in ((3, 0), (2, 1), (0, 3)):
+        np.testing.assert_allclose(z.text[row], text[slot], atol=1e-5)
+    assert not np.asarray(z.image)[[1, 3]].any() and not np.asarray(z.text)[1].any()
+    (_, metrics), _ = terms2()
+    wanted = {
+        "touch_to_vision": loop(z.touch, z.image, [0, 2]),
+        "vision_to_text": loop(z.image, z.text, [0, 2]),
+        "text_to_touch": loop(z.text, z.touch, [0, 2, 3]),
+    }
+    for name, value in wanted.items():
+        np.testing.assert_allclose(metrics[name], value, rtol=1e-4)
+    assert [int(metrics[f"{p}_pairs"]) for p in ("touch_vision", "touch_text", "vision_text")] == [2, 3, 2]
+
+
+def embed_image():
+    return np.asarray(jax.jit(lambda p, x: NET2.apply(p, "embed_image", x))(PARAMS2, ALIGN.image))
+
+
+def embed_text():
+    return np.asarray(jax.jit(lambda p, *x: NET2.apply(p, "embed_text", *x))(PARAMS2, ALIGN.text, ALIGN.text_mask))
+
+
+def loop(a, b, rows):
+    """InfoNCE over the rows that are there, written out."""
+    a, b = np.asarray(a, np.float64)[rows], np.asarray(b, np.float64)[rows]
+    logits = a @ b.T / 0.07
+    return float(np.mean([np.log(np.exp(row - row[i]).sum()) for i, row in enumerate(logits)]))
+
+
+def test_garbage_in_unused_slots_changes_nothing():
+    spoilt = ALIGN._replace(
+        image=ALIGN.image.at[2].set(jnp.nan),
+        text=ALIGN.text.at[2].set(1_000_000),
+        text_mask=ALIGN.text_mask.at[2].set(False),
+    )
+    jax.tree.map(np.testing.assert_array_equal, terms2(spoilt), terms2())
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(terms2(spoilt)))
+
+
+def test_the_order_of_the_slots_changes_nothing():
+    i, t = jnp.asarray([2, 0, 1]), jnp.asarray([3, 1, 0, 2])
+    moved = ALIGN._replace(
+        image=ALIGN.image[i], image_row=ALIGN.image_row[i],
+        text=ALIGN.text[t], text_mask=ALIGN.text_mask[t], text_row=ALIGN.text_row[t],
+    )  # fmt: skip
+    close(terms2(moved), terms2())
+
+
+def test_towers_that_nothing_is_shown_to_cost_nothing_and_need_not_exist():
+    none = ALIGN._replace(
+        image=ALIGN.image[:0], image_row=ALIGN.image_row[:0],
+        text=ALIGN.text[:0], text_mask=ALIGN.text_mask[:0], text_row=ALIGN.text_row[:0],
+    )  # fmt: skip
+    terms = lambda p, b: objectives.stage2_terms(p, Stage2Batch(b, None), None, net=NET2, config=CONFIG2)  # noqa: E731
+    touch = {name: PARAMS2[name] for name in ("touch", "logit_scale")}  # no towers, no decoder, no matching head
+    encode = flops(lambda p: NET2.apply(p, "encode", ALIGN.clip, SENSOR), touch)
+    assert flops(terms, touch, none) < 1.02 * encode
+    assert flops(terms, PARAMS2, ALIGN) > 1.3 * encode
+    loss, metrics = terms(touch, none)
+    assert float(loss) == 0 and set(metrics) == {"align", "temperature"}
+
+
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+def test_the_weights_of_the_sum(recipe):
+    config = tiny_config(2, recipe)
+    net = build(config.model)
+    params = net.init(jax.random.key(1))
+    terms = jax.jit(partial(objectives.stage2_terms, net=net, config=config))
+    align = ALIGN._replace(clip=CLIP4)
+    total, m = terms(params, Stage2Batch(align, MATCH), NOISE)
+    text = {"paper": 0.5, "release": 1.0}[recipe]  # the release does not halve the touch-text pair (golden Q9)
+    by_hand = (
+        0.5 * (m["touch_to_vision"] + m["vision_to_touch"])
+        + text * (m["touch_to_text"] + m["text_to_touch"])
+        + 0.1 * (m["vision_to_text"] + m["text_to_vision"])
+    )
+    np.testing.assert_allclose(m["align"], by_hand, rtol=1e-6)
+    pixel_loss = m["reconstruction"] + m["next_frame"] if recipe == "release" else 0.0
+    assert ("reconstruction" in m) == (recipe == "release")
+    np.testing.assert_allclose(total, by_hand + 0.1 * m["match"] + pixel_loss, rtol=1e-6)
+    np.testing.assert_allclose(m["temperature"], 0.07, rtol=1e-6)
+    assert 0 <= float(m["match_accuracy"]) <= 1
+
+
+def test_matching_in_one_pass_equals_three_passes():
+    logits = jax.jit(partial(objectives.match_logits, net=NET2))(PARAMS2, MATCH)
+    encode = jax.jit(lambda p, c, s: NET2.apply(p, "encode", c, s))
+    z = [encode(PARAMS2, c, s) for c, s in zip(MATCH[::2], MATCH[1::2], strict=True)]
+    z = [x / jnp.linalg.norm(x, axis=1, keepdims=True) for x in z]
+    for logit, other in zip(logits, z[1:], strict=True):
+        np.testing.assert_allclose(logit, NET2.apply(PARAMS2, "match", z[0], other), rtol=1e-4, atol=1e-5)
+    loss = np.log1p(np.exp(-np.asarray(logits[0]))).mean() + np.log1p(np.exp(np.asarray(logits[1]))).mean()
+    (_, metrics), _ = terms2()
+    np.testing.assert_allclose(metrics["match"], loss, rtol=1e-5)
+
+
+def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
+    terms = lambda p, b: objectives.stage2_terms(p, b, None, net=NET2, config=CONFIG2)[0]  # noqa: E731
+    both = flops(terms, PARAMS2, Stage2Batch(ALIGN, MATCH))
+    headless = {name: value for name, value in PARAMS2.items() if name != "matcher"}
+    align = flops(terms, headless, Stage2Batch(ALIGN, None))
+    touch = {name: PARAMS2[name] for name in ("touch", "matcher")}
+    match = flops(terms, touch, Stage2Batch(None, MATCH))
+    assert both == pytest.approx(align + match, rel=0.01) and match > 0.2 * both
+
+
+# Universal tokens ---------------------------------------------------------------------------------------------------
+
+
+def drawn(monkeypatch, config, progress, rows=64):
+    """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each (rows,)."""
+    seen = {}
+
+    def spy(params, batch, noise, *, net, config, decoder_sensor):
+        seen["rows"] = (batch.align.sensor, *batch.match[1::2])
+        seen["own"] = decoder_sensor
+        return jnp.zeros(()), {}
+
+    monkeypatch.setattr(objectives, "stage2_terms", spy)
+    one, sensor = np.zeros((rows, 1, 28, 28, 3), np.uint8), np.full(rows, 2, np.int32)
+    empty = np.zeros((0, 28, 28, 3), np.uint8), np.zeros(0, np.int32)
+    text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), np.zeros(0, np.int32)
+    batch = Stage2Batch(AlignBatch(one, sensor, *empty, *text), MatchBatch(*(one, sensor) * 3))
+    objectives.stage2_loss({}, batch, jax.random.key(3), jnp.float32(progress), net=NET2, config=config)
+    np.testing.assert_array_equal(seen["own"], sensor)  # the decoder is told the sensor's own tokens
+    return [np.asarray(x) for x in seen["rows"]]
+
+
+def test_the_draw_of_universal_tokens(monkeypatch):
+    for rows in drawn(monkeypatch, CONFIG2, 0.0):
+        assert (rows == 2).all()
+    align, anchor, positive, negative = drawn(monkeypatch, CONFIG2, 1.0)
+    for rows in (align, anchor, positive, negative):
+        assert set(rows.tolist()) == {2, 9} and 0.55 < (rows == 9).mean() < 0.92  # p_u = 0.75 at the end
+    assert (anchor != positive).any() and (anchor != negative).any() and (align != anchor).any()
+    _, anchor, positive, negative = drawn(monkeypatch, tiny_config(2, "release"), 1.0)
+    assert (anchor == positive).all() and (anchor == negative).all() and set(anchor.tolist()) == {2, 9}
+
+
+def test_at_the_start_no_universal_token_is_touched():
+    batch = TouchBatch(pixels(2, 1), np.asarray([0, 3], np.int32))
+    loss = jax.jit(jax.grad(lambda *a: objectives.stage1_loss(*a, net=NET1, config=CONFIG1)[0]))
+    for progress, used in ((0.0, [0, 3]), (1e6, [9])):
+        grad = loss(PARAMS1, batch, jax.random.key(1), jnp.float32(progress))["touch"]["sensor_tokens"]
+        assert np.flatnonzero(np.abs(np.asarray(grad)).max(axis=(1, 2))).tolist() == used
+
+
+# The real step ------------------------------------------------------------------------------------------------------
+
+
+def real_config(stage):
+    config = tiny_config(stage)
+    return replace(
+        config,
+        optim=replace(config.optim, learning_rate=6e-3 if stage == 1 else 2e-3, warmup=1),
+        run=replace(config.run, steps=100),
+    )
+
+
+def real_batch(stage):
+    rng = np.random.default_rng(7)
+    draw = lambda *shape: rng.integers(0, 256, (*shape, 28, 28, 3), np.uint8)  # noqa: E731
+    sensor = np.asarray([0, 1, 3, 0, 1, 3, 0, 1], np.int32)
+    if stage == 1:
+        smooth = np.repeat(np.repeat(rng.integers(0, 256, (8, 4, 2, 2, 3), np.uint8), 14, 2), 14, 3)
+        return TouchBatch(smooth, sensor)
+    text = rng.integers(1, 40, (4, 8)).astype(np.int32)
+    text[:, 6:] = 49
+    rows = np.asarray([1, 4, 6, 8], np.int32), np.asarray([1, 2, 4, 7], np.int32)
+    align = AlignBatch(draw(8, 1), sensor, draw(4), rows[0], text, text < 100, rows[1])
+    return Stage2Batch(align, MatchBatch(draw(8, 1), sensor, draw(8, 1), sensor[::-1].copy(), draw(8, 1), sensor))
+
+
+@cache
+def real_step(stage, devices=1):
+    """(compiled step, first state, placed batch) on a mesh of so many devices."""
+    config = real_config(stage)
+    net = build(config.model)
+    loss = objectives.stage1_loss if stage == 1 else objectives.stage2_loss
+    mesh = make_mesh(devices=jax.devices()[:devices])
+    state = jax.device_put(init_state(net.init(jax.random.key(2)), config), replicated(mesh))
+    step = jax.jit(
+        make_step(partial(loss, net=net, config=config), optimizer(config), total_steps=config.run.steps),
+        out_shardings=replicated(mesh),
+    )
+    key = jax.device_put(jax.random.key(0), replicated(mesh))
+    return step, state, lambda batch: put_batch(batch, batch_sharding(mesh)), key
+
+
+def steps(stage, devices, count, batch=None):
+    step, state, place, key = real_step(stage, devices)
+    batch, values = place(real_batch(stage) if batch is None else batch), []
+    for _ in range(count):
+        state, metrics = step(state, batch, key)
+        values.append(metrics)
+    return state, jax.device_get(values)
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_the_loss_falls_on_a_fixed_batch(stage):
+    _, found = steps(stage, 1, 40)
+    losses = [row["loss"] for row in found]
+    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5]), losses
+    assert not any(row["skipped"] for row in found)
+    if stage == 2:
+        assert found[-1]["match"] < found[0]["match"] and found[-1]["align"] < found[0]["align"]
+
+
+@pytest.mark.parametrize("devices", [2, 4])
+@pytest.mark.parametrize("stage", [1, 2])
+def test_devices_share_the_batch_and_change_nothing(stage, devices):
+    (one, wanted), (many, found) = steps(stage, 1, 2), steps(stage, devices, 2)
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(a["loss"], b["loss"], rtol=1e-5)
+        np.testing.assert_allclose(a["grad_norm"], b["grad_norm"], rtol=1e-4)
+    params = [flatten_names(merge(state.trainable, state.frozen)) for state in (many, one)]
+    for name, value in params[1].items():
+        # A key's bias has no gradient but rounding noise, which Adam blows up to a step of the learning rate.
+        noise = 2 * real_config(stage).optim.learning_rate if name.endswith("key/bias") else 1e-5
+        np.testing.assert_allclose(params[0][name], value, rtol=0, atol=noise, err_msg=name)
+    first = flatten_names(real_step(stage)[1].trainable)["touch/patch/kernel"]
+    moved = np.asarray(params[0]["touch/patch/kernel"]) - np.asarray(first)
+    assert np.abs(moved).max() > 1e-4
+
+
+def test_a_sensor_outside_the_table_skips_the_step_and_counts_it():
+    batch = real_batch(1)
+    wrong = batch._replace(sensor=np.where(np.arange(8) == 5, 10, batch.sensor).astype(np.int32))
+    _, start, _, _ = real_step(1)
+    state, (row,) = steps(1, 1, 1, wrong)
+    assert row["skipped"] == 1 and row["update_norm"] == 0 and not np.isfinite(row["loss"])
+    jax.tree.map(np.testing.assert_array_equal, (state.trainable, state.opt_state), (start.trainable, start.opt_state))
+    assert int(state.step) == 1

@@ -1,0 +1,226 @@
+"""Whole runs on a small world on disk: stage 1, then stage 2 from it, resumed, refused, started from other weights."""
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
+
+from anytouch_jax.config import SENSORS, UserError, from_json
+from anytouch_jax.data import text as texts
+from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.functional import build
+from anytouch_jax.train.optim import flatten_names
+
+
+@pytest.fixture(autouse=True)
+def _compiled_once(compiled_once):
+    """Most runs here share their programs."""
+
+
+@pytest.fixture(scope="session")
+def straight(tmp_path_factory, world, compiled_once):
+    """Stage 1, four steps at once: (run folder, result)."""
+    run = tmp_path_factory.mktemp("straight") / "run"
+    return run, train(run_config(world), run)
+
+
+def clips_only(config):
+    """Stage 2 on clips alone: one program instead of two."""
+    return replace(config, data=replace(config.data, clip_share=1.0))
+
+
+# Stage 1 ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_folder(straight, world):
+    run, result = straight
+    assert (result.step, result.traces) == (4, 2)  # stills and clips
+    assert from_json((run / "config.json").read_text()) == run_config(world)
+    lines = read_metrics(run)
+    assert [line["step"] for line in lines] == [0, 1, 2, 3]
+    assert ["next_frame" in line for line in lines] == [False, True, False, True]
+    assert [line["p_u"] for line in lines] == [0.0, 0.1875, 0.375, 0.5625]
+    assert all(line["loss"] > 0 and line["skipped"] == 0 and line["samples"] == 8 for line in lines)
+    told = checkpoint.read_metadata(run)
+    assert told["sensors"] == list(SENSORS) and told["source"] == {"init": None, "clip": None}
+    assert told["preprocessing"]["touch"]["size"] == 28 and told["preprocessing"]["touch"]["channels"] == "RGB"
+
+
+def test_stopping_and_going_on_is_bit_for_bit_one_run(straight, world, tmp_path):
+    run, result = straight
+    said = []
+    config = replace(run_config(world), run=replace(run_config(world).run, figure_every=4))
+    first = train(config, tmp_path / "r", stop_after=2)
+    assert (first.step, saved_steps(tmp_path / "r")) == (2, [2])
+    second = train(config, tmp_path / "r", said)
+    assert second.resumed == 2 and "going on from the checkpoint of step 2" in said
+    wanted, found = arrays_of(result), arrays_of(second)
+    assert found.keys() == wanted.keys() and any(name.startswith("opt_state/moments") for name in found)
+    for name, array in wanted.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    assert read_metrics(tmp_path / "r") == read_metrics(run)
+    figures = sorted((tmp_path / "r" / "figures").iterdir())  # at the end of each part
+    assert [figure.name for figure in figures] == ["reconstruction_000002.png", "reconstruction_000004.png"]
+    assert all(figure.stat().st_size > 1000 for figure in figures)
+    assert train(config, tmp_path / "r", said).step == 4 and "nothing to do" in said[-1]
+
+
+def refused(config, run, **options):
+    """The one sentence that a mistake is answered with; nothing of the run is touched."""
+    with pytest.raises(UserError) as error:
+        train(config, run, **options)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_another_preset_in_the_same_folder_is_refused(straight, world):
+    run, _ = straight
+    before = (run / "config.json").read_bytes(), saved_steps(run)
+    told = refused(run_config(world, model={"embed": 16}), run)
+    assert "model.embed was 12 and is now 16" in told and str(run) in told
+    assert "stage" in refused(run_config(world, 2), run)
+    assert ((run / "config.json").read_bytes(), saved_steps(run)) == before
+
+
+# Stage 2 ------------------------------------------------------------------------------------------------------------
+
+
+def parts(params, *names):
+    return flatten_names({name: params[name] for name in names})
+
+
+def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp_path):
+    run, stage1 = straight
+    config, said = clips_only(run_config(world, 2)), []
+    first = train(config, tmp_path / "r", said, init=run, stop_after=1)
+    # the learning rate of step 0 is 0: what stage 1 learned is still whole
+    for name, array in parts(stage1.params, "touch", "decoder").items():
+        np.testing.assert_array_equal(parts(first.params, "touch", "decoder")[name], array, err_msg=name)
+    assert not any("without a stage-1 run" in line for line in said)
+
+    tokenizer = (tmp_path / "r" / "tokenizer.json").read_bytes()
+    vocabulary = texts.load(tmp_path / "r" / "tokenizer.json").vocab_size
+    assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == vocabulary < 2048
+    assert first.params["text"]["token"].shape == (vocabulary, 16)
+
+    last = train(config, tmp_path / "r", said, init=run)
+    assert (last.resumed, last.step, last.traces) == (1, 4, 1)
+    assert (tmp_path / "r" / "tokenizer.json").read_bytes() == tokenizer
+    lines = read_metrics(tmp_path / "r")
+    assert [line["step"] for line in lines] == [0, 1, 2, 3]
+    for line in lines:
+        assert line["align"] > 0 and line["match"] > 0 and "reconstruction" not in line
+        assert line["touch_text_pairs"] > 0 and line["touch_vision_pairs"] > 0
+        assert line["loss"] == pytest.approx(line["align"] + 0.1 * line["match"], rel=1e-5)
+    moved = parts(last.params, "touch", "image", "text", "matcher", "logit_scale")
+    same = {n for n, a in parts(first.params, "touch", "image", "text", "matcher", "logit_scale").items()
+            if np.array_equal(a, moved[n])}  # fmt: skip
+    assert same == set()
+    source = checkpoint.read_metadata(tmp_path / "r")["source"]
+    assert source == {"init": str(run), "clip": None}
+
+
+def test_stage_two_of_the_release(straight, world, tmp_path):
+    run, _ = straight
+    config = clips_only(run_config(world, 2, "release"))
+    result = train(config, tmp_path / "r", init=run)
+    lines = read_metrics(tmp_path / "r")
+    kinds = {("align" in line, "match" in line, "reconstruction" in line, "next_frame" in line) for line in lines}
+    assert kinds == {(True, False, True, True), (False, True, False, False)}  # never both in a step
+    assert {line["samples"] for line in lines} == {8, 4} and result.traces == 2
+    for line in lines:
+        sum_ = line.get("align", 0) + line.get("reconstruction", 0) + line.get("next_frame", 0)
+        assert line["loss"] == pytest.approx(sum_ + 0.1 * line.get("match", 0), rel=1e-5)
+
+
+def clip_folder(folder, config):
+    """Weights and tokenizer as CLIP's download has them, of the smallest towers."""
+    tokenizer = texts.train(["a round thing", "an edge", "smooth and hard"], 300)
+    tokenizer.save(folder)
+    model = replace(config.model, text=replace(config.model.text, vocab=tokenizer.vocab_size))
+    params = build(model).init(jax.random.key(9))
+    plain = replace(model, lora_rank=0)
+    full = release.to_release({n: p for n, p in params.items() if n != "lora"}, plain, allow_extra=True)
+    keys = release.release_names(plain, "clip")
+    release.write_safetensors(folder / "model.safetensors", {key: full[key] for key in keys}, {"format": "pt"})
+    return replace(config, model=model), params
+
+
+def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora(straight, world, tmp_path):
+    config, clip = clip_folder(tmp_path / "clip", clips_only(run_config(world, 2, towers="pretrained", steps=4)))
+    result = train(config, tmp_path / "r", init=straight[0], clip=tmp_path / "clip", stop_after=3)
+    assert (tmp_path / "r" / "tokenizer.json").exists()
+    for name, array in parts(clip, "image", "text").items():  # frozen, and CLIP's own
+        np.testing.assert_array_equal(parts(result.params, "image", "text")[name], array, err_msg=name)
+    lora = parts(result.params, "lora")
+    assert all(np.any(np.asarray(array)) for array in lora.values())  # b starts at zero, so it has learned
+    assert all(line["align"] > 0 for line in read_metrics(tmp_path / "r"))
+    assert "model.bin" in refused(config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin")
+
+
+def test_stage_one_starts_its_touch_encoder_from_clip(world, tmp_path):
+    _, clip = clip_folder(tmp_path / "clip", run_config(world, 2))
+    result = train(run_config(world), tmp_path / "r", clip=tmp_path / "clip", stop_after=0)
+    touch = result.params["touch"]
+    np.testing.assert_array_equal(touch["position"], clip["image"]["position"])
+    for frame in np.asarray(touch["patch"]["kernel"]):  # repeated, not divided (golden Q1)
+        np.testing.assert_array_equal(frame, clip["image"]["patch"]["kernel"])
+
+
+# Mistakes -----------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
+    run, _ = straight
+    stage2 = run_config(world, 2)
+    assert "no run folder or weights file" in refused(stage2, tmp_path / "a", init=tmp_path / "gone")
+    (tmp_path / "empty").mkdir()
+    assert str(tmp_path / "empty") in refused(stage2, tmp_path / "a", init=tmp_path / "empty")
+    other = run_config(world, 2, model={"embed": 16})
+    assert "touch/projection/kernel has (16, 12) instead of (16, 16)" in refused(other, tmp_path / "b", init=run)
+    pretrained = run_config(world, 2, towers="pretrained")
+    assert "--clip" in refused(pretrained, tmp_path / "c")
+    assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")
+    texts.train(["a"], 300).save(tmp_path / "empty")
+    assert "no weights" in refused(pretrained, tmp_path / "d", clip=tmp_path / "empty")
+    assert not (tmp_path / "a").exists() or not saved_steps_if_any(tmp_path / "a")
+
+
+def saved_steps_if_any(run):
+    return saved_steps(run) if (run / "checkpoints").exists() else []
+
+
+def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):
+    assert "4 devices" in refused(run_config(world, batch=6), tmp_path / "r")
+
+
+def test_without_captions_and_photographs_stage_two_still_matches(world, tmp_path):
+    """No tokenizer is needed, none is written, and no text tower is asked for anything."""
+    rows = [{**row, "text": "", "image_path": ""} for row in read_rows(world)]
+    columns = tuple(rows[0])
+    manifest = write_manifest(world.parent / "bare.csv", [[row[c] for c in columns] for row in rows], columns)
+    result = train(clips_only(run_config(manifest, 2)), tmp_path / "r", stop_after=1)
+    assert not (tmp_path / "r" / "tokenizer.json").exists()
+    (line,) = read_metrics(tmp_path / "r")
+    assert line["match"] > 0 and line["align"] == 0 and result.step == 1
+
+
+# Sensors ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("place", [len(SENSORS), 2], ids=["last", "in the middle"])
+def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path, place):
+    run, stage1 = straight
+    names = (*SENSORS[:place], "new_sensor", *SENSORS[place:])
+    config = clips_only(run_config(world, 2, model={"sensors": names}))
+    tokens = train(config, tmp_path / "r", init=run, stop_after=0).params["touch"]["sensor_tokens"]
+    old = dict(zip(SENSORS, np.asarray(stage1.params["touch"]["sensor_tokens"]), strict=True))
+    new = dict(zip(names, np.asarray(tokens), strict=True))
+    for name in SENSORS:
+        np.testing.assert_array_equal(new[name], old[name], err_msg=name)
+    np.testing.assert_array_equal(new["new_sensor"], old["universal"])
+    assert json.loads((tmp_path / "r" / "config.json").read_text())["model"]["sensors"] == list(names)

@@ -15,11 +15,30 @@ from runs import read_rows, write_manifest
 from anytouch_jax.cli import _COMMANDS, main
 from anytouch_jax.evaluate.features import load_encoder
 
-SIZES = """
-    --model.image-size 28 --model.patch 7 --model.embed 12 --model.touch.width 16 --model.touch.depth 2
-    --model.touch.heads 2 --model.touch.mlp 32 --model.decoder.width 8 --model.decoder.depth 1
-    --model.decoder.heads 2 --model.decoder.mlp 16
-""".split()
+SIZES = [
+    "--model.image-size",
+    "28",
+    "--model.patch",
+    "7",
+    "--model.embed",
+    "12",
+    "--model.touch.width",
+    "16",
+    "--model.touch.depth",
+    "2",
+    "--model.touch.heads",
+    "2",
+    "--model.touch.mlp",
+    "32",
+    "--model.decoder.width",
+    "8",
+    "--model.decoder.depth",
+    "1",
+    "--model.decoder.heads",
+    "2",
+    "--model.decoder.mlp",
+    "16",
+]
 
 
 @pytest.fixture(autouse=True)

@@ -1,14 +1,10 @@
 """CLIP's towers: causality, padding, the pooled token, LoRA."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from tiny_models import full_model
 
 from anytouch_jax.nn.functional import build

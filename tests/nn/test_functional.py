@@ -1,14 +1,9 @@
 """Building networks: shapes without memory, reproducible first values, parts that do not exist."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from tiny_models import full_model, touch_model
 
 from anytouch_jax.config import preset

@@ -1,13 +1,8 @@
 """Layers against plain formulas, and the scanned stack against the loop."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from tiny_models import STACK, touch_model
 
 from anytouch_jax.nn.functional import build

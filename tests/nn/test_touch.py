@@ -1,14 +1,9 @@
 """The touch encoder and decoder: what they see, what they cannot see, what they cost."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from tiny_models import touch_model
 
 from anytouch_jax.nn.functional import build

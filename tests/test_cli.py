@@ -8,12 +8,18 @@ import sys
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 import pytest
 from runs import read_rows, write_manifest
+from tiny_models import touch_model
 
 from anytouch_jax.cli import _COMMANDS, main
+from anytouch_jax.config import SENSORS, to_json
 from anytouch_jax.evaluate.features import load_encoder
+from anytouch_jax.io import release
+from anytouch_jax.io.checkpoint import export_safetensors
+from anytouch_jax.nn.functional import build
 
 SIZES = [
     "--model.image-size",
@@ -299,6 +305,25 @@ def test_convert_to_the_authors_names_and_back(tmp_path, tiny_run, capsys):
     expected = load_encoder(tiny_run).embed(clip, "digit")
     for path in (theirs, ours, again):  # two heads of width 8: the shapes alone would tell one head
         np.testing.assert_array_equal(load_encoder(path).embed(clip, "digit"), expected)
+
+
+def test_convert_brings_the_universal_tokens_to_the_last_row(tmp_path):
+    # A sensor added at the end of the table stands behind them; the authors' code reads the last row.
+    model = touch_model(sensors=(*SENSORS, "mine"))
+    params = build(model).init(jax.random.key(0))
+    export_safetensors(tmp_path / "own.safetensors", params, {release.MODEL_KEY: to_json(model)})
+    assert run("convert", tmp_path / "own.safetensors", tmp_path / "theirs.safetensors") == 0
+    table = release.read_weights(tmp_path / "theirs.safetensors")["sensor_token"]
+    np.testing.assert_array_equal(table[-1], params["touch"]["sensor_tokens"][SENSORS.index("universal")])
+    np.testing.assert_array_equal(table[-2], params["touch"]["sensor_tokens"][-1])
+    assert load_encoder(tmp_path / "theirs.safetensors").sensor_row("mine") == len(SENSORS) - 1
+
+
+def test_a_reader_that_goes_away_is_no_traceback():
+    ended = subprocess.run(
+        f"{sys.executable} -m anytouch_jax --help | true", shell=True, capture_output=True, text=True, check=False
+    )
+    assert "Traceback" not in ended.stderr
 
 
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys, tmp_path):

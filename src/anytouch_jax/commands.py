@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table
 
-from anytouch_jax.config import Config, UserError
+from anytouch_jax.config import UNIVERSAL, Config, Model, UserError
 
 if TYPE_CHECKING:
     from anytouch_jax import cli
@@ -165,6 +166,8 @@ def convert(options: cli.Convert) -> int:
         weights = release.read_weights(source)
         model = release.model_of(source, weights)
         params = release.to_params(weights, model)
+    if options.names == "release" and model.sensors[-1] != UNIVERSAL:
+        params, model = _universal_last(params, model)
     about = {"source": str(source), release.MODEL_KEY: to_json(model)}
     if options.names == "own":
         checkpoint.export_safetensors(options.target, params, about)
@@ -175,3 +178,12 @@ def convert(options: cli.Convert) -> int:
         release.write_safetensors(options.target, arrays, about | {"format": "pt"})
     print(f"{options.target}: written")
     return 0
+
+
+def _universal_last(params: dict[str, Any], model: Model) -> tuple[dict[str, Any], Model]:
+    """The same model with its universal tokens in the last row, where the authors' code looks for them (id -1)."""
+    from anytouch_jax.io import release
+
+    names = (*(name for name in model.sensors if name != UNIVERSAL), UNIVERSAL)
+    rows = release.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
+    return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(model, sensors=names)

@@ -24,7 +24,7 @@ _VIDEOS = (".avi", ".mp4", ".mov", ".mkv", ".webm", ".m4v")
 
 def say(sentence: str) -> None:
     """Tell the user something that is not a result: on standard error."""
-    Console(stderr=True, highlight=False).print(sentence, markup=False)
+    Console(stderr=True, highlight=False).print(sentence, markup=False, soft_wrap=True)
 
 
 def train(options: cli.Train, config: Config) -> int:

@@ -220,12 +220,13 @@ record["slip"] = json.loads(results.to_json(slips))
 # %% [markdown]
 # ## Finding
 #
-# Stage 1 paints hidden patches with little more than half of the error of the plain guess. It predicts the next frame far worse than a
-# copy of the last one: the copy has all pixels, the encoder a quarter of them, and neighbouring frames hardly differ.
-# The object probe cannot tell the encoders apart: the test split has 14 recordings, every paired interval contains zero, and even the
-# encoder that was trained with labels does no better on them than an untrained one; objects of recordings that repeat
-# a grasp are found by set-up (dots, tint), which raw pixels show best. Slip with objects left out stays within the
-# interval of the commonest flag for every feature. A small pack trains and shows the machinery; it does not rank encoders.
+# Stage 1 paints hidden patches with little more than half of the error of the plain guess. It predicts the next frame
+# far worse than a copy of the last one: the copy has all pixels, the encoder a quarter of them, and neighbouring
+# frames hardly differ. The object probe cannot tell the encoders apart: the test split has 14 recordings, every paired
+# interval contains zero, and even the encoder that was trained with labels does no better on them than an untrained
+# one. Set-up (dots, tint) and object are partly confounded in the pack, and raw pixels see the set-up. Slip with objects
+# left out stays within its interval of the commonest flag for every feature. So the pack trains and exercises both
+# stages; it is too small to rank encoders.
 
 # %%
 from anytouch_jax.train.record import write_atomic  # noqa: E402

@@ -224,7 +224,7 @@ record["slip"] = json.loads(results.to_json(slips))
 # far worse than a copy of the last one: the copy has all pixels, the encoder a quarter of them, and neighbouring
 # frames hardly differ. The object probe cannot tell the encoders apart: the test split has 14 recordings, every paired
 # interval contains zero, and even the encoder that was trained with labels does no better on them than an untrained
-# one. Set-up (dots, tint) and object are partly confounded in the pack, and raw pixels see the set-up. Slip with objects
+# one. Set-up (dots, tint) and object are partly confounded in the pack, and raw pixels see it. Slip with objects
 # left out stays within its interval of the commonest flag for every feature. So the pack trains and exercises both
 # stages; it is too small to rank encoders.
 

@@ -285,10 +285,14 @@ def test_a_second_interrupt_is_not_held_back(tmp_path):
                 signal.raise_signal(signal.SIGINT)
             yield step, batch, info
 
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, batches=batches)
-    assert signal.getsignal(signal.SIGINT) is before
+    # Workers of pytest-xdist ignore SIGINT; a program does not.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, batches=batches)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_it_runs_outside_the_main_thread(tmp_path):

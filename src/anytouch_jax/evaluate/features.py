@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -25,6 +26,10 @@ Join = Literal["mean", "sum", "concat"]
 Say = Callable[[str], None]
 
 
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=4)
+
+
 @dataclass(frozen=True)
 class Encoder:
     """A touch encoder with its parameters. `source` says where they came from."""
@@ -37,7 +42,7 @@ class Encoder:
     def net(self) -> Net:
         return build(self.config.model)
 
-    def sensor_row(self, name: str, say: Say = lambda _: None) -> int:
+    def sensor_row(self, name: str, say: Say = _warn) -> int:
         """Row of a sensor's tokens; the universal ones for a sensor that the table does not have, said aloud."""
         model = self.config.model
         if name in model.sensors:
@@ -146,7 +151,7 @@ def embed_rows(
     join: Join = "mean",
     *,
     batch: int = 64,
-    say: Say = lambda _: None,
+    say: Say = _warn,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(row numbers, features) of manifest rows, each frame encoded once; `frames` is the length of a row's clip.
 

@@ -152,7 +152,8 @@ def close(a, b):
 
 
 def test_packed_slots_reach_their_rows():
-    z = jax.jit(partial(objectives.align_embeddings, net=NET2))(PARAMS2, ALIGN)
+    (touch,) = objectives.touch_embeddings(PARAMS2, [(ALIGN.clip, ALIGN.sensor)], net=NET2)
+    z = jax.jit(partial(objectives.align_embeddings, net=NET2))(PARAMS2, ALIGN, touch)
     assert z.has_image.tolist() == [True, False, True, False] and z.has_text.tolist() == [True, False, True, True]
     unit = lambda x: np.asarray(x) / np.linalg.norm(x, axis=-1, keepdims=True)  # noqa: E731
     image, text = unit(embed_image()), unit(embed_text())
@@ -242,14 +243,22 @@ def test_the_weights_of_the_sum(recipe):
     assert 0 <= float(m["match_accuracy"]) <= 1
 
 
-def test_matching_in_one_pass_equals_three_passes():
-    logits = jax.jit(partial(objectives.match_logits, net=NET2))(PARAMS2, MATCH)
+def test_touches_of_one_shape_share_a_pass_and_keep_their_rows():
     encode = jax.jit(lambda p, c, s: NET2.apply(p, "encode", c, s))
-    z = [encode(PARAMS2, c, s) for c, s in zip(MATCH[::2], MATCH[1::2], strict=True)]
-    z = [x / jnp.linalg.norm(x, axis=1, keepdims=True) for x in z]
-    for logit, other in zip(logits, z[1:], strict=True):
-        np.testing.assert_allclose(logit, NET2.apply(PARAMS2, "match", z[0], other), rtol=1e-4, atol=1e-5)
-    loss = np.log1p(np.exp(-np.asarray(logits[0]))).mean() + np.log1p(np.exp(np.asarray(logits[1]))).mean()
+    embed = jax.jit(partial(objectives.touch_embeddings, net=NET2))
+    touches = [*zip(MATCH[::2], MATCH[1::2], strict=True), (MATCH.clip[:2], MATCH.sensor[:2])]
+    z = embed(PARAMS2, touches)
+    for (clip, sensor), got in zip(touches, z, strict=True):
+        wanted = encode(PARAMS2, clip, sensor)
+        np.testing.assert_allclose(got, wanted / jnp.linalg.norm(wanted, axis=1, keepdims=True), rtol=1e-4, atol=1e-5)
+    scans = lambda touches: str(jax.make_jaxpr(embed)(PARAMS2, touches)).count(" scan[")  # noqa: E731
+    assert scans(touches) == 2 * scans(touches[:3]) == 2 * scans(touches[:1]) > 0
+
+
+def test_the_matching_loss_is_that_of_the_logits():
+    z = objectives.touch_embeddings(PARAMS2, list(zip(MATCH[::2], MATCH[1::2], strict=True)), net=NET2)
+    logits = [np.asarray(NET2.apply(PARAMS2, "match", z[0], other)) for other in z[1:]]
+    loss = np.log1p(np.exp(-logits[0])).mean() + np.log1p(np.exp(logits[1])).mean()
     (_, metrics), _ = terms2()
     np.testing.assert_allclose(metrics["match"], loss, rtol=1e-5)
 

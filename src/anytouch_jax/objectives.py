@@ -6,6 +6,7 @@ draw masks and sensor tokens from a key, then call the terms: what training runs
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -105,13 +106,29 @@ class Embeddings(NamedTuple):
     has_text: Array | None
 
 
-def align_embeddings(params: Params, batch: AlignBatch, *, net: Net) -> Embeddings:
-    """Embed the touches and the packed images and texts, scattered back to the rows they belong to.
+def touch_embeddings(params: Params, touches: Sequence[tuple[Array, Array]], *, net: Net) -> list[Array]:
+    """Unit-norm embeddings (B, E) of several batches of (clip (B, T, H, W, 3) float, sensor i32 (B,)).
+
+    Batches of one shape share a pass of the encoder: one stack to compile and larger products. They are interleaved row
+    by row, not chained, so that each row stays on its device.
+    """
+    z: list[Array] = [jnp.zeros(0)] * len(touches)
+    for shape in {clip.shape: None for clip, _ in touches}:
+        members = [i for i, (clip, _) in enumerate(touches) if clip.shape == shape]
+        clips, sensors = (jnp.stack(part, axis=1) for part in zip(*(touches[i] for i in members), strict=True))
+        flat = net.apply(params, "encode", clips.reshape(-1, *shape[1:]), sensors.reshape(-1))
+        each = losses.normalise(flat).reshape(shape[0], len(members), -1)
+        for j, i in enumerate(members):
+            z[i] = each[:, j]
+    return z
+
+
+def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Net) -> Embeddings:
+    """The embeddings `touch` (B, E) beside those of the packed images and texts, scattered to the rows they belong to.
 
     A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats. What an unused
     slot holds is replaced first: NaN would pass into the gradients although the slot's value is dropped.
     """
-    touch = losses.normalise(net.apply(params, "encode", batch.clip[:, : net.model.frames], batch.sensor))
     image = text = has_image = has_text = None
     if batch.image.shape[0]:
         used = (batch.image_row < len(touch))[:, None, None, None]
@@ -131,14 +148,6 @@ def _scatter(packed: Array, row: Array, rows: int) -> tuple[Array, Array]:
     return full, jnp.zeros(rows, bool).at[row].set(True, mode="drop")
 
 
-def match_logits(params: Params, batch: MatchBatch, *, net: Net) -> tuple[Array, Array]:
-    """Matching logits (B,) of anchor with positive and of anchor with negative (Eq. 5), in one pass over 3B touches."""
-    clips = jnp.concatenate([batch.clip, batch.positive, batch.negative])
-    sensors = jnp.concatenate([batch.sensor, batch.positive_sensor, batch.negative_sensor])
-    anchor, positive, negative = jnp.split(losses.normalise(net.apply(params, "encode", clips, sensors)), 3)
-    return net.apply(params, "match", anchor, positive), net.apply(params, "match", anchor, negative)
-
-
 def stage2_terms(
     params: Params,
     batch: Stage2Batch,
@@ -156,8 +165,9 @@ def stage2_terms(
     objective = config.objective
     total = jnp.zeros(())
     metrics: Metrics = {}
+    z_touch = touch_embeddings(params, _touches(batch, net.model.frames), net=net)
     if batch.align is not None:
-        z = align_embeddings(params, batch.align, net=net)
+        z = align_embeddings(params, batch.align, z_touch.pop(0), net=net)
         scale = net.apply(params, "scale")
         align, terms = losses.alignment_loss(
             z.touch, z.image, z.text, z.has_image, z.has_text, scale, objective.pair_weights, groups=objective.groups
@@ -175,12 +185,20 @@ def stage2_terms(
             )
             total, metrics = total + pixels, metrics | terms
     if batch.match is not None:
-        positive, negative = match_logits(params, batch.match, net=net)
+        z_anchor, z_positive, z_negative = z_touch
+        positive, negative = (net.apply(params, "match", z_anchor, z) for z in (z_positive, z_negative))  # Eq. 5
         match = losses.matching_loss(positive, negative)
         total = total + objective.match_weight * match
         right = jnp.concatenate([positive > 0, negative < 0])
         metrics |= {"match": match, "match_accuracy": jnp.mean(right.astype(jnp.float32))}
     return total, metrics
+
+
+def _touches(batch: Stage2Batch, frames: int) -> list[tuple[Array, Array]]:
+    """The touches that a batch embeds: those to align (without a next frame), then anchor, positive and negative."""
+    align, match = batch
+    touches = [] if align is None else [(align.clip[:, :frames], align.sensor)]
+    return touches + ([] if match is None else [(match[i], match[i + 1]) for i in (0, 2, 4)])
 
 
 def stage2_loss(

@@ -194,7 +194,8 @@ def _align_all(params: Params, inputs: Any, *, net: Net, config: Config) -> tupl
         params, Stage2Batch(batch, None), noise, net=net, config=config, decoder_sensor=target
     )
     hidden = masking.random_mask(noise, masking.kept(net.model.patches, config.objective.keep_ratio))[2]
-    return total, metrics, objectives.align_embeddings(params, batch, net=net), hidden
+    touch = losses.normalise(net.apply(params, "encode", batch.clip[:, : net.model.frames], batch.sensor))
+    return total, metrics, objectives.align_embeddings(params, batch, touch, net=net), hidden
 
 
 def _align_value(params: Params, inputs: Any, *, net: Net, config: Config) -> jax.Array:
@@ -287,10 +288,11 @@ def match(case: Case) -> None:
     clips = [channel_last(case.inputs(name)) for name in ("touch", "positive", "negative")]
     sensors = [table_rows(case.inputs(name), net) for name in ("sensor_type", "pos_sensors", "neg_sensors")]
     batch = MatchBatch(*(x for pair in zip(clips, sensors, strict=True) for x in pair))
-    for name, clip, sensor in zip(("touch", "positive", "negative"), clips, sensors, strict=True):
-        case.compare(f"out/{name}_embeds", losses.normalise(encode(params, clip, sensor, net=net)))
-    logits = jax.jit(partial(objectives.match_logits, net=net))(params, batch)
-    for name, logit in zip(("positive", "negative"), logits, strict=True):
-        case.compare(f"out/{name}_sim", logit)
+    touches = list(zip(clips, sensors, strict=True))
+    z = jax.jit(partial(objectives.touch_embeddings, net=net))(params, touches)
+    for name, embedding in zip(("touch", "positive", "negative"), z, strict=True):
+        case.compare(f"out/{name}_embeds", embedding)
+    for name, other in zip(("positive", "negative"), z[1:], strict=True):
+        case.compare(f"out/{name}_sim", net.apply(params, "match", z[0], other))
     case.compare("out/loss", jax.jit(partial(_match_value, net=net, config=config))(params, batch))
     _compare_gradients(case, _match_value, params, batch, batch, net, config)

@@ -5,166 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from anytouch_jax import __version__
-from anytouch_jax.config import Config, Data, Model, Objective, Optim, Run, UserError, preset
-
-Paths = tuple[Path, ...]
-
-
-@dataclass(frozen=True)
-class Train:
-    """Pre-train stage 1 (masked autoencoding, next frame) or stage 2 (alignment, matching), or go on with a run.
-
-    Example: anytouch train --stage 1 --data manifest.csv --run runs/stage1 --preset tiny --steps 800
-
-    The same command again goes on from the last checkpoint. `--help-all` lists every field of the configuration.
-    """
-
-    data: Paths
-    """Manifests (.csv or .parquet) to train on."""
-    run: Path
-    """Run folder: config.json, metrics.jsonl, checkpoints/, figures/."""
-    stage: Literal[1, 2] = 1
-    """1: pixels. 2: touch-vision-text alignment and cross-sensor matching."""
-    preset: Literal["tiny", "small", "base", "large"] = "tiny"
-    """Sizes of the network; large is the paper's."""
-    recipe: Literal["paper", "release"] = "paper"
-    """Follow the paper's text, or the authors' released code where they differ."""
-    towers: Literal["scratch", "pretrained"] = "scratch"
-    """Stage 2: train small image and text towers, or start from CLIP weights (--clip)."""
-    init: Path | None = None
-    """Start from this stage-1 run or weights file."""
-    clip: Path | None = None
-    """CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json."""
-    steps: int | None = None
-    """Length of the whole schedule in steps (default 1000)."""
-    stop_after: int | None = None
-    """Stop after this many steps without changing the schedule."""
-    save_every: int | None = None
-    """Steps between checkpoints (default 200)."""
-    batch: int | None = None
-    """Samples a step (default: the preset's)."""
-    seed: int = 0
-    """Seed of everything drawn."""
-    on_bad_sample: Literal["error", "skip"] = "error"
-    """A sample that cannot be read stops the run, or is counted and replaced."""
-    tensorboard: bool = False
-    """Write TensorBoard events too."""
-
-
-@dataclass(frozen=True)
-class Sections:
-    """Every field of the configuration, with the defaults of the preset, the recipe and the options of --help."""
-
-    model: Model
-    """Shapes and arithmetic of the network."""
-    objective: Objective
-    """Weights and choices of the losses."""
-    optim: Optim
-    """AdamW and its schedule."""
-    loader: Data
-    """How data are read and augmented (data in config.json)."""
-    loop: Run
-    """How the run goes (run in config.json)."""
-
-
-@dataclass(frozen=True)
-class Embed:
-    """Embed a manifest, a folder of frames or a video with a trained encoder; writes an .npz of features.
-
-    Example: anytouch embed --run runs/stage2 --input manifest.csv --split test --out features.npz
-    """
-
-    run: Path
-    """Run folder or weights file (.pth, .safetensors)."""
-    input: Path
-    """Manifest (.csv, .parquet), folder of frames, or video file."""
-    out: Path
-    """The .npz to write: features (n, d), rows (n,), key/* (n,)."""
-    split: str | None = None
-    """Only this split of a manifest."""
-    sensor: str = "universal"
-    """Sensor of a folder or a video; one that the model does not know gets the universal tokens."""
-    frames: int = 1
-    """Frames of a clip that ends at each row: 1 (stills), 3, or more (segments of three)."""
-    pooling: Literal["class", "mean", "both"] = "class"
-    """Class token (what alignment trains), mean of patch tokens, or both."""
-    join: Literal["mean", "sum", "concat"] = "mean"
-    """How the segments of a long clip are joined."""
-    batch: int = 64
-    """Frames at a time."""
-
-
-@dataclass(frozen=True)
-class Probe:
-    """Probe a label column with frozen features: linear and kNN, beside raw pixels and a random encoder.
-
-    Example: anytouch probe --run runs/stage1 --data manifest.csv --label object --where label.contact_score 7
-
-    The penalty is chosen on split val, or by cross-validation in groups inside train; the report is on split test.
-    """
-
-    data: Paths
-    """Manifests with the label column."""
-    run: Paths = ()
-    """Run folders or weights files to compare."""
-    label: str = "object"
-    """Label column, with or without "label."."""
-    group: str = "grasp_group"
-    """Column whose values never stand on both sides of a split (falls back to sequence)."""
-    leave_out: str | None = None
-    """Leave whole values of this column out in turn (for slip: object), instead of the splits."""
-    where: tuple[str, float] | None = None
-    """Keep rows whose column is above a number."""
-    sensor: str | None = None
-    """Keep rows of this sensor."""
-    frames: int = 1
-    """Frames of a clip that ends at each row: 1 (stills), 3 or more."""
-    pooling: Literal["class", "mean", "both"] = "both"
-    """Features: class token, mean of patch tokens, or both."""
-    seeds: int = 5
-    """Bootstrap resamples of the training groups."""
-    protocol: Literal["honest", "published"] = "honest"
-    """published chooses the penalty on the test split, as the authors' code does, and is labelled so."""
-    controls: bool = True
-    """Also probe raw pixels and a random encoder."""
-    out: Path | None = None
-    """Write the results as JSON."""
-
-
-@dataclass(frozen=True)
-class Parity:
-    """Compare this implementation with golden vectors of the authors' PyTorch code.
-
-    Example: anytouch parity ../shared/golden
-
-    Exits 1 when a case is out of tolerance or not understood.
-    """
-
-    folder: Path
-    """Folder with A_*.json, A_*.npz, ..."""
-    verbose: bool = False
-    """Print every array, not only the worst of a case."""
-
-
-@dataclass(frozen=True)
-class Convert:
-    """Convert weights: authors' .pth, CLIP (.safetensors, .bin) or a run -> .safetensors with the authors' key names.
-
-    Example: anytouch convert runs/stage2 weights.safetensors
-    """
-
-    source: Path
-    """Run folder or weights file."""
-    target: Path
-    """The .safetensors to write."""
-    names: Literal["release", "own"] = "release"
-    """Key names of the authors' files, or this package's parameter names."""
-
+from anytouch_jax.config import Config, UserError, preset
+from anytouch_jax.options import Convert, Embed, Parity, Probe, Sections, Train
 
 _COMMANDS: dict[str, tuple[type, str]] = {
     "train": (Train, "pre-train stage 1 or stage 2, or go on with a run"),
@@ -226,11 +73,10 @@ anytouch COMMAND --help explains a command and gives an example."""
 def _run(name: str, args: list[str]) -> int:
     from anytouch_jax import commands
 
+    run: Callable[..., int] = getattr(commands, name).run
     if name == "train":
-        return commands.train(*_parse_train(args))
-    options = _parse(_COMMANDS[name][0], name, args)
-    run: Callable[[Any], int] = getattr(commands, name)
-    return run(options)
+        return run(*_parse_train(args))
+    return run(_parse(_COMMANDS[name][0], name, args))
 
 
 def _parse(kind: Any, name: str, args: list[str], default: Any = None) -> Any:

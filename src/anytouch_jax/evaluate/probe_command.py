@@ -15,7 +15,7 @@ from anytouch_jax.evaluate import baseline, probe
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder
 
 if TYPE_CHECKING:
-    from anytouch_jax import cli
+    from anytouch_jax.options import Probe
 
 Say = Callable[[str], None]
 RAW = "raw pixels"
@@ -43,7 +43,7 @@ class Task:
         )  # fmt: skip
 
 
-def run_probes(options: cli.Probe, say: Say) -> list[Any]:
+def run_probes(options: Probe, say: Say) -> list[Any]:
     """All results: for each encoder (and the controls) a linear probe and kNN, or the groups left out."""
     task = read_task(options, say)
     found: list[Any] = []
@@ -59,7 +59,7 @@ def run_probes(options: cli.Probe, say: Say) -> list[Any]:
 
 
 def probe_features(
-    options: cli.Probe, task: Task, values: np.ndarray, name: str, scaling: Literal["column", "common"] = "column"
+    options: Probe, task: Task, values: np.ndarray, name: str, scaling: Literal["column", "common"] = "column"
 ) -> list[Any]:
     """Linear and kNN results of one set of features (n, d) on a task; `scaling` as in `probe.linear_probe`."""
     if options.leave_out is not None:
@@ -77,7 +77,7 @@ def probe_features(
     ]
 
 
-def read_task(options: cli.Probe, say: Say) -> Task:
+def read_task(options: Probe, say: Say) -> Task:
     """Rows with a label that pass the filters. Raises UserError on a column that is not there."""
     manifest = manifests.read([str(path) for path in options.data])
     table = manifest.table
@@ -110,7 +110,7 @@ def _column(table: Any, name: str) -> list[Any]:
     raise UserError(f"the manifest has no column {name!r} or 'label.{name}'; it has {', '.join(table.column_names)}")
 
 
-def _groups(manifest: Any, options: cli.Probe, rows: np.ndarray) -> np.ndarray:
+def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
     """The column asked for, the sequence where it is empty; with leave_out that column alone."""
     sequence = _column(manifest.table, "sequence")
     name = options.leave_out or options.group
@@ -130,7 +130,7 @@ def _subsets(manifest: Any, label: list[Any], split: np.ndarray, rows: np.ndarra
     return {"classes with a photograph or caption": mask, "classes without": ~mask}
 
 
-def _features(options: cli.Probe, task: Task, say: Say) -> Any:
+def _features(options: Probe, task: Task, say: Say) -> Any:
     """(name, features) of every encoder asked for, then of the controls."""
     encoders: list[tuple[str, Encoder]] = [(str(path), load_encoder(path)) for path in options.run]
     if options.controls:

@@ -1,0 +1,92 @@
+"""`anytouch embed`: features of a manifest, a folder of frames or a video."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anytouch_jax.commands.words import say
+from anytouch_jax.config import UserError
+from anytouch_jax.options import Embed
+
+if TYPE_CHECKING:
+    from anytouch_jax.evaluate.features import Encoder
+
+_MANIFESTS = (".csv", ".parquet")
+
+
+def run(options: Embed) -> int:
+    """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
+    from anytouch_jax.evaluate import features
+
+    encoder = features.load_encoder(options.run)
+    if not options.input.exists():
+        raise UserError(f"no manifest, folder or video at {options.input}")
+    if options.input.suffix.lower() in _MANIFESTS:
+        found = _embed_manifest(encoder, options)
+    else:
+        found = _embed_frames(encoder, options)
+    about = {
+        "encoder": encoder.source,
+        "input": str(options.input),
+        "pooling": options.pooling,
+        "frames": str(options.frames),
+        "join": options.join,
+    }
+    features.save_npz(options.out, found, about)
+    left = f", {found.skipped} skipped" if found.skipped else ""
+    print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
+    return 0
+
+
+def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
+    from anytouch_jax.data import manifest as manifests
+    from anytouch_jax.evaluate import features
+
+    manifest = manifests.read(options.input)
+    rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
+    usable = rows if options.frames == 1 else np.intersect1d(rows, manifest.clips(options.frames)[:, -1])
+    if len(usable) < len(rows):
+        say(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
+    rows, values = features.embed_rows(
+        encoder, manifest, usable, options.frames, options.pooling, options.join, batch=options.batch, say=say
+    )
+    keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
+    keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
+    return features.Features(values, rows, keys, len(usable) - len(rows))
+
+
+def _embed_frames(encoder: Encoder, options: Embed) -> Any:
+    """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame."""
+    from anytouch_jax.data.loader import frames_from_folder, frames_from_video
+    from anytouch_jax.data.transforms import touch_evaluation
+    from anytouch_jax.evaluate import features
+
+    read = frames_from_folder if options.input.is_dir() else frames_from_video
+    row, size = encoder.sensor_row(options.sensor, say), encoder.config.model.image_size
+    ring: list[np.ndarray] = []
+    waiting: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+    count = 0
+
+    def flush() -> None:
+        if waiting:
+            full = np.stack(waiting + waiting[-1:] * (options.batch - len(waiting)))  # one shape, one compilation
+            z = encoder.embed(full, np.full(len(full), row), pooling=options.pooling, join=options.join)
+            values.append(z[: len(waiting)])
+            waiting.clear()
+
+    for frame in read(options.input):
+        count += 1
+        ring = [*ring, touch_evaluation([frame], size)[0]][-options.frames :]
+        if len(ring) == options.frames:
+            waiting.append(np.stack(ring))
+        if len(waiting) == options.batch:
+            flush()
+    flush()
+    if not values:
+        raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames}")
+    stacked = np.concatenate(values)
+    index = np.arange(options.frames - 1, count)
+    return features.Features(stacked, index, {"frame_index": index})

@@ -38,7 +38,7 @@ from anytouch_jax.io import release
 from anytouch_jax.io.shapes import param_shapes
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, tokens
-from anytouch_jax.train.optim import flatten_names, learning_rate, optimizer
+from anytouch_jax.train.optim import flatten_names, learning_rate, moments, optimizer
 from anytouch_jax.train.step import TrainState, init_state, make_step, merge
 
 Params = dict[str, Any]
@@ -185,10 +185,9 @@ def _compare_final(case: Case, params: Params, state: TrainState, config: Config
         if not np.array_equal(before[key], after[key]):
             case.fail(f"unchanged/{key}", "moved, although the reference leaves it")
     counts = jax.tree.map(
-        lambda moments, p: np.full(p.shape, moments.count, np.float32),
-        state.opt_state.moments,
+        lambda p, held: np.full(p.shape, held.count, np.float32),
         state.trainable,
-        is_leaf=lambda node: hasattr(node, "count"),
+        moments(state.opt_state, state.trainable),
     )
     full = merge(counts, jax.tree.map(lambda p: np.zeros(p.shape, np.float32), state.frozen))
     for key, value in release.to_release(full, config.model).items():

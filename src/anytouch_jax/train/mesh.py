@@ -13,10 +13,10 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from anytouch_jax.config import ConfigError
+from anytouch_jax.train.pack import SMALL
 
 Tree = Any
 BATCH_AXES = ("data", "fsdp")
-SMALL = 2**14  # elements; a smaller array is cheaper to copy than to gather
 
 
 def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:

@@ -1,21 +1,22 @@
-"""The optimiser: names and regex rules, the learning-rate schedule, AdamW with one state per parameter.
+"""The optimiser: names and regex rules, the learning-rate schedule, AdamW with one count per parameter.
 
 A step may leave a parameter out (a clip's head on a batch of stills). Such a parameter is skipped whole: no decay,
-no moment, no count, as PyTorch does when a gradient is None. Hence each parameter has its own Adam state.
+no moment, no count, as PyTorch does when a gradient is None. Hence each parameter has its own count.
 """
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from anytouch_jax.config import Config, ConfigError
+from anytouch_jax.train.pack import Packing, norm, packing
 
 Array = jax.Array
 Tree = Any
@@ -23,12 +24,29 @@ T = TypeVar("T")
 
 
 class OptState(NamedTuple):
-    """State of `optimizer`: `moments`, an optax ScaleByAdamState a parameter; `ema`, averaged parameters or {};
-    `learning_rate` f32 (), the rate of the last update."""
+    """State of `optimizer`: `count` i32 (parameters,), how often each was updated; `mu` and `nu`, first and second
+    moments as `pack.packing` groups them; `ema`, averaged parameters or {}; `learning_rate` f32 (), the last one."""
 
-    moments: Tree
+    count: Array
+    mu: tuple[Array, ...]
+    nu: tuple[Array, ...]
     ema: Tree
     learning_rate: Array
+
+
+class Moments(NamedTuple):
+    """What Adam knows of one parameter: `count` i32 (), `mu` and `nu` of its shape."""
+
+    count: Array
+    mu: Array
+    nu: Array
+
+
+def moments(state: OptState, params: Tree) -> Tree:
+    """The `Moments` of every parameter, in a tree like `params`."""
+    layout = packing(params)
+    counts = layout.treedef.unflatten(list(state.count))
+    return jax.tree.map(Moments, counts, layout.unpack(state.mu), layout.unpack(state.nu))
 
 
 def flatten_names(tree: Tree) -> dict[str, Any]:
@@ -87,13 +105,13 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
     at `step`, or `learning_rate` if given. So a skipped step does not shift the schedule. `ema_params` reads the EMA.
     """
     options, rate = config.optim, schedule(config)
-    adam = optax.scale_by_adam(options.beta1, options.beta2, options.eps)
-    adamw = functools.partial(_adamw, config, adam)
 
     def init(params: Tree) -> OptState:
         # A copy: the parameters and their average must not share buffers, since both are donated to the step.
         ema = {} if options.ema is None else jax.tree.map(jnp.copy, params)
-        return OptState(jax.tree.map(adam.init, params), ema, jnp.zeros((), jnp.float32))
+        layout = packing(params)
+        mu, nu = (tuple(jnp.zeros_like(x) for x in layout.pack(params)) for _ in range(2))
+        return OptState(jnp.zeros(len(layout.shapes), jnp.int32), mu, nu, ema, jnp.zeros((), jnp.float32))
 
     def update(
         grads: Tree,
@@ -108,37 +126,47 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
         if params is None or (step is None and learning_rate is None):
             raise TypeError("update needs params, and step or learning_rate")
         lr = jnp.asarray(rate(step) if learning_rate is None else learning_rate, jnp.float32)  # type: ignore[arg-type]
-        directions, moments = adamw(grads, state.moments, params, used)
-        updates = jax.tree.map(lambda d, p: (-lr * d).astype(p.dtype), directions, params)
+        layout = packing(params)
+        directions, count, mu, nu = _adamw(config, layout, grads, state, params, used)
+        updates = layout.unpack([(-lr * d).astype(d.dtype) for d in directions])
         ema = state.ema
         if options.ema is not None:
             ema = optax.incremental_update(optax.apply_updates(params, updates), ema, 1.0 - options.ema)
-        return updates, OptState(moments, ema, lr)
+        return updates, OptState(count, mu, nu, ema, lr)
 
     return optax.GradientTransformationExtraArgs(init, update)
 
 
 def _adamw(
-    config: Config, adam: optax.GradientTransformation, grads: Tree, moments: Tree, params: Tree, used: Tree | None
-) -> tuple[Tree, Tree]:
-    """Directions of AdamW before the learning rate, and the moments; zero and unmoved where a leaf is not used."""
-    treedef: Any = jax.tree.structure(params)
-    values, states, gradients = (treedef.flatten_up_to(tree) for tree in (params, moments, grads))
-    uses = [True] * len(values) if used is None else treedef.flatten_up_to(used)
-    decays = match_rules(config.weight_decay, flatten_names(params)).values()
-    norm = config.optim.clip_norm
-    clip = optax.identity() if norm is None else optax.clip_by_global_norm(norm)
-    kept, _ = clip.update([g for g, use in zip(gradients, uses, strict=True) if use], optax.EmptyState())
-    clipped = iter(kept)
-    directions = []
-    for i, (value, use, decay) in enumerate(zip(values, uses, decays, strict=True)):
-        if not use:
+    config: Config, layout: Packing, grads: Tree, state: OptState, params: Tree, used: Tree | None
+) -> tuple[list[Array], Array, tuple[Array, ...], tuple[Array, ...]]:
+    """Packed directions of AdamW before the learning rate, counts and moments; a leaf not used gets 0 and stays."""
+    options = config.optim
+    uses = np.asarray([True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used))
+    decays = np.asarray(list(match_rules(config.weight_decay, flatten_names(params)).values()), np.float32)
+    count = state.count + uses.astype(np.int32)
+    first, second = (1.0 - jnp.float32(beta) ** count for beta in (options.beta1, options.beta2))  # bias corrections
+    gradients = layout.pack(grads)
+    use = [layout.spread(k, uses) for k in range(len(gradients))]
+    if options.clip_norm is not None:
+        length = norm([jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)])
+        gradients = tuple(g * jnp.minimum(1.0, options.clip_norm / length) for g in gradients)
+    directions, mus, nus = [], list(state.mu), list(state.nu)
+    for k, (grad, value) in enumerate(zip(gradients, layout.pack(params), strict=True)):
+        if not np.any(use[k]):
             directions.append(jnp.zeros_like(value))
             continue
-        direction, states[i] = adam.update(next(clipped), states[i])
-        direction, _ = optax.add_decayed_weights(decay).update(direction, optax.EmptyState(), value)
-        directions.append(direction)
-    return treedef.unflatten(directions), treedef.unflatten(states)
+        mu = options.beta1 * mus[k] + (1 - options.beta1) * grad
+        nu = options.beta2 * nus[k] + (1 - options.beta2) * grad * grad
+        mu_hat, nu_hat = mu / layout.spread(k, first), nu / layout.spread(k, second)
+        direction = mu_hat / (jnp.sqrt(nu_hat) + options.eps) + layout.spread(k, decays) * value
+        if not np.all(use[k]):  # the counts of unused leaves may be 0: what stands there is not a number
+            direction, mu, nu = (
+                jnp.where(use[k], new, old) for new, old in ((direction, 0.0), (mu, mus[k]), (nu, nus[k]))
+            )
+        directions.append(direction.astype(value.dtype))
+        mus[k], nus[k] = mu.astype(mus[k].dtype), nu.astype(nus[k].dtype)
+    return directions, count, tuple(mus), tuple(nus)
 
 
 def ema_params(opt_state: OptState) -> Tree | None:

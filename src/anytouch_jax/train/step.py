@@ -12,6 +12,7 @@ import optax
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config, ConfigError
 from anytouch_jax.train.optim import flatten_names, match_rules, optimizer
+from anytouch_jax.train.pack import norm, packing
 from anytouch_jax.train.usage import used_parameters
 
 __all__ = ["TrainState", "init_state", "make_step", "merge", "split", "used_parameters"]
@@ -107,14 +108,15 @@ def _finish(
     state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
     """Apply the update where loss and gradient are finite, and report."""
-    norm = optax.tree.norm(grads)
-    good = jnp.isfinite(loss) & jnp.isfinite(norm)
+    layout = packing(state.trainable)
+    grad_norm = norm(layout.pack(grads))
+    good = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
     rate = getattr(opt_state, "learning_rate", jnp.nan)
     metrics = metrics | {
         "loss": loss,
-        "grad_norm": norm,
-        "param_norm": optax.tree.norm(state.trainable),
-        "update_norm": jnp.where(good, optax.tree.norm(updates), 0.0),
+        "grad_norm": grad_norm,
+        "param_norm": norm(layout.pack(state.trainable)),
+        "update_norm": jnp.where(good, norm(layout.pack(updates)), 0.0),
         "learning_rate": jnp.asarray(rate),
         "skipped": jnp.where(good, 0.0, 1.0),
     }

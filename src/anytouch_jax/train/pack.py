@@ -1,0 +1,71 @@
+"""Small arrays of a tree as one vector, so that the optimiser has a few large kernels instead of hundreds of small ones.
+
+A ViT has some twenty parameters a stack and most are vectors. Updated one by one they cost more time to compile than
+the whole backward pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array
+Tree = Any
+SMALL = 2**16  # elements; a larger array is worth a kernel of its own, and a share on each device
+
+
+class Packing(NamedTuple):
+    """Which leaves of a tree lie together: `groups` of leaf numbers, `shapes` and `treedef` of the tree.
+
+    A group of several is a vector of all its leaves, in their order; a group of one is the leaf itself.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    shapes: tuple[tuple[int, ...], ...]
+    treedef: Any
+
+    def pack(self, tree: Tree) -> tuple[Array, ...]:
+        """One array a group."""
+        leaves = self.treedef.flatten_up_to(tree)
+        return tuple(
+            leaves[group[0]] if len(group) == 1 else jnp.concatenate([leaves[i].reshape(-1) for i in group])
+            for group in self.groups
+        )
+
+    def unpack(self, arrays: Sequence[Array]) -> Tree:
+        """The tree that was packed."""
+        leaves: list[Any] = [None] * len(self.shapes)
+        for group, array in zip(self.groups, arrays, strict=True):
+            start = 0
+            for i in group:
+                size = int(np.prod(self.shapes[i]))
+                leaves[i] = array if len(group) == 1 else array[start : start + size].reshape(self.shapes[i])
+                start += size
+        return self.treedef.unflatten(leaves)
+
+    def spread(self, group: int, values: Any) -> Any:
+        """`values` (leaves,), one a leaf, over the elements of a group's array: (n,), or () for a leaf alone."""
+        leaves = self.groups[group]
+        if len(leaves) == 1:
+            return values[leaves[0]]
+        # The index is known while tracing: jnp.repeat would leave XLA to fold a cumulative sum for seconds.
+        return values[np.repeat(np.asarray(leaves, np.int32), [int(np.prod(self.shapes[i])) for i in leaves])]
+
+
+def packing(tree: Tree, small: int = SMALL) -> Packing:
+    """How to pack a tree of arrays (or their shapes): the leaves below `small` elements together, by data type."""
+    leaves, treedef = jax.tree.flatten(tree)
+    together: dict[Any, list[int]] = {}
+    for i, leaf in enumerate(leaves):
+        together.setdefault(leaf.dtype if leaf.size < small else i, []).append(i)
+    groups = tuple(tuple(group) for group in together.values())
+    return Packing(groups, tuple(leaf.shape for leaf in leaves), treedef)
+
+
+def norm(arrays: Sequence[Array]) -> Array:
+    """Euclidean norm of all elements, f32 ()."""
+    return jnp.sqrt(sum(jnp.sum(jnp.square(x.astype(jnp.float32))) for x in arrays))

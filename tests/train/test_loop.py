@@ -152,7 +152,7 @@ def test_skipped_steps_are_counted_and_change_nothing(tmp_path):
     assert [row["skipped"] for row in found] == [0, 0, 1, 1, 0, 1]
     assert [row["skipped_batches"] for row in found] == [0, 0, 1, 2, 2, 3]
     assert found[2]["loss"] is None and found[2]["update_norm"] == 0
-    assert moments(result.state.opt_state, result.state.trainable)["trunk"]["kernel"].count == 3
+    assert moments(result.state.opt_state, result.state.trainable)["trunk"]["kernel"].updates == 3
 
 
 def test_too_many_skipped_in_a_row_end_the_run(tmp_path):

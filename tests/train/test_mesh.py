@@ -101,7 +101,7 @@ def test_one_two_and_four_devices_agree():
         kernel = other.trainable["trunk"]["kernel"]
         assert kernel.sharding.spec == (PartitionSpec("fsdp") if fsdp > 1 else PartitionSpec())
         held = moments(other.opt_state, other.trainable)["trunk"]["kernel"]
-        assert held.count == 3 and np.abs(held.mu).max() > 0
+        assert held.updates == 3 and np.abs(held.mu).max() > 0
 
 
 def test_no_cluster_is_joined_unless_asked():

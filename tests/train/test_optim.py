@@ -141,7 +141,7 @@ def test_adamw_with_skipped_parameters_equals_plain_numpy():
     held = flatten_names(moments(state, params))
     for name, value in flatten_names(got).items():
         np.testing.assert_allclose(value, expected[name], rtol=0, atol=2e-6, err_msg=name)
-        assert held[f"{name}/count"] == count[name], name
+        assert held[f"{name}/updates"] == count[name], name
         np.testing.assert_allclose(held[f"{name}/mu"], m[name], rtol=1e-5, atol=1e-7 * np.abs(m[name]).max())
         np.testing.assert_allclose(held[f"{name}/nu"], v2[name], rtol=1e-5, atol=1e-7 * np.abs(v2[name]).max())
     np.testing.assert_array_equal(got["idle"]["kernel"], params["idle"]["kernel"])

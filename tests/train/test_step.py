@@ -98,12 +98,12 @@ def test_a_kind_of_batch_leaves_the_head_it_does_not_use():
         now, then = (moments(s.opt_state, s.trainable)["decoder"][idle] for s in (state, before))
         assert_same(now, then)
     held = moments(state.opt_state, state.trainable)
-    counts = {k: v for k, v in flatten_names(held).items() if k.endswith("kernel/count")}
+    counts = {k: v for k, v in flatten_names(held).items() if k.endswith("kernel/updates")}
     assert counts == {
-        "decoder/clip_head/kernel/count": 2,
-        "decoder/still_head/kernel/count": 3,
-        "idle/kernel/count": 0,
-        "trunk/kernel/count": 5,
+        "decoder/clip_head/kernel/updates": 2,
+        "decoder/still_head/kernel/updates": 3,
+        "idle/kernel/updates": 0,
+        "trunk/kernel/updates": 5,
     }
     assert_same(state.trainable["idle"], toy_params()["idle"])
     assert_same(state.frozen, {"decoder": {"position": toy_params()["decoder"]["position"]}})
@@ -145,7 +145,7 @@ def test_micro_batches_have_their_own_keys_and_skip_unused_heads():
     draws = [float(jax.random.uniform(jax.random.fold_in(key, m))) for m in range(4)]
     assert metrics["draw"] == pytest.approx(np.mean(draws), rel=1e-6)
     assert_same(new.trainable["decoder"]["clip_head"], state.trainable["decoder"]["clip_head"])
-    assert moments(new.opt_state, new.trainable)["decoder"]["clip_head"]["kernel"].count == 0
+    assert moments(new.opt_state, new.trainable)["decoder"]["clip_head"]["kernel"].updates == 0
 
 
 def test_rows_are_dealt_out_to_micro_batches():

@@ -185,7 +185,7 @@ def _compare_final(case: Case, params: Params, state: TrainState, config: Config
         if not np.array_equal(before[key], after[key]):
             case.fail(f"unchanged/{key}", "moved, although the reference leaves it")
     counts = jax.tree.map(
-        lambda p, held: np.full(p.shape, held.count, np.float32),
+        lambda p, held: np.full(p.shape, held.updates, np.float32),
         state.trainable,
         moments(state.opt_state, state.trainable),
     )

@@ -24,10 +24,10 @@ T = TypeVar("T")
 
 
 class OptState(NamedTuple):
-    """State of `optimizer`: `count` i32 (parameters,), how often each was updated; `mu` and `nu`, first and second
+    """State of `optimizer`: `counts` i32 (parameters,), how often each was updated; `mu` and `nu`, first and second
     moments as `pack.packing` groups them; `ema`, averaged parameters or {}; `learning_rate` f32 (), the last one."""
 
-    count: Array
+    counts: Array
     mu: tuple[Array, ...]
     nu: tuple[Array, ...]
     ema: Tree
@@ -35,9 +35,9 @@ class OptState(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """What Adam knows of one parameter: `count` i32 (), `mu` and `nu` of its shape."""
+    """What Adam knows of one parameter: `updates` i32 (), how often; `mu` and `nu` of its shape."""
 
-    count: Array
+    updates: Array
     mu: Array
     nu: Array
 
@@ -45,7 +45,7 @@ class Moments(NamedTuple):
 def moments(state: OptState, params: Tree) -> Tree:
     """The `Moments` of every parameter, in a tree like `params`."""
     layout = packing(params)
-    counts = layout.treedef.unflatten(list(state.count))
+    counts = layout.treedef.unflatten(list(state.counts))
     return jax.tree.map(Moments, counts, layout.unpack(state.mu), layout.unpack(state.nu))
 
 
@@ -144,7 +144,7 @@ def _adamw(
     options = config.optim
     uses = np.asarray([True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used))
     decays = np.asarray(list(match_rules(config.weight_decay, flatten_names(params)).values()), np.float32)
-    count = state.count + uses.astype(np.int32)
+    count = state.counts + uses.astype(np.int32)
     first, second = (1.0 - jnp.float32(beta) ** count for beta in (options.beta1, options.beta2))  # bias corrections
     gradients = layout.pack(grads)
     use = [layout.spread(k, uses) for k in range(len(gradients))]

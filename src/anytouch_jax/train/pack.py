@@ -1,4 +1,4 @@
-"""Small arrays of a tree as one vector, so that the optimiser has a few large kernels instead of hundreds of small ones.
+"""Small arrays of a tree as one vector, so that the optimiser has a few large kernels, not hundreds of small ones.
 
 A ViT has some twenty parameters a stack and most are vectors. Updated one by one they cost more time to compile than
 the whole backward pass.

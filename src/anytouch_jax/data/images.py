@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 import re
 import struct
 from collections.abc import Iterator
@@ -11,9 +13,12 @@ import cv2
 import numpy as np
 
 from anytouch_jax.config import UserError
+from anytouch_jax.data.packed import read_file
 
 MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
+
+_HEADER_1, _HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
 cv2.setNumThreads(1)  # the loader has its own threads
 
@@ -23,7 +28,7 @@ class ImageError(UserError):
 
 
 def decode(path: str | Path) -> np.ndarray:
-    """The picture in `path` as RGB u8 (h, w, 3).
+    """The picture in `path`, a file or a row of a shard (see packed.py), as RGB u8 (h, w, 3).
 
     Grey becomes RGB, an alpha channel is dropped, 16 bits are scaled to 8, floats are taken as 0..1. PNG, JPEG, TIFF,
     BMP, WebP and .npy are read; orientation tags are ignored. Raises ImageError for a missing, broken or too large
@@ -31,16 +36,27 @@ def decode(path: str | Path) -> np.ndarray:
     """
     path = Path(path)
     try:
-        pixels = np.load(path, "r", allow_pickle=False) if path.suffix.lower() == ".npy" else _read(path)
+        data = read_file(path)
     except FileNotFoundError:
         raise ImageError(f"there is no file {path}") from None
-    except (OSError, ValueError, EOFError, MemoryError) as error:
+    except (OSError, ValueError, MemoryError) as error:
+        raise ImageError(f"{path} cannot be read: {error}") from None
+    return decode_bytes(data, path)
+
+
+def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
+    """The picture that `data` is, as `decode` gives it; `name` is for errors."""
+    path = Path(name)
+    try:
+        pixels = _unpack(data)
+    except (ValueError, EOFError, MemoryError) as error:
         raise ImageError(f"{path} cannot be read: {error}") from None
     return _to_rgb(pixels, path)
 
 
-def _read(path: Path) -> np.ndarray:
-    data = path.read_bytes()
+def _unpack(data: bytes) -> np.ndarray:
+    if data[:6] == b"\x93NUMPY":
+        return _array(data)
     size = _declared_size(data)
     if size is None:
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
@@ -58,6 +74,21 @@ def _read(path: Path) -> np.ndarray:
     if pixels.ndim == 3 and pixels.shape[2] in (3, 4):
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
     return pixels
+
+
+def _array(data: bytes) -> np.ndarray:
+    """A .npy as a view of its bytes, which cannot declare more than there is."""
+    stream = io.BytesIO(data)
+    try:
+        old = np.lib.format.read_magic(stream) == (1, 0)
+        shape, fortran, kind = (_HEADER_1 if old else _HEADER_2)(stream)
+    except Exception:  # the header is Python text: a spoiled one fails in the tokenizer, the parser or in NumPy
+        raise ValueError("the file is cut short, or its header is corrupt") from None
+    if kind.hasobject:
+        raise ValueError("it holds Python objects")
+    if stream.tell() + math.prod(shape) * kind.itemsize > len(data):
+        raise ValueError("the file is cut short")
+    return np.frombuffer(data, kind, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 def _to_rgb(pixels: np.ndarray, path: Path) -> np.ndarray:
@@ -90,7 +121,7 @@ def _declared_size(data: bytes) -> tuple[int, int] | None:
     """(width, height) that the header declares, before anything is unpacked; None for another kind of file."""
     try:
         if data[:8] == b"\x89PNG\r\n\x1a\n":
-            return struct.unpack(">II", data[16:24])
+            return _png_size(data)
         if data[:2] == b"\xff\xd8":
             return _jpeg_size(data)
         if data[:4] in (b"II*\0", b"MM\0*"):
@@ -103,6 +134,20 @@ def _declared_size(data: bytes) -> tuple[int, int] | None:
     except struct.error:
         raise ValueError("the file is cut short") from None
     return None
+
+
+def _png_size(data: bytes) -> tuple[int, int]:
+    """Width and height, after a walk over the chunks: OpenCV fills the memory for one that declares 2 GB."""
+    at, kind, kinds = 8, b"", 0
+    while kind != b"IEND":
+        length, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
+        at += 12 + length
+        if at > len(data):
+            raise ValueError("the picture is corrupt or cut short")
+        kinds += kind == b"IHDR"
+    if kinds != 1 or data[12:16] != b"IHDR":
+        raise ValueError("the picture is corrupt")
+    return struct.unpack(">II", data[16:24])
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
@@ -124,11 +169,12 @@ def _tiff_size(data: bytes) -> tuple[int, int]:
     order = "<" if data[:2] == b"II" else ">"
     (at,) = struct.unpack(order + "I", data[4:8])
     (count,) = struct.unpack(order + "H", data[at : at + 2])
-    found = {}
+    found: dict[int, int] = {}
     for entry in range(at + 2, at + 2 + 12 * count, 12):
         tag, kind = struct.unpack(order + "HH", data[entry : entry + 4])
         if tag in (256, 257):
-            (found[tag],) = struct.unpack(order + ("H2x" if kind == 3 else "I"), data[entry + 8 : entry + 12])
+            (side,) = struct.unpack(order + ("H2x" if kind == 3 else "I"), data[entry + 8 : entry + 12])
+            found[tag] = max(side, found.get(tag, 0))  # decoders go by the first or by the last one
     if len(found) != 2:
         raise ValueError("the picture is corrupt")
     return found[256], found[257]

@@ -1,0 +1,275 @@
+"""Captions from a vision-language model, as the paper had GPT-4o write them: one for each touch, paid for once.
+
+Answers are kept in `answers.jsonl`, by a hash of the model, the words of the prompt and the bytes of the pictures, so
+the same call goes on after a kill and asks nothing twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+
+from anytouch_jax.config import UserError
+from anytouch_jax.data.bounded import bounded_map
+from anytouch_jax.data.edit import replace_column
+from anytouch_jax.data.endpoint import AnswerError, Client, Endpoint, EndpointError
+from anytouch_jax.data.files import write_whole
+from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.prompts import Nonsense, caption_of
+from anytouch_jax.data.questions import PHRASE, Job, data_url, find_jobs, picture_bytes, small_jpeg
+
+_NONSENSE_TRIES = 3
+_STREAK = 25  # failures in a row after which the run stops instead of paying on
+_TILE = 512  # the model's price of a picture: a base and so much for each tile of 512 pixels
+_BASE_TOKENS, _TILE_TOKENS, _ANSWER_TOKENS = 85, 170, 80
+
+
+class Estimate(NamedTuple):
+    """What is about to be asked: questions, those answered before, tokens, and their price where prices are given."""
+
+    questions: int
+    cached: int
+    tokens_in: int
+    tokens_out: int
+    cost: float | None
+
+    def __str__(self) -> str:
+        price = "no prices given" if self.cost is None else f"about {self.cost:.2f}"
+        return (
+            f"{self.questions} questions ({self.cached} answered before), about {self.tokens_in} tokens in and "
+            f"{self.tokens_out} out: {price}"
+        )
+
+
+class Caption(NamedTuple):
+    """A caption, the object that the model saw, and the job that it answers."""
+
+    job: Job
+    text: str
+    object: str
+
+
+class Failure(NamedTuple):
+    """A caption that could not be had: where its first row is, how many rows lack it, and why."""
+
+    where: str
+    rows: int
+    reason: str
+
+
+class Annotated(NamedTuple):
+    """The manifest with its captions, what could not be had, rows left out by reason, and what was used."""
+
+    manifest: Manifest
+    captions: tuple[Caption, ...]
+    failures: tuple[Failure, ...]
+    left_out: dict[str, int]
+    asked: int
+    tokens_in: int
+    tokens_out: int
+
+
+class AnnotateError(UserError):
+    """An annotation that was not begun, or stopped; answers that were given are kept."""
+
+
+def annotate(
+    manifest: Manifest,
+    endpoint: Endpoint,
+    folder: str | Path,
+    *,
+    confirm: Callable[[Estimate], bool],
+    price_in: float | None = None,
+    price_out: float | None = None,
+    threads: int = 4,
+    side: int = 512,
+    split: str | None = None,
+    families: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+    second_image: str = "image2_path",
+    limit: int | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Annotated:
+    """Ask `endpoint` for every caption that is lacking, after `confirm(estimate)`; answers and failures in `folder`.
+
+    One question for each touch (else each sequence), `threads` at a time; pictures are sent with no side longer than
+    `side`. Prices are for a million tokens. `limit`: only the first so many captions (to look at a sample first).
+    A phrase that was expanded moves to the column `phrase`. Raises AnnotateError when it is not confirmed or too many
+    questions in a row fail, EndpointError when the endpoint cannot be used, UserError when no caption is lacking.
+    """
+    if threads < 1 or side < 16:
+        raise AnnotateError(f"threads {threads} must be at least 1 and side {side} at least 16")
+    client = Client(endpoint)
+    store = _Store(Path(folder).expanduser().resolve())
+    found = find_jobs(manifest, split=split, families=families, overwrite=overwrite, second_image=second_image)
+    run = _Run(manifest, client, store, side)
+    jobs = found.jobs[:limit]
+    keys = run.keys(jobs, threads)
+    lacking = [(job, key) for job, key in zip(jobs, keys, strict=True) if key and key not in store.answers]
+    if say and client.exposes_key:
+        say(f"the key travels unencrypted to {endpoint.url}; use https")
+    estimate = _estimate([job for job, _ in lacking], len(jobs) - len(lacking), side, price_in, price_out)
+    if lacking and not confirm(estimate):
+        raise AnnotateError("not confirmed: nothing was asked")
+    run.ask(lacking, threads, say)
+    captions = tuple(
+        Caption(job, store.answers[key]["caption"], store.answers[key]["object"])
+        for job, key in zip(jobs, keys, strict=True) if key in store.answers
+    )  # fmt: skip
+    store.write_failures(run.failures)
+    return Annotated(
+        _attach(manifest, captions), captions, tuple(run.failures), found.left_out,
+        run.asked, run.tokens[0], run.tokens[1],
+    )  # fmt: skip
+
+
+def _estimate(jobs: list[Job], cached: int, side: int, price_in: float | None, price_out: float | None) -> Estimate:
+    picture = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
+    tokens_in = sum(
+        len(job.question.system + job.question.text) // 4 + picture * len(job.pictures) + 20 for job in jobs
+    )
+    tokens_out = _ANSWER_TOKENS * len(jobs)
+    cost = None if price_in is None or price_out is None else (tokens_in * price_in + tokens_out * price_out) / 1e6
+    return Estimate(len(jobs), cached, tokens_in, tokens_out, cost)
+
+
+class _Run:
+    """One pass over the questions; `failures` and the counts grow as it goes."""
+
+    def __init__(self, manifest: Manifest, client: Client, store: _Store, side: int) -> None:
+        self.manifest, self.client, self.store, self.side = manifest, client, store, side
+        self.failures: list[Failure] = []
+        self.asked, self.tokens = 0, [0, 0]
+
+    def keys(self, jobs: list[Job], threads: int) -> list[str]:
+        """The name of each job's answer; "" and a failure where a picture cannot be read."""
+        keys = []
+        with closing(bounded_map(self._key, jobs, threads)) as found:
+            for job, key in zip(jobs, found, strict=True):
+                if isinstance(key, UserError):
+                    self._fail(job, str(key))
+                keys.append(key if isinstance(key, str) else "")
+        return keys
+
+    def _key(self, job: Job) -> str | UserError:
+        end = self.client.endpoint
+        digest = hashlib.sha256(json.dumps([end.model, job.question.hash(), self.side, end.max_tokens]).encode())
+        for row, column in job.pictures:
+            try:
+                digest.update(hashlib.sha256(picture_bytes(self.manifest, row, column)).digest())
+            except (UserError, OSError, ValueError) as error:
+                reason = getattr(error, "strerror", None) or error
+                return UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}")
+        return digest.hexdigest()[:32]
+
+    def ask(self, lacking: list[tuple[Job, str]], threads: int, say: Callable[[str], None] | None) -> None:
+        """Ask all questions; stops at an endpoint that is of no use. In the end no thread is left."""
+        streak = 0
+        with closing(bounded_map(self._ask_one, lacking, threads)) as reasons:
+            try:
+                for count, ((job, _), reason) in enumerate(zip(lacking, reasons, strict=True), 1):
+                    streak = streak + 1 if reason else 0
+                    if reason:
+                        self._fail(job, reason)
+                    if streak >= _STREAK:
+                        raise AnnotateError(f"{streak} questions in a row failed, the last one: {reason}")
+                    if say and (count % 100 == 0 or count == len(lacking)):
+                        say(f"{count} of {len(lacking)} questions, {len(self.failures)} failed")
+            finally:
+                self.client.stop.set()  # before the threads are waited for: none goes on waiting for a server
+
+    def _ask_one(self, item: tuple[Job, str]) -> str:
+        """Get one answer and keep it; why there is none, or ""."""
+        job, key = item
+        try:
+            pictures = [
+                data_url(small_jpeg(picture_bytes(self.manifest, row, column), f"{column} of row {row}", self.side))
+                for row, column in job.pictures
+            ]
+        except (UserError, OSError, ValueError) as error:
+            return str(error)
+        reason = ""
+        for _ in range(_NONSENSE_TRIES):
+            try:
+                answer = self.client.ask(job.question.messages(pictures))
+            except AnswerError as error:
+                return str(error)
+            except EndpointError:
+                self.client.stop.set()
+                raise
+            with self.store.lock:
+                self.asked += 1
+                self.tokens[0] += answer.tokens_in
+                self.tokens[1] += answer.tokens_out
+            text = self.client.redact(answer.text)
+            try:
+                caption, seen = caption_of(text, answer.finish)
+            except Nonsense as error:
+                reason = f"nonsense ({error}): {text[:100]!r}"
+                continue
+            self.store.keep(key, {
+                "model": self.client.endpoint.model, "prompt": job.question.hash(), "family": job.question.family,
+                "caption": caption, "object": seen, "tokens_in": answer.tokens_in, "tokens_out": answer.tokens_out,
+            })  # fmt: skip
+            return ""
+        return f"{reason} ({_NONSENSE_TRIES} times)"
+
+    def _fail(self, job: Job, reason: str) -> None:
+        self.failures.append(Failure(self.manifest.where(int(job.rows[0])), len(job.rows), self.client.redact(reason)))
+
+
+class _Store:
+    """The answers of a folder: one JSON line each, added as they come; a line that was cut off is asked again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.lock = folder, threading.Lock()
+        self.answers: dict[str, dict[str, Any]] = {}
+        self._path, self._begin = folder / "answers.jsonl", ""
+        folder.mkdir(parents=True, exist_ok=True)
+        if self._path.is_file():
+            with self._path.open(encoding="utf-8", errors="replace") as file:
+                for line in file:
+                    self._begin = "" if line.endswith("\n") else "\n"
+                    self._load(line)
+
+    def _load(self, line: str) -> None:
+        try:
+            entry = json.loads(line)
+            if isinstance(entry["caption"], str) and isinstance(entry["object"], str):
+                self.answers[str(entry["key"])] = entry
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return
+
+    def keep(self, key: str, entry: dict[str, Any]) -> None:
+        """Add an answer, from any thread: what was paid for is on the disk when this returns."""
+        line = json.dumps({"key": key, **entry}, ensure_ascii=False)
+        with self.lock, self._path.open("a", encoding="utf-8") as file:
+            file.write(f"{self._begin}{line}\n")
+            self._begin = ""
+            self.answers[key] = entry
+
+    def write_failures(self, failures: list[Failure]) -> None:
+        """failures.jsonl: what this run could not get."""
+        lines = "".join(json.dumps(failure._asdict(), ensure_ascii=False) + "\n" for failure in failures)
+        write_whole(self.folder / "failures.jsonl", lines)
+
+
+def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
+    text = manifest.column("text").to_pylist()
+    kept = manifest.column(PHRASE) if PHRASE in manifest.table.column_names else [None] * len(manifest)
+    phrase = kept if isinstance(kept, list) else kept.to_pylist()
+    for caption in captions:
+        for row in caption.job.rows:
+            text[row] = caption.text
+            phrase[row] = caption.job.phrase if caption.job.phrase is not None else phrase[row]
+    result = replace_column(manifest, "text", pa.array(text, pa.string()))
+    if any(caption.job.phrase is not None for caption in captions):
+        result = replace_column(result, PHRASE, pa.array(phrase, pa.string()))
+    return result

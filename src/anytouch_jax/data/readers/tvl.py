@@ -1,0 +1,168 @@
+"""TVL's human-collected part, HCT (Fu et al., ICML 2024): a hand-held DIGIT and a camera.
+
+Seen: the dataset's card: `hct/data{1,2,3}/<recording>/{tactile,vision}/<id>-<time>.jpg`, with `contact.json`,
+`not_contact.json`, `train.csv`, `test.csv` beside the recordings; the authors' loader: the JSON files hold equally long
+lists `tactile`, `vision`, `background` of paths below `data<k>`, and a missing background means
+`data<k>/digit_background.png`; the CSV files have the columns tactile and caption (T3). Code is Apache-2.0; no licence
+of the data was found.
+
+* Some recordings have the two folders swapped (reported to the authors, who point to a corrected copy). A recording is
+  read the other way round where that is certain: by the declared size (a DIGIT gives 240 x 320), else by likeness to
+  the other recordings' touch. Two headers or pictures a recording are opened for this, the only ones.
+* The vision frame has the touch frame's name. Frames are matched by their whole number, never by a string prefix.
+* Frames in no contact list of a `data<k>` that has one are background (label.contact 0).
+* The split is that of test.csv, by frame; a recording's test frames are a sequence of their own. Without the CSV files:
+  by hash of the recording.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from anytouch_jax.data.readers.common import (
+    Columns,
+    DatasetError,
+    Frames,
+    Notes,
+    Options,
+    Reader,
+    Rows,
+    find,
+    hash_split,
+    listing,
+    numbered,
+    read_json,
+    read_table,
+)
+from anytouch_jax.data.readers.swapped import swapped
+
+FRAME = r"(\d+)-[\d.e+-]+\.(?:jpe?g|png)"
+
+
+def read(root: Path, options: Options, notes: Notes) -> Columns:
+    """Every recording of data1, data2, data3. Raises DatasetError when there is none of them."""
+    parts = ("data1", "data2", "data3")
+    base = find(root, "tvl_dataset/hct", "hct", ".", inside=parts)
+    prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
+    rows = Rows("image_path", "background_path", "text", "label.contact")
+    places = [f"{part}/{name}" for part in parts if (base / part).is_dir() for name in listing(base / part, notes)[0]]
+    found = {place: _folders(base, place, notes) for place in places}
+    pairs = {place: pair for place, pair in found.items() if pair is not None}
+    turned = swapped(
+        {place: tuple(base / place / side / frames[0][1] for side, frames in pair.items() if frames)
+         for place, pair in pairs.items() if all(pair.values())}
+    )  # fmt: skip
+    for place in sorted(turned):
+        notes.skip("recording with tactile and vision swapped (read the other way round)", f"{prefix}{place}")
+    for part in parts:
+        if (base / part).is_dir():
+            mine = {place: pair for place, pair in pairs.items() if place.startswith(f"{part}/")}
+            _part(rows, notes, base / part, prefix, mine, turned, options)
+    return rows.columns()
+
+
+def _folders(base: Path, place: str, notes: Notes) -> dict[str, Frames] | None:
+    folders = listing(base / place, notes)[0]
+    if "tactile" not in folders:
+        notes.skip("recording without a folder 'tactile'", place)
+        return None
+    sides = ("tactile", "vision") if "vision" in folders else ("tactile",)
+    return {side: numbered(listing(base / place / side, notes)[1], FRAME, notes, f"{place}/{side}") for side in sides}
+
+
+def _part(rows: Rows, notes: Notes, folder: Path, prefix: str, pairs: dict[str, dict[str, Frames]], turned: set[str],
+          options: Options) -> None:  # fmt: skip
+    contact, backgrounds = _contact(folder, notes)
+    tests, captions = _tables(folder, notes)
+    spare = folder / "digit_background.png"
+    common = f"{prefix}{folder.name}/{spare.name}" if spare.is_file() else None
+    found = 0
+    for place, pair in pairs.items():
+        touch, sight = ("vision", "tactile") if place in turned else ("tactile", "vision")
+        frames, photos = pair.get(touch, []), {name for _, name in pair.get(sight, [])}
+        name_of = place.split("/", 1)[1]
+        keys = [f"{name_of}/{name}" for _, name in frames]
+        hit = [None if contact is None else key in contact for key in keys]
+        found += sum(bool(one) for one in hit)
+        notes.skip("photograph missing (kept without)", place, sum(name not in photos for _, name in frames))
+        parts = ["test" if key in tests else "train" for key in keys] if tests or captions else [
+            hash_split("tvl", place, options)] * len(keys)  # fmt: skip
+        split = ["background" if one is False else part for one, part in zip(hit, parts, strict=True)]
+        behind: list[Any] = [backgrounds.get(key) for key in keys]
+        rows.add(
+            [f"{prefix}{place}/{touch}/{name}" for _, name in frames],
+            sensor="digit",
+            sequence=[f"{place}/test" if part == "test" and tests else place for part in split],
+            frame_index=[number for number, _ in frames],
+            split=split,
+            image_path=[f"{prefix}{place}/{sight}/{name}" if name in photos else None for _, name in frames],
+            background_path=[_known(one, pairs, turned, folder.name, prefix) or common for one in behind],
+            text=[captions.get(key) for key in keys],
+            **{"label.contact": [None if one is None else int(one) for one in hit]},
+        )
+    notes.skip("listed contact frame that is not on disk", str(folder), len(contact) - found if contact else 0)
+
+
+def _known(path: str | None, pairs: dict[str, dict[str, Frames]], turned: set[str], part: str,
+           prefix: str) -> str | None:  # fmt: skip
+    """The background named in contact.json, where it is a frame on disk, in the folder that holds the touch."""
+    match = re.fullmatch(r"([^/]+)/(?:tactile|vision)/([^/]+)", path or "")
+    if not match:
+        return None
+    place = f"{part}/{match[1]}"
+    side = "vision" if place in turned else "tactile"
+    there = place in pairs and any(name == match[2] for _, name in pairs[place].get(side, [])[:50])
+    return f"{prefix}{place}/{side}/{match[2]}" if there else None
+
+
+def _key(path: str) -> str:
+    """recording/name of recording/tactile/name: swapped folders keep their key."""
+    parts = path.replace("\\", "/").split("/")
+    return f"{parts[-3]}/{parts[-1]}" if len(parts) > 2 else path
+
+
+def _contact(folder: Path, notes: Notes) -> tuple[set[str] | None, dict[str, str]]:
+    path = folder / "contact.json"
+    if not path.is_file():
+        notes.say(f"no {folder.name}/contact.json: which of its frames are contact is not known")
+        return None, {}
+    table = read_json(path)
+    if not isinstance(table, dict) or not isinstance(table.get("tactile"), list):
+        raise DatasetError(f"{path}: expected a list 'tactile' of contact frames")
+    keys = [_key(one) for one in table["tactile"]]
+    return set(keys), dict(zip(keys, table.get("background", []), strict=False))
+
+
+def _tables(folder: Path, notes: Notes) -> tuple[set[str], dict[str, str]]:
+    """Frames of the test table, and captions of both."""
+    tests: set[str] = set()
+    captions: dict[str, str] = {}
+    for split in ("train", "test"):
+        path = folder / f"{split}.csv"
+        if not path.is_file():
+            notes.say(f"no {folder.name}/{split}.csv: no captions and no test frames of it")
+            continue
+        for row in read_table(path):
+            if "tactile" not in row:
+                raise DatasetError(f"{path}: expected a column 'tactile', found {', '.join(row)}")
+            key = _key(row["tactile"])
+            if row.get("caption"):
+                captions[key] = row["caption"]
+            if split == "test":
+                tests.add(key)
+    return tests, captions
+
+
+READER = Reader(
+    name="tvl",
+    read=read,
+    sensor="digit",
+    license="not stated",
+    commercial=False,
+    about="HCT: a hand-held DIGIT and a camera, with short phrases (SSVTP is a reader of its own)",
+    url="https://huggingface.co/datasets/mlfu7/Touch-Vision-Language-Dataset",
+    citation="Fu et al., A Touch, Vision, and Language Dataset for Multimodal Alignment, ICML 2024",
+    paper=39_000,
+)

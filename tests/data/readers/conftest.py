@@ -1,0 +1,29 @@
+"""One fixture: index a small dataset, and check what must hold for every manifest."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # reader_world.py
+
+from reader_world import Table, check_laws
+
+from anytouch_jax.data.readers import Options, index
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., Table]:
+    """read(name, root=tmp_path, out=None, **options): index a dataset, check the laws of every manifest."""
+
+    def run(name: str, root: Path = tmp_path, out: Path | None = None, **options: object) -> Table:
+        table = Table(index(name, root, out, options=Options(**options)))  # type: ignore[arg-type]
+        check_laws(table, root)
+        again = Table(index(name, root, out, options=Options(**options)))  # type: ignore[arg-type]
+        assert again.report.content_hash == table.report.content_hash  # one order, always
+        return table
+
+    return run

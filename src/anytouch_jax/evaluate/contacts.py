@@ -1,0 +1,106 @@
+"""What a manifest itself says of its touches: the deepest frame, the contact's numbers, the picture's difference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from ..config import UserError
+from ..data.images import decode
+from ..data.manifest import Manifest
+from .features import text_column
+
+Array = npt.NDArray[Any]
+
+COVARIATES = ("label.x", "label.y", "label.depth", "label.force")  # mm, mm, mm, N
+VECTOR = ("label.area", "label.x", "label.y", "label.force")  # mm2, mm, mm, N
+
+
+def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
+    """Columns of measured values, f64 (rows, columns), NaN where a cell is empty. Raises UserError on text."""
+    columns = []
+    for name in names:
+        try:
+            column = manifest.column(name).cast(pa.float64())
+        except pa.ArrowException:
+            raise UserError(f"column {name!r} holds text; it must hold numbers") from None
+        columns.append(column.to_numpy().astype(np.float64))
+    return np.stack(columns, axis=1)[rows] if columns else np.zeros((len(rows), 0))
+
+
+def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:
+    """One row for each touch, sensor and unit: that of the largest `label.force`, the first of equals; in order.
+
+    Looks at `rows`, or at the whole `split`; with `frames` > 1 only at rows that end a clip of so many. Without forces
+    it goes by `label.depth`, without either it takes the middle frame. Rows without a touch are nobody's and left
+    out. Raises UserError when none is left.
+    """
+    rows = np.unique(manifest.rows_of(split) if rows is None else np.asarray(rows))
+    rows = rows[manifest.present("touch")[rows]]
+    if frames > 1:
+        rows = np.intersect1d(rows, manifest.clips(frames)[:, -1])
+    if not len(rows):
+        raise UserError("no row has a touch; cross-sensor tasks need the column 'touch' (the place, whoever feels it)")
+    codes = np.stack([manifest.codes("touch", own=True), manifest.codes("sensor"), manifest.codes("unit", own=True)], 1)
+    _, contact = np.unique(codes[rows], axis=0, return_inverse=True)
+    order = np.lexsort((rows, -_depth(manifest, rows, contact.ravel()), contact.ravel()))
+    first = np.unique(contact.ravel()[order], return_index=True)[1]
+    return np.sort(rows[order[first]])
+
+
+def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
+    for name in ("label.force", "label.depth"):
+        if name in manifest.table.column_names:
+            depth = numbers(manifest, (name,), rows)[:, 0]
+            if np.isfinite(depth).any():
+                return np.where(np.isfinite(depth), depth, -np.inf)
+    frame = np.asarray(manifest.column("frame_index"))[rows].astype(np.float64)
+    middle = np.array([np.median(frame[contact == one]) for one in range(contact.max() + 1)])
+    return -np.abs(frame - middle[contact])
+
+
+def contact_vector(manifest: Manifest, rows: Array) -> Array:
+    """Area, centroid and force of each contact, those the manifest has, f32 (rows, up to 4).
+
+    Each is brought to mean 0 and spread 1 within its sensor; compare them by Euclidean distance. Raises UserError when
+    the manifest has none of them, or a row lacks one.
+    """
+    names = [name for name in VECTOR if name in manifest.table.column_names]
+    if not names:
+        raise UserError(f"the manifest has none of the columns {', '.join(VECTOR)}")
+    values = numbers(manifest, names, rows)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise UserError(f"{manifest.where(int(rows[bad[0]]))} has no value in one of {', '.join(names)}")
+    sensors = text_column(manifest, "sensor")[rows]
+    for sensor in np.unique(sensors):
+        here = values[sensors == sensor]
+        spread = here.std(axis=0, keepdims=True)
+        values[sensors == sensor] = (here - here.mean(axis=0, keepdims=True)) / np.where(spread > 0, spread, 1.0)
+    return values.astype(np.float32)
+
+
+def background_difference(manifest: Manifest, rows: Array, size: tuple[int, int] = (24, 32)) -> Array:
+    """Frame minus background in RGB, averaged down to `size` (rows, columns): f32 (n, 3 * rows * columns) in -1..1.
+
+    Raises UserError that names the row without a background, or whose background has another size.
+    """
+    behind: dict[str, Array] = {}
+    found = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
+    for place, row in enumerate(map(int, rows)):
+        if manifest.value(row, "background_path") is None:
+            raise UserError(f"{manifest.where(row)} has no background_path; give one, or leave this baseline out")
+        file = manifest.file(row, "background_path")
+        if str(file) not in behind:
+            behind[str(file)] = _small(decode(file), size)
+        found[place] = _small(decode(manifest.file(row)), size) - behind[str(file)]
+    return found
+
+
+def _small(image: Array, size: tuple[int, int]) -> Array:
+    return cv2.resize(image.astype(np.float32) / 255, size[::-1], interpolation=cv2.INTER_AREA).ravel()

@@ -1,0 +1,232 @@
+"""The simulator's mechanics: time per frame against the error, for each fidelity, grid and number of iterations."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from jax import Array
+
+from ..config import UserError
+from ..sim.mechanics import Contact, Fidelity, Gel, press
+from ..sim.shear import Shear, shear_step
+
+Fields = npt.NDArray[Any]
+Surface = Callable[[Fields, Fields], Fields]
+# (displacement (H, W), tangential (H, W, 2)) and the same of the reference, in mm on its grid -> an error
+ImageError = Callable[[Fields, Fields, Fields, Fields], float]
+
+
+def _sphere(x: Fields, y: Fields) -> Fields:
+    return -(x**2 + y**2) / 8
+
+
+def _textured(x: Fields, y: Fields) -> Fields:
+    return np.where(np.maximum(abs(x), abs(y)) < 5, -0.1 * (1 - np.cos(4 * x) * np.cos(4 * y)), -np.inf)
+
+
+def _edge(x: Fields, y: Fields) -> Fields:
+    return -0.6 * abs(0.9 * x + 0.44 * y)
+
+
+def _ring(x: Fields, y: Fields) -> Fields:
+    return -((np.hypot(x, y) - 3) ** 2) / 1.2
+
+
+SCENES: Mapping[str, Surface] = {"sphere": _sphere, "textured flat": _textured, "edge": _edge, "ring": _ring}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to solve: `grid` pixels a side; `iterations` None is the fidelity's own."""
+
+    fidelity: Fidelity
+    grid: int
+    iterations: int | None = None
+
+
+VARIANTS = (
+    *(Variant("exact", grid) for grid in (56, 112, 224)),
+    *(Variant("exact", 112, iterations) for iterations in (4, 8, 16)),
+    *(Variant("fast", grid) for grid in (56, 112, 224)),
+    *(Variant("fast", 112, iterations) for iterations in (1, 4, 8)),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A variant's figures; errors are over the reference's largest displacement, of the worst scene where not told.
+
+    `press_ms`, `shear_ms`: median milliseconds a frame of one step, a batch of all scenes at a time. `rms`, `largest`:
+    scene -> error of the normal displacement, brought to the reference's grid by cubic interpolation. `shear`: the
+    root mean square of the tangential one. `force`: of the normal force, over the force. `converged`: of the scenes.
+    `image`: scene -> what the caller's measure of images says.
+    """
+
+    fidelity: str
+    grid: int
+    iterations: int | None
+    press_ms: float
+    shear_ms: float
+    rms: dict[str, float]
+    largest: dict[str, float]
+    shear: float
+    force: float
+    converged: int
+    image: dict[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all variants solve: a square field in mm, a depth in mm, a motion (mm, mm, rad), friction, a gel."""
+
+    size: float = 16.0
+    depth: float = 0.4
+    motion: tuple[float, float, float] = (0.15, 0.05, 0.02)
+    friction: float = 0.6
+    gel: Gel = field(default_factory=Gel)
+
+
+def speed_against_error(
+    variants: Sequence[Variant] = VARIANTS,
+    scenes: Mapping[str, Surface] = SCENES,
+    *,
+    setting: Setting | None = None,
+    reference: int = 224,
+    rounds: int = 9,
+    image_error: ImageError | None = None,
+) -> list[Row]:
+    """Time a frame and error of every variant, against the converged float64 solution on `reference` pixels a side.
+
+    The variants take turns, `rounds` times, in this process. `scenes`: name -> height in mm of x, y in mm, arrays.
+    Raises UserError without a variant, a scene or a round.
+    """
+    if not variants or not scenes or rounds < 1:
+        raise UserError("a table of speed against error needs at least one variant, one scene and one round")
+    setting = Setting() if setting is None else setting
+    right = _references(setting, scenes.values(), reference)
+    solved = [_solvers(setting, variant, scenes) for variant in variants]
+    found = [(pressed(), sheared()) for pressed, sheared in solved]  # compiles
+    times = np.zeros((rounds, len(variants), 2))
+    for turn in range(rounds):
+        for number, pair in enumerate(solved):
+            for kind, solve in enumerate(pair):
+                start = time.perf_counter()
+                jax.block_until_ready(solve())
+                times[turn, number, kind] = time.perf_counter() - start
+    milliseconds = np.median(times, 0) * 1e3 / len(scenes)
+    return [
+        _row(variant, milliseconds[number], list(scenes), *found[number], right, image_error)
+        for number, variant in enumerate(variants)
+    ]
+
+
+def _heights(setting: Setting, surface: Surface, grid: int) -> Fields:
+    axis = ((np.arange(grid) + 0.5) / grid - 0.5) * setting.size
+    return surface(*np.meshgrid(axis, axis))
+
+
+def _references(setting: Setting, surfaces: Iterable[Surface], grid: int) -> list[tuple[Fields, Fields, float]]:
+    """For each surface displacement (H, W), tangential displacement (H, W, 2) in mm and force in N."""
+    pitch, gel, friction, found = setting.size / grid, setting.gel, setting.friction, []
+
+    def solve(heights: Array) -> tuple[Contact, Shear]:
+        contact = press(heights, setting.depth, gel, pitch, tolerance=1e-6, iterations=1000)
+        slid = shear_step(None, contact, setting.motion, gel, pitch, friction, tolerance=1e-4, iterations=1000)
+        return contact, slid
+
+    with jax.enable_x64(True):
+        solved = jax.jit(solve)
+        for surface in surfaces:
+            contact, slid = solved(jnp.asarray(_heights(setting, surface, grid)))
+            if not (bool(contact.converged) and bool(slid.converged)):
+                raise UserError("the reference did not converge: take a coarser one, or a smoother scene")
+            found.append((np.asarray(contact.displacement), np.asarray(slid.displacement), float(contact.force)))
+    return found
+
+
+def _solvers(
+    setting: Setting, variant: Variant, scenes: Mapping[str, Surface]
+) -> tuple[Callable[[], Contact], Callable[[], Shear]]:
+    pitch, gel = setting.size / variant.grid, setting.gel
+    fidelity, iterations = variant.fidelity, variant.iterations
+    heights = np.stack([_heights(setting, surface, variant.grid) for surface in scenes.values()])
+    surfaces = jnp.asarray(heights, jnp.float32)
+
+    def push(heights: Array) -> Contact:
+        return press(heights, setting.depth, gel, pitch, fidelity=fidelity, iterations=iterations)
+
+    def slide(contact: Contact) -> Shear:
+        most = None if iterations is None else 3 * iterations  # as in the fidelities' own numbers for `fast`
+        friction, motion = setting.friction, setting.motion
+        return shear_step(None, contact, motion, gel, pitch, friction, fidelity=fidelity, iterations=most)
+
+    pressed = jax.jit(jax.vmap(push))
+    sheared, contact = jax.jit(jax.vmap(slide)), pressed(surfaces)
+    return lambda: pressed(surfaces), lambda: sheared(contact)
+
+
+def _row(
+    variant: Variant,
+    milliseconds: Fields,
+    names: list[str],
+    contact: Contact,
+    slid: Shear,
+    right: list[tuple[Fields, Fields, float]],
+    image_error: ImageError | None,
+) -> Row:
+    rms, largest, image, shear, force = {}, {}, {}, 0.0, 0.0
+    for number, name in enumerate(names):
+        displacement, tangential, load = right[number]
+        moved = _resized(contact.displacement[number], displacement.shape)
+        dragged = _resized(slid.displacement[number], tangential.shape)
+        error, top = moved - displacement, displacement.max()
+        rms[name], largest[name] = float(np.sqrt(np.mean(error**2)) / top), float(abs(error).max() / top)
+        shear = max(shear, float(np.sqrt(np.mean((dragged - tangential) ** 2)) / abs(tangential).max()))
+        force = max(force, abs(float(contact.force[number]) / load - 1))
+        if image_error is not None:
+            image[name] = image_error(moved, dragged, displacement, tangential)
+    press_ms, shear_ms = map(float, milliseconds)
+    converged = int(np.sum(np.asarray(contact.converged)))
+    return Row(
+        **dataclasses.asdict(variant),
+        press_ms=press_ms,
+        shear_ms=shear_ms,
+        rms=rms,
+        largest=largest,
+        shear=shear,
+        force=force,
+        converged=converged,
+        image=image,
+    )
+
+
+def _resized(values: Any, shape: tuple[int, ...]) -> Fields:
+    return np.asarray(jax.image.resize(values, shape, "cubic"))
+
+
+def to_markdown(rows: Sequence[Row]) -> str:
+    """A table with a line a variant; errors in percent of the largest displacement, times in milliseconds a frame."""
+    names = list(rows[0].rms) if rows else []
+    heads = ["fidelity", "grid", "iterations", "press ms", "shear ms"]
+    heads += [f"{name}: rms / max %" for name in names] + ["shear rms %", "force %", "converged"]
+    if any(row.image for row in rows):
+        heads += [f"{name}: image" for name in names]
+    lines = [heads, ["---"] * len(heads)]
+    for row in rows:
+        cells = [row.fidelity, str(row.grid), "own" if row.iterations is None else str(row.iterations)]
+        cells += [f"{row.press_ms:.2f}", f"{row.shear_ms:.2f}"]
+        cells += [f"{100 * row.rms[name]:.2f} / {100 * row.largest[name]:.2f}" for name in names]
+        cells += [f"{100 * row.shear:.2f}", f"{100 * row.force:.2f}", f"{row.converged} of {len(row.rms)}"]
+        lines.append(cells + [f"{row.image[name]:.4g}" for name in names if name in row.image])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"

@@ -1,0 +1,284 @@
+"""A report: sections of text, figures and tables as one Markdown file with its pictures and numbers beside it.
+
+`demo_report` is the whole of it for a simulated manifest and the two runs trained on it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import FIELD_SENSORS, UserError
+from ..data import manifest as manifests
+from ..data.manifest import Manifest
+from . import baseline, plots, probe, results, retrieval, space
+from .contacts import background_difference, contact_vector, deepest_rows
+from .features import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from .sections import (
+    Section,
+    losses_section,
+    markdown,
+    probes_section,
+    reconstructions_section,
+    retrieval_section,
+    samples_section,
+    space_section,
+)  # fmt: skip
+
+Array = npt.NDArray[Any]
+Say = Callable[[str], None]
+
+RANDOM, PIXELS, VECTOR = "random encoder", "pixels minus background", "area, centroid, force"
+LABELS = ("hardness", "roughness", "material", "indenter")
+QUANTITIES = ("force",)
+_T_SNE_ROWS = 800
+
+
+def write_report(
+    folder: Path, sections: Sequence[Section], *, title: str = "Report", numbers: Mapping[str, Any] | None = None
+) -> Path:
+    """Write `folder`/report.md, report.json (`numbers`) and figures/; gives back the path of report.md.
+
+    A figure from elsewhere is copied in. The pictures come first and report.md last, each in one move, so that a
+    report that is there is whole. Raises UserError for a figure that is not there and for a full disk.
+    """
+    lines = [f"# {title}"]
+    for number, section in enumerate(sections, 1):
+        lines.append(f"## {section.title}")
+        if section.text:
+            lines.append(section.text.strip())
+        if section.figure is not None:
+            lines.append(f"![{section.title}](figures/{_place(section.figure, folder, number)})")
+        lines += [part.strip() for part in (section.table, section.notes) if part]
+    if numbers is not None:
+        plots.write_bytes(folder / "report.json", (_json(numbers) + "\n").encode())
+    plots.write_bytes(folder / "report.md", ("\n\n".join(lines) + "\n").encode())
+    return folder / "report.md"
+
+
+def _place(figure: Path, folder: Path, number: int) -> str:
+    """The name of a figure in figures/, copied there when it lies elsewhere."""
+    if not figure.is_file():
+        raise UserError(f"there is no figure {figure} for the report; draw it first or leave it out")
+    if figure.resolve().parent == (folder / "figures").resolve():
+        return figure.name
+    name = f"{number:02d}_{figure.name}"
+    plots.write_bytes(folder / "figures" / name, figure.read_bytes())
+    return name
+
+
+def _json(numbers: Mapping[str, Any]) -> str:
+    return json.dumps(_plain(numbers), indent=2, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return {one.name: _plain(getattr(value, one.name)) for one in fields if one.name not in ("outcome", "found")}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, Path):
+        return str(value)
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+@dataclass(frozen=True, eq=False)
+class _Study:
+    """The chosen rows of a manifest with the features of each encoder: class token and mean of patches apart."""
+
+    manifest: Manifest
+    rows: Array
+    split: Array
+    classes: dict[str, Array]
+    patches: dict[str, Array]
+    pixels: Array | None
+    notes: tuple[str, ...]
+
+    def test(self, values: Array) -> Array:
+        return values[self.split == "test"]
+
+
+def demo_report(
+    manifest: str | Path,
+    stage1: str | Path,
+    stage2: str | Path,
+    out: str | Path,
+    say: Say = print,
+    *,
+    touches: int = 200,
+    gallery_size: int = retrieval.GALLERY,
+    seed: int = 0,
+) -> Path:
+    """What two runs learned of a manifest, on its split test: samples, losses, pictures, space, retrieval, probes.
+
+    `touches` bounds how many touches of test are looked at, and half as many of train and of val, each by its deepest
+    frame. Writes the folder `out` as `write_report` does; gives back the path of report.md. Raises UserError.
+    """
+    clock, out = time.perf_counter(), Path(out)
+    table = manifests.read(manifest)
+    first, second = load_encoder(stage1), load_encoder(stage2)
+    encoders = {RANDOM: random_encoder(first.config, seed), "stage 1": first, "stage 2": second}
+    numbers: dict[str, Any] = {
+        "manifest": str(manifest), "data": table.content_hash, "stage1": str(stage1), "stage2": str(stage2),
+    }  # fmt: skip
+    sections = [_facts(table, first, second), *samples_section(table, out, seed=seed)]
+    sections.append(losses_section({"stage 1": Path(stage1), "stage 2": Path(stage2)}, out))
+    sections.append(reconstructions_section(table, Path(stage1), out))
+    say("report: samples, losses and reconstructions are drawn")
+    study = _study(table, encoders, touches, seed, say)
+    say(f"report: {len(study.rows)} touches embedded by {len(encoders)} encoders")
+    section, numbers["space"] = _space(study, out, seed)
+    sections.append(section)
+    say("report: t-SNE is drawn")
+    section, numbers["retrieval"] = _retrieval(study, out, gallery_size)
+    sections.append(section)
+    say("report: retrieval is scored")
+    section, numbers["probes"] = _probes(study, out)
+    sections.append(section)
+    numbers["seconds"] = round(time.perf_counter() - clock, 1)
+    path = write_report(out, sections, title="What the demo learned", numbers=numbers)
+    say(f"{path}: written in {numbers['seconds']:.0f} s")
+    return path
+
+
+def _facts(table: Manifest, first: Encoder, second: Encoder) -> Section:
+    split, objects = text_column(table, "split"), text_column(table, "object")
+    touch, sensors = table.codes("touch", own=True), text_column(table, "sensor")
+    rows = []
+    for name in manifests.SPLITS:
+        here = split == name
+        if here.any():
+            felt = touch[here & (touch >= 0)]
+            counts = (here.sum(), len(np.unique(felt)), len(set(objects[here]) - {""}))
+            rows.append((name, *map(str, counts), ", ".join(sorted(set(sensors[here])))))
+    text = (
+        f"Data {table.content_hash[:12]}. Stage 1: preset {first.config.preset}, {first.config.run.steps} steps of "
+        f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of {second.config.data.batch_size}, "
+        f"recipe {second.config.recipe}, towers {second.config.towers}. All figures below are of split test."
+    )
+    return Section("Data and runs", text, table=markdown(("split", "frames", "touches", "objects", "sensors"), rows))
+
+
+def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:
+    most = {"train": touches // 2, "val": touches // 2, "test": touches}
+    rows = np.concatenate([_chosen(table, name, count, seed) for name, count in most.items()])
+    classes, patches = {}, {}
+    for name, encoder in encoders.items():
+        found, values = embed_rows(encoder, table, rows, pooling="both", say=say)
+        if not np.array_equal(found, rows):
+            raise UserError(f"{len(rows) - len(found)} rows could not be read; repair the manifest first")
+        classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
+    pixels: Array | None = None
+    notes: tuple[str, ...] = ()
+    try:
+        pixels = background_difference(table, rows)
+    except UserError as error:
+        notes = (f"no baseline by {PIXELS}: {error}",)
+    return _Study(table, rows, text_column(table, "split")[rows], classes, patches, pixels, notes)
+
+
+def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
+    """Deepest rows of at most `touches` touches of a split, drawn whole; none of a split other than test if empty."""
+    if split != "test" and split not in set(text_column(table, "split")):
+        return np.zeros(0, np.int64)
+    rows = table.rows_of(split)
+    rows = deepest_rows(table, rows[~np.isin(text_column(table, "sensor")[rows], FIELD_SENSORS)])
+    codes = table.codes("touch", own=True)[rows]
+    names = np.unique(codes)
+    if len(names) > touches:
+        rows = rows[np.isin(codes, np.random.default_rng(seed).choice(names, touches, replace=False))]
+    return rows
+
+
+def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[space.Space]]:
+    rows = study.test(study.rows)
+    sensors, objects = text_column(study.manifest, "sensor")[rows], text_column(study.manifest, "object")[rows]
+    touch = study.manifest.codes("touch", own=True)[rows]
+    shown = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_T_SNE_ROWS])
+    found, points = [], {}
+    for name, values in study.classes.items():
+        here = study.test(values)
+        found.append(space.describe(here, sensors, objects, touch, name=name))
+        points[name] = space.tsne(here[shown], seed=seed)
+    return space_section(found, points, sensors[shown], objects[shown], out), found
+
+
+def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, Any]]:
+    """Retrieval of the test rows, each grade of alignment apart, with galleries matched and drawn by chance."""
+    table, rows, notes = study.manifest, study.test(study.rows), list(study.notes)
+    features = {name: study.test(values) for name, values in study.classes.items()}
+    features |= {f"{name} (patches)": study.test(values) for name, values in study.patches.items()}
+    features |= {} if study.pixels is None else {PIXELS: study.test(study.pixels)}
+    try:
+        features[VECTOR] = contact_vector(table, rows)
+    except UserError as error:
+        notes.append(f"no baseline by {VECTOR}: {error}")
+    grades = text_column(table, "grade")[rows] if "grade" in table.table.column_names else np.full(len(rows), "test")
+    found: dict[str, dict[str, list[retrieval.Retrieval]]] = {}
+    for grade in map(str, np.unique(grades)):
+        here = np.flatnonzero(grades == grade)
+        least = _fewest(table, rows[here])
+        if least < size:
+            notes.append(f"{grade}: a sensor has {least} touches only, so galleries hold {least}, not {size}")
+        for kind, match in (("matched", retrieval.COVARIATES), ("by chance", None)):
+            try:
+                found.setdefault(grade, {})[kind] = retrieval.cross_sensor_retrieval(
+                    table, {name: values[here] for name, values in features.items()}, rows[here],
+                    gallery_size=min(size, least), match=match, metrics={VECTOR: "euclidean"},
+                )  # fmt: skip
+            except UserError as error:
+                notes.append(f"{grade}, gallery {kind}: not scored: {error}")
+    section, changes = retrieval_section(found, "stage 2", notes, out)
+    return section, {"found": found, "differences": changes, "notes": notes}
+
+
+def _fewest(table: Manifest, rows: Array) -> int:
+    """The fewest touches that a sensor has among `rows`."""
+    sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
+    return min(len(np.unique(touch[sensors == name])) for name in np.unique(sensors))
+
+
+def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
+    """Probes of labels on objects never seen; a label that cannot be probed is named with its reason."""
+    table, rows, notes = study.manifest, study.rows, list(study.notes)
+    features = {name: np.concatenate([study.classes[name], study.patches[name]], 1) for name in study.classes}
+    if study.pixels is not None:
+        features[PIXELS] = baseline.reduce(study.pixels, study.split == "train")
+    objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
+    groups = np.where(objects == "", sequences, objects)
+    found: dict[str, list[results.Result]] = {}
+    for label in (*LABELS, *QUANTITIES):
+        name = f"label.{label}"
+        if name not in table.table.column_names:
+            notes.append(f"{label}: the manifest has no column {name}")
+            continue
+        values = [table.value(int(row), name) for row in rows]
+        measured = any(isinstance(one, float) and one % 1 for one in values)
+        found[label] = []
+        try:
+            for key, x in features.items():
+                found[label].append(_probe(x, values, groups, study.split, key, measured))
+        except UserError as error:
+            notes.append(f"{label}: not probed: {error}")
+    found = {label: several for label, several in found.items() if several}
+    return probes_section(found, notes, out), {"found": found, "notes": notes}
+
+
+def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> results.Result:
+    if measured:
+        return probe.regression_probe(x, labels, groups, split, name=name)
+    # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.
+    return probe.linear_probe(
+        x, labels, groups, split, name=name, seeds=0, scaling="common" if name == PIXELS else "column"
+    )

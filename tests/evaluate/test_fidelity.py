@@ -1,0 +1,76 @@
+"""The table of speed against error, at a size for tests."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from anytouch_jax.config import UserError
+from anytouch_jax.evaluate import fidelity
+from anytouch_jax.evaluate.fidelity import SCENES, Row, Setting, Variant, speed_against_error, to_markdown
+
+SETTING = Setting(size=8.0)
+VARIANTS = (Variant("exact", 32), Variant("exact", 16), Variant("exact", 16, 1), Variant("fast", 32))
+
+
+@pytest.fixture(scope="module")
+def rows():
+    seen = []
+
+    def image_error(displacement, tangential, right, right_tangential):
+        seen.append((displacement.shape, tangential.shape, right.shape, right_tangential.shape))
+        return float(np.abs(displacement - right).sum())
+
+    scenes = {name: SCENES[name] for name in ("sphere", "ring")}
+    found = speed_against_error(VARIANTS, scenes, setting=SETTING, reference=32, rounds=2, image_error=image_error)
+    assert seen == [((32, 32), (32, 32, 2), (32, 32), (32, 32, 2))] * (2 * len(VARIANTS))
+    return found
+
+
+def test_a_row_a_variant_with_times_and_errors(rows):
+    assert [(row.fidelity, row.grid, row.iterations) for row in rows] == [dataclasses.astuple(one) for one in VARIANTS]
+    for row in rows:
+        assert row.press_ms > 0 and row.shear_ms > 0
+        assert set(row.rms) == set(row.largest) == set(row.image) == {"sphere", "ring"}
+        assert all(0 <= row.rms[name] <= row.largest[name] < 1 for name in row.rms)
+        assert np.isfinite([row.shear, row.force, *row.image.values()]).all()
+
+
+def test_the_reference_itself_has_no_error(rows):
+    same = rows[0]
+    assert max(same.largest.values()) < 1e-3 and same.force < 1e-3 and same.shear < 5e-3 and same.converged == 2
+
+
+def test_errors_are_told(rows):
+    same, coarse, hasty, quick = rows
+    assert coarse.converged == 2 and hasty.converged < 2
+    assert max(hasty.rms.values()) > max(coarse.rms.values()) > 5 * max(same.rms.values())
+    assert max(same.rms.values()) < max(quick.rms.values()) < 0.05
+    assert coarse.image["ring"] > 5 * same.image["ring"]
+
+
+def test_markdown_and_json(rows):
+    lines = to_markdown(rows).splitlines()
+    assert len(lines) == 2 + len(rows)
+    assert len({line.count("|") for line in lines}) == 1
+    assert "sphere: rms / max %" in lines[0] and "ring: image" in lines[0]
+    assert lines[2].startswith("| exact | 32 | own |") and lines[4].startswith("| exact | 16 | 1 |")
+    plain = [dataclasses.replace(row, image={}) for row in rows]
+    assert "image" not in to_markdown(plain)
+    assert Row(**json.loads(json.dumps(rows[0].as_dict()))) == rows[0]
+
+
+def test_own_scenes_are_pressed_and_not_empty():
+    for name, surface in SCENES.items():
+        heights = fidelity._heights(Setting(), surface, 64)
+        assert heights.shape == (64, 64), name
+        assert -0.1 < heights.max() <= 0 and (heights + Setting().depth > 0).sum() > 20
+
+
+def test_mistakes_are_named():
+    for variants, scenes, rounds in (((), SCENES, 1), (VARIANTS, {}, 1), (VARIANTS, SCENES, 0)):
+        with pytest.raises(UserError, match="at least one"):
+            speed_against_error(variants, scenes, rounds=rounds)

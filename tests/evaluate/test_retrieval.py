@@ -1,0 +1,353 @@
+"""Laws of cross-sensor retrieval: what must be found, what must not, and that a contact's size gives nothing away."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from touch_world import SENSORS, make_touches
+
+from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import retrieval
+from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
+from anytouch_jax.evaluate.galleries import draw_galleries, score
+from anytouch_jax.evaluate.retrieval import averaged, cross_sensor_retrieval, difference, retrieve
+
+Array = np.ndarray[Any, Any]
+COUNT, OBJECTS = 240, 24
+NAMES = [f"touch {i}" for i in range(COUNT)]
+THINGS = [f"object {i % OBJECTS}" for i in range(COUNT)]
+
+
+def noise(count: int = COUNT, width: int = 16, seed: int = 0) -> Array:
+    return np.random.default_rng(seed).normal(size=(count, width))
+
+
+def ask(query: Array, gallery: Array, **options: Any) -> retrieval.Retrieval:
+    return retrieve(query, gallery, NAMES, NAMES, groups=THINGS, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"match": noise(width=3, seed=5)}, {"centre": True}, {"metric": "euclidean"}])
+def test_perfect_features_find_every_touch(options: dict[str, Any]) -> None:
+    found = ask(noise(), noise(), **options)
+    assert found.top1 == found.top5 == found.low == found.high == 1.0
+    assert (found.queries, found.groups, found.gallery) == (COUNT, OBJECTS, 50)
+
+
+@pytest.mark.parametrize("options", [{}, {"match": noise(width=3, seed=5)}, {"centre": True}])
+def test_features_without_a_bond_find_chance(options: dict[str, Any]) -> None:
+    found = ask(noise(), noise(seed=1), **options)
+    assert (found.chance1, found.chance5) == (0.02, 0.1)
+    assert found.low <= 0.02 <= found.high and found.top5_low <= 0.1 <= found.top5_high
+    assert found.low < found.top1 < found.high
+
+
+@pytest.mark.parametrize("metric", ["cosine", "euclidean"])
+@pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize("level", [0.0, 0.1, 1e6])
+def test_constant_features_score_chance_exactly(metric: Any, centre: bool, level: float) -> None:
+    same = np.full((COUNT, 7), level)
+    found = ask(same, same, metric=metric, centre=centre)
+    assert found.top1 == pytest.approx(1 / 50) and found.top5 == pytest.approx(5 / 50)
+
+
+@pytest.mark.parametrize("centre", [False, True])
+def test_rounding_errors_are_no_features(centre: bool) -> None:
+    """What differs in the last digits is a constant, even where the same touch has the same digits."""
+    same = 3.0 + 1e-13 * noise()
+    assert ask(same, same, centre=centre).top1 == pytest.approx(1 / 50)
+
+
+def test_a_tie_is_counted_as_a_lot_would_be() -> None:
+    """Two kinds of touches: the own kind ties with all of its kind, so that top 5 is 5 of those in the gallery."""
+    kind = np.eye(2)[np.arange(COUNT) % 2]
+    drawn = draw_galleries(NAMES, NAMES, seeds=1)
+    top1, top5 = score(kind, kind, drawn)
+    equal = np.sum(kind[drawn.items[0]][:, :, 0] == kind[drawn.queries][:, :1], axis=1)
+    np.testing.assert_allclose(top1, 1 / equal)
+    np.testing.assert_allclose(top5, 5 / equal)
+    worse = np.concatenate([kind[:, 1:], kind[:, :1]], axis=1)  # the own kind is the unlike one
+    assert max(one.max() for one in score(worse, kind, drawn)) == 0
+
+
+def test_a_score_by_hand() -> None:
+    query, gallery = np.array([[1.0, 0.0]]), np.array([[1.0, 1.0], [1.0, 0.1], [0.0, 1.0], [1.0, 0.2], [-1.0, 0.0]])
+    drawn = draw_galleries(["a"], ["a", "b", "c", "d", "e"], gallery_size=5)
+    assert [one.tolist() for one in score(query, gallery, drawn)] == [[0.0], [1.0]]
+    far = np.array([[5.0, 5.0]])
+    assert score(far, gallery, drawn)[0] == [1.0]  # by angle the first is nearest
+    assert score(np.array([[0.9, 0.2]]), gallery, drawn, metric="euclidean")[0] == [0.0]
+
+
+def test_matching_takes_away_what_place_and_force_tell() -> None:
+    """Features that hold a contact's covariates alone, with the error that another sensor makes."""
+    rng = np.random.default_rng(3)
+    names = [f"t{i}" for i in range(3000)]
+    covariates = rng.normal(size=(3000, 2))
+    query, gallery = (covariates + 0.25 * rng.normal(size=covariates.shape) for _ in range(2))
+    asked = (query[:200], gallery, names[:200], names)
+    loose = retrieve(*asked, metric="euclidean", seeds=2)
+    tight = retrieve(*asked, metric="euclidean", match=covariates)
+    assert loose.top1 > 0.2 and loose.nearness is None
+    assert 0.5 * tight.chance1 <= tight.top1 < 2.5 * tight.chance1 < loose.low
+    assert tight.nearness < 0.15
+    texture = rng.normal(size=(3000, 8))
+    kept = retrieve(texture[:200], texture, names[:200], names, match=covariates)
+    assert kept.top1 == 1.0  # what is not a covariate is found all the same
+
+
+def test_distractors_are_the_nearest_in_units_of_each_covariate() -> None:
+    covariates = noise(width=2, seed=4) * [1.0, 1000.0]
+    drawn = draw_galleries(NAMES, NAMES, match=covariates, gallery_size=6)
+    standard = covariates / covariates.std(axis=0)
+    for query, items in zip(drawn.queries, drawn.items[0], strict=True):
+        away = np.linalg.norm(standard - standard[query], axis=1)
+        assert items[0] == query and set(items) == set(np.argsort(away)[:6])
+    assert 0 < drawn.nearness < 0.25
+
+
+def test_a_covariate_that_never_changes_says_nothing() -> None:
+    flat = np.concatenate([noise(width=1), np.full((COUNT, 1), 7.0)], axis=1)
+    one, two = (draw_galleries(NAMES, NAMES, match=match).items for match in (flat, flat[:, :1]))
+    np.testing.assert_array_equal(one, two)
+    assert draw_galleries(NAMES, NAMES, match=np.zeros((COUNT, 1))).nearness is None
+
+
+@pytest.mark.parametrize("matched", [False, True])
+def test_no_order_of_rows_matters(matched: bool) -> None:
+    query, gallery = noise(), noise() + 1.5 * noise(seed=1)
+    covariates = np.round(noise(width=2, seed=2))  # many are equally near
+    first = ask(query, gallery, match=covariates if matched else None)
+    assert 0.05 < first.top1 < 0.95
+    mixed, turned = (np.random.default_rng(seed).permutation(COUNT) for seed in (8, 9))
+    again = retrieve(
+        query[turned], gallery[mixed], np.array(NAMES)[turned], np.array(NAMES)[mixed],
+        groups=np.array(THINGS)[turned], match=covariates[mixed] if matched else None,
+    )  # fmt: skip
+    np.testing.assert_array_equal(again.found.keys, first.found.keys[turned])
+    np.testing.assert_allclose(again.found.top1, first.found.top1[turned])
+    assert again == first
+
+
+def test_centring_takes_away_what_a_sensor_adds() -> None:
+    texture, common = noise(), 30.0 * np.ones((1, 16))
+    query, gallery = texture + common, texture - common + 0.5 * noise(seed=1)
+    plain, centred = ask(query, gallery), ask(query, gallery, centre=True)
+    assert centred.top1 > 0.95 > 0.5 > plain.top1
+    mean, low, high = difference(centred, plain)
+    assert mean == pytest.approx(centred.top1 - plain.top1) and 0 < low <= mean <= high
+
+
+def test_a_units_own_touches_never_enter_its_gallery() -> None:
+    """The same array as query and gallery: only touches by another unit may be looked for, or be distractors."""
+    names, units = np.repeat(NAMES, 2), np.tile(["unit a", "unit b"], COUNT)
+    features = noise(2 * COUNT)
+    own = retrieve(features, features, names, names, query_unit=units, gallery_unit=units, seeds=2)
+    assert own.low <= 0.02 <= own.high  # its own row would be found at once
+    drawn = draw_galleries(names, names, query_unit=units, gallery_unit=units, seeds=3)
+    assert (units[drawn.items] != units[drawn.queries][None, :, None]).all()
+    np.testing.assert_array_equal(names[drawn.items[:, :, 0]], np.broadcast_to(names[drawn.queries], (3, 2 * COUNT)))
+    assert (names[drawn.items[:, :, 1:]] != names[drawn.queries][None, :, None]).all()
+    with pytest.raises(UserError, match="share no touch"):
+        ask(noise(), noise(), query_unit=["x"] * COUNT, gallery_unit=["x"] * COUNT)
+
+
+def test_the_interval_is_over_objects_not_over_touches() -> None:
+    """Half of the objects are found always, half never: the interval is that of a few objects."""
+    query, gallery = noise(), noise()
+    lost = np.array([int(thing.split()[1]) % 2 == 0 for thing in THINGS])
+    query[lost] = noise(seed=9)[lost]
+    by_object, by_touch = ask(query, gallery), retrieve(query, gallery, NAMES, NAMES)
+    assert by_object.low < by_object.top1 < by_object.high and by_touch.low < by_touch.top1 < by_touch.high
+    assert by_object.high - by_object.low > 2 * (by_touch.high - by_touch.low)
+    alone = retrieve(query, gallery, NAMES, NAMES, groups=["one"] * COUNT)
+    assert alone.low is None and alone.groups == 1
+
+
+def test_a_paired_difference_is_narrower_than_two_intervals() -> None:
+    base = noise()
+    weak = ask(base, base + 1.2 * noise(seed=1), name="weak")
+    strong = ask(base, base + 1.1 * noise(seed=1), name="strong")
+    mean, low, high = difference(strong, weak)
+    assert mean == pytest.approx(strong.top1 - weak.top1) and low <= mean <= high
+    assert high - low < weak.high - weak.low
+    assert difference(weak, weak) == (0.0, 0.0, 0.0)
+    other = retrieve(base[:100], base, NAMES[:100], NAMES, name="other")
+    with pytest.raises(UserError, match="'other' did not answer the same queries"):
+        difference(weak, other)
+
+
+def test_runs_of_several_seeds_are_averaged_query_by_query() -> None:
+    several = [ask(noise(), noise() + 1.5 * noise(seed=seed)) for seed in (1, 2, 3)]
+    whole = averaged(several, "three seeds")
+    assert whole.name == "three seeds" and whole.top1 == pytest.approx(np.mean([one.top1 for one in several]))
+    assert whole.low <= whole.top1 <= whole.high
+    np.testing.assert_allclose(whole.found.top5, np.mean([one.found.top5 for one in several], axis=0))
+
+
+def test_queries_without_a_partner_are_counted() -> None:
+    found = retrieve(noise(), noise()[:200], NAMES, NAMES[:200])
+    assert found.queries == 200 and "40 queries left out" in found.notes[0] and found.top1 == 1.0
+
+
+BAD = noise()
+BAD[3, 2] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"gallery_size": 241}, "needs 240 other touches .* there are 239"),
+        ({"gallery_size": 1}, "too small"),
+        ({"gallery_touch": ["touch 0"] * COUNT}, "'touch 0' twice"),
+        ({"gallery_touch": [f"other {i}" for i in range(COUNT)]}, "share no touch"),
+        ({"query": BAD}, "query row 3 is not finite"),
+        ({"gallery": noise(width=4)}, "16 and 4 values"),
+        ({"match": BAD}, "covariate row 3"),
+        ({"match": noise(9)}, "match has 9 rows"),
+        ({"groups": ["a"]}, "one name for each touch"),
+        ({"query": np.zeros(COUNT)}, r"must be \(n, d\)"),
+    ],
+)
+def test_mistakes_are_one_sentence(options: dict[str, Any], words: str) -> None:
+    whole = {"query": noise(), "gallery": noise(), "query_touch": NAMES, "gallery_touch": NAMES} | options
+    with pytest.raises(UserError, match=words):
+        retrieve(**whole)
+
+
+# --- manifests ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def touched(tmp_path_factory: Any) -> manifests.Manifest:
+    """Forty touches of eight objects by three sensors, three frames each."""
+    return manifests.read(make_touches(tmp_path_factory.mktemp("touched"), touches={"test": 40, "train": 3}, frames=3))
+
+
+def with_columns(manifest: manifests.Manifest, drop: tuple[str, ...] = (), **columns: Any) -> manifests.Manifest:
+    table = manifest.table.drop_columns(list(drop))
+    return manifests.from_columns(table.to_pydict() | columns, manifest.files[0])
+
+
+def test_the_deepest_frame_of_each_touch(touched: manifests.Manifest) -> None:
+    rows = deepest_rows(touched)
+    assert len(rows) == 40 * 3 and (np.asarray(touched.column("frame_index"))[rows] == 2).all()
+    np.testing.assert_array_equal(deepest_rows(touched, rows[::-1]), rows)
+    np.testing.assert_array_equal(deepest_rows(touched, frames=3), rows)
+    force = -np.asarray(touched.column("label.force"))
+    assert (
+        np.asarray(touched.column("frame_index"))[deepest_rows(with_columns(touched, **{"label.force": force}))] == 0
+    ).all()
+    flat = with_columns(touched, **{"label.force": np.ones(len(touched))})
+    assert (np.asarray(touched.column("frame_index"))[deepest_rows(flat)] == 0).all()  # a tie: the first
+    bare = with_columns(touched, ("label.force", "label.depth"))
+    assert (np.asarray(touched.column("frame_index"))[deepest_rows(bare)] == 1).all()  # the middle
+    with pytest.raises(UserError, match="no row has a touch"):
+        deepest_rows(with_columns(touched, ("touch",)))
+
+
+def texture_features(manifest: manifests.Manifest, rows: Array) -> Array:
+    """A perfect encoder: noise that depends on the touch alone."""
+    return noise(1000)[manifest.codes("touch")[rows]]
+
+
+def test_a_manifest_is_scored_by_pairs_and_pooled(touched: manifests.Manifest) -> None:
+    rows = touched.rows_of("test")
+    features = {"perfect": texture_features(touched, rows), "lost": noise(len(rows), seed=3)}
+    found = cross_sensor_retrieval(touched, features, rows, gallery_size=20)
+    assert [(one.name, one.centred) for one in found[::7]] == [
+        ("perfect", False), ("perfect", True), ("lost", False), ("lost", True),
+    ]  # fmt: skip
+    for start in range(0, 28, 7):
+        pairs, pooled = found[start : start + 6], found[start + 6]
+        assert {(one.query_sensor, one.gallery_sensor) for one in pairs} == {
+            (a, b) for a in SENSORS for b in SENSORS if a != b
+        }
+        assert (pooled.query_sensor, pooled.queries, pooled.groups, pooled.gallery) == ("all", 240, 8, 20)
+        assert pooled.top1 == pytest.approx(np.mean([one.top1 for one in pairs]))
+        assert pooled.matched == ("label.x", "label.y", "label.depth", "label.force") and 0 < pooled.nearness < 1
+    assert found[6].top1 == 1.0 and found[20].low <= 1 / 20 <= found[20].high
+    mean, low, _ = difference(found[6], found[20])
+    assert mean > low > 0.8
+    plain = json.loads(json.dumps(retrieval.to_records(found)))
+    assert plain[6]["top1"] == 1.0 and "found" not in plain[6]
+
+
+def test_only_the_deepest_frames_count(touched: manifests.Manifest) -> None:
+    rows = touched.rows_of("test")
+    features = texture_features(touched, rows)
+    features[np.asarray(touched.column("frame_index"))[rows] < 2] = 0
+    mixed = np.random.default_rng(0).permutation(len(rows))
+    found = cross_sensor_retrieval(touched, {"x": features[mixed]}, rows[mixed], gallery_size=20, match=None)
+    assert found[-1].top1 == 1.0 and found[-1].matched == ()
+
+
+def test_a_sensor_is_not_found_by_itself(touched: manifests.Manifest) -> None:
+    rows = touched.rows_of("test")
+    features = {"x": texture_features(touched, rows)}
+    with pytest.raises(UserError, match="both by 'digit'"):
+        cross_sensor_retrieval(touched, features, rows, pairs=[("digit", "digit")], gallery_size=5)
+    with pytest.raises(UserError, match="no touch is by the sensor 'tacto'"):
+        cross_sensor_retrieval(touched, features, rows, pairs=[("digit", "tacto")], gallery_size=5)
+    with pytest.raises(UserError, match="by two sensors"):
+        cross_sensor_retrieval(with_columns(touched, sensor=["digit"] * len(touched)), features, rows, gallery_size=5)
+
+
+def test_what_a_manifest_lacks_is_said(touched: manifests.Manifest) -> None:
+    rows = deepest_rows(touched)
+    features = {"x": texture_features(touched, rows)}
+    bare = with_columns(touched, ("label.x", "label.y", "label.depth", "label.force"))
+    with pytest.raises(UserError, match=r"none of label\.x"):
+        cross_sensor_retrieval(bare, features, rows, gallery_size=5)
+    partly = with_columns(touched, ("label.y",))
+    force = partly.table["label.force"].to_pylist()
+    force[rows[0]] = None
+    found = cross_sensor_retrieval(
+        with_columns(touched, ("label.y",), **{"label.depth": force}), features, rows, gallery_size=9
+    )
+    assert found[-1].matched == ("label.x", "label.depth", "label.force")
+    assert "1 touches without" in found[-1].notes[0] and found[-1].queries == 236
+    with pytest.raises(UserError, match="have 2 rows"):
+        cross_sensor_retrieval(touched, {"x": np.ones((2, 3))}, rows)
+    with pytest.raises(UserError, match="a gallery of 50 needs 49"):
+        cross_sensor_retrieval(touched, features, rows)
+    field = with_columns(
+        touched, sensor=["tac3d" if one == "gelslim" else one for one in touched.column("sensor").to_pylist()]
+    )
+    found = cross_sensor_retrieval(field, features, rows, gallery_size=9)
+    assert found[-1].queries == 80 and "40 touches by force-field sensors" in found[-1].notes[0]
+
+
+def test_the_vector_of_a_contact(touched: manifests.Manifest) -> None:
+    rows = deepest_rows(touched)
+    vector = contact_vector(touched, rows)
+    assert vector.shape == (120, 4) and vector.dtype == np.float32
+    sensors = np.array(touched.column("sensor").to_pylist())[rows]
+    for name in SENSORS:
+        np.testing.assert_allclose(vector[sensors == name].mean(0), 0, atol=1e-6)
+        np.testing.assert_allclose(vector[sensors == name].std(0), 1, atol=1e-5)
+    assert contact_vector(with_columns(touched, ("label.area", "label.x")), rows).shape == (120, 2)
+    with pytest.raises(UserError, match="none of the columns"):
+        contact_vector(with_columns(touched, ("label.area", "label.x", "label.y", "label.force")), rows)
+    area = [None, *touched.table["label.area"].to_pylist()[1:]]
+    with pytest.raises(UserError, match=r"row 0 of .* has no value"):
+        contact_vector(with_columns(touched, **{"label.area": area}), np.array([0]))
+    with pytest.raises(UserError, match=r"'label\.area' holds text"):
+        contact_vector(with_columns(touched, **{"label.area": ["big"] * len(touched)}), rows)
+
+
+def test_pixels_minus_background(touched: manifests.Manifest) -> None:
+    rows = deepest_rows(touched)[:4]
+    change = background_difference(touched, rows, (8, 8))
+    assert change.shape == (4, 8 * 8 * 3) and change.dtype == np.float32
+    from anytouch_jax.data.images import decode
+
+    frame, ground = (decode(touched.file(int(rows[1]), name)).astype(float) for name in ("path", "background_path"))
+    np.testing.assert_allclose(change[1], (frame - ground).reshape(8, 4, 8, 4, 3).mean((1, 3)).ravel() / 255, atol=1e-5)
+    same = with_columns(touched, path=touched.column("background_path").to_pylist())
+    assert not background_difference(same, rows, (8, 8)).any()
+    with pytest.raises(UserError, match=r"row \d+ of .* has no background_path"):
+        background_difference(with_columns(touched, ("background_path",)), rows)

@@ -1,0 +1,1 @@
+"""Touch scenes: surfaces, contact, optics and recordings of several sensors, from one seed."""

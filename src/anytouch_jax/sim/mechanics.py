@@ -1,0 +1,206 @@
+"""Frictionless normal contact of a gel with an object pressed in to a given depth: pressure, displacement, force.
+
+mm, kPa, N. The gel is a linear elastic half-space, or a layer bonded to a rigid plate where its thickness is finite;
+friction does not change the pressure (exact for an incompressible gel on a rigid object).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..config import UserError
+from .convolve import Plan
+from .elastic import normal_spectrum
+from .solver import OWN, Compliance, Solution, complementarity, conjugate_gradients, descent, scaled
+
+Fidelity = Literal["exact", "fast"]
+
+KPA_MM2 = 1e-3  # N
+COARSEST = 24  # pixels; a coarser grid saves no time
+
+
+@dataclass(frozen=True)
+class Gel:
+    """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm (infinite: a half-space).
+
+    `modulus` and `thickness` may be traced arrays.
+    """
+
+    modulus: Any = 150.0
+    poisson: float = 0.48
+    thickness: Any = float("inf")
+
+    @property
+    def plane(self) -> Any:
+        """The plane strain modulus E / (1 - nu^2) in kPa."""
+        return self.modulus / (1 - self.poisson**2)
+
+
+jax.tree_util.register_dataclass(Gel, data_fields=["modulus", "thickness"], meta_fields=["poisson"])
+
+
+class Contact(NamedTuple):
+    """What a press gives: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface, force N.
+
+    A displacement is positive away from the object; it is negative where a bonded layer bulges around the contact.
+    `residual`: the largest gap where they touch, or overlap where they do not, over the largest penetration;
+    `converged`: whether it is below the tolerance; `iterations` used.
+    """
+
+    pressure: Array
+    displacement: Array
+    force: Array
+    converged: Array
+    iterations: Array
+    residual: Array
+
+
+def press(
+    surface: Array,
+    depth: Any,
+    gel: Gel,
+    pitch: Any,
+    *,
+    fidelity: Fidelity = "exact",
+    modulus_object: Any = float("inf"),
+    tolerance: float = 1e-4,
+    iterations: int | None = None,
+) -> Contact:
+    """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the flat gel.
+
+    `pitch` mm per pixel; `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf is no object. `exact`:
+    conjugate gradients on the contact set (Polonsky and Keer 1999) to `tolerance`, at most `iterations` (300). `fast`:
+    `iterations` (2) projected gradients on this grid, after twice and four times as many on coarser ones, and the
+    object where the gel still cuts it, as Taxim (Si and Yuan 2022) keeps its contact. For a batch, `jax.vmap`.
+    Raises UserError on a negative depth or a surface of NaN, where their values are known.
+    """
+    _check(surface, depth, pitch, fidelity)
+    surface = jnp.asarray(surface)
+    if surface.dtype not in (jnp.float32, jnp.float64):
+        surface = surface.astype(jnp.float32)
+    dtype = surface.dtype
+    depth, pitch = jnp.asarray(depth, dtype), jnp.asarray(pitch, dtype)
+    plane = jnp.asarray(gel.plane, dtype)
+    share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))  # E* over the gel's own plane modulus
+    cut = jnp.where(jnp.isfinite(surface), surface + depth, -jnp.ones((), dtype))
+    scale = jnp.max(cut)
+    scale = jnp.where((scale > 0) & (depth >= 0), scale, 0)
+    cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)  # 1 at the deepest point
+    plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
+    compliances = [_compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)]
+    solve, most = (_fast, 2) if fidelity == "fast" else (_exact, 300)
+    found, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
+    pressure = found.x * (scale * plane * share / pitch)
+    force = jnp.sum(pressure) * pitch**2 * KPA_MM2
+    converged = found.residual <= tolerance
+    return Contact(pressure, moved * (scale * share), force, converged, found.iterations, found.residual)
+
+
+def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
+    if fidelity not in ("exact", "fast"):
+        raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
+    if np.ndim(surface) != 2:
+        raise UserError(f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap for more")
+    for name, value, least in (("depth", depth, 0.0), ("pitch", pitch, 1e-12)):
+        if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) >= least):
+            raise UserError(f"{name} must be {'at least 0' if least == 0 else 'above 0'} mm, not {value}")
+    if not isinstance(surface, jax.core.Tracer):
+        values = np.asarray(surface)
+        if np.isnan(values).any() or np.isposinf(values).any():
+            raise UserError("a surface may hold heights in mm and -inf for no object, but no NaN and no +inf")
+
+
+def grids(shape: tuple[int, ...], least: int = COARSEST, levels: int = 3) -> list[Plan]:
+    """The grid of `shape` and coarser ones, each half of the one before, as far as they divide."""
+    plans = [Plan(shape[0], shape[1])]
+    while len(plans) < levels and all(n % 2 == 0 and n // 2 >= least for n in (plans[-1].rows, plans[-1].columns)):
+        plans.append(Plan(plans[-1].rows // 2, plans[-1].columns // 2))
+    return plans
+
+
+def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) -> Compliance:
+    spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, share, dtype)
+    return lambda pressure: plan.inverse(plan.even(plan.forward(pressure), spectrum))
+
+
+def _exact(compliances: list[Compliance], cut: Array, tolerance: float, iterations: int) -> tuple[Solution, Array]:
+    (apply,) = compliances
+    start = jnp.maximum(cut, 0)
+    start = start * scaled(start, apply(start), cut)
+    found = conjugate_gradients(apply, cut, start, tolerance, iterations)
+    return found, found.excess + cut
+
+
+def _fast(compliances: list[Compliance], cut: Array, tolerance: float, iterations: int) -> tuple[Solution, Array]:
+    """From coarse to fine, `iterations` on the finest grid and twice as many on each coarser one."""
+    cuts = [cut]
+    for _ in compliances[1:]:
+        cuts.append(halved(cuts[-1]))
+    pressure = jnp.maximum(cuts[-1], 0)
+    for level in range(len(cuts) - 1, -1, -1):
+        apply, here = compliances[level], cuts[level]
+        pressure = jnp.where(here > 0, pressure, 0)  # a flat gel never bulges to touch what is above it
+        found = _descended(apply, here, pressure, iterations * 2**level)
+        pressure = doubled(found.x) if level else found.x
+    moved = jnp.maximum(found.excess, 0) + cut
+    return found._replace(x=_sharpened(found)), moved
+
+
+def _sharpened(found: Solution) -> Array:
+    """One more local step without a convolution, the load kept: it ends the pressure where there is a gap."""
+    local = jnp.maximum(found.x - found.excess / OWN, 0)
+    total = jnp.sum(local)
+    return jnp.where(total > 0, local * (jnp.sum(found.x) / jnp.where(total > 0, total, 1)), found.x)
+
+
+def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) -> Solution:
+    """Projected gradients from `pressure` at its best scale, and their end brought to its best scale."""
+    moved = apply(pressure)
+    factor = scaled(pressure, moved, cut)
+    found = descent(apply, lambda p: jnp.maximum(p, 0), cut, factor * pressure, iterations, moved=factor * moved)
+    factor = scaled(found.x, found.excess + cut, cut)
+    excess = factor * (found.excess + cut) - cut
+    return Solution(factor * found.x, excess, complementarity(factor * found.x, excess), found.iterations)
+
+
+def halved(field: Array) -> Array:
+    """Means over 2 x 2 pixels of (H, W)."""
+    rows, columns = field.shape
+    return jnp.mean(field.reshape(rows // 2, 2, columns // 2, 2), (1, 3))
+
+
+def doubled(field: Array) -> Array:
+    """Linear interpolation of (H, W) to twice the size."""
+    return jax.image.resize(field, (2 * field.shape[0], 2 * field.shape[1]), "linear")
+
+
+def positions(shape: tuple[int, int], pitch: Any) -> tuple[Array, Array]:
+    """x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre, each (H, W)."""
+    pitch = jnp.asarray(pitch)
+    y, x = (pitch * (jnp.arange(n, dtype=pitch.dtype) - (n - 1) / 2) for n in shape)
+    return jnp.broadcast_to(x[None, :], shape), jnp.broadcast_to(y[:, None], shape)
+
+
+def area(pressure: Array, pitch: Any) -> Array:
+    """The contact's area in mm^2."""
+    return jnp.sum(pressure > 0, (-2, -1)) * jnp.asarray(pitch, pressure.dtype) ** 2
+
+
+def centroid(pressure: Array, pitch: Any) -> Array:
+    """The centre of pressure (H, W), (x, y) in mm from the field's centre; (0, 0) without contact."""
+    x, y = positions((pressure.shape[0], pressure.shape[1]), jnp.asarray(pitch, pressure.dtype))
+    total = jnp.sum(pressure)
+    moments = jnp.stack([jnp.sum(x * pressure), jnp.sum(y * pressure)])
+    return moments / jnp.where(total > 0, total, 1)
+
+
+def torque(pressure: Array, pitch: Any) -> Array:
+    """(2,) N mm: the moment of the pressure (H, W) about the field's x and y axes, (sum y p, -sum x p)."""
+    middle, load = centroid(pressure, pitch), jnp.sum(pressure) * jnp.asarray(pitch, pressure.dtype) ** 2 * KPA_MM2
+    return load * jnp.stack([middle[1], -middle[0]])

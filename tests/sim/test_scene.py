@@ -1,0 +1,132 @@
+"""Drawn scenes: seeds, splits, grades and motions. Nothing is simulated here."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from anytouch_jax.config import UserError
+from anytouch_jax.sim import scene
+from anytouch_jax.sim.scene import Gesture, Scenes
+
+SCENES = Scenes(touches=60, objects=60, seed=3)
+THINGS, SPLITS = scene.cast(SCENES)
+
+
+def recordings(scenes, number=0):
+    touch = scene.draw_touch(scenes, number, SPLITS)
+    return {sensor: scene.draw_recording(scenes, touch, sensor) for sensor in scenes.sensors}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"sensors": ("digit", "nose")}, "no sensor 'nose'"),
+        ({"sensors": ()}, "at least one"),
+        ({"sensors": ("digit", "digit")}, "once"),
+        ({"depth": (-0.1, 0.5)}, "depth is a range of mm from 0 on, lowest first, not -0.1 to 0.5"),
+        ({"depth": (0.5, 0.1)}, "lowest first"),
+        ({"fields": ("heat",)}, "no field 'heat'"),
+        ({"touches": 0}, "touches must be at least 1"),
+        ({"vision": 1.5}, "vision is a share"),
+        ({"grade": "rough"}, "grade is fine or coarse"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(change, sentence):
+    with pytest.raises(UserError, match=sentence):
+        replace(SCENES, **change)
+
+
+def test_splits_share_no_pair_of_primitive_and_texture():
+    kinds = {split: {t.kind for t, s in zip(THINGS, SPLITS, strict=True) if s == split} for split in set(SPLITS)}
+    assert set(kinds) == {"train", "val", "test"}
+    assert not kinds["train"] & kinds["test"] and not kinds["train"] & kinds["val"] and not kinds["val"] & kinds["test"]
+    assert 0.25 <= SPLITS.count("test") / len(SPLITS) < 0.4
+    for part in range(2):  # every primitive and every texture of the test objects is seen in training, apart
+        assert {kind[part] for kind in kinds["test"]} <= {kind[part] for kind in kinds["train"]}
+
+
+def test_objects_take_turns_and_a_seed_decides():
+    touches = [scene.draw_touch(SCENES, number, SPLITS) for number in range(120)]
+    counts = np.bincount([touch.object for touch in touches], minlength=60)
+    assert (counts == 2).all()
+    again = scene.draw_touch(SCENES, 7, SPLITS)
+    assert again.object == touches[7].object and np.array_equal(again.place, touches[7].place)
+    other = scene.draw_touch(replace(SCENES, seed=4), 7, SPLITS)
+    assert not np.array_equal(other.place, again.place)
+
+
+def test_another_sensor_in_the_list_changes_nothing():
+    few = recordings(replace(SCENES, sensors=("digit",)))["digit"]
+    many = recordings(replace(SCENES, sensors=("gelslim", "tac3d", "digit")))["digit"]
+    for one, two in zip(few.unit, many.unit, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert (few.has_photo, few.has_text, few.seed) == (many.has_photo, many.has_text, many.seed)
+
+
+def test_fine_recordings_move_alike_and_coarse_ones_share_only_the_place():
+    fine = list(recordings(SCENES, 5).values())
+    assert all(np.array_equal(fine[0].motion, r.motion) and np.array_equal(fine[0].depth, r.depth) for r in fine)
+    assert all(np.array_equal(fine[0].start, r.start) and not r.tilt.any() for r in fine)
+    assert len({float(r.unit.rotation) for r in fine}) == len(fine)  # but no two units are alike
+    coarse = list(recordings(replace(SCENES, grade="coarse"), 5).values())
+    assert len({r.depth.max() for r in coarse}) == len({tuple(r.start) for r in coarse}) == len(coarse)
+    assert all(r.tilt.any() for r in coarse)
+    assert all(np.array_equal(r.touch.place, coarse[0].touch.place) for r in coarse)
+    offsets = np.asarray(
+        [r.start[:2] for n in range(60) for r in recordings(replace(SCENES, grade="coarse"), n).values()]
+    )
+    assert 0.6 < offsets.std() < 1.0 and np.abs(offsets.mean()) < 0.15
+
+
+def test_units_and_noise_are_never_shared_between_recordings():
+    found = [r for n in range(20) for r in recordings(SCENES, n).values()]
+    assert len({tuple(np.concatenate([np.ravel(v) for v in r.unit])) for r in found}) == len(found)
+    assert len({r.seed for r in found}) == len(found)
+
+
+def test_shares_of_photographs_and_captions():
+    found = [r for n in range(60) for r in recordings(replace(SCENES, vision=0.25, text=0.75), n).values()]
+    assert 0.15 < np.mean([r.has_photo for r in found]) < 0.35
+    assert 0.65 < np.mean([r.has_text for r in found]) < 0.85
+    none = [r for n in range(20) for r in recordings(replace(SCENES, vision=0, text=1), n).values()]
+    assert not any(r.has_photo for r in none) and all(r.has_text for r in none)
+
+
+@pytest.mark.parametrize("motion", ["hold", "slide", "twist"])
+@pytest.mark.parametrize("pace", [0.6, 1.0, 1.5])
+def test_a_gesture_presses_then_moves_then_lets_go(motion, pace):
+    slide, twist = np.array([1.5, -0.5]) * (motion == "slide"), 0.2 * (motion == "twist")
+    moved, depth = scene.trajectory(40, Gesture(0.8, motion, slide, twist, pace))
+    assert moved.shape == (40, 3) and depth.shape == (40,)
+    assert depth[0] == pytest.approx(0.08) and depth.max() == pytest.approx(0.8, rel=0.02)
+    assert (np.diff(depth[: np.argmax(depth)]) >= 0).all() and np.abs(np.diff(depth)).max() < 0.2
+    assert not moved[0].any()
+    if pace >= 1:
+        np.testing.assert_allclose(moved[-1], [*slide, twist], atol=1e-9)
+        assert depth[-1] == pytest.approx(0.32)
+    assert (np.diff(moved @ np.sign([1.5, -0.5, 0.2])) >= -1e-12).all()  # never backwards
+
+
+def test_a_still_is_the_deepest_press():
+    moved, depth = scene.trajectory(1, Gesture(0.8, "slide", np.ones(2), 0.0, 1.0))
+    assert not moved.any() and depth.tolist() == [0.8]
+
+
+def test_directions_are_those_of_the_picture():
+    recording = recordings(SCENES, 0)["digit"]
+
+    def seen(motion, slide=(0.0, 0.0), twist=0.0, mirror=(1, 1), rotation=0.0):
+        unit = recording.unit._replace(mirror=np.asarray(mirror, np.float32), rotation=np.float32(rotation))
+        gesture = Gesture(0.5, motion, np.asarray(slide), twist, 1.0)
+        return scene.directions(recording._replace(unit=unit, gesture=gesture))
+
+    assert seen("hold") == {"label.twist": "none", "label.slide": "none"}
+    assert seen("slide", (2, 0.3)) == {"label.twist": "none", "label.slide": "right"}
+    assert seen("slide", (2, 0.3), mirror=(-1, 1))["label.slide"] == "left"
+    assert seen("slide", (0.1, 1))["label.slide"] == "down"
+    assert seen("slide", (1, 0), rotation=math.pi / 2)["label.slide"] == "down"
+    assert seen("twist", twist=0.2)["label.twist"] == "clockwise"  # from x (right) to y (down)
+    assert seen("twist", twist=0.2, mirror=(-1, 1))["label.twist"] == "counterclockwise"
+    assert seen("twist", twist=0.2, mirror=(-1, -1))["label.twist"] == "clockwise"

@@ -11,16 +11,24 @@ from typing import Any
 
 from anytouch_jax import __version__
 from anytouch_jax.config import Config, UserError, preset
-from anytouch_jax.options import Convert, Embed, Parity, Probe, Sections, Train
+from anytouch_jax.options import Convert, Embed, Parity, Probe, Sections, Simulate, Train
+from anytouch_jax.options_data import Annotate, Contact, Index, Pack, Verify
 
 _COMMANDS: dict[str, tuple[type, str]] = {
+    "simulate": (Simulate, "touch scenes by several sensors, with photographs, captions and forces"),
+    "index": (Index, "a downloaded dataset becomes a manifest"),
+    "contact": (Contact, "which frames are touched"),
+    "verify": (Verify, "check a manifest and its files; repair; rows for commercial use"),
+    "annotate": (Annotate, "captions from a vision-language model"),
+    "pack": (Pack, "millions of small files as a few shards"),
     "train": (Train, "pre-train stage 1 or stage 2, or go on with a run"),
     "embed": (Embed, "features of a manifest, a folder or a video"),
     "probe": (Probe, "linear and kNN probes of frozen features"),
     "parity": (Parity, "compare with golden vectors of the authors' code"),
     "convert": (Convert, "weights in and out"),
 }
-_POSITIONAL = (Parity, Convert)  # what these require is given by place, not by name
+# What these require is given by place, not by name.
+_POSITIONAL = (Index, Contact, Verify, Annotate, Pack, Parity, Convert)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

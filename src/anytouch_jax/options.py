@@ -160,3 +160,44 @@ class Convert:
     """The .safetensors to write."""
     names: Literal["release", "own"] = "release"
     """Key names of the authors' files, or this package's parameter names."""
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Simulate touch scenes: the same touches felt by several sensors, with photographs, captions, forces and slip.
+
+    Example: anytouch simulate --out data/scenes --touches 400 --sensors gelsight_mini,digit,duragel --seed 0
+
+    The same command again goes on where it was interrupted.
+    """
+
+    out: Path
+    """Folder for images and manifest.parquet."""
+    touches: int = 400
+    """Places to touch; each is felt once by every sensor."""
+    sensors: str = "gelsight_mini,digit,duragel"
+    """Sensors, with commas between: gelsight, gelsight_mini, gelslim, digit, duragel, tac3d (a field of forces)."""
+    seed: int = 0
+    """Seed of everything drawn."""
+    grade: Literal["fine", "coarse"] = "fine"
+    """fine: the same motion for all sensors, frame by frame. coarse: by hand, only the place is shared."""
+    fidelity: Literal["fast", "exact"] = "fast"
+    """Contact solved in a few rounds, or to convergence."""
+    frames: int = 10
+    """Frames of a recording, at 30 a second."""
+    objects: int = 200
+    """Objects of the catalogue that take turns."""
+    depth: tuple[float, float] = (0.3, 1.0)
+    """Range of the deepest press, mm."""
+    vision: float = 0.7
+    """Share of the recordings with a photograph."""
+    text: float = 0.7
+    """Share of the recordings with a caption."""
+    held_out: float = 0.25
+    """Share of the objects that only the test split touches, by whole pairs of primitive and texture."""
+    fields: str = ""
+    """Fields to write beside the images (.npy), with commas between: displacement, pressure, shear."""
+    size: int = 224
+    """Pixels of an image's shorter side."""
+    threads: int = 2
+    """Threads that render photographs and write files."""

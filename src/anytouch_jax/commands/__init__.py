@@ -3,6 +3,6 @@
 Each `run` returns an exit status. Heavy imports wait until a command runs.
 """
 
-from anytouch_jax.commands import convert, embed, parity, probe, train
+from anytouch_jax.commands import annotate, contact, convert, embed, index, pack, parity, probe, simulate, train, verify
 
-__all__ = ["convert", "embed", "parity", "probe", "train"]
+__all__ = ["annotate", "contact", "convert", "embed", "index", "pack", "parity", "probe", "simulate", "train", "verify"]

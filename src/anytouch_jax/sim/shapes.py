@@ -163,7 +163,7 @@ def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.A
         first = jnp.floor(at)
         weights.append(_cubic_weights((at - first).astype(raster.dtype)))
         index.append([jnp.clip(first.astype(jnp.int32) + i, 0, count - 1) for i in (-1, 0, 1, 2)])
-    flat = raster.reshape(-1)
+    flat = jnp.asarray(raster).reshape(-1)
     total = jnp.zeros(inside.shape, raster.dtype)
     for row, across in zip(index[0], weights[0], strict=True):
         line = jnp.zeros_like(total)

@@ -1,0 +1,77 @@
+"""`anytouch annotate`: captions from a vision-language model behind an OpenAI-compatible endpoint."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from anytouch_jax.commands.output import beside, write_new
+from anytouch_jax.commands.words import say
+from anytouch_jax.config import UserError
+from anytouch_jax.options_data import Annotate
+
+if TYPE_CHECKING:
+    from anytouch_jax.data.annotate import Annotated, Estimate
+    from anytouch_jax.data.endpoint import Endpoint
+
+
+class _OnlyAnEstimate(Exception):
+    """What was asked for has been printed; nothing goes out."""
+
+
+def run(options: Annotate) -> int:
+    """Estimate, ask for consent, annotate, write the manifest with its captions; 1 when a caption could not be had."""
+    from anytouch_jax.data import manifest as manifests
+    from anytouch_jax.data.annotate import annotate
+    from anytouch_jax.data.sheet import sample_sheet
+
+    manifest = manifests.read(options.manifest)
+    target = options.out or beside(options.manifest, "captions")
+    if target.expanduser().resolve() in manifest.files:
+        raise UserError(f"{target} is the manifest that was read; name another file with --out")
+    try:
+        found = annotate(
+            manifest, _endpoint(options), options.answers or beside(options.manifest, "answers", ""),
+            confirm=lambda estimate: _consent(options, estimate), price_in=options.price_in,
+            price_out=options.price_out, threads=options.threads, side=options.side, split=options.split,
+            families=dict(options.family), overwrite=options.overwrite, second_image=options.second_image,
+            limit=options.limit, say=say,
+        )  # fmt: skip
+    except _OnlyAnEstimate:
+        return 0
+    _tell(found)
+    if options.sheet is not None:
+        say(f"{sample_sheet(manifest, found.captions, options.sheet, count=options.sheet_count)}: captions to check")
+    print(f"{write_new(found.manifest, target)}: {len(found.captions):,} captions")
+    return 1 if found.failures else 0
+
+
+def _endpoint(options: Annotate) -> Endpoint:
+    from anytouch_jax.data import endpoint
+
+    return endpoint.Endpoint(
+        options.url, options.model, key_variable=options.key_variable, timeout=options.timeout, tries=options.tries,
+        max_tokens=options.max_tokens, temperature=options.temperature, json_mode=options.json_mode,
+        token_field=options.token_field,
+    )  # fmt: skip
+
+
+def _consent(options: Annotate, estimate: Estimate) -> bool:
+    print(f"{options.model} at {options.url}: {estimate}", flush=True)
+    if options.estimate:
+        raise _OnlyAnEstimate
+    if options.yes:
+        return True
+    if not sys.stdin.isatty():
+        raise UserError("nobody is there to confirm this; add --yes, or --estimate to see the estimate only")
+    return input("Ask now? [y/N] ").strip().lower() in ("y", "yes")
+
+
+def _tell(found: Annotated) -> None:
+    print(f"{found.asked:,} questions asked, {found.tokens_in:,} tokens in, {found.tokens_out:,} tokens out")
+    for reason, count in found.left_out.items():
+        print(f"left out, {reason}: {count:,} rows")
+    for failure in found.failures[:5]:
+        say(f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}")
+    if len(found.failures) > 5:
+        say(f"... and {len(found.failures) - 5} more: failures.jsonl has them all")

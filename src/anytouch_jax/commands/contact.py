@@ -1,0 +1,31 @@
+"""`anytouch contact`: which frames are touched, by difference from the untouched gel."""
+
+from __future__ import annotations
+
+from anytouch_jax.commands.output import beside, write_new
+from anytouch_jax.commands.words import say
+from anytouch_jax.options_data import Contact
+
+
+def run(options: Contact) -> int:
+    """Score every frame; write the marked manifest, the picture of both sides, or compare with what is known."""
+    from anytouch_jax.data import contact
+    from anytouch_jax.data import manifest as manifests
+    from anytouch_jax.evaluate.contact_report import contact_picture, contact_quality
+
+    manifest = manifests.read(options.manifest)
+    limits = dict(options.threshold)
+    scores = contact.contact_scores(manifest, workers=options.threads)
+    marked, report = contact.mark_contact(manifest, scores, thresholds=limits, drop=options.drop)
+    print("\n".join(report.lines()))
+    if options.check:
+        quality = contact_quality(
+            manifest, reference=options.reference, above=options.above, scores=scores, thresholds=limits
+        )
+        print("\n".join(quality.lines()))
+    if options.picture is not None:
+        say(f"{contact_picture(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
+    if options.out is not None or not options.check:
+        target = write_new(marked, options.out or beside(options.manifest, "contact"))
+        print(f"{target}: {len(marked):,} rows, with label.contact_score and label.contact")
+    return 0

@@ -1,0 +1,42 @@
+"""Where a command writes a manifest that it made from another one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from anytouch_jax.config import UserError
+
+if TYPE_CHECKING:
+    from anytouch_jax.data.manifest import Manifest
+
+
+def beside(manifest: Path, word: str, suffix: str | None = None) -> Path:
+    """The default place of a result: `<name>_<word>` beside the manifest, with its ending unless `suffix` is given."""
+    return manifest.with_name(f"{manifest.stem}_{word}{manifest.suffix if suffix is None else suffix}")
+
+
+def write_new(manifest: Manifest, path: Path) -> Path:
+    """Write `manifest` to `path`, whole or not at all. Raises UserError for one of the files that it was read from."""
+    from anytouch_jax.data import manifest as manifests
+
+    target = path.expanduser().resolve()
+    if target in manifest.files:
+        raise UserError(f"{target} is the manifest that was read; name another file")
+    try:
+        manifests.write(manifest, target)
+    except OSError as error:
+        raise UserError(f"{target} cannot be written: {error.strerror or error}") from None
+    return target
+
+
+def write_text(text: str, path: Path) -> Path:
+    """Write a report to `path`, whole or not at all; its folder is made."""
+    from anytouch_jax.data.files import write_whole
+
+    target = path.expanduser().resolve()
+    try:
+        write_whole(target, text)
+    except OSError as error:
+        raise UserError(f"{target} cannot be written: {error.strerror or error}") from None
+    return target

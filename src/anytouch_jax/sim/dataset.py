@@ -1,0 +1,215 @@
+"""A simulated data set on disk: images, fields, photographs and a manifest, in parts that survive an interruption.
+
+Touches are simulated in groups; a group's files are written first, then its table under `parts/`. When all parts are
+there they become `manifest.parquet` in one rename: a folder without it is not finished, and the same command goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
+
+from . import captions, objects, photo, scene
+from .record import Recorder, Take
+from .scene import Recording, Scenes
+from .sensors import SENSORS
+
+MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
+GROUP = 8  # touches a part
+VERSION = 1  # of what a seed gives; a change of the simulator raises it
+Row = dict[str, Any]
+Say = Callable[[str], None]
+
+
+def simulate(
+    scenes: Scenes,
+    out: str | Path,
+    *,
+    threads: int = 2,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Path:
+    """Simulate `scenes` in the folder `out`, or finish what was begun there; gives back the manifest's path.
+
+    `progress(touches done, touches)` is called as parts are finished. The files are the same byte for byte for a seed
+    and a machine. Raises UserError when `out` holds something else, or cannot be written.
+    """
+    out = Path(out)
+    try:
+        return _simulate(scenes, out, threads, progress)
+    except OSError as error:
+        raise UserError(
+            f"{error.filename or out}: {error.strerror or error}; what is finished is kept, the same command goes on"
+        ) from None
+
+
+def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, int], None]) -> Path:
+    _claim(scenes, out)
+    target = out / MANIFEST
+    if target.exists():
+        return target
+    (out / PARTS).mkdir(parents=True, exist_ok=True)
+    things, splits = scene.cast(scenes)
+    groups = [range(start, min(start + GROUP, scenes.touches)) for start in range(0, scenes.touches, GROUP)]
+    files = [out / PARTS / f"{i:05d}.parquet" for i in range(len(groups))]
+    done = sum(len(group) for group, file in zip(groups, files, strict=True) if file.exists())
+    progress(done, scenes.touches)
+    recorder = Recorder(scenes, things, GROUP)
+    with ThreadPoolExecutor(threads) as pool:
+        for group, file in zip(groups, files, strict=True):
+            if file.exists():
+                continue
+            touches = [scene.draw_touch(scenes, number, splits) for number in group]
+            rows = _write_group(scenes, things, touches, recorder, out, pool)
+            _write_table(rows, file)
+            done += len(group)
+            progress(done, scenes.touches)
+    _write_manifest(files, target)
+    shutil.rmtree(out / PARTS)
+    return target
+
+
+def _claim(scenes: Scenes, out: Path) -> None:
+    """Note the settings in the folder, or check that they are those of the folder."""
+    settings = {"version": VERSION} | dataclasses.asdict(scenes)
+    text, file = json.dumps(settings, indent=2) + "\n", out / SETTINGS
+    if file.exists():
+        if file.read_text() == text:
+            return
+        try:
+            held = json.loads(file.read_text())
+        except json.JSONDecodeError:
+            held = {}
+        now = json.loads(text)
+        other = [f"{name} {held.get(name)!r}, not {now[name]!r}" for name in now if held.get(name) != now[name]]
+        raise UserError(f"{out} holds a data set with {'; '.join(other)}: give another folder, or the same options")
+    if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
+        raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    _write_bytes(file, text.encode())
+
+
+def _write_group(
+    scenes: Scenes, things: Any, touches: list[scene.Touch], recorder: Recorder, out: Path, pool: ThreadPoolExecutor
+) -> list[Row]:
+    """Simulate and write the recordings of a few touches, sensor by sensor; their manifest rows."""
+    found = []
+    for sensor in scenes.sensors:
+        recordings = [scene.draw_recording(scenes, touch, sensor) for touch in touches]
+        takes = recorder.record(recordings)
+        found += [
+            pool.submit(_write_recording, scenes, things[recording.touch.object], recording, take, out)
+            for recording, take in zip(recordings, takes, strict=True)
+        ]
+    return [row for future in found for row in future.result()]
+
+
+def _write_recording(scenes: Scenes, thing: objects.Object, recording: Recording, take: Take, out: Path) -> list[Row]:
+    """Write the files of one recording; the rows of its frames and of its background."""
+    touch, kind = recording.touch, SENSORS[recording.sensor].kind
+    name = f"{touch.number:06d}-{recording.sensor}"
+    common = _common_row(scenes, thing, recording) | {"sequence": name}
+    folder = Path(recording.sensor) / f"{touch.number:06d}"
+    (out / folder).mkdir(parents=True, exist_ok=True)
+    picture = caption = None
+    if recording.has_photo:
+        picture = folder / "photo.jpg"
+        image = photo.photograph(thing, touch.place, scene.photo_rng(scenes, recording), scenes.size)
+        _write_image(out / picture, image)
+    if recording.has_text:
+        caption = captions.caption(thing, scene.caption_rng(scenes, recording))
+    background = None if kind == "field" else folder / "background.jpg"
+    common |= {
+        "image_path": picture and picture.as_posix(),
+        "text": caption,
+        "background_path": background and background.as_posix(),
+    }
+    rows = []
+    for t in range(scenes.frames):
+        path = folder / f"{t:03d}{'.npy' if kind == 'field' else '.jpg'}"
+        field = folder / f"{t:03d}.npy" if scenes.fields or kind == "field" else None
+        if kind != "field":
+            _write_image(out / path, take.image[t])
+        if field is not None:
+            _write_array(out / field, take.field[t])
+        rows.append(
+            common
+            | {"path": path.as_posix(), "frame_index": t, "field_path": field and field.as_posix()}
+            | {f"label.{name}": float(np.float32(values[t])) for name, values in take.labels.items()}
+        )
+    if background is not None:
+        _write_image(out / background, take.background)
+        alone = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
+        rows.append(common | alone | {"split": "background", "touch": None, "text": None, "image_path": None})
+    return rows
+
+
+def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> Row:
+    """What all frames of a recording share."""
+    touch, gesture = recording.touch, recording.gesture
+    return {
+        "sensor": recording.sensor,
+        "split": touch.split,
+        "dataset": f"simulated-{scenes.grade}",
+        "unit": f"{recording.sensor}-{touch.split}-{touch.number:06d}",
+        "stride": 1,
+        "touch": f"{touch.number:06d}",
+        "object": thing.name,
+        "license": "CC0-1.0",
+        "commercial": True,
+        "grade": scenes.grade,
+        "label.object": thing.name,
+        "label.material": thing.material.name,
+        "label.hardness": objects.hardness_of(thing),
+        "label.roughness": objects.roughness_of(thing),
+        "label.indenter": thing.shape.primitive,
+        "label.texture": thing.shape.texture,
+        "label.motion": gesture.motion,
+    } | scene.directions(recording)
+
+
+def _write_table(rows: list[Row], file: Path) -> None:
+    names = dict.fromkeys(name for row in rows for name in row)
+    table = pa.table({name: [row.get(name) for row in rows] for name in names})
+    temporary = file.with_suffix(".tmp")
+    pq.write_table(table, temporary)
+    os.replace(temporary, file)
+
+
+def _write_manifest(parts: list[Path], target: Path) -> None:
+    table = pa.concat_tables([pq.read_table(part) for part in parts], promote_options="permissive")
+    whole = manifests.from_columns({name: table[name].combine_chunks() for name in table.column_names}, target)
+    manifests.write(whole, target)
+
+
+def _write_image(path: Path, image: np.ndarray) -> None:
+    good, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    if not good:
+        raise RuntimeError(f"OpenCV could not encode {path}")
+    _write_bytes(path, data.tobytes())
+
+
+def _write_array(path: Path, array: np.ndarray) -> None:
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        np.save(file, array, allow_pickle=False)
+    os.replace(temporary, path)
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes(data)
+    os.replace(temporary, path)

@@ -1,0 +1,234 @@
+"""Recordings computed: surface under the gel, contact, shear, picture, for a batch of clips in one compiled program.
+
+Only what is asked for is computed: a sensor of fields draws no picture, shear is solved where markers, fields or
+labels need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from . import mechanics, optics, shapes, shear
+from .mechanics import Contact, Fidelity, Gel
+from .objects import Object
+from .scene import Recording, Scenes
+from .sensors import SENSORS, Sensor, look
+from .units import from_gel, stack
+
+SPACING = 0.1  # mm a pixel of a relief
+RELIEF = 400  # pixels of a relief: 40 mm, more than any field turned by any angle, and its motion
+GRID = 96  # pixels of the contact's grid on the field's short side
+
+
+class Clip(NamedTuple):
+    """What a recording needs of a scene, T frames; every array may have a leading batch axis.
+
+    `relief` (RELIEF, RELIEF) mm, the object's height map of SPACING mm a pixel; `place` (2,) mm on it; `start`,
+    `motion`, `depth`, `tilt` as in `scene.Recording`; `modulus` kPa of the object and its `friction` on the gel; `unit`
+    of the sensor; `seed` u32 of the image noise.
+    """
+
+    relief: Any
+    place: Any
+    start: Any
+    motion: Any
+    depth: Any
+    tilt: Any
+    modulus: Any
+    friction: Any
+    unit: Any
+    seed: Any
+
+
+class Take(NamedTuple):
+    """What a recording gives, T frames; as numpy, one a recording, from `Recorder.record`.
+
+    `image` u8 (T, h, w, 3) and `background` u8 (h, w, 3), or None for a sensor of fields; `field` f32: (T, 20, 20, 6)
+    of such a sensor, displacement mm and force N, or (T, h0, w0, channels) of the fields asked for, or None; `labels`
+    f32 (T,): force N, depth mm, area mm2, x and y mm of the pressure's centroid in the picture, slip (share of the
+    contact that slides), and for fidelity exact whether it converged.
+    """
+
+    image: Any
+    background: Any
+    field: Any
+    labels: dict[str, Any]
+
+
+def solve_grid(sensor: Sensor) -> tuple[tuple[int, int], float]:
+    """Rows and columns of the contact's grid over a sensor's field, and its pitch in mm: square pixels."""
+    pitch = min(sensor.field) / GRID
+    rows, columns = (4 * round(side / pitch / 4) for side in sensor.field)
+    return (rows, columns), pitch
+
+
+def surfaces(clip: Clip, x: Array, y: Array) -> Array:
+    """Heights (T, h0, w0) mm of the object under the gel's points `x`, `y` mm; 0 where it is met first.
+
+    The object turns and slides about the middle of the gel; its tilt is that of the sensor in the hand. The unit's own
+    mounting turns and moves all of it.
+    """
+    x, y = from_gel(clip.unit, x, y)
+
+    def under(motion: Array) -> Array:
+        u, v = _turned(x - motion[0], y - motion[1], -motion[2])
+        u, v = _turned(u - clip.start[0], v - clip.start[1], -clip.start[2])
+        z = shapes.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
+        return z + clip.tilt[0] * x + clip.tilt[1] * y
+
+    z = jax.vmap(under)(clip.motion)
+    return z - jnp.max(z[0])
+
+
+def gel_motion(clip: Clip) -> Array:
+    """Motion (T, 3) mm, mm, rad of the object from frame to frame in the gel's own frame; 0 in the first."""
+    steps = jnp.diff(clip.motion, axis=0, prepend=clip.motion[:1])
+    c, s = jnp.cos(clip.unit.rotation), jnp.sin(clip.unit.rotation)
+    return jnp.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1], steps[:, 2]], 1)
+
+
+def record(
+    clip: Clip, *, sensor: Sensor, fidelity: Fidelity, size: int, fields: tuple[str, ...] = (), slides: bool = True
+) -> Take:
+    """One recording by `sensor`: contact of every frame, shear with its history, pictures and labels.
+
+    `size` pixels of the picture's short side; `slides` False leaves the shear out (stills, units without markers).
+    """
+    (rows, columns), pitch = solve_grid(sensor)
+    y, x = jnp.meshgrid(*((jnp.arange(n) - (n - 1) / 2) * pitch for n in (rows, columns)), indexing="ij")
+    gel = replace(
+        sensor.gel, modulus=sensor.gel.modulus * clip.unit.modulus, thickness=sensor.gel.thickness * clip.unit.thickness
+    )
+    press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
+    contact = jax.vmap(press)(surfaces(clip, x, y), clip.depth)
+    sheared = _sheared(clip, contact, gel, pitch, fidelity) if slides else _unsheared(contact)
+    labels = _labels(clip, contact, sheared, pitch)
+    if fidelity == "fast":
+        del labels["converged"]  # a few rounds are not meant to converge
+    if sensor.kind == "field":
+        measured = jax.vmap(partial(optics.field, pitch=pitch))(
+            contact.displacement, sheared.displacement, contact.pressure, sheared.traction
+        )
+        return Take(None, None, measured, labels)
+    shape = optics.picture_size(sensor, size)
+    draw = partial(optics.render, pitch=pitch, sensor=sensor, unit=clip.unit, resolution=shape)
+    keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
+    behind = optics.backdrop(sensor, clip.unit, shape)
+    image = jax.vmap(lambda u, t, key: draw(u, t, key=key, behind=behind))(
+        contact.displacement, sheared.displacement, keys[1:]
+    )
+    background = optics.background(sensor, clip.unit, keys[0], resolution=shape)
+    return Take(image, background, _fields(fields, contact, sheared), labels)
+
+
+def _sheared(clip: Clip, contact: Contact, gel: Gel, pitch: float, fidelity: Fidelity) -> shear.Shear:
+    """The tangential state of every frame, each from the one before it."""
+
+    def step(state: shear.Shear, frame: tuple[Contact, Array]) -> tuple[shear.Shear, shear.Shear]:
+        state = shear.shear_step(
+            state, frame[0], frame[1], gel, pitch, clip.friction, fidelity=fidelity, modulus_object=clip.modulus
+        )
+        return state, state
+
+    start = shear.at_rest((contact.pressure.shape[1], contact.pressure.shape[2]), contact.pressure.dtype)
+    return jax.lax.scan(step, start, (contact, gel_motion(clip)))[1]
+
+
+def _unsheared(contact: Contact) -> shear.Shear:
+    frames, rows, columns = contact.pressure.shape
+    still = shear.at_rest((rows, columns), contact.pressure.dtype)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape)), still)
+
+
+def _labels(clip: Clip, contact: Contact, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
+    centre = jax.vmap(lambda p: jnp.asarray(mechanics.centroid(p, pitch)))(contact.pressure)
+    shown = (centre - clip.unit.window[None]) * clip.unit.mirror[None]
+    return {
+        "force": contact.force,
+        "depth": clip.depth,
+        "area": jax.vmap(lambda p: mechanics.area(p, pitch))(contact.pressure),
+        "x": shown[:, 0],
+        "y": shown[:, 1],
+        "slip": sheared.slip_fraction,
+        "converged": (contact.converged & sheared.converged).astype(jnp.float32),
+    }
+
+
+def _fields(names: tuple[str, ...], contact: Contact, sheared: shear.Shear) -> Array | None:
+    """The fields asked for, as channels: displacement mm, pressure kPa, shear (2) mm."""
+    known = {
+        "displacement": contact.displacement[..., None],
+        "pressure": contact.pressure[..., None],
+        "shear": sheared.displacement,
+    }
+    return jnp.concatenate([known[name] for name in names], -1) if names else None
+
+
+def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * x - s * y, s * x + c * y
+
+
+class Recorder:
+    """Computes recordings of a data set in batches of one size, so that each sensor is compiled once."""
+
+    def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
+        self._scenes, self._objects, self._batch = scenes, objects, batch
+        self._reliefs: dict[int, np.ndarray] = {}
+        self._programs: dict[str, Any] = {}
+
+    def record(self, recordings: Sequence[Recording]) -> list[Take]:
+        """The takes of at most `batch` recordings of one sensor, as numpy. Raises ValueError for more."""
+        count = len(recordings)
+        if not 0 < count <= self._batch or len({r.sensor for r in recordings}) > 1:
+            raise ValueError(f"record takes 1 to {self._batch} recordings of one sensor")
+        clips = [self._clip(recording) for recording in recordings]
+        clips += clips[-1:] * (self._batch - count)  # one shape, one compilation
+        units = stack([clip.unit for clip in clips])
+        batch = Clip(*(np.stack(values) for values in zip(*(c._replace(unit=0) for c in clips), strict=True)))
+        takes = jax.device_get(self._program(recordings[0].sensor)(batch._replace(unit=units)))
+        return [jax.tree.map(lambda x, i=i: x[i], takes) for i in range(count)]
+
+    def _program(self, name: str) -> Any:
+        if name not in self._programs:
+            scenes = self._scenes
+            if SENSORS[name].kind == "image":
+                look(SENSORS[name])  # fitted to real presses once, outside of the program
+            one = partial(
+                record,
+                sensor=SENSORS[name],
+                fidelity=scenes.fidelity,
+                size=scenes.size,
+                fields=scenes.fields,
+                slides=scenes.frames > 1,
+            )
+            self._programs[name] = jax.jit(jax.vmap(one))
+        return self._programs[name]
+
+    def _clip(self, recording: Recording) -> Clip:
+        touch = recording.touch
+        thing = self._objects[touch.object]
+        if touch.object not in self._reliefs:
+            if len(self._reliefs) > 64:
+                self._reliefs.pop(next(iter(self._reliefs)))
+            self._reliefs[touch.object] = shapes.relief(thing.shape, RELIEF, SPACING)
+        return Clip(
+            relief=self._reliefs[touch.object],
+            place=np.asarray(touch.place, np.float32),
+            start=np.asarray(recording.start, np.float32),
+            motion=np.asarray(recording.motion, np.float32),
+            depth=np.asarray(recording.depth, np.float32),
+            tilt=np.asarray(recording.tilt, np.float32),
+            modulus=np.float32(thing.material.modulus),
+            friction=np.float32(thing.material.friction),
+            unit=recording.unit,
+            seed=np.uint32(recording.seed),
+        )

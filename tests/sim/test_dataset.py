@@ -1,0 +1,193 @@
+"""A data set on disk: the same bytes for a seed, whole or not there, going on after an interruption."""
+
+import errno
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.cli import main
+from anytouch_jax.config import UserError, preset
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.loader import Loader
+from anytouch_jax.sim import dataset, scene
+from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.sim.sensors import SENSORS
+
+SCENES = Scenes(touches=10, objects=24, seed=4, sensors=("digit", "tac3d"), size=32, frames=4, vision=0.5, text=0.5)
+
+
+class Blank:
+    """In the place of `Recorder`: takes that tell which recording they are of, without any physics."""
+
+    def __init__(self, scenes, objects, batch):
+        self.scenes = scenes
+
+    def record(self, recordings):
+        return [self.take(recording) for recording in recordings]
+
+    def take(self, recording):
+        frames, rng = self.scenes.frames, np.random.default_rng(recording.seed)
+        labels = {name: rng.random(frames) for name in ("force", "depth", "area", "x", "y", "slip")}
+        if SENSORS[recording.sensor].kind == "field":
+            return dataset.Take(None, None, rng.random((frames, 20, 20, 6), np.float32), labels)
+        picture = np.full((frames, 43, 32, 3), recording.seed % 251, np.uint8)
+        field = rng.random((frames, 12, 8, len(self.scenes.fields)), np.float32) if self.scenes.fields else None
+        return dataset.Take(picture, picture[0], field, labels)
+
+
+@pytest.fixture(autouse=True)
+def _no_physics(monkeypatch, compiled_once):
+    monkeypatch.setattr(dataset, "Recorder", Blank)
+
+
+def tree(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "Recorder", Blank)
+        dataset.simulate(SCENES, folder)
+    return folder
+
+
+def test_the_manifest_is_one_that_the_project_reads(made):
+    table = manifests.read(made / "manifest.parquet")
+    splits = set(table.column("split").to_pylist())
+    assert len(table) == 10 * 2 * 4 + 10 and splits == {"train", "val", "test", "background"}
+    rows = table.table.to_pylist()
+    for index, row in enumerate(rows):
+        assert table.file(index).exists() and (row["path"].endswith(".npy") == (row["sensor"] == "tac3d"))
+        if row["split"] == "background":
+            assert row["touch"] is None and row["text"] is None and row["image_path"] is None
+    clips = table.clips(4)
+    assert len(clips) == 20 and all(len({rows[i]["unit"] for i in clip}) == 1 for clip in clips)
+    pairs = {(row["touch"], row["sensor"]) for row in rows if row["touch"]}
+    assert len(pairs) == 20
+    units = {split: {row["unit"] for row in rows if row["split"] == split} for split in ("train", "val", "test")}
+    assert not units["train"] & units["test"] and not units["val"] & units["test"]
+
+
+def test_shares_and_labels_are_as_drawn(made):
+    rows = [row for row in manifests.read(made / "manifest.parquet").table.to_pylist() if row["touch"]]
+    things, splits = scene.cast(SCENES)
+    for row in rows:
+        touch = scene.draw_touch(SCENES, int(row["touch"]), splits)
+        recording = scene.draw_recording(SCENES, touch, row["sensor"])
+        thing = things[touch.object]
+        assert (row["image_path"] is not None, row["text"] is not None) == (recording.has_photo, recording.has_text)
+        assert (row["object"], row["split"]) == (thing.name, touch.split)
+        assert row["label.material"] == thing.material.name and row["label.indenter"] == thing.shape.primitive
+        if row["text"]:
+            assert thing.name not in row["text"].lower()
+    assert {row["image_path"] is None for row in rows} == {row["text"] is None for row in rows} == {True, False}
+
+
+def test_images_and_fields_are_whole(made):
+    for row in manifests.read(made / "manifest.parquet").table.to_pylist():
+        if row["sensor"] == "tac3d":
+            assert np.load(made / row["path"]).shape == (20, 20, 6) and row["field_path"] == row["path"]
+        else:
+            assert cv2.imread(str(made / row["path"])).shape == (43, 32, 3) and row["field_path"] is None
+            assert cv2.imread(str(made / row["background_path"])).shape == (43, 32, 3)
+    assert not list(made.rglob("*.tmp")) and not (made / "parts").exists()
+
+
+def test_only_what_is_asked_for_is_written(tmp_path):
+    folder = tmp_path / "few"
+    asked = replace(SCENES, sensors=("digit",), vision=0.0, text=0.0, fields=("pressure",), touches=3)
+    dataset.simulate(asked, folder)
+    assert {path.name for path in folder.iterdir()} == {"digit", "manifest.parquet", "dataset.json"}
+    assert not list(folder.rglob("photo.jpg"))
+    rows = manifests.read(folder / "manifest.parquet").table.to_pylist()
+    assert all(row["text"] is None for row in rows)
+    assert np.load(folder / rows[0]["field_path"]).shape == (12, 8, 1)
+
+
+def test_a_seed_gives_the_same_bytes_and_another_seed_does_not(made, tmp_path):
+    dataset.simulate(SCENES, tmp_path / "again", threads=1)
+    assert tree(tmp_path / "again") == tree(made)
+    dataset.simulate(replace(SCENES, seed=2), tmp_path / "other")
+    assert tree(tmp_path / "other") != tree(made)
+
+
+@pytest.mark.parametrize("broken_at", [0, 9, 20, 47])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch, broken_at):
+    calls = []
+    write = dataset._write_bytes
+
+    def stop_once(path, data):
+        calls.append(path)
+        if len(calls) == broken_at + 1:
+            path.with_name(path.name + ".tmp").write_bytes(data[:10])
+            raise KeyboardInterrupt
+        write(path, data)
+
+    monkeypatch.setattr(dataset, "_write_bytes", stop_once)
+    with pytest.raises(KeyboardInterrupt):
+        dataset.simulate(SCENES, tmp_path / "cut")
+    assert not (tmp_path / "cut" / "manifest.parquet").exists()
+    done = []
+    dataset.simulate(SCENES, tmp_path / "cut", progress=lambda n, of: done.append((n, of)))
+    assert done[-1] == (10, 10) and (broken_at < 20 or done[0][0] == 0 or done[0] == (8, 10))
+    assert tree(tmp_path / "cut") == tree(made)
+
+
+def test_a_finished_part_is_not_made_again(tmp_path, monkeypatch):
+    class Counting(Blank):
+        made = 0
+
+        def record(self, recordings):
+            Counting.made += 1
+            if Counting.made == 3:  # the second part
+                raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
+            return super().record(recordings)
+
+    monkeypatch.setattr(dataset, "Recorder", Counting)
+    with pytest.raises(UserError, match="No space left on device; what is finished is kept, the same command goes on"):
+        dataset.simulate(SCENES, tmp_path / "full")
+    assert [path.name for path in (tmp_path / "full" / "parts").iterdir()] == ["00000.parquet"]
+    dataset.simulate(SCENES, tmp_path / "full")
+    assert Counting.made == 5  # two sensors of the second part, and the one that failed
+    again = Counting.made
+    dataset.simulate(SCENES, tmp_path / "full")
+    assert Counting.made == again
+
+
+def test_a_folder_of_something_else_is_left_alone(made, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match="is not empty and holds no simulated data set"):
+        dataset.simulate(SCENES, tmp_path)
+    assert (tmp_path / "mine.txt").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
+    with pytest.raises(UserError, match=r"holds a data set with seed 4, not 5; vision 0.5, not 0.25"):
+        dataset.simulate(replace(SCENES, seed=5, vision=0.25), made)
+
+
+def test_the_loader_trains_on_it(made):
+    config = preset("tiny", stage=2)
+    config = replace(config, data=replace(config.data, batch_size=4), model=replace(config.model, image_size=28))
+    loader = Loader(manifests.read(made / "manifest.parquet"), config)
+    batch = loader.batch(0)
+    assert any("left out" in note and "tac3d" in note for note in loader.notes)
+    assert batch.align.clip.shape == (4, 1, 28, 28, 3)
+    assert batch.match is None  # one camera: nothing to match
+
+
+def test_a_mistake_on_the_command_line_is_one_sentence(tmp_path, capsys):
+    assert main(["simulate", "--out", str(tmp_path / "x"), "--sensors", "nose"]) == 1
+    assert capsys.readouterr().err.startswith("anytouch simulate: there is no sensor 'nose' to simulate; choose among")
+    assert main(["simulate", "--out", str(tmp_path / "x"), "--depth", "-1", "1"]) == 1
+    assert "depth is a range of mm" in capsys.readouterr().err and not (tmp_path / "x").exists()
+
+
+def test_the_command_makes_a_data_set(tmp_path, capsys):
+    out = tmp_path / "scenes"
+    options = ["--touches", "2", "--sensors", "digit", "--objects", "6", "--frames", "2", "--size", "32"]
+    assert main(["simulate", "--out", str(out), *options]) == 0
+    assert "2 touches by digit" in capsys.readouterr().err
+    assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2

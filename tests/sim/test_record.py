@@ -1,0 +1,158 @@
+"""A recording computed: the surface under the gel and its motion, labels that agree with physics, only what is asked."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from anytouch_jax.sim import record, scene
+from anytouch_jax.sim.record import SPACING, Clip, Recorder
+from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.sim.sensors import SENSORS
+from anytouch_jax.sim.units import identity_unit
+
+SURFACES = jax.jit(record.surfaces)
+DIGIT = SENSORS["digit"]
+RNG = np.random.default_rng(0)
+AXIS = (np.arange(160) - 79.5) * SPACING
+BUMPY = sum(
+    np.cos(AXIS[:, None] * RNG.uniform(-2, 2) + AXIS[None, :] * RNG.uniform(-2, 2) + RNG.uniform(0, 6))
+    for _ in range(12)
+).astype(np.float32)
+
+
+def clip(**change):
+    unit = identity_unit(DIGIT)
+    values = {
+        "relief": BUMPY * 0.1,
+        "place": np.zeros(2, np.float32),
+        "start": np.zeros(3, np.float32),
+        "motion": np.zeros((2, 3), np.float32),
+        "depth": np.full(2, 0.5, np.float32),
+        "tilt": np.zeros(2, np.float32),
+        "modulus": np.float32(1e5),
+        "friction": np.float32(0.6),
+        "unit": unit._replace(**change.pop("unit", {})),
+        "seed": np.uint32(1),
+    }
+    return Clip(**(values | change))
+
+
+def grid(n=30, pitch=0.2):
+    line = (jnp.arange(n) - (n - 1) / 2) * pitch
+    return jnp.meshgrid(line, line)  # x, y
+
+
+def heights(**change):
+    """Surface under the gel, not shifted to its first contact."""
+    z = np.asarray(SURFACES(clip(**change), *grid()))
+    return z - z[0, 0, 0]
+
+
+def test_the_surface_is_zero_where_it_is_met_first():
+    z = np.asarray(SURFACES(clip(), *grid()))
+    assert z.shape == (2, 30, 30) and z[0].max() == 0 and z.std() > 0.05
+    np.testing.assert_array_equal(z[0], z[1])
+
+
+def test_sliding_moves_the_imprint_with_the_object():
+    z = heights(motion=np.asarray([[0, 0, 0], [0.6, -0.4, 0]], np.float32))  # three columns right, two rows up
+    np.testing.assert_allclose(z[1][:-2, 3:] - z[1][0, 3], z[0][2:, :-3] - z[0][2, 0], atol=2e-5)
+
+
+def test_a_quarter_turn_turns_the_imprint_from_x_to_y():
+    z = heights(motion=np.asarray([[0, 0, 0], [0, 0, np.pi / 2]], np.float32))
+    np.testing.assert_allclose(z[1] - z[1].mean(), np.rot90(z[0] - z[0].mean(), -1), atol=2e-4)
+
+
+def test_the_place_lies_under_the_middle_and_the_start_moves_it():
+    plain, moved = heights(), heights(place=np.asarray([1.0, 0.4], np.float32), start=np.asarray([1.0, 0.4, 0], np.float32))
+    np.testing.assert_allclose(moved, plain, atol=2e-5)
+    place = heights(place=np.asarray([0.6, 0.0], np.float32))[0]
+    np.testing.assert_allclose(place[:, :-3] - place[0, 0], plain[0][:, 3:] - plain[0][0, 3], atol=2e-5)
+
+
+def test_tilt_is_a_plane():
+    rise = heights(tilt=np.asarray([0.02, -0.05], np.float32)) - heights()
+    x, y = grid()
+    plane = 0.02 * np.asarray(x) - 0.05 * np.asarray(y)
+    np.testing.assert_allclose(rise[0] - rise[0].mean(), plane, atol=1e-4)
+
+
+def test_the_mounting_turns_surface_and_motion_alike():
+    motion = np.asarray([[0, 0, 0], [0.6, 0, 0]], np.float32)
+    turned = clip(motion=motion, unit={"rotation": np.float32(np.pi / 2)})
+    np.testing.assert_allclose(record.gel_motion(turned), [[0, 0, 0], [0, 0.6, 0]], atol=1e-6)
+    z = np.asarray(SURFACES(turned, *grid()))
+    np.testing.assert_allclose(z[1][3:] - z[1][3, 0], z[0][:-3] - z[0][0, 0], atol=2e-4)  # three rows down
+    plain = np.asarray(SURFACES(clip(motion=motion), *grid()))
+    np.testing.assert_allclose(z[0], np.rot90(plain[0], -1), atol=2e-4)
+
+
+def test_every_sensor_is_solved_on_square_pixels_over_its_whole_field():
+    for sensor in SENSORS.values():
+        (rows, columns), pitch = record.solve_grid(sensor)
+        assert rows % 4 == columns % 4 == 0
+        np.testing.assert_allclose((rows * pitch, columns * pitch), sensor.field, atol=2 * pitch)
+
+
+@pytest.fixture(scope="module")
+def takes(compiled_once):
+    """Six touches by a camera and by a sensor of fields: [(recording, take)] by sensor."""
+    scenes = Scenes(touches=6, objects=6, seed=2, sensors=("digit", "tac3d"), size=32, frames=5, fields=("pressure", "shear"))
+    things, splits = scene.cast(scenes)
+    recorder = Recorder(scenes, things, batch=6)
+    touches = [scene.draw_touch(scenes, number, splits) for number in range(6)]
+    found = {}
+    for sensor in scenes.sensors:
+        recordings = [scene.draw_recording(scenes, touch, sensor) for touch in touches]
+        found[sensor] = list(zip(recordings, recorder.record(recordings), strict=True))
+    assert len(recorder.record(recordings[:2])) == 2  # a short group reuses the program
+    return found
+
+
+def test_a_camera_gives_pictures_and_the_fields_asked_for(takes):
+    for recording, take in takes["digit"]:
+        assert take.image.shape == (5, 43, 32, 3) and take.image.dtype == np.uint8  # portrait, square pixels
+        assert take.background.shape == (43, 32, 3)
+        rows, columns = record.solve_grid(DIGIT)[0]
+        assert take.field.shape == (5, rows, columns, 3)
+        changed = np.abs(take.image.astype(float) - take.background).mean((1, 2, 3))
+        assert changed[2] > 1.2 * changed[0]  # pressed beside barely touched
+        assert recording.depth[2] > 5 * recording.depth[0]
+
+
+def test_a_sensor_of_fields_gives_no_picture(takes):
+    for _, take in takes["tac3d"]:
+        assert take.image is None and take.background is None and take.field.shape == (5, 20, 20, 6)
+        np.testing.assert_allclose(take.field[..., 5].sum((1, 2)), take.labels["force"], rtol=0.02, atol=1e-3)
+
+
+def test_labels_agree_with_the_pressure(takes):
+    (rows, columns), pitch = record.solve_grid(DIGIT)
+    for recording, take in takes["digit"]:
+        pressure = take.field[..., 0]
+        np.testing.assert_allclose(take.labels["force"], pressure.sum((1, 2)) * pitch**2 * 1e-3, rtol=1e-4)
+        np.testing.assert_allclose(take.labels["area"], (pressure > 0).sum((1, 2)) * pitch**2, rtol=1e-4)
+        np.testing.assert_allclose(take.labels["depth"], recording.depth, rtol=1e-6)
+        x = (np.arange(columns) - (columns - 1) / 2) * pitch
+        middle = (pressure.sum(1) * x).sum(1) / pressure.sum((1, 2))
+        unit = recording.unit
+        np.testing.assert_allclose(take.labels["x"], (middle - unit.window[0]) * unit.mirror[0], atol=1e-3)
+        assert (take.labels["force"] > 0).all() and take.labels["force"][2] > take.labels["force"][0]
+        assert ((take.labels["slip"] >= 0) & (take.labels["slip"] <= 1)).all()
+        if recording.gesture.motion == "hold":
+            assert not take.field[..., 1:].any() and not take.labels["slip"].any()
+        else:
+            assert np.abs(take.field[-1, ..., 1:]).max() > np.abs(take.field[1, ..., 1:]).max()
+
+
+def test_another_batch_gives_the_same_recording(takes):
+    scenes = Scenes(touches=6, objects=6, seed=2, sensors=("digit",), size=32, frames=5, fields=("pressure", "shear"))
+    things, splits = scene.cast(scenes)
+    recording, take = takes["digit"][4]
+    alone = Recorder(scenes, things, batch=6).record([recording])[0]
+    np.testing.assert_array_equal(alone.image, take.image)
+    jax.tree.map(np.testing.assert_array_equal, alone.labels, take.labels)
+    with pytest.raises(ValueError, match="1 to 6 recordings of one sensor"):
+        Recorder(scenes, things, batch=6).record([])

@@ -7,27 +7,35 @@ PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.made
 
 PRESET     ?= tiny
-DATA       ?=
+SCENES     ?= data/scenes
+DATA       ?= $(SCENES)/manifest.parquet
 INIT       ?= runs/stage1
 STEPS      ?=
 STOP_AFTER ?=
 SAVE       ?=
 BATCH      ?=
-LABEL      ?= object
+LABEL      ?= material
 GOLDEN     ?= ../shared/golden
 WORKERS    ?= 2
 
+DEMO       ?= runs/demo
+
 train-stage1: RUN ?= runs/stage1
 train-stage2 probe: RUN ?= runs/stage2
+
+# The schedules of the demo: minutes on two cores, not what a paper would train.
+DEMO1 := --preset tiny --steps 200 --batch 64 --optim.learning-rate 1e-3
+DEMO2 := --preset tiny --steps 150 --batch 32 --optim.learning-rate 5e-4
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
 CHECKED  := src tests $(wildcard experiments)
 OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if $(STOP_AFTER), --stop-after $(STOP_AFTER))$(if $(SAVE), --save-every $(SAVE))$(if $(BATCH), --batch $(BATCH))
-need      = $(if $($(1)),,$(error `make $@` needs $(1)=, for example: make $@ $(2)))
+# Simulated data are made when they are what is asked for and are not there.
+scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train-stage1 train-stage2 probe parity test test-all lint format clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -35,6 +43,7 @@ help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):[^#]*## /\1\t/p' Makefile | while IFS='	' read -r name text; do printf '  %-14s %s\n' "$$name" "$$text"; done
 	@echo
 	@echo "  DATA=a.parquet   manifest of frames, Parquet or CSV; several in quotes: DATA=\"a.parquet b.csv\""
+	@echo "                   (default: simulated scenes in $(SCENES), which are made when they are not there)"
 	@echo "  RUN=folder       where the run is kept and resumed from (runs/stage1, runs/stage2)"
 	@echo "  INIT=path        what stage 2 starts from: a stage-1 run or a weights file ($(INIT))"
 	@echo "  PRESET=name      tiny, small, base or large ($(PRESET))"
@@ -43,14 +52,23 @@ help: ## list the targets
 
 setup: $(STAMP) ## make .venv with the pinned versions
 
-train-stage1: $(STAMP) ## masked and next-frame pre-training: DATA= [RUN= PRESET= STEPS= STOP_AFTER= SAVE=]
-	$(call need,DATA,DATA=touch.parquet)$(ANYTOUCH) train --stage 1 --data $(DATA) $(OPTIONS)
+demo: $(STAMP) ## simulate, train both stages, probe and report, in some ten minutes: [DEMO=]
+	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 600 --objects 300 --size 128
+	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/manifest.parquet --run $(DEMO)/stage1 $(DEMO1)
+	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/manifest.parquet --run $(DEMO)/stage2 --init $(DEMO)/stage1 $(DEMO2)
+	$(ANYTOUCH) report --data $(DEMO)/scenes/manifest.parquet --stage1 $(DEMO)/stage1 --stage2 $(DEMO)/stage2 --out $(DEMO)/report
 
-train-stage2: $(STAMP) ## alignment and matching on top of INIT: DATA= [INIT= RUN= PRESET= STEPS= ...]
-	$(call need,DATA,DATA=touch.parquet INIT=runs/stage1)$(ANYTOUCH) train --stage 2 --data $(DATA) $(OPTIONS) --init $(INIT)
+simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
+	$(ANYTOUCH) simulate --out $(SCENES)
 
-probe: $(STAMP) ## linear and kNN probes of a run on a label column: DATA= LABEL= [RUN=]
-	$(call need,DATA,DATA=touch.parquet LABEL=object)$(ANYTOUCH) probe --run $(RUN) --data $(DATA) --label $(LABEL)
+train-stage1: $(STAMP) $(scenes) ## masked and next-frame pre-training: [DATA= RUN= PRESET= STEPS= STOP_AFTER= SAVE=]
+	$(ANYTOUCH) train --stage 1 --data $(DATA) $(OPTIONS)
+
+train-stage2: $(STAMP) $(scenes) ## alignment and matching on top of INIT: [DATA= INIT= RUN= PRESET= STEPS= ...]
+	$(ANYTOUCH) train --stage 2 --data $(DATA) $(OPTIONS) --init $(INIT)
+
+probe: $(STAMP) $(scenes) ## linear and kNN probes of a run on a label column: [DATA= LABEL= RUN=]
+	$(ANYTOUCH) probe --run $(RUN) --data $(DATA) --label $(LABEL)
 
 parity: $(STAMP) ## compare with recorded outputs of the authors' code: [GOLDEN=]
 	$(ANYTOUCH) parity $(GOLDEN)
@@ -73,6 +91,9 @@ format: $(STAMP) ## rewrite the sources in the project's format
 clean: ## remove .venv, builds and caches; runs stay
 	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(SCENES)/manifest.parquet: | $(STAMP)
+	$(ANYTOUCH) simulate --out $(SCENES)
 
 $(STAMP): requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "This project needs Python 3.11 or newer; name one with PYTHON=, for example: make PYTHON=python3.12" >&2; exit 1; }

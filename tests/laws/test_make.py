@@ -11,7 +11,21 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ("DATA", "RUN", "INIT", "PRESET", "STEPS", "STOP_AFTER", "SAVE", "LABEL", "GOLDEN", "PYTHON", "MAKEFLAGS")
+NAMES = (
+    "DATA",
+    "SCENES",
+    "DEMO",
+    "RUN",
+    "INIT",
+    "PRESET",
+    "STEPS",
+    "STOP_AFTER",
+    "SAVE",
+    "LABEL",
+    "GOLDEN",
+    "PYTHON",
+    "MAKEFLAGS",
+)
 
 
 def make(*words: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -69,7 +83,7 @@ def test_every_target_makes_the_environment_first() -> None:
     text = (ROOT / "Makefile").read_text()
     targets = re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE).group(1).split()
     for target in set(targets) - {"help", "clean"}:
-        assert re.search(rf"^{target}: \$\(STAMP\) ## \S", text, re.MULTILINE), target
+        assert re.search(rf"^{target}: \$\(STAMP\)( \$\(scenes\))? ## \S", text, re.MULTILINE), target
 
 
 def test_plain_make_lists_every_target() -> None:
@@ -80,10 +94,24 @@ def test_plain_make_lists_every_target() -> None:
 
 
 @pytest.mark.parametrize("target", ["train-stage1", "train-stage2", "probe"])
-def test_missing_data_is_one_sentence(target: str) -> None:
-    done = make("-n", target)
-    assert done.returncode != 0
-    assert f"`make {target}` needs DATA=, for example: make {target} DATA=touch.parquet" in done.stderr
+def test_without_data_the_simulated_scenes_are_made_first(target: str, tmp_path: Path) -> None:
+    scenes = tmp_path / "scenes"
+    done = make("-n", target, f"SCENES={scenes}")
+    assert done.returncode == 0
+    simulate, use = [line for line in done.stdout.splitlines() if "anytouch_jax" in line and "pip" not in line]
+    assert simulate.endswith(f"anytouch_jax simulate --out {scenes}") and f"--data {scenes}/manifest.parquet" in use
+    scenes.mkdir()
+    (scenes / "manifest.parquet").write_bytes(b"")
+    assert "simulate" not in make("-n", target, f"SCENES={scenes}").stdout
+    assert "simulate" not in make("-n", target, "DATA=a.csv").stdout
+
+
+def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
+    done = make("-n", "demo", "DEMO=d")
+    steps = [line for line in done.stdout.splitlines() if "anytouch_jax " in line and "pip" not in line]
+    words = [line.split("anytouch_jax ")[1].split()[0] for line in steps]
+    assert words == ["simulate", "train", "train", "report"]
+    assert "--stage 1" in steps[1] and "--stage 2" in steps[2] and "--init d/stage1" in steps[2]
 
 
 def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:

@@ -66,7 +66,10 @@ def test_a_quarter_turn_turns_the_imprint_from_x_to_y():
 
 
 def test_the_place_lies_under_the_middle_and_the_start_moves_it():
-    plain, moved = heights(), heights(place=np.asarray([1.0, 0.4], np.float32), start=np.asarray([1.0, 0.4, 0], np.float32))
+    plain, moved = (
+        heights(),
+        heights(place=np.asarray([1.0, 0.4], np.float32), start=np.asarray([1.0, 0.4, 0], np.float32)),
+    )
     np.testing.assert_allclose(moved, plain, atol=2e-5)
     place = heights(place=np.asarray([0.6, 0.0], np.float32))[0]
     np.testing.assert_allclose(place[:, :-3] - place[0, 0], plain[0][:, 3:] - plain[0][0, 3], atol=2e-5)
@@ -99,7 +102,9 @@ def test_every_sensor_is_solved_on_square_pixels_over_its_whole_field():
 @pytest.fixture(scope="module")
 def takes(compiled_once):
     """Six touches by a camera and by a sensor of fields: [(recording, take)] by sensor."""
-    scenes = Scenes(touches=6, objects=6, seed=2, sensors=("digit", "tac3d"), size=32, frames=5, fields=("pressure", "shear"))
+    scenes = Scenes(
+        touches=6, objects=6, seed=2, sensors=("digit", "tac3d"), size=32, frames=5, fields=("pressure", "shear")
+    )
     things, splits = scene.cast(scenes)
     recorder = Recorder(scenes, things, batch=6)
     touches = [scene.draw_touch(scenes, number, splits) for number in range(6)]
@@ -149,7 +154,7 @@ def test_labels_agree_with_the_pressure(takes):
 
 def test_another_batch_gives_the_same_recording(takes):
     scenes = Scenes(touches=6, objects=6, seed=2, sensors=("digit",), size=32, frames=5, fields=("pressure", "shear"))
-    things, splits = scene.cast(scenes)
+    things, _ = scene.cast(scenes)
     recording, take = takes["digit"][4]
     alone = Recorder(scenes, things, batch=6).record([recording])[0]
     np.testing.assert_array_equal(alone.image, take.image)

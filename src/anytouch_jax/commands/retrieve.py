@@ -1,0 +1,84 @@
+"""`anytouch retrieve`: the same touch by another sensor, among touches that resemble it in place, depth and force."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markdown import Markdown
+
+from anytouch_jax.commands.words import say
+from anytouch_jax.config import FIELD_SENSORS, UserError
+from anytouch_jax.options import Retrieve
+
+if TYPE_CHECKING:
+    from anytouch_jax.evaluate.features import Encoder
+
+
+def run(options: Retrieve) -> int:
+    """Score cross-sensor retrieval of frozen features, print a table, write JSON when asked."""
+    from anytouch_jax.data import manifest as manifests
+    from anytouch_jax.evaluate import features, retrieval
+    from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
+    from anytouch_jax.evaluate.report import PIXELS, VECTOR
+    from anytouch_jax.evaluate.sections import markdown
+
+    table = manifests.read(options.data)
+    rows = table.rows_of(options.split)
+    rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]
+    rows = deepest_rows(table, rows, frames=options.frames)
+    found: dict[str, Any] = {}
+    for name, encoder in _encoders(options).items():
+        kept, found[name] = features.embed_rows(encoder, table, rows, options.frames, options.pooling, say=say)
+        if len(kept) < len(rows):
+            raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows could not be read; repair the manifest first")
+    if options.controls:
+        for name, make in ((PIXELS, background_difference), (VECTOR, contact_vector)):
+            try:
+                found[name] = make(table, rows)
+            except UserError as error:
+                say(f"no control by {name}: {error}")
+    match = None if options.by_chance else retrieval.COVARIATES
+    scored = retrieval.cross_sensor_retrieval(
+        table,
+        found,
+        rows,
+        gallery_size=options.gallery,
+        match=match,
+        seeds=options.seeds,
+        metrics={VECTOR: "euclidean"},
+    )
+    head = ("features", "query", "gallery", "centred", "top-1", "95 %", "top-5", "chance", "of", "queries")
+    text = markdown(head, [_row(one) for one in scored])
+    Console().print(Markdown(text)) if Console().is_terminal else print(text)
+    for note in dict.fromkeys(note for one in scored for note in one.notes):
+        say(note)
+    if options.out is not None:
+        from anytouch_jax.train.record import write_atomic
+
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
+        write_atomic(options.out, json.dumps(about | {"results": retrieval.to_records(scored)}, indent=2) + "\n")
+    return 0
+
+
+def _encoders(options: Retrieve) -> dict[str, Encoder]:
+    from anytouch_jax.evaluate import features
+
+    encoders = {str(run): features.load_encoder(run) for run in options.run}
+    if options.controls and encoders:
+        encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
+    if not encoders and not options.controls:
+        raise UserError("nothing to compare: give --run, or leave the controls on")
+    return encoders
+
+
+def _row(one: Any) -> tuple[str, ...]:
+    interval = "-" if one.low is None else f"{100 * one.low:.1f} to {100 * one.high:.1f}"
+    shares = (f"{100 * one.top1:.1f} %", interval, f"{100 * one.top5:.1f} %", f"{100 * one.chance1:.1f} %")
+    return (
+        one.name, one.query_sensor, one.gallery_sensor, "yes" if one.centred else "no", *shares, str(one.gallery),
+        str(one.queries),
+    )  # fmt: skip

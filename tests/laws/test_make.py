@@ -102,8 +102,8 @@ def test_without_data_the_simulated_scenes_are_made_first(target: str, tmp_path:
     assert simulate.endswith(f"anytouch_jax simulate --out {scenes}") and f"--data {scenes}/manifest.parquet" in use
     scenes.mkdir()
     (scenes / "manifest.parquet").write_bytes(b"")
-    assert "simulate" not in make("-n", target, f"SCENES={scenes}").stdout
-    assert "simulate" not in make("-n", target, "DATA=a.csv").stdout
+    assert "anytouch_jax simulate" not in make("-n", target, f"SCENES={scenes}").stdout
+    assert "anytouch_jax simulate" not in make("-n", target, "DATA=a.csv").stdout
 
 
 def test_the_demo_simulates_trains_both_stages_and_reports() -> None:

@@ -1,4 +1,6 @@
-"""A recording computed: the surface under the gel and its motion, labels that agree with physics, only what is asked."""
+"""A recording computed: the surface under the gel, its motion, labels that agree with physics, only what is asked."""
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,9 @@ from anytouch_jax.sim.units import identity_unit
 
 SURFACES = jax.jit(record.surfaces)
 DIGIT = SENSORS["digit"]
+SCENES = Scenes(
+    touches=6, objects=6, seed=2, sensors=("digit", "tac3d"), size=32, frames=5, fields=("pressure", "shear")
+)
 RNG = np.random.default_rng(0)
 AXIS = (np.arange(160) - 79.5) * SPACING
 BUMPY = sum(
@@ -102,9 +107,7 @@ def test_every_sensor_is_solved_on_square_pixels_over_its_whole_field():
 @pytest.fixture(scope="module")
 def takes(compiled_once):
     """Six touches by a camera and by a sensor of fields: [(recording, take)] by sensor."""
-    scenes = Scenes(
-        touches=6, objects=6, seed=2, sensors=("digit", "tac3d"), size=32, frames=5, fields=("pressure", "shear")
-    )
+    scenes = SCENES
     things, splits = scene.cast(scenes)
     recorder = Recorder(scenes, things, batch=6)
     touches = [scene.draw_touch(scenes, number, splits) for number in range(6)]
@@ -134,7 +137,7 @@ def test_a_sensor_of_fields_gives_no_picture(takes):
 
 
 def test_labels_agree_with_the_pressure(takes):
-    (rows, columns), pitch = record.solve_grid(DIGIT)
+    (_, columns), pitch = record.solve_grid(DIGIT)
     for recording, take in takes["digit"]:
         pressure = take.field[..., 0]
         np.testing.assert_allclose(take.labels["force"], pressure.sum((1, 2)) * pitch**2 * 1e-3, rtol=1e-4)
@@ -153,7 +156,7 @@ def test_labels_agree_with_the_pressure(takes):
 
 
 def test_another_batch_gives_the_same_recording(takes):
-    scenes = Scenes(touches=6, objects=6, seed=2, sensors=("digit",), size=32, frames=5, fields=("pressure", "shear"))
+    scenes = replace(SCENES, sensors=("digit",))
     things, _ = scene.cast(scenes)
     recording, take = takes["digit"][4]
     alone = Recorder(scenes, things, batch=6).record([recording])[0]

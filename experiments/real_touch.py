@@ -36,7 +36,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from anytouch_jax.cli import Probe
 from anytouch_jax.config import Config, from_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.evaluation import evaluation
@@ -47,6 +46,7 @@ from anytouch_jax.io import checkpoint
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch, stage1_terms
 from anytouch_jax.ops import masking
+from anytouch_jax.options import Probe
 from anytouch_jax.train.loop import fit
 
 DATA = Path(os.environ.get("DATA", "../shared/real_touch/manifest.csv"))

@@ -33,6 +33,7 @@ SENSORS = (
     UNIVERSAL,
 )
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))  # how often the release draws these in an epoch
 
 # Mean and spread of RGB in 0..1, for touch images (ImageNet) and for ordinary images (CLIP), as the release.
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -179,7 +180,9 @@ class Data:
 
     `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the
     release). `split_steps`: stage 2 takes align and match batches in separate steps (the release).
-    `window`: frames of a stage-2 align clip, 4 when it is reconstructed as well, else 3.
+    `weights`: (dataset, how often it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is
+    what the recipe does (the release: RELEASE_WEIGHTS, for the datasets that are there). `negatives`: of matching,
+    from any sensor or from the positive's, so that the sensor alone does not tell them apart.
     """
 
     manifests: tuple[str, ...] = ()
@@ -188,6 +191,8 @@ class Data:
     clip_share: float = 0.5
     order: Literal["alternate", "random"] = "alternate"
     split_steps: bool = False
+    weights: tuple[tuple[str, float], ...] | None = None
+    negatives: Literal["any", "same_sensor"] = "any"
     flip: float = 0.5
     jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)
     rotation: float = 20.0

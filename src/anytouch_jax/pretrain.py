@@ -15,6 +15,7 @@ from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, Model, UserError, from_json
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data import sources
 from anytouch_jax.data import text as texts
 from anytouch_jax.data.loader import Loader
 from anytouch_jax.evaluate import figures
@@ -48,7 +49,8 @@ def pretrain(
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
     net = build(config.model)
     params = _first_params(config, net, init, clip, say)
-    loader = Loader(manifest, config, tokenizer=tokenizer, devices=jax.local_device_count())
+    shard = (jax.process_index(), jax.process_count())
+    loader = Loader(manifest, config, tokenizer=tokenizer, devices=jax.device_count(), shard=shard)
     for note in loader.notes:
         say(note)
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
@@ -91,10 +93,10 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
         tokenizer = texts.load(_beside(clip, "tokenizer.json"))
     else:
         rows = manifest.rows_of(config.data.split)
-        captions = [manifest.value(int(row), "text") for row in rows[manifest.present("text")[rows]]]
+        captions = sources.captions(manifest, rows)
         if not captions:
             return config, None
-        tokenizer = texts.train(sorted(set(captions)), SCRATCH_VOCABULARY)
+        tokenizer = texts.train(captions, SCRATCH_VOCABULARY)
     if not own.exists():
         run.mkdir(parents=True, exist_ok=True)
         tokenizer.save(own)

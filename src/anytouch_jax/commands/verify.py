@@ -22,9 +22,7 @@ def run(options: Verify) -> int:
     if options.swap and options.repair is None:
         raise UserError("--swap exchanges files in the repaired copy: say where it goes with --repair OUT")
     manifest = manifests.read(options.manifests)
-    report = verify.verify(
-        manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say
-    )
+    report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)
     print(report.to_markdown(), end="")
     if options.out is not None:
         say(f"{write_text(report.to_json(), options.out)}: the report")

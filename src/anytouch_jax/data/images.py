@@ -13,11 +13,15 @@ import cv2
 import numpy as np
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data.packed import read_file
+from anytouch_jax.data.packed import HEADER_LOCK, read_file
 
 MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
 
+# Since OpenCV 4.11; orientation tags are ignored as for other files.
+_JPEG_RGB: int = cv2.IMREAD_UNCHANGED
+if hasattr(cv2, "IMREAD_COLOR_RGB"):
+    _JPEG_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _HEADER_1, _HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
 cv2.setNumThreads(1)  # the loader has its own threads
@@ -65,13 +69,14 @@ def _unpack(data: bytes) -> np.ndarray:
     # OpenCV fills the lost part of some cut JPEG files with grey; in a whole one an end marker follows the last scan.
     if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise ValueError("the file is cut short")
+    jpeg = data[:2] == b"\xff\xd8" and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(error.err) from None
     if pixels is None:
         raise ValueError("the picture is corrupt or cut short")
-    if pixels.ndim == 3 and pixels.shape[2] in (3, 4):
+    if not jpeg and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
     return pixels
 
@@ -81,7 +86,8 @@ def _array(data: bytes) -> np.ndarray:
     stream = io.BytesIO(data)
     try:
         old = np.lib.format.read_magic(stream) == (1, 0)
-        shape, fortran, kind = (_HEADER_1 if old else _HEADER_2)(stream)
+        with HEADER_LOCK:
+            shape, fortran, kind = (_HEADER_1 if old else _HEADER_2)(stream)
     except Exception:  # the header is Python text: a spoiled one fails in the tokenizer, the parser or in NumPy
         raise ValueError("the file is cut short, or its header is corrupt") from None
     if kind.hasobject:

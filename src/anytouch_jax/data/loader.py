@@ -6,7 +6,7 @@ Where a batch reaches over the end of an epoch (always, where there are fewer ro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Literal
 
@@ -18,7 +18,8 @@ from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.images import frames_from_folder, frames_from_video
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.samples import Reader, SampleError, fill_slot
-from anytouch_jax.data.sampling import BOTH, TEXT, VISION, Strata, Turns, uniform
+from anytouch_jax.data.sampling import BOTH, TEXT, VISION, Turns, uniform
+from anytouch_jax.data.shards import Shard, Slots
 from anytouch_jax.data.sources import CLIP, STILL, Pairs, Pool, find_sources
 from anytouch_jax.data.text import Tokenizer
 from anytouch_jax.data.workers import Work, do, pump
@@ -36,17 +37,27 @@ class Loader:
     """Batches for `config.stage` from the split `config.data.split` of a manifest.
 
     `notes` are sentences to tell the user once (rows left out, no clips, no pairs); `tokenizer` is the one in use, or
-    None; `steps_per_epoch` is how many batches hold every still and every clip once. `devices`: image and text slots
-    are a multiple of it. Raises UserError: ManifestError for an empty split or an unknown sensor, SampleError (from
-    `batch` and `stream`) for a bad sample.
+    None; `steps_per_epoch` is how many batches hold every still and every clip once (or as `data.weights` says).
+    `devices`: image and text slots are a multiple of it. `shard` (index, count): this process reads the files of its
+    part of every batch only, and gives that part; joined in order the parts are the batch of one process. Raises
+    UserError: ManifestError for an empty split or an unknown sensor, SampleError (from `batch` and `stream`) for a
+    bad sample.
     """
 
     def __init__(
-        self, manifest: Manifest, config: Config, *, tokenizer: Tokenizer | None = None, devices: int = 1
+        self,
+        manifest: Manifest,
+        config: Config,
+        *,
+        tokenizer: Tokenizer | None = None,
+        devices: int = 1,
+        shard: tuple[int, int] = (0, 1),
     ) -> None:
         if config.data.batch_size < 1 or devices < 1:
             raise UserError(f"batch_size {config.data.batch_size} and devices {devices} must be at least 1")
-        self.manifest, self.config = manifest, config
+        self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
+        for name, number in (("devices", devices), ("batch_size", config.data.batch_size)):
+            self._shard.check(number, name)
         self._reader = Reader(manifest, config)
         found = find_sources(manifest, config, tokenizer, devices)
         self._pools, self._pairs, self._sensor, self.tokenizer, self.notes = found
@@ -64,7 +75,7 @@ class Loader:
     def steps_per_epoch(self) -> int:
         """Batches that hold every still and every clip once (and every anchor, where matching has its own steps)."""
         size = self.config.data.batch_size
-        steps = sum(-(-len(pool.windows) // size) for pool in self._pools)
+        steps = sum(-(-pool.draws // size) for pool in self._pools)
         if self.config.data.split_steps:
             steps += sum(-(-pairs.anchors.size // self._match_size) for pairs in self._pairs if pairs)
         return steps
@@ -76,8 +87,8 @@ class Loader:
     def stream(self, start: int, stop: int) -> Iterator[tuple[int, Batch, Info]]:
         """(step, batch, info) for steps start .. stop - 1, made ahead by `data.threads` threads.
 
-        The bytes do not depend on the threads. `info` counts `skipped_samples`, `images` and `texts`. Close the
-        iterator to stop early; its threads end with it.
+        The bytes do not depend on the threads. `info` counts `skipped_samples` of this shard, `images` and `texts` of
+        the whole batch. Close the iterator to stop early; its threads end with it.
         """
         return pump(self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch)
 
@@ -118,7 +129,7 @@ class Loader:
         pairs = [pair for pair in self._pairs if pair is not None]
         if not self.config.data.split_steps or not pairs:
             return 1.0
-        align = sum(len(pool.windows) for pool in self._pools) / self.config.data.batch_size
+        align = sum(pool.draws for pool in self._pools) / self.config.data.batch_size
         return align / (align + sum(pair.anchors.size for pair in pairs) / self._match_size)
 
     @property
@@ -129,7 +140,7 @@ class Loader:
     # Filling a batch --------------------------------------------------------------------------------------------
 
     def _empty(self, rows: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
-        size = self.config.model.image_size
+        size, rows = self.config.model.image_size, self._shard.share(rows)
         return np.zeros((rows, frames, size, size, 3), np.uint8), np.zeros(rows, np.int32)
 
     def _plan_align(self, step: int, pool: Pool, rank: int) -> Work[AlignBatch]:
@@ -142,60 +153,86 @@ class Loader:
         ]  # fmt: skip
         seed, rows = self.config.run.seed % 2**63, self.config.data.batch_size
         order = np.random.default_rng([seed, _ORDER, step]).permutation(rows)
-        clip, sensor = self._empty(rows, pool.windows.shape[1])
-        batch = AlignBatch(clip, sensor, *self._slots(rows, pool.strata))
-        jobs, images, texts = [], 0, 0
+        image_row, text_row = np.full(pool.strata.images, rows, np.int32), np.full(self._texts(pool), rows, np.int32)
+        wanted: list[tuple[int, int | None, int | None]] = []  # stratum, image slot and text slot of every row
+        images = texts = 0
         for slot, at in enumerate(order):
-            stratum, index, epoch = draws[at]
-            image = text = None
+            stratum, image, text = draws[at][0], None, None
             if stratum in (VISION, BOTH):
                 image, images = images, images + 1
-                batch.image_row[image] = slot
+                image_row[image] = slot
             if stratum in (BOTH, TEXT):
                 text, texts = texts, texts + 1
-                batch.text_row[text] = slot
-            write = partial(self._write_align, batch, pool, stratum, slot, image, text)
+                text_row[text] = slot
+            wanted.append((stratum, image, text))
+        clip, sensor = self._empty(rows, pool.windows.shape[1])
+        batch = AlignBatch(clip, sensor, *self._slots(image_row, text_row))
+        jobs: list[Any] = []
+        for slot, (at, (stratum, image, text)) in enumerate(zip(order, wanted, strict=True)):
+            _, index, epoch = draws[at]
+            mine = Slots(
+                self._shard.place(slot, rows),
+                self._shard.place(image, len(image_row)),
+                self._shard.place(text, len(text_row)),
+            )
+            if mine == Slots(None, None, None):
+                continue
+            write = partial(self._write_align, batch, pool, stratum, mine)
             size = len(pool.members[stratum])
-            jobs.append(partial(fill_slot, write, size, step, slot, self.config, index, epoch))
+            job = partial(fill_slot, write, size, step, slot, self.config, index, epoch)
+            jobs.append(job if mine.touch is not None else partial(_uncounted, job))
         return Work(batch, jobs, {"images": images, "texts": texts})
 
-    def _slots(self, rows: int, strata: Strata) -> tuple[np.ndarray, ...]:
-        """Empty image and text slots. An unused text slot is an empty caption, so that no tower meets a text of
-        nothing but padding (its gradient could be NaN even where its value is dropped)."""
+    def _texts(self, pool: Pool) -> int:
+        return pool.strata.texts if self.tokenizer is not None else 0
+
+    def _slots(self, image_row: np.ndarray, text_row: np.ndarray) -> tuple[np.ndarray, ...]:
+        """This shard's image and text slots, still empty. An unused text slot is an empty caption, so that no tower
+        meets a text of nothing but padding (its gradient could be NaN even where its value is dropped)."""
         size, tower = self.config.model.image_size, self.config.model.text
-        image = np.zeros((strata.images, size, size, 3), np.uint8)
-        image_row = np.full(strata.images, rows, np.int32)
+        image_row, text_row = self._shard.cut(image_row), self._shard.cut(text_row)
+        image = np.zeros((len(image_row), size, size, 3), np.uint8)
         length = tower.length if tower else 0
-        if self.tokenizer is None or not strata.texts:
+        if self.tokenizer is None or not len(text_row):
             text, mask = np.zeros((0, length), np.int32), np.zeros((0, length), bool)
         else:
-            text, mask = self.tokenizer.encode([""] * strata.texts, length)
-        return image, image_row, text, mask, np.full(len(text), rows, np.int32)
+            text, mask = self.tokenizer.encode([""] * len(text_row), length)
+        return image, image_row, text, mask, text_row
 
     def _write_align(
-        self, batch: AlignBatch, pool: Pool, stratum: int, slot: int, image: int | None, text: int | None,
-        index: int, epoch: int,
+        self, batch: AlignBatch, pool: Pool, stratum: int, mine: Slots, index: int, epoch: int
     ) -> None:  # fmt: skip
         rows = pool.windows[pool.members[stratum][index]]
-        batch.clip[slot] = self._reader.touch(rows, epoch)
-        batch.sensor[slot] = self._sensor[rows[-1]]
-        if image is not None:
-            batch.image[image] = self._reader.vision(rows[-1], epoch)
-        if text is not None and self.tokenizer is not None:
+        # Which sample replaces a bad one must not depend on the shard, so where bad ones are skipped all is read.
+        whole = self.config.data.on_bad_sample == "skip"
+        if whole or mine.touch is not None:
+            self._reader.touch(rows, epoch, None if mine.touch is None else batch.clip[mine.touch])
+        picture = None
+        if stratum in (VISION, BOTH) and (whole or mine.image is not None):
+            picture = self._reader.vision(rows[-1], epoch)
+        if mine.touch is not None:
+            batch.sensor[mine.touch] = self._sensor[rows[-1]]
+        if mine.image is not None:
+            batch.image[mine.image] = picture
+        if mine.text is not None and self.tokenizer is not None:
             ids, mask = self.tokenizer.encode([self._reader.caption(rows[-1])], batch.text.shape[1])
-            batch.text[text], batch.text_mask[text] = ids[0], mask[0]
+            batch.text[mine.text], batch.text_mask[mine.text] = ids[0], mask[0]
 
     def _plan_match(self, step: int, kind: int, rank: int) -> Work[MatchBatch]:
         pairs, rows = self._pairs[kind], self._match_size
         assert pairs is not None
+        self._shard.check(rows, "the rows of a matching batch")
         parts = [self._empty(rows, pairs.windows.shape[1]) for _ in range(3)]
         batch = MatchBatch(*(array for part in parts for array in part))
         jobs: list[Any] = []
         for slot, (index, epoch) in enumerate(pairs.anchors.take(rank * rows, rows)):
-            write = partial(self._write_match, parts, pairs, slot)
+            mine = self._shard.place(slot, rows)
+            if mine is None:
+                continue
+            write = partial(self._write_match, parts, pairs, mine)
             # Slots of matching come after those of alignment, so that a replacement is drawn apart from theirs.
-            place = self.config.data.batch_size + slot
-            jobs.append(partial(fill_slot, write, pairs.anchors.size, step, place, self.config, index, epoch))
+            place, size = self.config.data.batch_size + slot, len(pairs.matches.anchors)
+            jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch))
         return Work(batch, jobs)
 
     def _write_match(
@@ -206,5 +243,11 @@ class Loader:
         rng = np.random.default_rng([self.config.run.seed % 2**63, _TRIPLE, epoch, row])
         for (clip, sensor), chosen in zip(parts, (anchor, *pairs.matches.draw(anchor, rng)), strict=True):
             rows = pairs.windows[chosen]
-            clip[slot] = self._reader.touch(rows, epoch)
+            self._reader.touch(rows, epoch, clip[slot])
             sensor[slot] = self._sensor[rows[-1]]
+
+
+def _uncounted(job: Callable[[], int]) -> int:
+    """Another shard has the row itself and counts what was skipped."""
+    job()
+    return 0

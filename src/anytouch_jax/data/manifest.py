@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,13 +56,14 @@ class Manifest:
         if name in self.table.column_names:
             return self.table[name]
         if name in SCHEMA:
-            fill = 1 if name == "stride" else None
-            return pa.chunked_array([pa.array([fill] * len(self), SCHEMA[name])])
+            fill = pa.scalar(1 if name == "stride" else None, SCHEMA[name])
+            return pa.chunked_array([pa.repeat(fill, len(self))])
         raise ManifestError(f"{self._name} has no column {name!r}; it has {', '.join(self.table.column_names)}")
 
     def value(self, row: int, name: str) -> Any:
         """One cell as a Python value, None where it is null or the column is absent."""
-        return self.table[name][int(row)].as_py() if name in self.table.column_names else None
+        column = self._cells.get(name)
+        return None if column is None else column[int(row)].as_py()
 
     def present(self, name: str) -> np.ndarray:
         """Which rows have a value in column `name`: bool (rows,)."""
@@ -81,7 +82,7 @@ class Manifest:
 
     def file(self, row: int, name: str = "path") -> Path:
         """The absolute file in a path column. Raises ManifestError when the path leaves the manifest's folder."""
-        return resolve(self.files[self.source[row]].parent, self.value(row, name))
+        return resolve(self._roots[self.source[row]], self.value(row, name))
 
     def rows_of(self, split: str) -> np.ndarray:
         """Row ids i64 of one split, in order. Raises ManifestError when it is unknown or empty."""
@@ -99,12 +100,14 @@ class Manifest:
         A clip is rows of one sequence and one split whose frame_index lie exactly `stride` (of the last row)
         apart. `split` keeps only clips of that split. Raises ManifestError when a sequence repeats a frame.
         """
-        found = windows(self._sequence, self._frame, self._stride, length, self._say_repeat)
+        wanted = None
         if split is not None:
             wanted = np.zeros(len(self), bool)
             wanted[self.rows_of(split)] = True
-            found = found[wanted[found[:, -1]]]
-        return found
+        try:
+            return windows(self._sequence, self._frame, self._stride, length, self._say_repeat, wanted)
+        except OverflowError as error:
+            raise ManifestError(f"{self._name}: {error}") from None
 
     @cached_property
     def content_hash(self) -> str:
@@ -120,13 +123,26 @@ class Manifest:
             digest.update(memoryview(text.buffers()[2] or b"")[ends[0] : ends[-1]])
         return digest.hexdigest()
 
+    @cached_property
+    def _cells(self) -> dict[str, Any]:
+        # A table makes a list of its names and a new column object at each look-up.
+        columns = {name: self.table[name] for name in self.table.column_names}
+        return {name: one.chunk(0) if one.num_chunks == 1 else one for name, one in columns.items()}
+
+    @cached_property
+    def _roots(self) -> tuple[str, ...]:
+        return tuple(str(file.parent) for file in self.files)
+
     @property
     def _name(self) -> str:
         return ", ".join(map(str, self.files))
 
     @cached_property
     def _sequence(self) -> np.ndarray:
-        return self.codes("sequence", own=True) * len(SPLITS) + self.codes("split")
+        codes = self.codes("sequence", own=True)
+        codes *= len(SPLITS)
+        codes += self.codes("split")
+        return codes
 
     @cached_property
     def _frame(self) -> np.ndarray:
@@ -134,7 +150,9 @@ class Manifest:
 
     @cached_property
     def _stride(self) -> np.ndarray:
-        return np.asarray(self.column("stride"))
+        if "stride" not in self.table.column_names:
+            return np.broadcast_to(np.int64(1), len(self))
+        return np.asarray(self.table["stride"])
 
     def _say_repeat(self, first: int, second: int) -> ManifestError:
         sequence, frame = self.value(second, "sequence"), self.value(second, "frame_index")
@@ -247,20 +265,30 @@ def _relative(manifest: Manifest, row: int, cell: str, folder: Path) -> str:
     return Path(file).relative_to(folder).as_posix()
 
 
-def resolve(root: Path, relative: str | None) -> Path:
+def resolve(root: str | Path, relative: str | None) -> Path:
     """The file `relative` inside the folder `root` (absolute, resolved).
 
     Raises ManifestError when the path is empty, absolute, or leaves the folder by "..", or by a symbolic link.
     """
     if not relative:
         raise ManifestError("the path is empty")
-    try:
-        path = os.path.realpath(os.path.join(root, relative))
-    except ValueError:
-        raise ManifestError(f"the path {relative!r} is not a file name") from None
-    if os.path.isabs(relative) or not path.startswith(os.path.join(root, "")):
+    if "\0" in relative:
+        raise ManifestError(f"the path {relative!r} is not a file name")
+    root = str(root)
+    head, _, name = relative.rpartition("/")
+    # A folder is looked at once and each file for itself: that is most of the time that a path takes.
+    path = f"{_real_folder(root, head)}/{name}"
+    if name in ("", ".", "..") or os.path.islink(path):
+        path = os.path.realpath(path)
+    if relative[0] == "/" or not path.startswith(root if root[-1] == "/" else f"{root}/"):
         raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}")
     return Path(path)
+
+
+@lru_cache(4096)
+def _real_folder(root: str, head: str) -> str:
+    folder = os.path.realpath(os.path.join(root, head))
+    return "" if folder == "/" else folder
 
 
 def sensor_rows(
@@ -283,7 +311,7 @@ def sensor_rows(
         inside[rows] = True
         codes = np.where(inside, codes, -1)
     notes = []
-    for code in np.unique(codes[codes >= 0]):
+    for code in np.flatnonzero(np.bincount(codes[codes >= 0])):
         here = np.flatnonzero(codes == code)
         name = manifest.value(here[0], "sensor")
         try:

@@ -24,24 +24,36 @@ class Matches:
 
     `anchors` ids i64 into `pool`: rows whose touch was also felt by another sensor, or else by another unit, and
     that have a negative. `one_object`: all of the pool is one known object, so negatives are its other places.
+    `same_sensor`: negatives are of the positive's sensor; a partner whose sensor felt no other known place is none.
     """
 
-    def __init__(self, pool: np.ndarray, keys: Keys) -> None:
-        self.pool = pool
+    def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False) -> None:
+        self.pool, self.same_sensor = pool, same_sensor
         self._keys = Keys(*(key[pool] for key in keys))
         touch = self._keys.touch
         self._order = np.argsort(touch, kind="stable")
         self._sorted = touch[self._order]
-        objects = np.unique(self._keys.object)
-        self.one_object = len(objects) == 1 and objects[0] >= 0
+        self._rows: dict[int | None, np.ndarray] = {}
+        self._usable = self._many_places() if same_sensor else np.ones(len(pool), bool)
+        thing = self._keys.object
+        self.one_object = len(thing) > 0 and bool((thing == thing[0]).all() and thing[0] >= 0)
         anchors = np.flatnonzero((touch >= 0) & self._has_partner())
-        many = len(np.unique(touch[touch >= 0])) > 1  # with one place only, a row of an unknown place may be it
-        self.anchors = anchors if many else anchors[[self._negatives(int(a)).size > 0 for a in anchors]]
+        felt = touch[touch >= 0]
+        many = felt.size > 0 and bool(
+            (felt != felt[0]).any()
+        )  # with one place only, a row of an unknown place may be it
+        known = many or same_sensor  # a usable partner's sensor felt another place
+        self.anchors = anchors if known else anchors[[self._negatives(int(a)).size > 0 for a in anchors]]
 
     def _has_partner(self) -> np.ndarray:
         touch, sensor, unit = self._keys.touch, self._keys.sensor, self._keys.unit
         sensors, units = _distinct(touch, sensor), _distinct(touch, unit)
-        return (sensors > 1) | ((units > 1) & (unit >= 0))
+        usable = _distinct(touch, np.where(self._usable, sensor, -1)) - self._usable
+        return np.where(sensors > 1, usable > 0, (units > 1) & (unit >= 0) & self._usable)
+
+    def _many_places(self) -> np.ndarray:
+        """Which rows are of a sensor that felt two known places or more: bool (rows,)."""
+        return _distinct(self._keys.sensor, self._keys.touch) > 1
 
     def draw(self, anchor: int, rng: np.random.Generator) -> tuple[int, int]:
         """(positive, negative) for `anchor`, as ids into `pool`: partner of another sensor, or else another unit;
@@ -49,24 +61,33 @@ class Matches:
         keys = self._keys
         low, high = np.searchsorted(self._sorted, keys.touch[anchor] + np.array([0, 1]))
         same = self._order[low:high]
-        others = same[keys.sensor[same] != keys.sensor[anchor]]
+        others = same[(keys.sensor[same] != keys.sensor[anchor]) & self._usable[same]]
         if not others.size:
             others = same[(keys.unit[same] != keys.unit[anchor]) & (keys.unit[same] >= 0)]
         positive = int(others[rng.integers(others.size)])
-        tries = rng.integers(len(self.pool), size=_TRIES)
+        sensor = int(keys.sensor[positive]) if self.same_sensor else None
+        rows = self._of_sensor(sensor)
+        tries = rows[rng.integers(len(rows), size=_TRIES)]
         fit = np.flatnonzero(self._elsewhere(anchor, tries))
         if fit.size:
             return positive, int(tries[fit[0]])
-        negatives = self._negatives(anchor)
+        negatives = self._negatives(anchor, sensor)
         return positive, int(negatives[rng.integers(negatives.size)])
 
-    def _negatives(self, anchor: int) -> np.ndarray:
-        rows = np.arange(len(self.pool))
-        found = np.flatnonzero(self._elsewhere(anchor, rows))
+    def _negatives(self, anchor: int, sensor: int | None = None) -> np.ndarray:
+        rows = self._of_sensor(sensor)
+        found = rows[self._elsewhere(anchor, rows)]
         if not found.size:  # no other object: another known place of the same one
-            touch = self._keys.touch
-            found = np.flatnonzero((touch >= 0) & (touch != touch[anchor]))
+            touch = self._keys.touch[rows]
+            found = rows[(touch >= 0) & (touch != self._keys.touch[anchor])]
         return found
+
+    def _of_sensor(self, sensor: int | None) -> np.ndarray:
+        """Ids i64 of the pool that a sensor felt (None: all of them)."""
+        if sensor not in self._rows:
+            every = np.arange(len(self.pool))
+            self._rows[sensor] = every if sensor is None else np.flatnonzero(self._keys.sensor == sensor)
+        return self._rows[sensor]
 
     def _elsewhere(self, anchor: int, rows: np.ndarray) -> np.ndarray:
         """Which rows are surely another place, and not of the anchor's object: bool of the shape of `rows`."""
@@ -82,8 +103,8 @@ class Matches:
 
 
 def _distinct(group: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """For every row, how many different known values (>= 0) its group has: i64 (rows,)."""
-    _, group = np.unique(group, return_inverse=True)
-    known = value >= 0
-    pairs = np.unique(np.stack([group[known], value[known]], 1), axis=0)
-    return np.bincount(pairs[:, 0], minlength=group.max(initial=-1) + 1)[group]
+    """For every row, how many different known values (>= 0) its group has, 0 without a group (-1): i64 (rows,)."""
+    known = (value >= 0) & (group >= 0)
+    width = int(value.max(initial=0)) + 1
+    pairs = np.unique(group[known].astype(np.int64) * width + value[known])
+    return np.bincount(pairs // width, minlength=int(group.max(initial=-1)) + 2)[group]  # -1 takes the last: none

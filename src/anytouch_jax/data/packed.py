@@ -19,6 +19,7 @@ import numpy as np
 MAX_BYTES = 1 << 29  # of one file: a picture of images.MAX_PIXELS with four channels of 16 bits
 INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
 _OPEN = 64  # shards held open at once
+HEADER_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 fails at times in two threads
 
 
 class ShardError(ValueError):
@@ -50,15 +51,21 @@ def forget() -> None:
 
 def _read_loose(path: Path) -> bytes:
     # Without O_NONBLOCK the opening of a named pipe waits for ever.
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        about = os.fstat(file.fileno())
+    file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        about = os.fstat(file)
         if stat.S_ISDIR(about.st_mode):
             raise IsADirectoryError("it is a folder")
         if not stat.S_ISREG(about.st_mode):
             raise ValueError("it is not a regular file")
         if about.st_size > MAX_BYTES:
             raise ValueError(f"it has {about.st_size} bytes, more than the limit of {MAX_BYTES}")
-        return file.read()
+        parts = []
+        while part := os.read(file, about.st_size + 1):
+            parts.append(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+    finally:
+        os.close(file)
 
 
 class _Shard:
@@ -94,7 +101,8 @@ class _Shard:
 
 def _read_index(path: Path) -> np.ndarray:
     try:
-        index = np.load(path, allow_pickle=False)
+        with HEADER_LOCK:
+            index = np.load(path, allow_pickle=False)
     except FileNotFoundError:
         raise ShardError(f"there is no {path}, the shard's index; copy it from where the data were packed") from None
     except (ValueError, EOFError, SyntaxError) as error:

@@ -35,17 +35,18 @@ class Reader:
     manifest: Manifest
     config: Config
 
-    def touch(self, rows: np.ndarray, epoch: int | None) -> np.ndarray:
+    def touch(self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None) -> np.ndarray:
         """The frames of a window of rows as u8 (T, size, size, 3); `epoch` None means no augmentation.
 
-        The last row decides the augmentation of the whole clip. Raises SampleError.
+        They are written into `out`, once all could be read, or into a new array. The last row decides the augmentation
+        of the whole clip. Raises SampleError.
         """
         size = self.config.model.image_size
         frames = [self._decode(row, "path") for row in rows]
-        if epoch is None:
-            return touch_evaluation(frames, size)
+        if epoch is None or not (self.config.data.flip or any(self.config.data.jitter)):
+            return touch_evaluation(frames, size, out)
         rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
-        return touch_transform(frames, size, rng, self.config.data)
+        return touch_transform(frames, size, rng, self.config.data, out)
 
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """The picture of a row's object as u8 (size, size, 3); `epoch` None means no augmentation."""

@@ -50,26 +50,55 @@ class Turns:
 
 
 class Stream:
-    """An endless stream over `size` things: epoch after epoch, each a seeded permutation of all of them."""
+    """An endless stream over `things` things: epoch after epoch, each a seeded permutation of `size` draws.
 
-    def __init__(self, size: int, seed: int, tag: int) -> None:
-        self.size = size
+    `weights` f64 (things,) above 0: how often each is drawn in an epoch; without them each once, so `size` is `things`.
+    Things of one weight w come floor(w) times each, and a seeded choice of them once more (one draw at least).
+    """
+
+    def __init__(self, things: int, seed: int, tag: int, weights: np.ndarray | None = None) -> None:
         self._seed = (seed % 2**63, tag)
-        self._epochs: dict[int, np.ndarray] = {}
+        self._groups: list[tuple[np.ndarray, int, int]] = []  # things of one weight, times each, how many once more
+        self.size, self._copies = things, 1
+        if weights is not None and (weights != 1).any():
+            for weight in np.unique(weights):
+                ids = np.flatnonzero(weights == weight)
+                draws, times = max(1, round(weight * len(ids))), int(weight)
+                self._groups.append((ids, times, draws - times * len(ids)))
+                self._copies = max(self._copies, times + 1)
+            self.size = sum(times * len(ids) + more for ids, times, more in self._groups)
+        self._epochs: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
 
     def take(self, start: int, count: int) -> list[tuple[int, int]]:
-        """(thing, epoch) at places start .. start + count - 1 of the stream; fewer things than `count` come again."""
-        if not count:
-            return []
-        places = [divmod(place, self.size) for place in range(start, start + count)]
-        return [(int(self._epoch(epoch)[place]), epoch) for epoch, place in places]
+        """(thing, pass) at places start .. start + count - 1 of the stream; fewer draws than `count` come again.
 
-    def _epoch(self, epoch: int) -> np.ndarray:
+        The pass is the epoch, or with weights another number for each time that an epoch draws the thing.
+        """
+        found = []
+        for place in range(start, start + count):
+            epoch, place = divmod(place, self.size)
+            order, copy = self._epoch(epoch)
+            found.append((int(order[place]), epoch if copy is None else epoch * self._copies + int(copy[place])))
+        return found
+
+    def _epoch(self, epoch: int) -> tuple[np.ndarray, np.ndarray | None]:
         if epoch not in self._epochs:
             while len(self._epochs) > 2:
                 self._epochs.pop(next(iter(self._epochs)))
-            self._epochs[epoch] = np.random.default_rng([*self._seed, epoch]).permutation(self.size)
+            self._epochs[epoch] = self._order(np.random.default_rng([*self._seed, epoch]))
         return self._epochs[epoch]
+
+    def _order(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
+        """The draws of an epoch in order: things i64 (size,), and which time each is drawn (None: once)."""
+        if not self._groups:
+            return rng.permutation(self.size), None
+        parts = []
+        for ids, times, more in self._groups:
+            parts += [(ids, copy) for copy in range(times)] + [(rng.permutation(ids)[:more], times)]
+        things = np.concatenate([ids for ids, _ in parts])
+        copy = np.repeat([number for _, number in parts], [len(ids) for ids, _ in parts])
+        order = rng.permutation(self.size)
+        return things[order], copy[order]
 
 
 class Strata:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from anytouch_jax.config import Config, UserError
+from anytouch_jax.config import RELEASE_WEIGHTS, Config, UserError
 from anytouch_jax.data import text as texts
 from anytouch_jax.data.manifest import Manifest, ManifestError, sensor_rows
 from anytouch_jax.data.matching import Keys, Matches
@@ -14,6 +16,8 @@ from anytouch_jax.data.sampling import Strata, Stream
 
 STILL, CLIP = 0, 1
 _ALIGN, _ANCHOR = 100, 200  # tags that keep the random streams of one seed apart
+_WITHHELD = "downstream_test"  # column of frames in a test split of a downstream task (paper, appendix: fairness)
+_NOT_SET = ("", "0", "0.0", "false", "no", "none")
 
 
 class Pool(NamedTuple):
@@ -23,6 +27,11 @@ class Pool(NamedTuple):
     strata: Strata
     members: tuple[np.ndarray, ...]
     streams: tuple[Stream, ...]
+
+    @property
+    def draws(self) -> int:
+        """Windows that an epoch draws: each once, or as the weights say."""
+        return sum(stream.size for stream in self.streams)
 
 
 class Pairs(NamedTuple):
@@ -49,13 +58,19 @@ class Sources(NamedTuple):
 def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer | None, devices: int) -> Sources:
     """Look through the split `config.data.split`. Raises UserError: an empty split, an unknown sensor, no tokenizer."""
     rows, sensor, notes = _usable(manifest, config)
-    finder = _Finder(manifest, config, rows, sensor)
+    weights, note = _weights(manifest, config, rows)
+    notes += note
+    if weights is not None:
+        rows = rows[weights[rows] > 0]
+        sensor = np.where(weights > 0, sensor, -1)
+    finder = _Finder(manifest, config, rows, sensor, weights, {})
     has_image, has_text = finder.modalities()
     captioned = rows[has_text[rows]]
     if captioned.size:
-        captions = [str(manifest.value(row, "text")) for row in captioned]
-        tokenizer, note = _choose_tokenizer(tokenizer, captions, config)
+        tokenizer, note = _choose_tokenizer(tokenizer, manifest, captioned, config)
         notes += note
+    if config.model.text and (kept := (manifest.present("text") & withheld(manifest))[rows]).any():
+        notes.append(f"the text of {int(kept.sum())} rows is withheld: they are in a test split of a downstream task")
     length = config.model.frames + (config.stage == 1 or config.objective.reconstruct)
     pools = tuple(
         finder.pool(kind, windows, has_image[windows[:, -1]], has_text[windows[:, -1]], devices)
@@ -83,15 +98,58 @@ def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray,
     return rows, sensor, notes
 
 
+def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
+    """How often an epoch draws each row of the manifest, f64 (rows,), None where all are drawn once; and notes."""
+    column = manifest.column("dataset")
+    there = pc.unique(column.take(rows)).drop_null().to_pylist()
+    wanted = config.data.weights
+    if wanted is None:
+        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in there) if config.recipe == "release" else ()
+    for name, weight in wanted:
+        if name not in there:
+            known = ", ".join(sorted(there)) or "none: its column 'dataset' is empty"
+            raise UserError(f"data.weights names the dataset {name!r}, but split {config.data.split!r} has {known}")
+        if not 0 <= weight < 1e6:
+            raise UserError(f"data.weights of {name!r} is how often it is drawn in an epoch, not {weight}")
+    if len(set(dict(wanted))) < len(wanted):
+        raise UserError("data.weights names a dataset twice")
+    if not wanted:
+        return None, []
+    weights = np.ones(len(manifest))
+    for name, weight in wanted:
+        weights[np.asarray(pc.fill_null(pc.equal(column, name), False))] = weight
+    if not weights[rows].any():
+        raise UserError(f"data.weights leaves out every row of split {config.data.split!r}")
+    said = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
+    return weights, [f"an epoch draws {said}, other datasets once"]
+
+
+def withheld(manifest: Manifest) -> np.ndarray:
+    """Rows in a test split of a downstream task (column `downstream_test`): their text is not trained on, bool (rows,).
+
+    So a text that tells the label is never seen with a frame that a probe is tested on (paper, appendix).
+    """
+    if _WITHHELD not in manifest.table.column_names:
+        return np.zeros(len(manifest), bool)
+    word = pc.utf8_lower(manifest.table[_WITHHELD].cast(pa.string()))
+    return ~np.asarray(pc.is_in(pc.fill_null(word, ""), value_set=pa.array(_NOT_SET)))
+
+
+def captions(manifest: Manifest, rows: np.ndarray) -> list[str]:
+    """The different captions of `rows` that may be trained on, in order."""
+    kept = rows[~withheld(manifest)[rows]]
+    return sorted(pc.unique(manifest.column("text").take(kept)).drop_null().to_pylist())
+
+
 def _choose_tokenizer(
-    given: texts.Tokenizer | None, captions: list[str], config: Config
+    given: texts.Tokenizer | None, manifest: Manifest, rows: np.ndarray, config: Config
 ) -> tuple[texts.Tokenizer, list[str]]:
     tower, notes = config.model.text, []
     assert tower is not None
     if given is None and config.data.tokenizer is not None:
         given = texts.load(config.data.tokenizer)
     if given is None:
-        given = texts.train(captions, tower.vocab)
+        given = texts.train(captions(manifest, rows), tower.vocab)
         notes.append(f"no tokenizer is given: one of {given.vocab_size} tokens was trained on the captions")
     if given.vocab_size > tower.vocab:
         raise UserError(
@@ -106,6 +164,8 @@ class _Finder(NamedTuple):
     config: Config
     rows: np.ndarray
     sensor: np.ndarray
+    weights: np.ndarray | None
+    found: dict[int, np.ndarray]  # clips by their length
 
     def modalities(self) -> tuple[np.ndarray, np.ndarray]:
         """Which rows of the manifest have a picture and a caption that the model has a tower for."""
@@ -113,29 +173,47 @@ class _Finder(NamedTuple):
         if self.config.stage == 1:
             return none, none
         image = self.manifest.present("image_path") if model.image else none
-        text = self.manifest.present("text") if model.text else none
+        text = self.manifest.present("text") & ~withheld(self.manifest) if model.text else none
         return image, text
 
     def windows(self, kind: int, length: int) -> np.ndarray:
         if kind == STILL:
             return self.rows[:, None]
-        clips = self.manifest.clips(length, self.config.data.split)
-        return clips[(self.sensor[clips] >= 0).all(axis=1)]
+        if length not in self.found:
+            clips = self.manifest.clips(length, self.config.data.split)
+            good = np.ones(len(clips), bool)
+            for frame in clips.T:
+                good &= self.sensor[frame] >= 0
+            self.found[length] = clips if good.all() else clips[good]
+        return self.found[length]
 
     def pool(self, kind: int, windows: np.ndarray, image: np.ndarray, text: np.ndarray, devices: int) -> Pool:
         seed = self.config.run.seed
         members = tuple(np.flatnonzero(here) for here in (image & ~text, image & text, ~image & text, ~image & ~text))
-        streams = tuple(Stream(len(ids), seed, _ALIGN + 4 * kind + s) for s, ids in enumerate(members))
-        strata = Strata([len(ids) for ids in members], self.config.data.batch_size, devices)
+        streams = tuple(
+            Stream(len(ids), seed, _ALIGN + 4 * kind + s, self._weights_of(windows[ids]))
+            for s, ids in enumerate(members)
+        )
+        strata = Strata([stream.size for stream in streams], self.config.data.batch_size, devices)
         return Pool(windows, strata, members, streams)
 
+    def _weights_of(self, windows: np.ndarray) -> np.ndarray | None:
+        return None if self.weights is None else self.weights[windows[:, -1]]
+
     def both_pairs(self, has_clips: bool) -> tuple[tuple[Pairs | None, Pairs | None], list[str]]:
-        codes, notes = self.manifest.codes, []
+        def codes(name: str, own: bool = False) -> np.ndarray:
+            found = self.manifest.codes(name, own=own)
+            return found.astype(np.int32) if found.max(initial=0) < 1 << 31 else found
+
+        notes = []
         keys = Keys(codes("touch", own=True), self.sensor, codes("unit"), codes("object"), codes("dataset"))
         stills, clips = self._pairs(STILL, keys), self._pairs(CLIP, keys)
         if stills is None:
             notes.append(
                 "no touch was felt by two sensors or units (column 'touch'): there is no cross-sensor matching"
+                if self.config.data.negatives == "any"
+                else "no touch was felt by two sensors, one of which felt another place: there is no cross-sensor "
+                "matching with data.negatives=same_sensor"
             )
         elif stills.matches.one_object:
             notes.append("all touches are of one object: negatives of matching are other places of it")
@@ -145,7 +223,8 @@ class _Finder(NamedTuple):
 
     def _pairs(self, kind: int, keys: Keys) -> Pairs | None:
         windows = self.windows(kind, self.config.model.frames)
-        matches = Matches(windows[:, -1], keys)
+        matches = Matches(windows[:, -1], keys, same_sensor=self.config.data.negatives == "same_sensor")
         if not matches.anchors.size:
             return None
-        return Pairs(windows, matches, Stream(len(matches.anchors), self.config.run.seed, _ANCHOR + kind))
+        weights, seed = self._weights_of(windows[matches.anchors]), self.config.run.seed
+        return Pairs(windows, matches, Stream(len(matches.anchors), seed, _ANCHOR + kind, weights))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ SPLITS = ("train", "val", "test", "background", "unused")
 REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
 PATHS = ("path", "image_path", "background_path", "field_path")
 
+_READERS = 2  # columns of a Parquet file that are read at once: more need more memory
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
 SCHEMA: dict[str, pa.DataType] = {
     "path": _TEXT,
@@ -53,11 +55,31 @@ def load_table(path: Path) -> pa.Table:
     if kind not in (".csv", ".parquet"):
         raise ManifestError(f"{path}: a manifest ends in .csv or .parquet")
     try:
-        table = _read_csv(path) if kind == ".csv" else pa.parquet.read_table(path, partitioning=None)
+        return typed(_read_csv(path), str(path)) if kind == ".csv" else _load_parquet(path)
     except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ManifestError(f"{path} cannot be read as a {kind[1:]} table: {reason}") from None
-    return typed(table, str(path))
+
+
+def _load_parquet(path: Path) -> pa.Table:
+    """Column by column, so that a large table is never in the memory twice."""
+    with pa.parquet.ParquetFile(path) as file:
+        names, rows = file.schema_arrow.names, file.metadata.num_rows
+    _check_names(names, rows, str(path))
+
+    def load(name: str) -> pa.ChunkedArray:
+        with pa.parquet.ParquetFile(path) as file:  # a file is not to be read by two threads
+            column = file.read([name], use_threads=False)[name]
+        return _whole_chunk(_checked(name, column, str(path)))
+
+    with ThreadPoolExecutor(_READERS) as pool:
+        columns = dict(zip(names, pool.map(load, names), strict=True))
+    pa.default_memory_pool().release_unused()
+    return pa.table(columns)
+
+
+def _whole_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    return pa.table({"one": column}).combine_chunks()["one"]
 
 
 def typed(table: pa.Table, where: str) -> pa.Table:
@@ -66,26 +88,34 @@ def typed(table: pa.Table, where: str) -> pa.Table:
     Columns outside SCHEMA are carried through. `where` names the file in errors. Raises ManifestError when a
     required column or value is missing, a type is wrong, a split is unknown, a stride is below 1, or no row is there.
     """
-    names = table.column_names
+    _check_names(table.column_names, table.num_rows, where)
+    return pa.table({name: _checked(name, table[name], where) for name in table.column_names}).combine_chunks()
+
+
+def _check_names(names: Sequence[str], rows: int, where: str) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ManifestError(f"{where}: column {twice[0]!r} is there twice")
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {', '.join(names)}")
-    if not table.num_rows:
+    if not rows:
         raise ManifestError(f"{where} has no rows")
-    columns = {name: _convert(name, table[name], where) for name in names}
-    for name in REQUIRED:
-        _refuse(pc.is_null(columns[name]), where, name, lambda _: "is empty")
-    split = columns["split"]
-    unknown = pc.invert(pc.is_in(split, value_set=pa.array(SPLITS)))
-    choices = ", ".join(SPLITS)
-    _refuse(unknown, where, "split", lambda row: f"must be one of {choices}, is the unknown split {split[row]}")
-    if "stride" in columns:
-        stride = columns["stride"] = pc.fill_null(columns["stride"], 1)
-        _refuse(pc.less(stride, 1), where, "stride", lambda row: f"must be at least 1, is {stride[row]}")
-    return pa.table(columns).combine_chunks()
+
+
+def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
+    """A column with its type, every value checked."""
+    column = _convert(name, column, where)
+    if name in REQUIRED:
+        _refuse(pc.is_null(column), where, name, lambda _: "is empty")
+    if name == "split":
+        unknown = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS)))
+        choices = ", ".join(SPLITS)
+        _refuse(unknown, where, name, lambda row: f"must be one of {choices}, is the unknown split {column[row]}")
+    if name == "stride":
+        column = pc.fill_null(column, 1)
+        _refuse(pc.less(column, 1), where, name, lambda row: f"must be at least 1, is {column[row]}")
+    return column
 
 
 def _read_csv(path: Path) -> pa.Table:
@@ -122,8 +152,11 @@ def _convert(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
     is_text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     if is_text:
         column = column.cast(_TEXT)
-        bare = pc.utf8_trim_whitespace(column)
-        column = pc.if_else(pc.equal(bare, ""), pa.scalar(None, _TEXT), column if wanted == _TEXT else bare)
+        if wanted != _TEXT:
+            column = pc.utf8_trim_whitespace(column)
+        blank = pc.or_(pc.equal(pc.binary_length(column), 0), pc.utf8_is_space(column))
+        if pc.any(blank).as_py():  # copying millions of strings takes longer than looking at them
+            column = pc.if_else(blank, pa.scalar(None, _TEXT), column)
     if wanted == _TEXT:
         if not is_text:
             raise ManifestError(f"{where}: column {name!r} must be text, is {column.type}")

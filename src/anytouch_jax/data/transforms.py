@@ -30,86 +30,128 @@ def augmentation_rng(seed: int, epoch: int, row: int, stream: int = TOUCH) -> np
 
 
 def touch_transform(
-    frames: Sequence[np.ndarray] | np.ndarray, size: int, rng: np.random.Generator, config: Data
+    frames: Sequence[np.ndarray] | np.ndarray,
+    size: int,
+    rng: np.random.Generator,
+    config: Data,
+    out: np.ndarray | None = None,
 ) -> np.ndarray:
     """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), one draw for all frames.
 
     The whole image is resized (no crop), flipped in both directions with probability `config.flip` each, then
-    jittered in colour by `config.jitter` (the release's augmentation).
+    jittered in colour by `config.jitter` (the release's augmentation). `out`: where to write, else a new array.
     """
     across, down = rng.random(2) < config.flip
-    out = touch_evaluation(frames, size)
-    if across or down:
-        # A contiguous copy: arithmetic on a view with negative strides is six times slower than the flip.
-        out = np.ascontiguousarray(out[:, :: -1 if down else 1, :: -1 if across else 1])
-    return colour_jitter(out, rng, config.jitter)
-
-
-def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int) -> np.ndarray:
-    """Resize a still or a clip without randomness: T frames u8 (h, w, 3) -> u8 (T, size, size, 3)."""
-    out = np.empty((len(frames), size, size, 3), np.uint8)
+    out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
+    plain = np.empty(out.shape[1:], np.uint8) if across or down else None
     for target, frame in zip(out, frames, strict=True):
-        smaller = min(frame.shape[:2]) > size
-        cv2.resize(frame, (size, size), dst=target, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+        _resize(frame, target if plain is None else plain)
+        if plain is not None:  # NumPy takes thirty times as long
+            cv2.flip(plain, -1 if across and down else int(across), dst=target)
+    return colour_jitter(out, rng, config.jitter, out) if any(config.jitter) else out
+
+
+def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None) -> np.ndarray:
+    """Resize a still or a clip without randomness: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), into `out`."""
+    out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
+    for target, frame in zip(out, frames, strict=True):
+        _resize(frame, target)
     return out
 
 
+def _resize(frame: np.ndarray, target: np.ndarray) -> None:
+    smaller = min(frame.shape[:2]) > len(target)
+    how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    cv2.resize(frame, (target.shape[1], len(target)), dst=target, interpolation=how)
+
+
 def colour_jitter(
-    frames: np.ndarray, rng: np.random.Generator, jitter: tuple[float, float, float, float]
+    frames: np.ndarray,
+    rng: np.random.Generator,
+    jitter: tuple[float, float, float, float],
+    out: np.ndarray | None = None,
 ) -> np.ndarray:
     """Brightness, contrast, saturation and hue in a random order, the same for all frames: u8 (T, h, w, 3) -> same.
 
-    torchvision's ColorJitter on floats in 0..1: factors in 1 +- jitter (at least 0), hue turned by up to +-jitter of a
-    circle, each step clipped. All is float32 with one rounding at the end, so the error is half a grey level.
+    torchvision's ColorJitter on floats: factors in 1 +- jitter (at least 0), hue turned by up to +-jitter of a circle,
+    each step clipped. All is float32 with one rounding at the end, so the error is half a grey level. `out`: where to
+    write, also `frames` itself.
     """
     spread = np.asarray(jitter)
     low, high = np.maximum(0.0, 1.0 - spread), 1.0 + spread
     low[3], high[3] = -jitter[3], jitter[3]
     factors = low + (high - low) * rng.random(4)
-    order = [operation for operation in rng.permutation(4) if jitter[operation]]
-    out = np.empty(frames.shape, np.uint8)
+    steps = [(int(operation), float(factors[operation])) for operation in rng.permutation(4) if jitter[operation]]
+    out = np.empty(frames.shape, np.uint8) if out is None else out
     buffers = np.empty((2, *frames.shape[1:]), np.float32)
     for target, frame in zip(out, frames, strict=True):
-        here, there = buffers
-        np.multiply(frame, np.float32(1 / 255), out=here)
-        for operation in order:
-            here, there = _OPERATIONS[operation](here, there, float(factors[operation]))
-            np.clip(here, 0.0, 1.0, out=here)
-        cv2.convertScaleAbs(here, dst=target, alpha=255)
+        _Jitter(frame, *buffers).apply(steps, target)
     return out
 
 
-# Each operation takes the image, a buffer and a factor, and gives back (image, buffer): some of them swap the two.
-_Pair = tuple[np.ndarray, np.ndarray]
+_HUE = 3
+_IDENTITY = np.eye(3, 4)
 
 
-def _brightness(image: np.ndarray, spare: np.ndarray, factor: float) -> _Pair:
-    np.multiply(image, np.float32(factor), out=image)
-    return image, spare
+class _Jitter:
+    """One frame on its way, f32 in 0..255: brightness, contrast and saturation are affine maps of a pixel's colour.
 
+    `pending` (3, 4) is the map that is still to be applied to `here`. Maps are put together until a value could leave
+    the range (`low` and `high` bound them), where the picture has to be made and clipped, or until the hue is turned.
+    """
 
-def _contrast(image: np.ndarray, spare: np.ndarray, factor: float) -> _Pair:
-    mean = float(np.dot(cv2.mean(image)[:3], _GREY))
-    np.multiply(image, np.float32(factor), out=image)
-    np.add(image, np.float32((1 - factor) * mean), out=image)
-    return image, spare
+    def __init__(self, frame: np.ndarray, here: np.ndarray, spare: np.ndarray) -> None:
+        np.copyto(here, frame)
+        self.here, self.spare, self.pending = here, spare, _IDENTITY
+        self.low, self.high = float(frame.min()), float(frame.max())
 
+    def apply(self, steps: Sequence[tuple[int, float]], target: np.ndarray) -> None:
+        """Take the steps (operation, factor) in order and round the result into `target` u8."""
+        for operation, factor in steps:
+            if operation == _HUE:
+                self._turn(factor)
+            else:
+                self._blend(operation, factor)
+        self._settle()
+        cv2.convertScaleAbs(self.here, dst=target)
 
-def _saturation(image: np.ndarray, spare: np.ndarray, factor: float) -> _Pair:
-    mix = factor * np.eye(3) + (1 - factor) * np.tile(_GREY, (3, 1))
-    cv2.transform(image, mix.astype(np.float32), dst=spare)
-    return spare, image
+    def _blend(self, operation: int, factor: float) -> None:
+        """Mix with black (0), with the mean grey of the picture (1), or with each pixel's own grey (2)."""
+        step, low, high = _IDENTITY * factor, 0.0, 0.0
+        if operation == 1:
+            mean = self.pending @ (*cv2.mean(self.here)[:3], 1.0)
+            low = high = float(np.dot(mean, _GREY))
+            step[:, 3] = (1 - factor) * low
+        elif operation == 2:
+            step[:, :3] += (1 - factor) * np.asarray(_GREY)
+            low, high = (self.low, self.high) if factor <= 1 else (self.high, self.low)
+        self.low, self.high = factor * self.low + (1 - factor) * low, factor * self.high + (1 - factor) * high
+        linear = step[:, :3] @ self.pending
+        linear[:, 3] += step[:, 3]
+        self.pending = linear
+        if self.low < 0 or self.high > 255:
+            self._settle()
+            self._clip()
 
+    def _settle(self) -> None:
+        if self.pending is not _IDENTITY:
+            cv2.transform(self.here, self.pending.astype(np.float32), dst=self.spare)
+            self.here, self.spare, self.pending = self.spare, self.here, _IDENTITY
 
-def _hue(image: np.ndarray, spare: np.ndarray, factor: float) -> _Pair:
-    cv2.cvtColor(image, cv2.COLOR_RGB2HSV, dst=spare)
-    hue = spare[..., 0]
-    np.add(hue, np.float32(360 * (factor % 1.0)), out=hue)  # the way back takes angles above 360, not below 0
-    cv2.cvtColor(spare, cv2.COLOR_HSV2RGB, dst=image)
-    return image, spare
+    def _clip(self) -> None:
+        if self.high > 255:
+            cv2.threshold(self.here, 255, 0, cv2.THRESH_TRUNC, dst=self.here)
+        if self.low < 0:
+            cv2.threshold(self.here, 0, 0, cv2.THRESH_TOZERO, dst=self.here)
+        self.low, self.high = max(self.low, 0.0), min(self.high, 255.0)
 
-
-_OPERATIONS = (_brightness, _contrast, _saturation, _hue)
+    def _turn(self, factor: float) -> None:
+        """Turn the hue; a pixel's largest and smallest value stay, so the bounds do."""
+        self._settle()
+        cv2.cvtColor(self.here, cv2.COLOR_RGB2HSV, dst=self.spare)
+        hue = self.spare[..., 0]
+        np.add(hue, np.float32(360 * (factor % 1.0)), out=hue)  # the way back takes angles above 360, not below 0
+        cv2.cvtColor(self.spare, cv2.COLOR_HSV2RGB, dst=self.here)
 
 
 def vision_transform(

@@ -65,12 +65,13 @@ def contact_quality(
     above: float | None = None,
     split: str | None = None,
     scores: ContactScores | None = None,
+    thresholds: Mapping[str, float] | None = None,
     workers: int = 2,
 ) -> ContactQuality:
     """Compare the filter's verdict with column `reference` > `above` (default: the first of REFERENCES that is there).
 
-    Only rows of `split` (default: all but `background`) that have a value and a score are compared. Raises UserError
-    when no such column or row is there.
+    Only rows of `split` (default: all but `background`) that have a value and a score are compared. `thresholds`
+    replaces entries of THRESHOLDS. Raises UserError when no such column or row is there.
     """
     name = reference or next((one for one in REFERENCES if one in manifest.table.column_names), None)
     if name is None or name not in manifest.table.column_names:
@@ -91,7 +92,8 @@ def contact_quality(
     if not used.size:
         raise UserError(f"no row has both a value in {name} and a score")
     sensors = np.asarray(manifest.table["sensor"].to_pylist(), object)[used]
-    found = scores.score[used] > np.array([THRESHOLDS.get(one, DEFAULT_THRESHOLD) for one in sensors])
+    limits = {**THRESHOLDS, **(thresholds or {})}
+    found = scores.score[used] > np.array([limits.get(one, DEFAULT_THRESHOLD) for one in sensors])
     there = truth[used] > limit
     whole = ContactQuality(
         name, limit, len(used), len(rows) - len(used), int(there.sum()), int(found.sum()), int((there & found).sum()),

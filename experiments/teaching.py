@@ -1,0 +1,163 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Do simulated scenes teach a representation of touch?
+#
+# On objects never touched in training (whole pairs of primitive and texture are held out):
+#
+# 1. **Retrieval.** The same touch by another sensor and another unit, among 50 touches that resemble it most in
+#    position, depth and force. Stage 2 against stage 1 alone, an untrained encoder, background-differenced pixels, and
+#    the vector (contact area, centroid, force). For fine data (one motion for all sensors) and coarse data (by hand).
+# 2. **A sensor left out.** GelSlim is not in the sensor table of the trained encoders: its touches get the universal
+#    tokens. Linear probes on its features, for labels that captions name (hardness, roughness, material) and for one
+#    that they do not (indenter).
+#
+# `.venv/bin/python experiments/teaching.py` does all of it, run by run: what is finished is not done again. It takes
+# hours at its full size; `TOUCHES=260 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and
+# `OUT=` are where runs and results go.
+
+# %%
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.cli import main
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import baseline, probe, retrieval
+from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
+from anytouch_jax.evaluate.features import embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.train.record import write_atomic
+
+WORK = Path(os.environ.get("WORK", "runs/teaching"))
+OUT = Path(os.environ.get("OUT", "experiments/results"))
+TOUCHES = int(os.environ.get("TOUCHES", "2000"))
+STEPS1 = int(os.environ.get("STEPS1", "1500"))
+STEPS2 = int(os.environ.get("STEPS2", "2000"))
+SEEDS = [int(seed) for seed in os.environ.get("SEEDS", "0,1,2").split(",")]
+GRADES = os.environ.get("GRADES", "fine,coarse").split(",")
+SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
+TABLE = ["gelsight_mini", "digit", "duragel", "universal"]
+NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)
+
+
+def anytouch(*words: Any) -> None:
+    """Run a subcommand; a run or a data set that is finished answers at once."""
+    status = main([str(word) for word in words])
+    if status:
+        raise SystemExit(status)
+
+
+# %% [markdown]
+# ## Data and runs
+#
+# One data set a grade, and the same touches by the sensor that is left out. Both stages at preset tiny, for every seed.
+
+# %%
+TRAIN1 = ["--preset", "tiny", "--steps", STEPS1, "--batch", 64, "--optim.learning-rate", 5e-4]
+TRAIN2 = ["--preset", "tiny", "--steps", STEPS2, "--batch", 32, "--optim.learning-rate", 2e-4]
+
+
+def prepare(grade: str, seed: int) -> tuple[Path, Path]:
+    """The runs of both stages for a grade and a seed."""
+    scenes = WORK / f"scenes-{grade}"
+    common = ["--touches", TOUCHES, "--objects", min(TOUCHES // 2, 500), "--grade", grade, "--size", 128]
+    anytouch("simulate", "--out", scenes, "--sensors", SENSORS, *common)
+    anytouch("simulate", "--out", WORK / f"{LEFT_OUT}-{grade}", "--sensors", LEFT_OUT, *common)
+    one, two = (WORK / f"{grade}-{seed}-stage{stage}" for stage in (1, 2))
+    data = ["--data", scenes / "manifest.parquet", "--seed", seed, "--model.sensors", *TABLE]
+    anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
+    anytouch("train", "--stage", 2, "--run", two, "--init", one, *TRAIN2, *data)
+    return one, two
+
+
+def features(runs: tuple[Path, Path], seed: int, table: Any, rows: np.ndarray, pooling: Any) -> dict[str, np.ndarray]:
+    one, two = (load_encoder(run) for run in runs)
+    encoders = {"stage 2": two, "stage 1": one, "untrained": random_encoder(one.config, seed)}
+    return {name: embed_rows(e, table, rows, pooling=pooling, say=lambda _: None)[1] for name, e in encoders.items()}
+
+
+# %% [markdown]
+# ## Retrieval on objects never seen
+
+
+# %%
+def retrieve(grade: str, seed: int, runs: tuple[Path, Path]) -> list[retrieval.Retrieval]:
+    table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
+    rows = deepest_rows(table, table.rows_of("test"))
+    found = features(runs, seed, table, rows, "class")
+    found |= {"pixels": background_difference(table, rows), "vector": contact_vector(table, rows)}
+    scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(False,), metrics={"vector": "euclidean"})
+    return [one for one in scored if one.query_sensor == retrieval.ALL]
+
+
+def probes(grade: str, seed: int, runs: tuple[Path, Path]) -> dict[str, dict[str, Any]]:
+    """Linear probes on the sensor left out, universal tokens, objects never seen in the test split."""
+    table = manifests.read(WORK / f"{LEFT_OUT}-{grade}" / "manifest.parquet")
+    rows = np.concatenate([deepest_rows(table, table.rows_of(split)) for split in ("train", "val", "test")])
+    split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
+    found = features(runs, seed, table, rows, "both")
+    found["pixels"] = baseline.reduce(background_difference(table, rows), split == "train")
+    results: dict[str, dict[str, Any]] = {}
+    for label in (*NAMED, *UNNAMED):
+        values = [table.value(int(row), f"label.{label}") for row in rows]
+        for name, x in found.items():
+            scaling = "common" if name == "pixels" else "column"
+            one = probe.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
+            results.setdefault(label, {})[name] = {"accuracy": one.accuracy, "low": one.low, "high": one.high}
+    return results
+
+
+# %%
+def points(change: tuple[float, float | None, float | None]) -> str:
+    mean, low, high = change
+    return f"{100 * mean:+.1f}" + ("" if low is None or high is None else f" ({100 * low:+.1f} to {100 * high:+.1f})")
+
+
+def percent(values: list[float]) -> str:
+    return f"{100 * np.mean(values):.1f} %" + (f" +- {100 * np.std(values):.1f}" if len(values) > 1 else "")
+
+
+NAMES = ("stage 2", "stage 1", "untrained", "pixels", "vector")
+lines = ["# Simulated scenes as teachers", ""]
+record: dict[str, Any] = {"touches": TOUCHES, "steps": [STEPS1, STEPS2], "seeds": SEEDS}
+for grade in GRADES:
+    scored: dict[str, list[retrieval.Retrieval]] = {name: [] for name in NAMES}
+    probed: list[dict[str, dict[str, Any]]] = []
+    for seed in SEEDS:
+        runs = prepare(grade, seed)
+        for one in retrieve(grade, seed, runs):
+            scored[one.name].append(one)
+        probed.append(probes(grade, seed, runs))
+    pooled = {name: retrieval.averaged(several, name) for name, several in scored.items()}
+    rows = []
+    for name, one in pooled.items():
+        change = "-" if name == "stage 2" else points(retrieval.difference(pooled["stage 2"], one))
+        rows.append((name, f"{100 * one.top1:.1f} %", f"{100 * one.top5:.1f} %", change))
+    lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seeds", ""]
+    lines += [markdown(("features", "top-1 of 50", "top-5", "stage 2 ahead by (points, 95 %)"), rows), ""]
+    record[grade] = {"retrieval": retrieval.to_records(list(pooled.values())), "probes": probed}
+    lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
+    head = ("label", *NAMES[:4])
+    rows = [
+        (label, *(percent([found[label][name]["accuracy"] for found in probed]) for name in NAMES[:4]))
+        for label in (*NAMED, *UNNAMED)
+    ]
+    lines += [markdown(head, rows), ""]
+
+# %%
+OUT.mkdir(parents=True, exist_ok=True)
+write_atomic(OUT / "teaching.json", json.dumps(record, indent=2) + "\n")
+write_atomic(OUT / "teaching.md", "\n".join(lines))
+print("\n".join(lines))

@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.made
+TORCH  := .venv-torch
 
 PRESET     ?= tiny
 SCENES     ?= data/scenes
@@ -35,7 +36,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -88,12 +89,27 @@ format: $(STAMP) ## rewrite the sources in the project's format
 	$(PY) -m ruff check --fix $(CHECKED)
 	$(PY) -m ruff format $(CHECKED)
 
+bench: $(STAMP) ## speed against error: [PRESET= BATCH= OUT= WHAT="stage1 embed ..."]; quiet the machine first
+	$(ANYTOUCH) bench $(WHAT) --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+
+bench-torch: $(STAMP) $(TORCH)/.made ## beside PyTorch, in a venv of its own: [PRESET= BATCH= OUT= WHAT=]
+	$(PY) experiments/torch_rival/run.py $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+
+bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
+	$(PYTHON) experiments/bench_gpu.py $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+
 clean: ## remove .venv, builds and caches; runs stay
-	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(TORCH) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES)/manifest.parquet: | $(STAMP)
 	$(ANYTOUCH) simulate --out $(SCENES)
+
+$(TORCH)/.made: experiments/torch_rival/requirements.txt
+	$(PYTHON) -m venv $(TORCH)
+	@echo '*' > $(TORCH)/.gitignore
+	$(TORCH)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
 
 $(STAMP): requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "This project needs Python 3.11 or newer; name one with PYTHON=, for example: make PYTHON=python3.12" >&2; exit 1; }

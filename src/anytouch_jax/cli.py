@@ -11,7 +11,7 @@ from typing import Any
 
 from anytouch_jax import __version__
 from anytouch_jax.config import Config, UserError, preset
-from anytouch_jax.options import Convert, Embed, Parity, Probe, Sections, Simulate, Train
+from anytouch_jax.options import Bench, Convert, Embed, Parity, Probe, Report, Retrieve, Sections, Simulate, Train
 from anytouch_jax.options_data import Annotate, Contact, Index, Pack, Verify
 
 _COMMANDS: dict[str, tuple[type, str]] = {
@@ -24,11 +24,14 @@ _COMMANDS: dict[str, tuple[type, str]] = {
     "train": (Train, "pre-train stage 1 or stage 2, or go on with a run"),
     "embed": (Embed, "features of a manifest, a folder or a video"),
     "probe": (Probe, "linear and kNN probes of frozen features"),
+    "retrieve": (Retrieve, "the same touch by another sensor, among similar touches"),
+    "report": (Report, "what two runs learned, as Markdown with figures"),
     "parity": (Parity, "compare with golden vectors of the authors' code"),
     "convert": (Convert, "weights in and out"),
+    "bench": (Bench, "speed against error, on this machine"),
 }
 # What these require is given by place, not by name.
-_POSITIONAL = (Index, Contact, Verify, Annotate, Pack, Parity, Convert)
+_POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

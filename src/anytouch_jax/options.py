@@ -201,3 +201,80 @@ class Simulate:
     """Pixels of an image's shorter side."""
     threads: int = 2
     """Threads that render photographs and write files."""
+
+
+@dataclass(frozen=True)
+class Retrieve:
+    """Find the same touch by another sensor: top-1 and top-5 of frozen features, with controls and intervals.
+
+    Example: anytouch retrieve --run runs/stage2 --data data/scenes/manifest.parquet
+
+    A gallery holds the true touch once, and the touches that resemble it most in position, depth and force.
+    """
+
+    data: Path
+    """Manifest with the columns touch and unit, and labels of the contact (label.x, y, depth, force)."""
+    run: Paths = ()
+    """Run folders or weights files to compare."""
+    split: str = "test"
+    """Split that is looked at."""
+    frames: int = 1
+    """Frames of a clip that ends at each deepest frame: 1 (stills), 3 or more."""
+    pooling: Literal["class", "mean", "both"] = "class"
+    """Features: class token, mean of patch tokens, or both."""
+    gallery: int = 50
+    """Touches in a gallery."""
+    by_chance: bool = False
+    """Draw the galleries by chance, not matched in position, depth and force."""
+    seeds: int = 5
+    """Galleries drawn for each query."""
+    controls: bool = True
+    """Also score a random encoder, background-differenced pixels, and the contact's area, centroid and force."""
+    out: Path | None = None
+    """Write the results as JSON."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write what two runs learned of a manifest: samples, losses, reconstructions, t-SNE, retrieval and probes.
+
+    Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2 runs/stage2 --out report
+    """
+
+    data: Path
+    """Manifest of simulated scenes, or one with the same columns."""
+    stage1: Path
+    """Run folder of stage 1."""
+    stage2: Path
+    """Run folder of stage 2."""
+    out: Path
+    """Folder for report.md, report.json and figures/."""
+    touches: int = 200
+    """Touches of the test split that are looked at (and half as many of train and val)."""
+    gallery: int = 50
+    """Touches in a retrieval gallery."""
+    seed: int = 0
+    """Seed of what is drawn."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed against error: steps, embeddings, compilation, memory on many devices, simulator, loader.
+
+    Example: anytouch bench stage1 embed --preset small --out experiments/results
+
+    Without WHAT everything is measured. Variants take turns in one process; quiet the machine first.
+    """
+
+    what: tuple[Literal["stage1", "stage2", "embed", "compile", "memory", "simulator", "loader"], ...]
+    """What to measure (default: everything)."""
+    preset: Literal["tiny", "small", "base", "large"] = "tiny"
+    """Sizes of the network."""
+    batch: int | None = None
+    """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; a device for memory)."""
+    out: Path = Path("runs/bench")
+    """Folder for speed.md, speed.json and figures/."""
+    rounds: int = 9
+    """Rounds in which all variants take turns; figures are medians."""
+    quick: bool = False
+    """Two rounds of tiny batches: does it work?"""

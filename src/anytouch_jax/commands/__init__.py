@@ -3,6 +3,36 @@
 Each `run` returns an exit status. Heavy imports wait until a command runs.
 """
 
-from anytouch_jax.commands import annotate, contact, convert, embed, index, pack, parity, probe, simulate, train, verify
+from anytouch_jax.commands import (
+    annotate,
+    bench,
+    contact,
+    convert,
+    embed,
+    index,
+    pack,
+    parity,
+    probe,
+    report,
+    retrieve,
+    simulate,
+    train,
+    verify,
+)
 
-__all__ = ["annotate", "contact", "convert", "embed", "index", "pack", "parity", "probe", "simulate", "train", "verify"]
+__all__ = [
+    "annotate",
+    "bench",
+    "contact",
+    "convert",
+    "embed",
+    "index",
+    "pack",
+    "parity",
+    "probe",
+    "report",
+    "retrieve",
+    "simulate",
+    "train",
+    "verify",
+]

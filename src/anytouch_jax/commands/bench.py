@@ -1,0 +1,138 @@
+"""`anytouch bench`: one table of speed against error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from anytouch_jax.commands.words import say
+from anytouch_jax.options import Bench
+
+if TYPE_CHECKING:
+    from anytouch_jax.evaluate.speed import Row
+
+_QUICK_ROUNDS, _QUICK_SAMPLES, _QUICK_PEAK = 2, 2, 512
+_NETWORK = ("stage1", "stage2", "embed")
+Section = tuple[str, str, list[Any]]  # title, Markdown, records
+
+
+def run(options: Bench) -> int:
+    """Measure what was asked for, write speed.md, speed.json and a figure a workload, and print the tables."""
+    from anytouch_jax.evaluate import machine, speed_report
+
+    here = machine.describe()
+    say(here.sentence())
+    wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)
+    sections = [section for name in wanted for section in _SECTIONS[name](options, name)]
+    quick = "A quick run: two rounds on tiny batches, to see that everything works. Not for comparison.\n\n"
+    text = f"# Speed against error\n\n{here.sentence()}\n\n{quick if options.quick else ''}{speed_report.NOTES}\n"
+    text += "".join(f"\n## {title}\n\n{body}" for title, body, _ in sections)
+    numbers = {
+        "machine": speed_report.as_dict(here),
+        "preset": options.preset,
+        "rounds": _rounds(options),
+        "quick": options.quick,
+        "results": {title: [speed_report.as_dict(row) for row in rows] for title, _, rows in sections},
+    }
+    path = speed_report.write(options.out, "speed", text, numbers)
+    for _, body, _ in sections:
+        print(body)
+    say(f"{path}, speed.json and figures/ beside it")
+    return 0
+
+
+def _rounds(options: Bench) -> int:
+    return _QUICK_ROUNDS if options.quick else options.rounds
+
+
+def _batch(options: Bench) -> int | None:
+    return options.batch or (_QUICK_SAMPLES if options.quick else None)
+
+
+def _network(options: Bench, name: str) -> list[Section]:
+    from anytouch_jax.evaluate import speed, speed_report
+    from anytouch_jax.evaluate.workloads import workloads
+
+    found: list[Section] = []
+    for work in workloads(name, options.preset, _batch(options)):
+        rows = speed.measure(work, rounds=_rounds(options), peak_size=_QUICK_PEAK if options.quick else None, say=say)
+        body = speed_report.to_markdown(rows) + "\n" + _figure(options, rows)
+        found.append((f"{work.name}, preset {options.preset}", body, rows))
+    return found
+
+
+def _figure(options: Bench, rows: list[Row]) -> str:
+    """The Pareto plot of a workload, as a line of Markdown."""
+    from anytouch_jax.evaluate import plots, speed_report
+
+    points = speed_report.points(rows)
+    if not points:
+        return ""
+    what = "output" if rows[0].error_gradient is None else "gradient"
+    title = f"{rows[0].workload}, preset {options.preset}"
+    name = f"speed_{title.replace(', preset ', '_').replace(' ', '_')}.png"
+    y = f"relative error of the {what}, against float64"
+    plots.pareto(options.out / "figures" / name, points, x="time / float32 baseline", y=y, title=title)
+    return f"![{title}](figures/{name})\n"
+
+
+def _compile(options: Bench, _: str) -> list[Section]:
+    from anytouch_jax.evaluate import startup
+
+    say("compile: fresh processes, without and with the cache")
+    whats = ("stage1",) if options.quick else ("stage1", "stage2")
+    found = startup.starts(options.preset, whats, _batch(options))
+    title = f"First step of a fresh process, preset {options.preset}"
+    return [(title, startup.to_markdown(found), list(found))]
+
+
+def _memory(options: Bench, _: str) -> list[Section]:
+    from anytouch_jax.evaluate import memory
+
+    found = []
+    for devices, fsdp in memory.MESHES[:3] if options.quick else memory.MESHES:
+        say(f"memory: {devices} devices, {fsdp} to a copy of the state")
+        found.append(memory.simulate(options.preset, devices, fsdp, _batch(options) or 4))
+    title = f"Memory and communication of a device, stage 1 on clips, preset {options.preset}"
+    note = "\n" + " ".join((memory.__doc__ or "").split()) + "\n"
+    return [(title, memory.to_markdown(found) + note, list(found))]
+
+
+def _simulator(options: Bench, _: str) -> list[Section]:
+    from anytouch_jax.evaluate import fidelity, plots
+
+    say("simulator: contact and shear at every fidelity, against a converged float64 solution")
+    quick = options.quick
+    variants = [fidelity.Variant("exact", 28), fidelity.Variant("fast", 28)] if quick else fidelity.VARIANTS
+    scenes = {"sphere": fidelity.SCENES["sphere"]} if quick else fidelity.SCENES
+    reference = 56 if quick else 224
+    rows = fidelity.speed_against_error(variants, scenes, reference=reference, rounds=_rounds(options))
+    points = {
+        f"{row.fidelity} {row.grid}{'' if row.iterations is None else f', {row.iterations}'}": (
+            row.press_ms + row.shear_ms,
+            100 * max(row.rms.values()),
+        )
+        for row in rows
+    }
+    name = "speed_simulator.png"
+    y = "worst scene's rms error of the displacement, %"
+    plots.pareto(options.out / "figures" / name, points, x="ms a frame", y=y, title="contact and shear")
+    body = fidelity.to_markdown(rows) + f"\n![contact and shear](figures/{name})\n"
+    return [("Simulator", body, list(rows))]
+
+
+def _loader(options: Bench, _: str) -> list[Section]:
+    from anytouch_jax.evaluate import speed_data
+
+    say("loader: frames a second by threads")
+    rows = speed_data.measure(options.preset, _batch(options) or 64, rounds=_rounds(options))
+    return [(f"Loader, preset {options.preset}", speed_data.to_markdown(rows), list(rows))]
+
+
+_SECTIONS: dict[str, Callable[[Bench, str], list[Section]]] = {
+    **dict.fromkeys(_NETWORK, _network),
+    "compile": _compile,
+    "memory": _memory,
+    "simulator": _simulator,
+    "loader": _loader,
+}

@@ -1,0 +1,92 @@
+"""The machine that a benchmark ran on: what it is, and the matrix product it reaches at best.
+
+Imports nothing but jax and numpy, so that a bare accelerator image can run it.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+SIZES = {"cpu": 2048, "gpu": 8192, "tpu": 8192}  # of the square matrices whose product is the peak
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where figures were measured. `memory_gib` is the host's, `load` the mean of its last minute, as it began."""
+
+    device: str
+    devices: int
+    processor: str
+    cores: int
+    memory_gib: float
+    load: float
+    python: str
+    jax: str
+    system: str
+
+    def sentence(self) -> str:
+        """One line for a report."""
+        parts = [f"{self.devices} x {self.device}", f"{self.processor}, {self.cores} cores, {self.memory_gib:.0f} GiB"]
+        parts += [f"Python {self.python}", f"jax {self.jax}", self.system]
+        return f"{'; '.join(parts)}; load {self.load:.1f} at the start."
+
+
+def describe() -> Machine:
+    """The machine of this process."""
+    first = jax.devices()[0]
+    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return Machine(
+        device=first.device_kind,
+        devices=jax.device_count(),
+        processor=_processor(),
+        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        memory_gib=pages / 2**30,
+        load=os.getloadavg()[0],
+        python=platform.python_version(),
+        jax=jax.__version__,
+        system=platform.system(),
+    )
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def matmul(dtype: str, size: int | None = None) -> tuple[Callable[[], object], float]:
+    """(run, operations): `run` multiplies two square matrices of `dtype` on the first device and waits for the product.
+
+    float32 is full float32 (no TF32); a 16-bit type keeps its type.
+    """
+    size = size or SIZES.get(jax.default_backend(), 2048)
+    rng = np.random.default_rng(0)
+    a, b = (jnp.asarray(rng.standard_normal((size, size)), dtype) for _ in range(2))
+    precision = "highest" if dtype == "float32" else None
+    product = jax.jit(lambda a, b: jnp.matmul(a, b, precision=precision)).lower(a, b).compile()
+    return lambda: jax.block_until_ready(product(a, b)), 2.0 * size**3
+
+
+def peak(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
+    """Operations a second of the best of some matrix products: what a share of the peak is a share of."""
+    run, operations = matmul(dtype, size)
+    run()
+    best = min(_timed(run) for _ in range(rounds))
+    return operations / best
+
+
+def _timed(run: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start

@@ -1,0 +1,70 @@
+"""How long a fresh process takes to its first step: imports, tracing, compiling, without and with the cache."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import jax
+
+from anytouch_jax.evaluate.memory import ask
+from anytouch_jax.evaluate.speed_report import table
+from anytouch_jax.evaluate.workloads import abstract_state, make_batch, step_of, workloads
+from anytouch_jax.train.mesh import enable_compilation_cache
+
+
+@dataclass(frozen=True)
+class Start:
+    """Seconds of a fresh process; `imports` counts from its start. `cached`: it finds its program in the cache."""
+
+    workload: str
+    preset: str
+    samples: int
+    cached: bool
+    imports: float
+    trace: float
+    compile: float
+
+    @property
+    def total(self) -> float:
+        return self.imports + self.trace + self.compile
+
+
+def starts(preset: str, whats: Sequence[str] = ("stage1",), batch: int | None = None) -> list[Start]:
+    """Two fresh processes for the first workload of each of `whats`: one fills a new cache, the next reads it."""
+    found = []
+    for what in whats:
+        with tempfile.TemporaryDirectory() as folder:
+            for cached in (False, True):
+                found.append(Start(**ask("startup", json.dumps([what, preset, batch, cached, folder, time.time()]))))
+    return found
+
+
+def answer(question: str) -> None:
+    """What the child process does."""
+    what, preset, batch, cached, folder, begun = json.loads(question)
+    enable_compilation_cache(folder)
+    work = workloads(what, preset, batch)[0]
+    args = abstract_state(work.config), make_batch(work), jax.eval_shape(lambda: jax.random.key(0))
+    imports, ready = time.time() - begun, time.perf_counter()
+    lowered = jax.jit(step_of(work.config), donate_argnums=0).lower(*args)
+    traced = time.perf_counter()
+    lowered.compile()
+    done = time.perf_counter()
+    start = Start(work.name, preset, work.samples, cached, imports, traced - ready, done - traced)
+    sys.stdout.write(json.dumps(asdict(start)) + "\n")
+
+
+def to_markdown(found: Sequence[Start]) -> str:
+    """A line a process."""
+    heads = ("workload", "preset", "batch", "cache", "imports s", "trace s", "compile s", "sum s")
+    rows = [
+        [s.workload, s.preset, str(s.samples), "filled" if s.cached else "empty"]
+        + [f"{x:.2f}" for x in (s.imports, s.trace, s.compile, s.total)]
+        for s in found
+    ]
+    return table(heads, rows)

@@ -92,7 +92,8 @@ format: $(STAMP) ## rewrite the sources in the project's format
 bench: $(STAMP) ## speed against error: [PRESET= BATCH= OUT= WHAT="stage1 embed ..."]; quiet the machine first
 	$(ANYTOUCH) bench $(WHAT) --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
-bench-torch: $(STAMP) $(TORCH)/.made ## beside PyTorch, in a venv of its own: [PRESET= BATCH= OUT= WHAT=]
+bench-torch: $(TORCH)/.made
+bench-torch: $(STAMP) ## beside PyTorch, in a venv of its own: [PRESET= BATCH= OUT= WHAT=]
 	$(PY) experiments/torch_rival/run.py $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]

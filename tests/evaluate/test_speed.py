@@ -232,15 +232,15 @@ def test_all_take_turns_and_each_round_begins_with_another():
 
 
 def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
-    tried = (*FAST[:1], variants.Variant("kept", donate=False), variants.Variant("cuDNN", {"attention": "cudnn"}))
+    tried = (*FAST[:1], variants.Variant("donated", donate=True), variants.Variant("cuDNN", {"attention": "cudnn"}))
     rows = speed.measure(STAGE1, tried, rounds=2, with_errors=False, peak_size=64)
-    base, kept, absent = rows
+    base, donated, absent = rows
     assert base.ratio == 1 and base.ratio_iqr == 0 and base.calls == 2 and base.error_loss is None
     assert base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
-    assert kept.peak_bytes > kept.temp_bytes > 0 and kept.ratio > 0 and base.copies >= 0
+    assert donated.peak_bytes > donated.temp_bytes > 0 and donated.ratio > 0 and donated.copies > base.copies >= 0
     assert absent.note and np.isnan(absent.ratio) and absent.variant == "cuDNN"
     text = speed_report.to_markdown(rows)
-    assert absent.note.replace("|", "/") in text and "| kept | 4 |" in text
+    assert absent.note.replace("|", "/") in text and "| donated | 4 |" in text
     assert speed_report.as_dict(absent)["seconds"] is None
     json.dumps([speed_report.as_dict(row) for row in rows], allow_nan=False)
 

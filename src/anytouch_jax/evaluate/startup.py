@@ -14,7 +14,7 @@ import jax
 from anytouch_jax.evaluate.memory import ask
 from anytouch_jax.evaluate.speed_report import table
 from anytouch_jax.evaluate.workloads import abstract_state, make_batch, step_of, workloads
-from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.mesh import donated, enable_compilation_cache
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def answer(question: str) -> None:
     work = workloads(what, preset, batch)[0]
     args = abstract_state(work.config), make_batch(work), jax.eval_shape(lambda: jax.random.key(0))
     imports, ready = time.time() - begun, time.perf_counter()
-    lowered = jax.jit(step_of(work.config), donate_argnums=0).lower(*args)
+    lowered = jax.jit(step_of(work.config), donate_argnums=donated()).lower(*args)
     traced = time.perf_counter()
     lowered.compile()
     done = time.perf_counter()

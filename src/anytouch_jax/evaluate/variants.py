@@ -18,6 +18,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from anytouch_jax.evaluate.workloads import Workload, embed_of, make_batch, step_of
 from anytouch_jax.nn import functional, layers
+from anytouch_jax.train.mesh import donated
 
 Tree = Any
 
@@ -26,15 +27,15 @@ Tree = Any
 class Variant:
     """A way to compute the same: changes of `config.model`, and what no setting of the model changes.
 
-    `activation` jax: GELU as jax.nn writes it, its derivative traced. `donate`: the step may overwrite its state, as
-    in training. `dense`: a slot for image and text in every row. `precision`: of float32 products (a GPU may take
+    `activation` jax: GELU as jax.nn writes it, its derivative traced. `donate`: the step may overwrite its state; None
+    as in training. `dense`: a slot for image and text in every row. `precision`: of float32 products (a GPU may take
     TF32 for them).
     """
 
     name: str
     model: Mapping[str, Any] = field(default_factory=dict)
     activation: str = "own"
-    donate: bool = True
+    donate: bool | None = None
     dense: bool = False
     precision: str | None = "highest"
 
@@ -51,7 +52,7 @@ _STEPS = (
     Variant("bfloat16", BFLOAT16),
     Variant("float32, GELU of jax.nn", activation="jax"),
     Variant("float32, remat", {"remat": True}),
-    Variant("float32, state not donated", donate=False),
+    Variant("float32, state donated", donate=True),
 )
 
 
@@ -120,7 +121,8 @@ def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
     work = variant.of(work)
     batch = make_batch(work)
     if work.trains:
-        function = jax.jit(step_of(work.config), donate_argnums=0 if variant.donate else ())
+        donate = donated() if variant.donate is None else (0,) if variant.donate else ()
+        function = jax.jit(step_of(work.config), donate_argnums=donate)
         args = (state, batch, jax.eval_shape(lambda: jax.random.key(0)))
         batch = jax.device_put(batch)
     else:

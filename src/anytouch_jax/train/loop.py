@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, UserError, to_json
 from anytouch_jax.io.checkpoint import Checkpoints
-from anytouch_jax.train.mesh import batch_sharding, make_mesh, put_batch, replicated, state_sharding
+from anytouch_jax.train.mesh import batch_sharding, donated, make_mesh, put_batch, replicated, state_sharding
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.record import Record, open_run, writing
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
@@ -162,7 +162,7 @@ class _Loop:
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
     def compile(self, state: TrainState, loss_fn: LossFn) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
-        """The step under jit: the state is donated and keeps its place; each structure of a batch is traced once."""
+        """The step under jit: the state keeps its place; each structure of a batch is traced once."""
         config = self.config
         step = make_step(loss_fn, optimizer(config), total_steps=config.run.steps, accumulate=config.optim.accumulate)
 
@@ -172,7 +172,7 @@ class _Loop:
             return step(*args)
 
         places = jax.tree.map(lambda x: x.sharding, state)
-        return jax.jit(counted, donate_argnums=0, out_shardings=(places, replicated(self.mesh)))
+        return jax.jit(counted, donate_argnums=donated(), out_shardings=(places, replicated(self.mesh)))
 
     def log(self) -> None:
         """Fetch and write the metrics of the pending step; stop the run when too many were skipped in a row."""

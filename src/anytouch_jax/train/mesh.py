@@ -62,6 +62,15 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
     return jax.tree.map(place, abstract_state)
 
 
+def donated() -> tuple[int, ...]:
+    """Which arguments of a step its compiled program may overwrite, for `jax.jit(donate_argnums=...)`: the state.
+
+    On a CPU none: XLA copies a donated array that several of its kernels read before it is overwritten, which is every
+    parameter and moment, and the step takes longer (`anytouch bench stage1` has both).
+    """
+    return () if jax.default_backend() == "cpu" else (0,)
+
+
 def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
     """Send a host batch to the devices; with several processes each gives its own share of the rows.
 

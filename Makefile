@@ -25,8 +25,8 @@ train-stage1: RUN ?= runs/stage1
 train-stage2 probe: RUN ?= runs/stage2
 
 # The schedules of the demo: minutes on two cores, not what a paper would train.
-DEMO1 := --preset tiny --steps 200 --batch 64 --optim.learning-rate 1e-3
-DEMO2 := --preset tiny --steps 150 --batch 32 --optim.learning-rate 5e-4
+DEMO1 := --preset tiny --steps 150 --batch 64 --optim.learning-rate 1e-3
+DEMO2 := --preset tiny --steps 60 --batch 32 --optim.learning-rate 5e-4
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
@@ -54,7 +54,7 @@ help: ## list the targets
 setup: $(STAMP) ## make .venv with the pinned versions
 
 demo: $(STAMP) ## simulate, train both stages, probe and report, in some ten minutes: [DEMO=]
-	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 600 --objects 300 --size 128
+	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/manifest.parquet --run $(DEMO)/stage1 $(DEMO1)
 	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/manifest.parquet --run $(DEMO)/stage2 --init $(DEMO)/stage1 $(DEMO2)
 	$(ANYTOUCH) report --data $(DEMO)/scenes/manifest.parquet --stage1 $(DEMO)/stage1 --stage2 $(DEMO)/stage2 --out $(DEMO)/report

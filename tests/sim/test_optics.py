@@ -229,3 +229,12 @@ def test_steep_and_broken_surfaces_stay_pictures():
     np.testing.assert_array_equal(image[:, :20], levels(draw(wall, STILL, MARKED, KEY))[:, :20])
     spikes = jnp.asarray(np.random.default_rng(6).choice([0.0, 1e4], GRID).astype(np.float32))
     assert np.isfinite(levels(draw(spikes, STILL, PLAIN, KEY))).all()
+
+
+def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the_calibration():
+    sensor = SENSORS["gelsight_mini"]
+    unit = units.identity_unit(sensor)
+    draw = jax.jit(lambda d: optics.render(d, None, 0.15, sensor, unit, resolution=(48, 64)))
+    images = [np.asarray(draw(jnp.full((96, 128), depth))).astype(float) for depth in (0.0, 0.1, 3.0, 6.0)]
+    np.testing.assert_allclose(images[2], images[3], atol=1)  # the rounding of slopes that should be zero
+    assert images[3].mean() > 0.4 * images[0].mean() and images[1].mean() != images[0].mean()

@@ -200,7 +200,7 @@ def fit(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photo
     features = jax.jit(lambda c, r: _features(c, r, rows, columns, (height, width), indenter))
     u, v = np.meshgrid((columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1)
     grid, base = np.ix_(rows, columns), presses.background.astype(np.float64)
-    problem, colours, steepest = [], [], 0.0
+    problem, colours, steepest, widest = [], [], 0.0, np.zeros(shading.HALO)
     for k in train:
         near = np.hypot(columns - presses.centre[k, 0], rows[:, None] - presses.centre[k, 1]) < 2 * presses.radius[k]
         with jax.ensure_compile_time_eval():  # the first use may stand inside a function that is being traced
@@ -210,10 +210,11 @@ def fit(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photo
         problem.append(shading.design(nx, ny, known * u[near], known * v[near], soft))
         colours.append((presses.frames[k][grid] - base[grid])[near] / 255)
         steepest = max(steepest, float(np.hypot(nx, ny).max()))
+        widest = np.maximum(widest, np.abs(soft).max(0))
     rows_of, changes = np.concatenate(problem), np.concatenate(colours)
     models = []
     for columns_used in (rows_of.shape[1], len(shading.POWERS) * len(shading.PLACES)):
-        model = shading.assemble(shading.ridge(rows_of[:, :columns_used], changes), round(steepest, 3))
+        model = shading.assemble(shading.ridge(rows_of[:, :columns_used], changes), round(steepest, 3), widest)
         if indenter.fading is not None:
             for place in (shading.PLACES.index((2, 0)), shading.PLACES.index((0, 2))):
                 model.normal[:, place] = -indenter.fading * model.normal[:, 0]

@@ -30,12 +30,14 @@ class Photometry(NamedTuple):
 
     `normal` (20, 6, 3): for every power of the normal (`POWERS`) and of the position (`PLACES`) a colour.
     `halo` (3, 3, 3): the soft shadow and light bleed round a dent, on slope and depth (1/mm) of the blurred dent.
-    `steepest`: largest sine of the tilt that the fit has seen; steeper surfaces look like this one.
+    `steepest`: largest sine of the tilt that the fit has seen; steeper surfaces look like this one. `widest` (3,): the
+    same for the features of the halo: a gel pressed deeply all over is darker than a calibration ball's dent, not black.
     """
 
     normal: jax.Array | Array
     halo: jax.Array | Array
     steepest: float | jax.Array
+    widest: jax.Array | Array
 
 
 def tilt(slope_x: jax.Array, slope_y: jax.Array, steepest: float | jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -101,14 +103,15 @@ def ridge(rows: Array, colours: Array, penalty: float = 1e-6, halo_penalty: floa
     return np.asarray(np.linalg.solve(scaled, (rows.T @ colours / len(rows)) / scale[:, None]) / scale[:, None])
 
 
-def assemble(coefficients: Array, steepest: float) -> Photometry:
+def assemble(coefficients: Array, steepest: float, widest: Array | None = None) -> Photometry:
     """A `Photometry` from the columns of `design`; without halo columns its halo is zero. Rounded to f32."""
     count = len(POWERS) * len(PLACES)
     normal = coefficients[:count].reshape(len(POWERS), len(PLACES), 3)
     halo = np.zeros((HALO, len(HALO_PLACES), 3))
     if len(coefficients) > count:
         halo = coefficients[count:].reshape(HALO, len(HALO_PLACES), 3)
-    return Photometry(normal.astype(np.float32), halo.astype(np.float32), float(steepest))
+    widest = np.full(HALO, np.inf) if widest is None else widest
+    return Photometry(normal.astype(np.float32), halo.astype(np.float32), float(steepest), widest.astype(np.float32))
 
 
 def fit_shading(

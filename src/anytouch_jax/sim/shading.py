@@ -31,7 +31,7 @@ class Photometry(NamedTuple):
     `normal` (20, 6, 3): for every power of the normal (`POWERS`) and of the position (`PLACES`) a colour.
     `halo` (3, 3, 3): the soft shadow and light bleed round a dent, on slope and depth (1/mm) of the blurred dent.
     `steepest`: largest sine of the tilt that the fit has seen; steeper surfaces look like this one. `widest` (3,): the
-    same for the features of the halo: a gel pressed deeply all over is darker than a calibration ball's dent, not black.
+    same for the features of the halo: a gel pressed deeply all over is darker than a ball's dent, but not black.
     """
 
     normal: jax.Array | Array

@@ -94,7 +94,7 @@ def shear_step(
     most = iterations or (6 if fidelity == "fast" else 400)
     # In steps, not in totals: a small step is not lost in the rounding of a large traction.
     found = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
-    total = before + found.x
+    total = jnp.where((limit > 0)[..., None], before + found.x, 0)  # without pressure exactly nothing
     displacement = apply(total) * share
     if times > 1:
         displacement = jax.image.resize(displacement, state.displacement.shape, "cubic")

@@ -91,9 +91,9 @@ def render(
     halo = None
     if (shadow and np.any(np.asarray(photometry.halo))) or sensor.markers is not None:
         halo = _halo(displacement, matrices, pitch, sensor)
-    seen = None
+    glow: tuple[Array, ...] | None = None
     if shadow and halo is not None:
-        seen = tuple(jnp.clip(f, -most, most) for f, most in zip(halo, photometry.widest, strict=True))
+        glow = tuple(jnp.clip(f, -most, most) for f, most in zip(halo, photometry.widest, strict=True))
     ink = None
     if sensor.markers is not None and halo is not None:
         ink = unit.marked * _ink(tangential, halo, matrices, place, sensor.markers, sensor, unit)
@@ -101,8 +101,8 @@ def render(
 
     def channel(c: dict[str, Array]) -> Array:
         change = shading.colour_change(c["normal"], nx, ny, place.u, place.v)
-        if seen is not None:
-            change = change + shading.halo_change(c["halo"], seen, place.u, place.v)
+        if glow is not None:
+            change = change + shading.halo_change(c["halo"], glow, place.u, place.v)
         image = c["behind"] + c["gain"] * change
         if ink is not None:
             image = image + ink * (c["ink"] - image)

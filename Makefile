@@ -2,10 +2,13 @@
 # `make` alone lists the targets.
 
 PYTHON ?= python3
+# Large pages: half the time of a step on a CPU (src/anytouch_jax/pages.py).
+export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 VENV   := .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.made
 TORCH  := .venv-torch
+ONNX   := .venv-onnx
 
 PRESET     ?= tiny
 SCENES     ?= data/scenes
@@ -20,9 +23,12 @@ GOLDEN     ?= ../shared/golden
 WORKERS    ?= 2
 
 DEMO       ?= runs/demo
+PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics datasets
 
 train-stage1: RUN ?= runs/stage1
-train-stage2 probe: RUN ?= runs/stage2
+train-stage2 probe export-onnx: RUN ?= runs/stage2
+export-onnx: OUT ?= encoder.onnx
+export-onnx: FRAMES ?= 1
 
 # The schedules of the demo: minutes on two cores, not what a paper would train.
 DEMO1 := --preset tiny --steps 150 --batch 64 --optim.learning-rate 1e-3
@@ -36,7 +42,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation export-onnx experiments notebooks clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -99,8 +105,28 @@ bench-torch: $(STAMP) ## beside PyTorch, in a venv of its own: [PRESET= BATCH= O
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
 	$(PYTHON) experiments/bench_gpu.py $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
+pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: RUNS="anytouch=path static=path t3=path" [QUICK=1 OUT=]
+	RUNS="$(RUNS)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/pouring.py
+
+translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: RUNS="anytouch=path t3=path" [QUICK=1 OUT=]
+	RUNS="$(RUNS)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
+
+export-onnx: $(ONNX)/.made
+export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]
+	$(PY) experiments/onnx_export/run.py --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
+
+experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 MINUTES=75 ONLY="q1 q2" RENDER=1 PLAN=1]
+	$(PY) experiments/matrix.py$(if $(QUICK), --quick)$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(RENDER), --render)$(if $(PLAN), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
+
+notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..."]
+	@mkdir -p runs/notebooks
+	@for page in $(PAGES); do echo $$page; \
+	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$page.py && \
+	  PYTHONPATH=experiments $(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
+	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
+
 clean: ## remove .venv, builds and caches; runs stay
-	rm -rf $(VENV) $(TORCH) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(TORCH) $(ONNX) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES)/manifest.parquet: | $(STAMP)
@@ -110,6 +136,12 @@ $(TORCH)/.made: experiments/torch_rival/requirements.txt
 	$(PYTHON) -m venv $(TORCH)
 	@echo '*' > $(TORCH)/.gitignore
 	$(TORCH)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
+$(ONNX)/.made: experiments/onnx_export/requirements.txt
+	$(PYTHON) -m venv $(ONNX)
+	@echo '*' > $(ONNX)/.gitignore
+	$(ONNX)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
 $(STAMP): requirements.txt pyproject.toml

@@ -139,7 +139,8 @@ def match_batch():
 
 
 ALIGN, MATCH = align_batch(), match_batch()
-FUNCTION2 = partial(objectives.stage2_terms, noise=None, net=NET2, config=CONFIG2)
+PAPER2 = replace(CONFIG2, objective=replace(CONFIG2.objective, centre=False))  # Eq. 4 as it stands
+FUNCTION2 = partial(objectives.stage2_terms, noise=None, net=NET2, config=PAPER2)
 TERMS2 = jax.jit(jax.value_and_grad(FUNCTION2, has_aux=True))
 
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from anytouch_jax.cli import main
+from anytouch_jax.cli import console
 
-sys.exit(main())
+sys.exit(console())

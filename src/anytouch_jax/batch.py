@@ -12,10 +12,15 @@ Array = Any  # a numpy or a jax array
 
 
 class TouchBatch(NamedTuple):
-    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table."""
+    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table.
+
+    `force` f32 (B, 2), where the run has a head for it: force at the last frame seen and its change since the first
+    one, in spreads over the data (see `data.labels`), NaN where it is not known.
+    """
 
     clip: Array
     sensor: Array
+    force: Array | None = None
 
 
 class AlignBatch(NamedTuple):

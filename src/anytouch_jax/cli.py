@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import make_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from anytouch_jax import __version__
+from anytouch_jax import __version__, baselines, pages
 from anytouch_jax.config import Config, UserError, preset
 from anytouch_jax.options import Bench, Convert, Embed, Parity, Probe, Report, Retrieve, Sections, Simulate, Train
 from anytouch_jax.options_data import Annotate, Contact, Index, Pack, Verify
+from anytouch_jax.options_use import Adapt, Export, Pour, Translate
 
 _COMMANDS: dict[str, tuple[type, str]] = {
     "simulate": (Simulate, "touch scenes by several sensors, with photographs, captions and forces"),
@@ -22,16 +23,27 @@ _COMMANDS: dict[str, tuple[type, str]] = {
     "annotate": (Annotate, "captions from a vision-language model"),
     "pack": (Pack, "millions of small files as a few shards"),
     "train": (Train, "pre-train stage 1 or stage 2, or go on with a run"),
-    "embed": (Embed, "features of a manifest, a folder or a video"),
+    "embed": (Embed, "features of a manifest, a folder, a video or a camera"),
+    "adapt": (Adapt, "tokens for a sensor never seen, from a few of its frames"),
+    "export": (Export, "a trained encoder as one file that needs jax alone"),
     "probe": (Probe, "linear and kNN probes of frozen features"),
     "retrieve": (Retrieve, "the same touch by another sensor, among similar touches"),
+    "pour": (Pour, "pour beads by touch alone, in simulation"),
+    "translate": (Translate, "one sensor's touch as another would feel it"),
     "report": (Report, "what two runs learned, as Markdown with figures"),
     "parity": (Parity, "compare with golden vectors of the authors' code"),
     "convert": (Convert, "weights in and out"),
     "bench": (Bench, "speed against error, on this machine"),
 }
 # What these require is given by place, not by name.
-_POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert)
+_POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert, Translate)
+
+
+def console() -> int:
+    """The `anytouch` command in a process of its own: `main` with large pages (`pages.restart`)."""
+    if len(sys.argv) > 2 and sys.argv[1] in _COMMANDS and not {"-h", "--help", "--help-all"} & set(sys.argv):
+        pages.restart()
+    return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -97,6 +109,12 @@ def _parse(kind: Any, name: str, args: list[str], default: Any = None) -> Any:
     config: list[Any] = [tyro.conf.AvoidSubcommands]
     if kind in _POSITIONAL:
         config.append(tyro.conf.PositionalRequiredArgs)
+    if kind is Translate:  # Python does not allow a field called "from"
+        spelled = Annotated[str, tyro.conf.arg(name="from")]
+        about = {"__doc__": kind.__doc__}
+        kind = make_dataclass(
+            kind.__name__, [("source", spelled, kind.source)], bases=(kind,), frozen=True, namespace=about
+        )
     return tyro.cli(kind, prog=f"anytouch {name}", args=args, config=config, **extra)
 
 
@@ -148,4 +166,4 @@ def _configure(options: Train) -> Config:
         save_every=options.save_every or config.run.save_every,
         tensorboard=options.tensorboard,
     )
-    return replace(config, data=data, run=run)
+    return baselines.apply(options.baseline, replace(config, data=data, run=run))

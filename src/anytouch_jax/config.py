@@ -68,8 +68,8 @@ class TextTower:
 class Model:
     """Everything that decides the shapes and the arithmetic of the network.
 
-    `image` and `text` None leave the towers out (stage 1). `lora_rank` 0 means no LoRA. `sensors` names the
-    rows of the sensor-token table (Sec. 3.5); the row named "universal" serves sensors never seen.
+    `image` and `text` None leave the towers out (stage 1); `lora_rank` 0: no LoRA. `sensors` names the rows of sensor
+    tokens (Sec. 3.5) and of patch encoders if each has its own (T3); row "universal" serves sensors never seen.
     """
 
     image_size: int
@@ -86,12 +86,14 @@ class Model:
     norm_eps: float = 1e-5
     decoder_norm_eps: float = 1e-12
     decoder_sensor_tokens: bool = False
+    patch_encoder: Literal["shared", "sensor"] = "shared"
+    force_head: bool = False
     match_head: Literal["mlp", "linear", "none"] = "none"
     lora_rank: int = 0
     lora_alpha: float = 16.0
     temperature: float = 0.07
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"
-    attention: Literal["xla", "cudnn"] = "xla"
+    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"
     remat: bool = False
 
     def __post_init__(self) -> None:
@@ -129,6 +131,8 @@ class Objective:
     `touch_text_sum`: weigh the touch-text pair by alpha (the release) instead of alpha / 2 (Eq. 4).
     `reconstruct`: keep the stage-1 loss on the align batches of stage 2 (the release).
     `groups`: the batch is cut in that many shares and negatives stay within a share (1: the whole batch).
+    `centre`: embeddings less their mean over the batch before they are compared (towers from scratch, which else
+    collapse to one point). `differences`, `force`: stage-1 weights of frame differences, of model.force_head.
     """
 
     mask_ratio: float = 0.75
@@ -141,9 +145,12 @@ class Objective:
     match_weight: float = 0.1
     reconstruct: bool = False
     groups: int = 1
+    centre: bool = False
     universal_start: float = 0.0
     universal_end: float = 0.75
     universal_shared: bool = False
+    differences: float = 0.0
+    force: float = 0.0
 
     @property
     def keep_ratio(self) -> float:
@@ -182,7 +189,8 @@ class Data:
     release). `split_steps`: stage 2 takes align and match batches in separate steps (the release).
     `weights`: (dataset, how often it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is
     what the recipe does (the release: RELEASE_WEIGHTS, for the datasets that are there). `negatives`: of matching,
-    from any sensor or from the positive's, so that the sensor alone does not tell them apart.
+    from any sensor or from the positive's, so that the sensor alone does not tell them apart. `require`: draw only
+    rows that have these. `aligned_text`: train on the text of rows whose touch other sensors or units felt too.
     """
 
     manifests: tuple[str, ...] = ()
@@ -193,6 +201,8 @@ class Data:
     split_steps: bool = False
     weights: tuple[tuple[str, float], ...] | None = None
     negatives: Literal["any", "same_sensor"] = "any"
+    require: tuple[Literal["image", "text"], ...] = ()
+    aligned_text: bool = True
     flip: float = 0.5
     jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)
     rotation: float = 20.0
@@ -310,7 +320,8 @@ def preset(
             match_head="linear" if recipe == "release" else "mlp",
             lora_rank=16 if towers == "pretrained" else 0,
         )
-        config = replace(config, model=model, towers=towers)
+        objective = replace(config.objective, centre=towers == "scratch" and recipe == "paper")
+        config = replace(config, model=model, towers=towers, objective=objective)
     if recipe == "release":
         config = replace(
             config,

@@ -46,20 +46,31 @@ def stage1_terms(
     net: Net,
     config: Config,
     decoder_sensor: Array | None = None,
+    force: Array | None = None,
 ) -> tuple[Array, Metrics]:
     """Masked reconstruction, and next-frame prediction where there is a next frame (Eq. 8).
 
     `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame. `sensor` i32 (B,)
-    rows of the token table, already drawn; `noise` (B, N) decides the masks. Returns the loss and its terms.
+    rows of the token table, already drawn; `noise` (B, N) decides the masks. Returns the loss and its terms. Beyond the
+    paper, where `objective` weighs them: frame differences of clips, and `force` (B, 2) from the class token.
     """
-    frames = net.model.frames
-    if not config.objective.next_frame:
+    objective, frames = config.objective, net.model.frames
+    if not objective.next_frame:
         clip = clip[:, :frames]
-    pred, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor)
+    method = "reconstruct" if force is None else "reconstruct_force"
+    pred, hidden = _predict(params, method, clip, sensor, noise, net, config, decoder_sensor)
+    pixels, told = (pred, jnp.zeros(0)) if force is None else pred
     target = tokens.patchify(clip, net.model.patch)
-    if config.objective.norm_pix_loss:
+    if objective.norm_pix_loss:
         target = losses.normalise_patches(target)
-    return losses.reconstruction_loss(pred, target, hidden, next_frame=clip.shape[1] > frames)
+    loss, metrics = losses.reconstruction_loss(pixels, target, hidden, next_frame=clip.shape[1] > frames)
+    if objective.differences and clip.shape[1] > 1:
+        metrics["differences"] = losses.difference_loss(pixels, target, hidden)
+        loss = loss + objective.differences * metrics["differences"]
+    if force is not None:
+        error, terms = losses.force_loss(told, force)
+        loss, metrics = loss + objective.force * error, metrics | terms
+    return loss, metrics
 
 
 def reconstruct(
@@ -76,10 +87,24 @@ def reconstruct(
 
     The encoder sees the first three frames only, whatever T is.
     """
+    return _predict(params, "reconstruct", clip, sensor, noise, net, config, decoder_sensor)
+
+
+def _predict(
+    params: Params,
+    method: str,
+    clip: Array,
+    sensor: Array,
+    noise: Array,
+    net: Net,
+    config: Config,
+    decoder_sensor: Array | None,
+) -> tuple[Any, Array]:
+    """What a method of the network predicts from the visible positions, and hidden (B, N)."""
     visible = masking.kept(net.model.patches, config.objective.keep_ratio)
     keep_ids, restore_ids, hidden = masking.random_mask(noise, visible)
     seen = clip[:, : net.model.frames]
-    pred = net.apply(params, "reconstruct", seen, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
+    pred = net.apply(params, method, seen, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
     return pred, hidden
 
 
@@ -90,9 +115,8 @@ def stage1_loss(
     key_noise, key_universal = jax.random.split(key)
     noise = jax.random.uniform(key_noise, (len(batch.sensor), net.model.patches))
     p_u, sensor = _draw(batch.sensor, key_universal, progress, net, config)
-    loss, metrics = stage1_terms(
-        params, normalise_touch(batch.clip), sensor, noise, net=net, config=config, decoder_sensor=batch.sensor
-    )
+    clip, own, force = normalise_touch(batch.clip), batch.sensor, batch.force
+    loss, metrics = stage1_terms(params, clip, sensor, noise, net=net, config=config, decoder_sensor=own, force=force)
     return loss, metrics | {"p_u": p_u}
 
 
@@ -169,9 +193,8 @@ def stage2_terms(
     if batch.align is not None:
         z = align_embeddings(params, batch.align, z_touch.pop(0), net=net)
         scale = net.apply(params, "scale")
-        align, terms = losses.alignment_loss(
-            z.touch, z.image, z.text, z.has_image, z.has_text, scale, objective.pair_weights, groups=objective.groups
-        )
+        how: dict[str, Any] = {"groups": objective.groups, "centre": objective.centre}
+        align, terms = losses.alignment_loss(*z, scale, objective.pair_weights, **how)
         total, metrics = total + align, metrics | terms | {"align": align, "temperature": 1 / scale}
         if objective.reconstruct and noise is not None:
             pixels, terms = stage1_terms(

@@ -32,6 +32,8 @@ class Train:
     """Follow the paper's text, or the authors' released code where they differ."""
     towers: Literal["scratch", "pretrained"] = "scratch"
     """Stage 2: train small image and text towers, or start from CLIP weights (--clip)."""
+    baseline: str = "anytouch"
+    """A rival or an ablation in place of the paper's model: unitouch, tlv_link, t3, static_only, no_matching, ..."""
     init: Path | None = None
     """Start from this stage-1 run or weights file."""
     clip: Path | None = None
@@ -73,14 +75,16 @@ class Embed:
     """Embed a manifest, a folder of frames or a video with a trained encoder; writes an .npz of features.
 
     Example: anytouch embed --run runs/stage2 --input manifest.csv --split test --out features.npz
+
+    With --stream a camera (--input 0) or a video is embedded frame by frame; Ctrl-C ends it and saves what there is.
     """
 
     run: Path
     """Run folder or weights file (.pth, .safetensors)."""
     input: Path
-    """Manifest (.csv, .parquet), folder of frames, or video file."""
+    """Manifest (.csv, .parquet), folder of frames, or video file; with --stream a camera's number or a video."""
     out: Path
-    """The .npz to write: features (n, d), rows (n,), key/* (n,)."""
+    """The .npz to write: features (n, d), rows (n,), key/* (n,). With --stream also - for JSON lines on stdout."""
     split: str | None = None
     """Only this split of a manifest."""
     sensor: str = "universal"
@@ -93,6 +97,10 @@ class Embed:
     """How the segments of a long clip are joined."""
     batch: int = 64
     """Frames at a time."""
+    stream: bool = False
+    """One frame at a time, the newest of a camera; prints where the time went."""
+    stride: int = 1
+    """Frames from one frame of a streamed clip to its next: what the clips of the training data have."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +110,8 @@ class Probe:
     Example: anytouch probe --run runs/stage1 --data manifest.csv --label object --where label.contact_score 7
 
     The penalty is chosen on split val, or by cross-validation in groups inside train; the report is on split test.
+    --tasks and --benchmark run the battery instead: objects and recordings apart, dealt anew by every seed.
+    Example: anytouch probe --run runs/stage2 --data data/scenes/manifest.parquet --tasks material,slip,force,twist
     """
 
     data: Paths
@@ -118,14 +128,38 @@ class Probe:
     """Keep rows whose column is above a number."""
     sensor: str | None = None
     """Keep rows of this sensor."""
-    frames: int = 1
-    """Frames of a clip that ends at each row: 1 (stills), 3 or more."""
+    frames: int | None = None
+    """Frames of a clip that ends at each row: 1 (stills), 3 or more (default: 1, or each task's own)."""
     pooling: Literal["class", "mean", "both"] = "both"
     """Features: class token, mean of patch tokens, or both."""
+    join: Literal["mean", "sum", "concat"] = "mean"
+    """How the segments of a clip longer than the model's are joined (battery)."""
     seeds: int = 5
-    """Bootstrap resamples of the training groups."""
+    """Bootstrap resamples of the training groups; of the battery: deals of the groups."""
     protocol: Literal["honest", "published"] = "honest"
-    """published chooses the penalty on the test split, as the authors' code does, and is labelled so."""
+    """published chooses on the test split, as the authors' code does, and is labelled so (battery: beside honest)."""
+    tasks: str = ""
+    """Tasks of the battery, with commas between, or all: material, roughness, hardness, grasp, grasp_after, object,
+    slip, force, twist, slide, indenter."""
+    benchmark: str = ""
+    """A public benchmark with the authors' settings: touch_and_go_material, touch_and_go_roughness,
+    touch_and_go_hardness, feel_grasp, objectfolder1_material, objectfolder2_material."""
+    heads: str = "linear"
+    """Heads of the battery: linear, knn, gradient (the authors': one layer by AdamW)."""
+    order: Literal["right", "shuffled", "repeated"] = "right"
+    """Frames of a clip as they are, in another order, or the last one repeated (battery)."""
+    train_sensors: str = ""
+    """Learn from these sensors only (battery); --test-sensors likewise."""
+    test_sensors: str = ""
+    """Test on these sensors only."""
+    train_units: str = ""
+    """Learn from these units only, patterns such as cam0_* (battery); --test-units likewise: across fingers."""
+    test_units: str = ""
+    """Test on these units only."""
+    max_rows: int | None = None
+    """At most so many rows a task, by a fixed chance (battery)."""
+    cache: Path | None = None
+    """Folder that keeps features by content, so that nothing is encoded twice (battery)."""
     controls: bool = True
     """Also probe raw pixels and a random encoder."""
     out: Path | None = None
@@ -199,6 +233,8 @@ class Simulate:
     """Fields to write beside the images (.npy), with commas between: displacement, pressure, shear."""
     size: int = 224
     """Pixels of an image's shorter side."""
+    units: Literal["each", "one"] = "each"
+    """each: every recording by a device of its own. one: one device of each sensor, mounted straight."""
     threads: int = 2
     """Threads that render photographs and write files."""
 

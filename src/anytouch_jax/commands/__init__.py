@@ -4,35 +4,43 @@ Each `run` returns an exit status. Heavy imports wait until a command runs.
 """
 
 from anytouch_jax.commands import (
+    adapt,
     annotate,
     bench,
     contact,
     convert,
     embed,
+    export,
     index,
     pack,
     parity,
+    pour,
     probe,
     report,
     retrieve,
     simulate,
     train,
+    translate,
     verify,
 )
 
 __all__ = [
+    "adapt",
     "annotate",
     "bench",
     "contact",
     "convert",
     "embed",
+    "export",
     "index",
     "pack",
     "parity",
+    "pour",
     "probe",
     "report",
     "retrieve",
     "simulate",
     "train",
+    "translate",
     "verify",
 ]

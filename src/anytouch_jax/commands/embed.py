@@ -1,7 +1,8 @@
-"""`anytouch embed`: features of a manifest, a folder of frames or a video."""
+"""`anytouch embed`: features of a manifest, a folder of frames, a video or a camera."""
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from anytouch_jax.options import Embed
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.features import Encoder
+    from anytouch_jax.evaluate.stream import Embedded
 
 _MANIFESTS = (".csv", ".parquet")
 
@@ -21,23 +23,63 @@ def run(options: Embed) -> int:
     from anytouch_jax.evaluate import features
 
     encoder = features.load_encoder(options.run)
+    if options.stream:
+        return _stream(encoder, options)
     if not options.input.exists():
         raise UserError(f"no manifest, folder or video at {options.input}")
     if options.input.suffix.lower() in _MANIFESTS:
         found = _embed_manifest(encoder, options)
     else:
         found = _embed_frames(encoder, options)
-    about = {
+    features.save_npz(options.out, found, _about(encoder, options))
+    left = f", {found.skipped} skipped" if found.skipped else ""
+    print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
+    return 0
+
+
+def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
+    return {
         "encoder": encoder.source,
         "input": str(options.input),
         "pooling": options.pooling,
         "frames": str(options.frames),
         "join": options.join,
     }
-    features.save_npz(options.out, found, about)
-    left = f", {found.skipped} skipped" if found.skipped else ""
-    print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
+
+
+def _stream(encoder: Encoder, options: Embed) -> int:
+    """Embed a camera or a video frame by frame: features to an .npz, or as JSON lines; then the latency budget."""
+    from anytouch_jax.evaluate import features, stream
+
+    source, live = stream.open_source(options.input)
+    embedded = stream.stream(
+        encoder,
+        source,
+        live=live,
+        sensor=encoder.sensor_row(options.sensor, say),
+        frames=options.frames,
+        stride=options.stride,
+        pooling=options.pooling,
+        join=options.join,
+    )
+    lines = str(options.out) == "-"
+    result = stream.collect(embedded, _print_line if lines else None)
+    if not len(result.numbers) and not result.interrupted:
+        raise UserError(f"{options.input} has too few frames for a clip of {options.frames} at stride {options.stride}")
+    if not lines:
+        keys = {"frame_index": result.numbers, "time": result.at}
+        about = _about(encoder, options) | {"stride": str(options.stride)}
+        features.save_npz(options.out, features.Features(result.values, result.numbers, keys), about)
+    for line in stream.budget(result):
+        say(line)
+    if not lines:
+        print(f"{options.out}: {len(result.values)} features of {result.values.shape[1]} values")
     return 0
+
+
+def _print_line(one: Embedded) -> None:
+    values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
+    print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
 
 
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:

@@ -30,6 +30,7 @@ def run(options: Simulate) -> int:
         held_out=options.held_out,
         fields=_names(options.fields),
         size=options.size,
+        units=options.units,
     )
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)

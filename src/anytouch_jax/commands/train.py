@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import signal
 
+from anytouch_jax import baselines
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import Config
+from anytouch_jax.config import Config, UserError
 from anytouch_jax.options import Train
 
 
 def run(options: Train, config: Config) -> int:
-    """Train or go on; 0 also after SIGTERM (saved), 130 after Ctrl-C (saved)."""
+    """Train or go on, alone or as one of several processes; 0 also after SIGTERM (saved), 130 after Ctrl-C (saved)."""
+    baseline = baselines.find(options.baseline)
+    if options.stage == 2 and options.init and not baseline.starts_from_stage1:
+        raise UserError(f"baseline {baseline.name} has no stage 1: leave out --init")
     from anytouch_jax.pretrain import pretrain
     from anytouch_jax.train.mesh import enable_compilation_cache
+    from anytouch_jax.train.processes import joined
 
     enable_compilation_cache()
-    result = pretrain(config, options.run, init=options.init, clip=options.clip, stop_after=options.stop_after, say=say)
+    with joined() as place:
+        result = pretrain(
+            config, options.run, init=options.init, clip=options.clip, stop_after=options.stop_after, say=say
+        )
     if result.interrupted == signal.SIGINT:
         return 130
-    say(f"{options.run}: {result.step} of {config.run.steps} steps")
+    if place is None or place.index == 0:
+        say(f"{options.run}: {result.step} of {config.run.steps} steps")
     return 0

@@ -50,6 +50,7 @@ BFLOAT16 = {"dtype": "bfloat16"}
 _STEPS = (
     BASELINE,
     Variant("bfloat16", BFLOAT16),
+    Variant("float32, attention by XLA", {"attention": "xla"}),
     Variant("float32, GELU of jax.nn", activation="jax"),
     Variant("float32, remat", {"remat": True}),
     Variant("float32, state donated", donate=True),

@@ -48,6 +48,8 @@ class AnyTouch(nnx.Module):
         if model.image is not None or model.text is not None:
             self.logit_scale = table()
         self.matcher = _matcher(model)
+        if model.force_head:
+            self.force = Dense(model.embed, 2, model)
 
     def encode(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
         """Touch embeddings (B, E) of stills (T = 1) or clips, from the class token, not normalised.
@@ -85,10 +87,27 @@ class AnyTouch(nnx.Module):
         decoder_sensor: Array | None = None,
     ) -> Array:
         """Pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B, T, H, W, 3)."""
-        own = None
-        if hasattr(self.decoder, "sensor_projection"):
-            own = self.touch.sensor_tokens[...][sensor if decoder_sensor is None else decoder_sensor]
-        return self.decoder(self.encode_tokens(clip, sensor, keep_ids), restore_ids, frames, own)
+        latent = self.encode_tokens(clip, sensor, keep_ids)
+        return self._paint(latent, restore_ids, frames, sensor if decoder_sensor is None else decoder_sensor)
+
+    def reconstruct_force(
+        self,
+        clip: Array,
+        sensor: Array,
+        keep_ids: Array,
+        restore_ids: Array,
+        frames: int,
+        decoder_sensor: Array | None = None,
+    ) -> tuple[Array, Array]:
+        """As `reconstruct`, with force and its change (B, 2) from the class token of the visible patches."""
+        hidden = self.touch.hidden(clip, sensor, keep_ids)
+        own = sensor if decoder_sensor is None else decoder_sensor
+        pixels = self._paint(self.touch.projection(hidden), restore_ids, frames, own)
+        return pixels, self.force(self.touch.projection(self.touch.post_norm(hidden[:, 0])))
+
+    def _paint(self, latent: Array, restore_ids: Array, frames: int, sensor: Array) -> Array:
+        own = self.touch.sensor_tokens[...][sensor] if hasattr(self.decoder, "sensor_projection") else None
+        return self.decoder(latent, restore_ids, frames, own)
 
     def touch_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """The encoder's input sequence (B, 1 + S + K, D)."""

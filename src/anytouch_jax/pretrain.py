@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
@@ -22,6 +23,8 @@ from anytouch_jax.evaluate import figures
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
+from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.train.watch import silent
 
 Params = dict[str, Any]
 Say = Callable[[str], None]
@@ -37,20 +40,23 @@ def pretrain(
     clip: str | Path | None = None,
     stop_after: int | None = None,
     say: Say = print,
+    mesh: Mesh | None = None,
 ) -> FitResult:
     """Train stage 1 or stage 2 in the folder `run`, or go on with it (Sec. 3.6).
 
     `init`: a stage-1 run (or AnyTouch weights) that stage 2 starts from, or weights for the touch encoder of stage 1.
     `clip`: CLIP weights for the towers; stage 1 starts the touch encoder from their image tower, as the paper does.
-    Raises UserError for a mistake in the settings, the data or the folder.
+    `mesh`: the devices to train on, all of them if None. Raises UserError for a mistake in the settings, the data or
+    the folder.
     """
-    run = Path(run)
+    run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
+    say = say if jax.process_index() == 0 else silent
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
     net = build(config.model)
     params = _first_params(config, net, init, clip, say)
     shard = (jax.process_index(), jax.process_count())
-    loader = Loader(manifest, config, tokenizer=tokenizer, devices=jax.device_count(), shard=shard)
+    loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
     for note in loader.notes:
         say(note)
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
@@ -62,15 +68,23 @@ def pretrain(
         run_dir=run,
         stop_after=stop_after,
         on_report=partial(_report, run=run, net=net, config=config),
-        metadata=_describe(config, init, clip, manifest),
+        metadata=_describe(config, run, init, clip, manifest, loader),
         say=say,
+        mesh=mesh,
     )
 
 
-def _describe(config: Config, init: Any, clip: Any, manifest: Any) -> dict[str, Any]:
-    """What a checkpoint says of itself beside its config."""
+def _describe(
+    config: Config, run: Path, init: Any, clip: Any, manifest: manifests.Manifest, loader: Loader
+) -> dict[str, Any]:
+    """What a checkpoint says of itself beside its config; `seen`: the sensors that it, or `init`, was trained on."""
+    seen = set(loader.sensors_seen)
+    for before in (run, init):  # a run that goes on may do so without --init
+        if before is not None and checkpoint.steps(Path(before) / "checkpoints"):
+            seen |= set(checkpoint.read_metadata(before).get("seen", ()))
     return {
         "sensors": list(config.model.sensors),
+        "seen": [name for name in config.model.sensors if name in seen],
         "preprocessing": {
             "touch": {"size": config.model.image_size, "mean": IMAGENET_MEAN, "std": IMAGENET_STD, "channels": "RGB"},
             "image": {"size": config.model.image_size, "mean": CLIP_MEAN, "std": CLIP_STD, "channels": "RGB"},
@@ -93,7 +107,7 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
         tokenizer = texts.load(_beside(clip, "tokenizer.json"))
     else:
         rows = manifest.rows_of(config.data.split)
-        captions = sources.captions(manifest, rows)
+        captions = sources.captions(manifest, rows, aligned_text=config.data.aligned_text)
         if not captions:
             return config, None
         tokenizer = texts.train(captions, SCRATCH_VOCABULARY)
@@ -167,5 +181,7 @@ def _report(step: int, params: Params, batch: Any, *, run: Path, net: Net, confi
             return
     clip, sensor = (np.asarray(jax.device_get(x[:6])) for x in (batch.clip, batch.sensor))
     params = {name: params[name] for name in ("touch", "decoder")}
+    if jax.process_index():
+        return
     image = figures.reconstruction_panels(params, clip, sensor, net=net, config=config)
     figures.write_png(run / "figures" / f"reconstruction_{step:06d}.png", image)

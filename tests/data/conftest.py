@@ -33,7 +33,7 @@ def save(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = (12, 16
 
 @pytest.fixture
 def make(tmp_path: Path) -> Callable[..., manifests.Manifest]:
-    """make(rows, folder="."): a manifest of rows given as dicts; images are written for rows and `image_path`s."""
+    """make(rows, folder="."): a manifest of rows given as dicts; images are written for rows and their photographs."""
 
     def build(rows: list[dict[str, Any]], folder: str = ".") -> manifests.Manifest:
         root = tmp_path / folder
@@ -43,12 +43,28 @@ def make(tmp_path: Path) -> Callable[..., manifests.Manifest]:
         ]
         for i, row in enumerate(full):
             save(root / row["path"], colour(i))
-            if row.get("image_path"):
-                save(root / row["image_path"], (i + 1, 200, 9), (40, 40))
+            for name in ("image_path", "image2_path"):
+                if row.get(name):
+                    save(root / row[name], (i + 1, 200, 9), (40, 40))
         names = {name: None for row in full for name in row}
         return manifests.from_columns({name: [row.get(name) for row in full] for name in names}, root / "manifest.csv")
 
     return build
+
+
+@pytest.fixture
+def rich() -> list[dict[str, Any]]:
+    """Rows for `make`: clips of two sensors that touch the same places, some with pictures and captions."""
+    rows = []
+    for i in range(8):
+        for k in range(6):
+            row = {
+                "sequence": f"s{i}", "frame_index": k, "sensor": "digit" if i % 2 else "gelslim",
+                "touch": f"place{i // 2}.{k}", "object": f"o{i // 2}", "unit": f"u{i % 2}",
+            }  # fmt: skip
+            row |= {"image_path": f"v{i}{k}.png"} if i < 3 else {}
+            rows.append(row | ({"text": f"caption {i}"} if i % 3 == 2 else {}))
+    return rows
 
 
 @pytest.fixture

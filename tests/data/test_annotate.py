@@ -520,9 +520,11 @@ def test_bad_addresses_and_keys_are_named_without_showing_the_key(monkeypatch, u
 
 
 def test_a_local_server_needs_no_key_and_a_distant_one_is_warned_about(monkeypatch, make, tmp_path):
-    assert Client(Endpoint("http://gpu-box:8000/v1", "m")).exposes_key
-    assert not Client(Endpoint("https://gpu-box:8000/v1", "m")).exposes_key
+    assert Endpoint("http://gpu-box:8000/v1", "m").exposes_key
+    assert not Endpoint("https://gpu-box:8000/v1", "m").exposes_key
+    assert not Endpoint("http://localhost:8000/v1", "m").exposes_key
     monkeypatch.delenv("OPENAI_API_KEY")
+    assert not Endpoint("http://gpu-box:8000/v1", "m").exposes_key
     with serve() as server:
         _ask(server)
     assert "Authorization" not in server.heads[0][1]

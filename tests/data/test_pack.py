@@ -32,7 +32,7 @@ def _rows(sequences=4, length=6):
         {
             "path": f"touch {i}/ä{k}.png", "sequence": f"s{i}", "frame_index": k,
             "sensor": "digit" if i % 2 else "gelslim", "touch": f"place{i // 2}.{k}", "object": f"o{i // 2}",
-            "image_path": f"v{i}.png" if i < 3 else None,
+            "image_path": f"v{i}.png" if i < 3 else None, "image2_path": "w.png" if i == 1 else None,
             "text": f"caption {i}" if i % 2 else None, "background_path": f"touch {i}/ä0.png", "label.slip": k % 2,
         }
         for i in range(sequences)
@@ -76,16 +76,16 @@ def test_every_file_is_stored_once_and_unchanged(make, tmp_path):
     loose = make(_rows())
     again = manifests.read(pack(loose, tmp_path / "out"))
     for row in range(len(loose)):
-        for column in ("path", "image_path", "background_path"):
+        for column in ("path", "image_path", "image2_path", "background_path"):
             if loose.value(row, column) is not None:
                 assert packed.read_file(again.file(row, column)) == loose.file(row, column).read_bytes()
     touch = pyarrow.parquet.read_table(tmp_path / "out" / "touch" / "00000.parquet")
     shared = pyarrow.parquet.read_table(tmp_path / "out" / "shared" / "00000.parquet")
     # A background that is also a row's touch image is not stored a second time.
-    assert (touch.num_rows, shared.num_rows) == (24, 3)
+    assert (touch.num_rows, shared.num_rows) == (24, 4)
     assert again.value(3, "background_path") == again.value(0, "path")
     stored = touch["image"].to_pylist() + shared["image"].to_pylist()
-    assert len({entry["path"] for entry in stored}) == 27
+    assert len({entry["path"] for entry in stored}) == 28
     for entry in stored:
         assert entry["bytes"] == (tmp_path / entry["path"]).read_bytes()
     same = [name for name in loose.table.column_names if not name.endswith("path")]
@@ -211,7 +211,7 @@ def test_a_killed_pack_goes_on_behind_the_last_whole_shard(make, tmp_path, monke
     pack(loose, tmp_path / "out", shard_bytes=size)
     assert _bytes_of(tmp_path / "out") == _bytes_of(tmp_path / "whole")
     first = len(np.load(tmp_path / "whole" / "touch" / "00000.index"))
-    assert len(read) == 27 - (first if stop_at > 3 else 0)
+    assert len(read) == 28 - (first if stop_at > 3 else 0)
 
 
 def test_a_finished_pack_is_left_alone(make, tmp_path, monkeypatch):

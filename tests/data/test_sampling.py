@@ -81,13 +81,16 @@ def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
     np.testing.assert_array_equal(again[0] + again[1], total)
 
 
-@pytest.mark.parametrize("multiple", [1, 2, 4])
-def test_slots_are_full_in_every_batch_where_they_can_be(multiple):
-    strata = s.Strata((350, 250, 510, 450), 64, multiple)
+@pytest.mark.parametrize("multiple", [1, 2, 4, 16])
+def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend_on_them(multiple):
+    alone, strata = (s.Strata((350, 250, 510, 450), 64, m) for m in (1, multiple))
+    assert (alone.images, alone.texts) == (25, 32)  # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
+    assert strata.images == -(-25 // multiple) * multiple and strata.texts % multiple == 0
     for k in range(500):
-        _, now = strata.at(k)
-        assert now[s.VISION] + now[s.BOTH] == strata.images
-        assert now[s.TEXT] + now[s.BOTH] == strata.texts
+        before, now = strata.at(k)
+        np.testing.assert_array_equal([before, now], alone.at(k))
+        assert now[s.VISION] + now[s.BOTH] == alone.images
+        assert now[s.TEXT] + now[s.BOTH] == alone.texts
 
 
 def test_shares_that_are_whole_numbers_are_met_exactly():

@@ -11,19 +11,6 @@ from anytouch_jax.data.loader import Loader
 from anytouch_jax.data.shards import Shard
 
 
-def _rich():
-    rows = []
-    for i in range(8):
-        for k in range(6):
-            row = {
-                "sequence": f"s{i}", "frame_index": k, "sensor": "digit" if i % 2 else "gelslim",
-                "touch": f"place{i // 2}.{k}", "object": f"o{i // 2}", "unit": f"u{i % 2}",
-            }  # fmt: skip
-            row |= {"image_path": f"v{i}{k}.png"} if i < 3 else {}
-            rows.append(row | ({"text": f"caption {i}"} if i % 3 == 2 else {}))
-    return rows
-
-
 def _leaves(batch):
     if batch is None or isinstance(batch, np.ndarray):
         return [] if batch is None else [batch]
@@ -33,8 +20,8 @@ def _leaves(batch):
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize(("stage", "recipe"), [(1, "paper"), (2, "paper"), (2, "release")])
 @pytest.mark.parametrize("bad", ["error", "skip"])
-def test_the_parts_joined_are_the_whole(make, settings, stage, recipe, count, bad):
-    manifest = make(_rich())
+def test_the_parts_joined_are_the_whole(make, settings, stage, recipe, count, bad, rich):
+    manifest = make(rich)
     if bad == "skip":
         for row in (2, 7, 30):
             manifest.file(row).unlink()
@@ -55,8 +42,8 @@ def test_the_parts_joined_are_the_whole(make, settings, stage, recipe, count, ba
     assert (skipped > 0) == (bad == "skip")
 
 
-def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch):
-    manifest, read = make(_rich()), []
+def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch, rich):
+    manifest, read = make(rich), []
     decode = samples.decode
     monkeypatch.setattr(samples, "decode", lambda path: read.append(path) or decode(path))
     counts = {}
@@ -78,13 +65,13 @@ def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch):
         (8, 2, (0, 0), "there is no shard 0 of 0"),
     ],
 )
-def test_shares_that_do_not_add_up_are_told(make, settings, size, devices, shard, told):
+def test_shares_that_do_not_add_up_are_told(make, settings, size, devices, shard, told, rich):
     with pytest.raises(UserError, match=told):
-        Loader(make(_rich()), settings(batch_size=size), devices=devices, shard=shard)
+        Loader(make(rich), settings(batch_size=size), devices=devices, shard=shard)
 
 
-def test_half_batches_of_matching_must_be_shared_too(make, settings):
-    loader = Loader(make(_rich()), settings(2, "release", batch_size=2), devices=2, shard=(0, 2))
+def test_half_batches_of_matching_must_be_shared_too(make, settings, rich):
+    loader = Loader(make(rich), settings(2, "release", batch_size=2), devices=2, shard=(0, 2))
     with pytest.raises(UserError, match="the rows of a matching batch 1 cannot be shared by 2"):
         for step in range(40):
             loader.batch(step)

@@ -85,13 +85,10 @@ HARMS = [
 
 
 @pytest.mark.parametrize("how", HARMS)
-@pytest.mark.parametrize("column", ["path", "image_path"])
+@pytest.mark.parametrize("column", ["path", "image_path", "image2_path"])
 def test_a_bad_file_is_found_named_and_repaired(make, tmp_path, how, column):
-    loose = make(_clean(image_path="photo ü.png") if column == "image_path" else _clean())
-    if column == "image_path":
-        rows, spoiled = [0, 1, 2, 3, 4, 5], loose.file(2, "image_path")
-    else:
-        rows, spoiled = [2], loose.file(2)
+    loose = make(_clean() if column == "path" else _clean(**{column: "photo ü.png"}))
+    rows, spoiled = [2] if column == "path" else [0, 1, 2, 3, 4, 5], loose.file(2, column)
     _harm(spoiled, how)
     report = verify(loose, threads=2)
     state = how.split()[0]
@@ -104,7 +101,7 @@ def test_a_bad_file_is_found_named_and_repaired(make, tmp_path, how, column):
     if column == "path":
         assert fixed.manifest.column("path").to_pylist() == [f"f{i}.png" for i in (0, 1, 3, 4, 5)]
     else:
-        assert len(fixed.manifest) == 6 and not fixed.manifest.present("image_path").any()
+        assert len(fixed.manifest) == 6 and not fixed.manifest.present(column).any()
     target = write_repaired(fixed, tmp_path / "fixed.csv")
     assert verify(manifests.read(target)).ok
     assert not repair(manifests.read(target), verify(manifests.read(target))).done

@@ -11,6 +11,7 @@ import json
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,19 +107,20 @@ def annotate(
     """
     if threads < 1 or side < 16:
         raise AnnotateError(f"threads {threads} must be at least 1 and side {side} at least 16")
-    client = Client(endpoint)
+    exposed = endpoint.exposes_key  # a mistake in the address is told at once; a key is needed only to ask
     store = _Store(Path(folder).expanduser().resolve())
     found = find_jobs(manifest, split=split, families=families, overwrite=overwrite, second_image=second_image)
-    run = _Run(manifest, client, store, side)
+    run = _Run(manifest, endpoint, store, side)
     jobs = found.jobs[:limit]
     keys = run.keys(jobs, threads)
     lacking = [(job, key) for job, key in zip(jobs, keys, strict=True) if key and key not in store.answers]
-    if say and client.exposes_key:
+    if say and exposed:
         say(f"the key travels unencrypted to {endpoint.url}; use https")
     estimate = _estimate([job for job, _ in lacking], len(jobs) - len(lacking), side, price_in, price_out)
     if lacking and not confirm(estimate):
         raise AnnotateError("not confirmed: nothing was asked")
-    run.ask(lacking, threads, say)
+    if lacking:
+        run.ask(Client(endpoint), lacking, threads, say)
     captions = tuple(
         Caption(job, store.answers[key]["caption"], store.answers[key]["object"])
         for job, key in zip(jobs, keys, strict=True) if key in store.answers
@@ -143,8 +145,8 @@ def _estimate(jobs: list[Job], cached: int, side: int, price_in: float | None, p
 class _Run:
     """One pass over the questions; `failures` and the counts grow as it goes."""
 
-    def __init__(self, manifest: Manifest, client: Client, store: _Store, side: int) -> None:
-        self.manifest, self.client, self.store, self.side = manifest, client, store, side
+    def __init__(self, manifest: Manifest, endpoint: Endpoint, store: _Store, side: int) -> None:
+        self.manifest, self.endpoint, self.store, self.side = manifest, endpoint, store, side
         self.failures: list[Failure] = []
         self.asked, self.tokens = 0, [0, 0]
 
@@ -159,7 +161,7 @@ class _Run:
         return keys
 
     def _key(self, job: Job) -> str | UserError:
-        end = self.client.endpoint
+        end = self.endpoint
         digest = hashlib.sha256(json.dumps([end.model, job.question.hash(), self.side, end.max_tokens]).encode())
         for row, column in job.pictures:
             try:
@@ -169,23 +171,25 @@ class _Run:
                 return UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}")
         return digest.hexdigest()[:32]
 
-    def ask(self, lacking: list[tuple[Job, str]], threads: int, say: Callable[[str], None] | None) -> None:
+    def ask(
+        self, client: Client, lacking: list[tuple[Job, str]], threads: int, say: Callable[[str], None] | None
+    ) -> None:
         """Ask all questions; stops at an endpoint that is of no use. In the end no thread is left."""
         streak = 0
-        with closing(bounded_map(self._ask_one, lacking, threads)) as reasons:
+        with closing(bounded_map(partial(self._ask_one, client), lacking, threads)) as reasons:
             try:
                 for count, ((job, _), reason) in enumerate(zip(lacking, reasons, strict=True), 1):
                     streak = streak + 1 if reason else 0
                     if reason:
-                        self._fail(job, reason)
+                        self._fail(job, client.redact(reason))
                     if streak >= _STREAK:
                         raise AnnotateError(f"{streak} questions in a row failed, the last one: {reason}")
                     if say and (count % 100 == 0 or count == len(lacking)):
                         say(f"{count} of {len(lacking)} questions, {len(self.failures)} failed")
             finally:
-                self.client.stop.set()  # before the threads are waited for: none goes on waiting for a server
+                client.stop.set()  # before the threads are waited for: none goes on waiting for a server
 
-    def _ask_one(self, item: tuple[Job, str]) -> str:
+    def _ask_one(self, client: Client, item: tuple[Job, str]) -> str:
         """Get one answer and keep it; why there is none, or ""."""
         job, key = item
         try:
@@ -198,31 +202,31 @@ class _Run:
         reason = ""
         for _ in range(_NONSENSE_TRIES):
             try:
-                answer = self.client.ask(job.question.messages(pictures))
+                answer = client.ask(job.question.messages(pictures))
             except AnswerError as error:
                 return str(error)
             except EndpointError:
-                self.client.stop.set()
+                client.stop.set()
                 raise
             with self.store.lock:
                 self.asked += 1
                 self.tokens[0] += answer.tokens_in
                 self.tokens[1] += answer.tokens_out
-            text = self.client.redact(answer.text)
+            text = client.redact(answer.text)
             try:
                 caption, seen = caption_of(text, answer.finish)
             except Nonsense as error:
                 reason = f"nonsense ({error}): {text[:100]!r}"
                 continue
             self.store.keep(key, {
-                "model": self.client.endpoint.model, "prompt": job.question.hash(), "family": job.question.family,
+                "model": self.endpoint.model, "prompt": job.question.hash(), "family": job.question.family,
                 "caption": caption, "object": seen, "tokens_in": answer.tokens_in, "tokens_out": answer.tokens_out,
             })  # fmt: skip
             return ""
         return f"{reason} ({_NONSENSE_TRIES} times)"
 
     def _fail(self, job: Job, reason: str) -> None:
-        self.failures.append(Failure(self.manifest.where(int(job.rows[0])), len(job.rows), self.client.redact(reason)))
+        self.failures.append(Failure(self.manifest.where(int(job.rows[0])), len(job.rows), reason))
 
 
 class _Store:

@@ -81,6 +81,11 @@ class Endpoint:
         """Whether the endpoint is on this machine."""
         return urllib.parse.urlsplit(self.url).hostname in _LOCAL
 
+    @property
+    def exposes_key(self) -> bool:
+        """Whether a key is set and would travel unencrypted to another machine. Raises EndpointError as `address`."""
+        return self.address.startswith("http:") and not self.local and bool(os.environ.get(self.key_variable, ""))
+
 
 @dataclass
 class Client:
@@ -99,11 +104,6 @@ class Client:
             raise EndpointError(f"the environment variable {end.key_variable} does not hold a key")
         # A redirect would take the key to another host, so none is followed.
         self._opener = urllib.request.build_opener(_NoRedirect)
-
-    @property
-    def exposes_key(self) -> bool:
-        """Whether the key travels unencrypted to another machine."""
-        return bool(self._key) and self._address.startswith("http:") and not self.endpoint.local
 
     def ask(self, messages: list[dict[str, Any]]) -> Answer:
         """The answer to a chat. Raises AnswerError after all tries, EndpointError where no try can help."""

@@ -38,7 +38,7 @@ def decode(path: str | Path) -> np.ndarray:
     BMP, WebP and .npy are read; orientation tags are ignored. Raises ImageError for a missing, broken or too large
     file and for pixels that are NaN or outside 0..1.
     """
-    path = Path(path)
+    path = path if isinstance(path, Path) else Path(path)  # a copy takes as long as the reading
     try:
         data = read_file(path)
     except FileNotFoundError:
@@ -50,12 +50,11 @@ def decode(path: str | Path) -> np.ndarray:
 
 def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
     """The picture that `data` is, as `decode` gives it; `name` is for errors."""
-    path = Path(name)
     try:
         pixels = _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
-        raise ImageError(f"{path} cannot be read: {error}") from None
-    return _to_rgb(pixels, path)
+        raise ImageError(f"{name} cannot be read: {error}") from None
+    return _to_rgb(pixels, name)
 
 
 def _unpack(data: bytes) -> np.ndarray:
@@ -66,8 +65,8 @@ def _unpack(data: bytes) -> np.ndarray:
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
     if size[0] * size[1] > MAX_PIXELS:
         raise ValueError(f"it declares {size[0]} x {size[1]} pixels, more than the limit of {MAX_PIXELS}")
-    # OpenCV fills the lost part of some cut JPEG files with grey; in a whole one an end marker follows the last scan.
-    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+    # OpenCV fills the lost part of some cut JPEG files with grey; in a whole one no scan begins after the end marker.
+    if data[:2] == b"\xff\xd8" and data.find(b"\xff\xda", max(0, data.rfind(b"\xff\xd9"))) >= 0:
         raise ValueError("the file is cut short")
     jpeg = data[:2] == b"\xff\xd8" and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
     try:
@@ -97,7 +96,7 @@ def _array(data: bytes) -> np.ndarray:
     return np.frombuffer(data, kind, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
-def _to_rgb(pixels: np.ndarray, path: Path) -> np.ndarray:
+def _to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or 0 in pixels.shape:

@@ -16,6 +16,7 @@ from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config, UserError
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.images import frames_from_folder, frames_from_video
+from anytouch_jax.data.labels import UNKNOWN
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.samples import Reader, SampleError, fill_slot
 from anytouch_jax.data.sampling import BOTH, TEXT, VISION, Turns, uniform
@@ -60,7 +61,7 @@ class Loader:
             self._shard.check(number, name)
         self._reader = Reader(manifest, config)
         found = find_sources(manifest, config, tokenizer, devices)
-        self._pools, self._pairs, self._sensor, self.tokenizer, self.notes = found
+        self._pools, self._pairs, self._sensor, self.tokenizer, self.notes, self._force = found
         self._align_share = self._share_of_align()
         self._align, self._match = Turns(self._align_kinds), Turns(self._match_kinds)
 
@@ -80,6 +81,12 @@ class Loader:
             steps += sum(-(-pairs.anchors.size // self._match_size) for pairs in self._pairs if pairs)
         return steps
 
+    @property
+    def sensors_seen(self) -> list[str]:
+        """Names of the sensors that batches are drawn from, in the order of the table."""
+        rows = np.unique(np.concatenate([self._sensor[pool.windows[:, -1]] for pool in self._pools]))
+        return [self.config.model.sensors[row] for row in rows]
+
     def batch(self, step: int) -> Batch:
         """The batch of `step`, made in this thread: TouchBatch in stage 1, Stage2Batch in stage 2."""
         return do(self._plan(step))[0]
@@ -98,9 +105,10 @@ class Loader:
         align = self._plan_align(step, self._pools[align_kind], align_rank) if align_kind != _NEVER else None
         if self.config.stage == 1:
             assert align is not None
-            return Work(TouchBatch(align.batch.clip, align.batch.sensor), align.jobs, align.info)
+            part, force = align.batch
+            return Work(TouchBatch(part.clip, part.sensor, force), align.jobs, align.info)
         match = self._plan_match(step, match_kind, match_rank) if match_kind != _NEVER else None
-        batch = Stage2Batch(align.batch if align else None, match.batch if match else None)
+        batch = Stage2Batch(align.batch[0] if align else None, match.batch if match else None)
         jobs = [*(align.jobs if align else ()), *(match.jobs if match else ())]
         return Work(batch, jobs, align.info if align else {"images": 0, "texts": 0})
 
@@ -143,8 +151,11 @@ class Loader:
         size, rows = self.config.model.image_size, self._shard.share(rows)
         return np.zeros((rows, frames, size, size, 3), np.uint8), np.zeros(rows, np.int32)
 
-    def _plan_align(self, step: int, pool: Pool, rank: int) -> Work[AlignBatch]:
-        """Rows of all strata in a seeded order; images and texts are packed into the slots in that order."""
+    def _plan_align(self, step: int, pool: Pool, rank: int) -> Work[tuple[AlignBatch, np.ndarray | None]]:
+        """Rows of all strata in a seeded order; images and texts are packed into the slots in that order.
+
+        Beside the batch: force labels f32 (rows, 2) of this shard, or None.
+        """
         before, now = pool.strata.at(rank)
         draws = [
             (stratum, *draw)
@@ -167,6 +178,7 @@ class Loader:
             wanted.append((stratum, image, text))
         clip, sensor = self._empty(rows, pool.windows.shape[1])
         batch = AlignBatch(clip, sensor, *self._slots(image_row, text_row))
+        force = None if self._force is None else np.full((len(sensor), 2), UNKNOWN)
         jobs: list[Any] = []
         for slot, (at, (stratum, image, text)) in enumerate(zip(order, wanted, strict=True)):
             _, index, epoch = draws[at]
@@ -177,11 +189,11 @@ class Loader:
             )
             if mine == Slots(None, None, None):
                 continue
-            write = partial(self._write_align, batch, pool, stratum, mine)
+            write = partial(self._write_align, batch, force, pool, stratum, mine)
             size = len(pool.members[stratum])
             job = partial(fill_slot, write, size, step, slot, self.config, index, epoch)
             jobs.append(job if mine.touch is not None else partial(_uncounted, job))
-        return Work(batch, jobs, {"images": images, "texts": texts})
+        return Work((batch, force), jobs, {"images": images, "texts": texts})
 
     def _texts(self, pool: Pool) -> int:
         return pool.strata.texts if self.tokenizer is not None else 0
@@ -200,7 +212,7 @@ class Loader:
         return image, image_row, text, mask, text_row
 
     def _write_align(
-        self, batch: AlignBatch, pool: Pool, stratum: int, mine: Slots, index: int, epoch: int
+        self, batch: AlignBatch, force: np.ndarray | None, pool: Pool, stratum: int, mine: Slots, index: int, epoch: int
     ) -> None:  # fmt: skip
         rows = pool.windows[pool.members[stratum][index]]
         # Which sample replaces a bad one must not depend on the shard, so where bad ones are skipped all is read.
@@ -212,6 +224,8 @@ class Loader:
             picture = self._reader.vision(rows[-1], epoch)
         if mine.touch is not None:
             batch.sensor[mine.touch] = self._sensor[rows[-1]]
+            if force is not None and self._force is not None:
+                force[mine.touch] = self._force.of(rows)
         if mine.image is not None:
             batch.image[mine.image] = picture
         if mine.text is not None and self.tokenizer is not None:

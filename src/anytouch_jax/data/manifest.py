@@ -137,8 +137,8 @@ class Manifest:
     def _name(self) -> str:
         return ", ".join(map(str, self.files))
 
-    @cached_property
-    def _sequence(self) -> np.ndarray:
+    @property
+    def _sequence(self) -> np.ndarray:  # not kept: 20 MB of a large manifest, for a fraction of a second
         codes = self.codes("sequence", own=True)
         codes *= len(SPLITS)
         codes += self.codes("split")

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+_TABLE = 16  # cells of a table of flags that a row may take before pairs are sorted instead
 _TRIES = 32  # uniform draws before the whole pool is searched
 
 
@@ -31,7 +32,8 @@ class Matches:
         self.pool, self.same_sensor = pool, same_sensor
         self._keys = Keys(*(key[pool] for key in keys))
         touch = self._keys.touch
-        self._order = np.argsort(touch, kind="stable")
+        order = np.argsort(touch, kind="stable")
+        self._order = order.astype(np.int32) if len(order) < 1 << 31 else order  # millions of them are held
         self._sorted = touch[self._order]
         self._rows: dict[int | None, np.ndarray] = {}
         self._usable = self._many_places() if same_sensor else np.ones(len(pool), bool)
@@ -102,9 +104,21 @@ class Matches:
         return place & ~same_object
 
 
+def felt_twice(touch: np.ndarray, sensor: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Rows whose touch, of codes i64 (rows,), was felt by two known sensors or units or more: bool (rows,)."""
+    return (_distinct(touch, sensor) > 1) | (_distinct(touch, unit) > 1)
+
+
 def _distinct(group: np.ndarray, value: np.ndarray) -> np.ndarray:
     """For every row, how many different known values (>= 0) its group has, 0 without a group (-1): i64 (rows,)."""
     known = (value >= 0) & (group >= 0)
-    width = int(value.max(initial=0)) + 1
-    pairs = np.unique(group[known].astype(np.int64) * width + value[known])
-    return np.bincount(pairs // width, minlength=int(group.max(initial=-1)) + 2)[group]  # -1 takes the last: none
+    width, groups = int(value.max(initial=0)) + 1, int(group.max(initial=-1)) + 2  # the last group is that of -1: none
+    pairs = group[known].astype(np.int64) * width + value[known]
+    if width * groups <= _TABLE * len(group):  # a few values a group: no need to sort millions of pairs
+        seen = np.zeros(width * groups, bool)
+        seen[pairs] = True
+        count = np.count_nonzero(seen.reshape(groups, width), axis=1)
+    else:
+        pairs.sort()
+        count = np.bincount(pairs[np.diff(pairs, prepend=-1) > 0] // width, minlength=groups)
+    return count[group]

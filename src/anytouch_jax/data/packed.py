@@ -60,9 +60,10 @@ def _read_loose(path: Path) -> bytes:
             raise ValueError("it is not a regular file")
         if about.st_size > MAX_BYTES:
             raise ValueError(f"it has {about.st_size} bytes, more than the limit of {MAX_BYTES}")
-        parts = []
-        while part := os.read(file, about.st_size + 1):
-            parts.append(part)
+        parts = [os.read(file, about.st_size + 1)]
+        if len(parts[0]) != about.st_size:  # it grew, or the read was interrupted
+            while part := os.read(file, about.st_size + 1):
+                parts.append(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
     finally:
         os.close(file)

@@ -105,19 +105,21 @@ class Strata:
     """How many rows of each stratum (vision, both, text, neither) a batch takes, so that its slots are full.
 
     `sizes` (4,) rows in each stratum; `images`, `texts` are the slots of a batch: the share of each modality, rounded
-    up to a multiple of `multiple`, at most `batch`. The strata lie on a line of length `batch`, each as long as the
-    rows it gives on average; a batch takes the points u, u + 1, ... of that line, so every count is its average
-    rounded down or up, and so is the number of images (vision + both) and of texts (both + text), which lie together
-    on the line. u moves by the golden section from batch to batch, in whole units of the line's common denominator:
-    every stratum is visited, in its exact share.
+    up to a whole number, and this to a multiple of `multiple`, at most `batch`. `multiple` is the number of devices,
+    which may change in a run: what a batch takes does not depend on it, and fewer than `multiple` slots stay unused.
+
+    The strata lie on a line of length `batch`, each as long as the rows it gives on average; a batch takes the points
+    u, u + 1, ... of that line, so every count is its average rounded down or up, and so is the number of images
+    (vision + both) and of texts (both + text), which lie together on the line. u moves by the golden section from
+    batch to batch, in whole units of the line's common denominator: every stratum is visited, in its exact share.
     """
 
     def __init__(self, sizes: Sequence[int], batch: int, multiple: int = 1) -> None:
         rows = sum(sizes)
         shares = [Fraction(batch * size, rows) for size in sizes]
-        self.images = _slots(shares[VISION] + shares[BOTH], batch, multiple)
-        self.texts = _slots(shares[TEXT] + shares[BOTH], batch, multiple)
-        shares = _fill(shares, self.images, self.texts)
+        images, texts = shares[VISION] + shares[BOTH], shares[TEXT] + shares[BOTH]
+        self.images, self.texts = (_slots(share, batch, multiple) for share in (images, texts))
+        shares = _fill(shares, _slots(images, batch, 1), _slots(texts, batch, 1))
         edges = [sum(shares[:end], Fraction(0)) for end in range(5)]
         self._unit = lcm(*(edge.denominator for edge in edges))
         self._edges = np.array([int(edge * self._unit) for edge in edges], np.int64)

@@ -10,8 +10,9 @@ import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config, UserError
 from anytouch_jax.data import text as texts
+from anytouch_jax.data.labels import Force, find_force
 from anytouch_jax.data.manifest import Manifest, ManifestError, sensor_rows
-from anytouch_jax.data.matching import Keys, Matches
+from anytouch_jax.data.matching import Keys, Matches, felt_twice
 from anytouch_jax.data.sampling import Strata, Stream
 
 STILL, CLIP = 0, 1
@@ -45,7 +46,8 @@ class Pairs(NamedTuple):
 class Sources(NamedTuple):
     """All there is to draw from, by kind: `pools` (stills, and clips if any), `pairs` (None where there are none).
 
-    `sensor` i32 (rows of the manifest,) sensor-table rows; `tokenizer` the one in use; `notes` to tell the user.
+    `sensor` i32 (rows of the manifest,) sensor-table rows; `tokenizer` the one in use; `notes` to tell the user;
+    `force` the labels of a run with a force head.
     """
 
     pools: tuple[Pool, ...]
@@ -53,6 +55,7 @@ class Sources(NamedTuple):
     sensor: np.ndarray
     tokenizer: texts.Tokenizer | None
     notes: list[str]
+    force: Force | None
 
 
 def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer | None, devices: int) -> Sources:
@@ -63,27 +66,30 @@ def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer 
     if weights is not None:
         rows = rows[weights[rows] > 0]
         sensor = np.where(weights > 0, sensor, -1)
-    finder = _Finder(manifest, config, rows, sensor, weights, {})
+    rows, drawn, note = _required(manifest, config, rows)
+    notes += note
+    finder = _Finder(manifest, config, rows, sensor, weights, drawn, {})
     has_image, has_text = finder.modalities()
     captioned = rows[has_text[rows]]
     if captioned.size:
         tokenizer, note = _choose_tokenizer(tokenizer, manifest, captioned, config)
         notes += note
-    if config.model.text and (kept := (manifest.present("text") & withheld(manifest))[rows]).any():
-        notes.append(f"the text of {int(kept.sum())} rows is withheld: they are in a test split of a downstream task")
+    if config.stage == 2 and config.model.text:
+        notes += _say_withheld(manifest, config, rows)
     length = config.model.frames + (config.stage == 1 or config.objective.reconstruct)
     pools = tuple(
         finder.pool(kind, windows, has_image[windows[:, -1]], has_text[windows[:, -1]], devices)
-        for kind in (STILL, CLIP)
+        for kind in ((STILL, CLIP) if config.data.clip_share else (STILL,))
         if len(windows := finder.windows(kind, length))
     )
-    if len(pools) == 1:
+    if len(pools) == 1 and config.data.clip_share:
         notes.append(f"split {config.data.split!r} has no clip of {length} frames: all batches are stills")
     pairs: tuple[Pairs | None, Pairs | None] = (None, None)
-    if config.stage == 2:
+    if config.stage == 2 and config.model.match_head != "none":
         pairs, note = finder.both_pairs(len(pools) > 1)
         notes += note
-    return Sources(pools, pairs, sensor, tokenizer, notes)
+    force = find_force(manifest, config, rows, pools[CLIP].windows if len(pools) > 1 else None)
+    return Sources(pools, pairs, sensor, tokenizer, notes, force)
 
 
 def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray, list[str]]:
@@ -96,6 +102,20 @@ def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray,
         files = ", ".join(map(str, manifest.files))
         raise ManifestError(f"{files}: split {split!r} has no row of a known sensor with images")
     return rows, sensor, notes
+
+
+def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """`rows` that have what `data.require` names; which rows of the manifest those are (None: any); notes."""
+    wanted = config.data.require
+    if not wanted:
+        return rows, None, []
+    text = manifest.present("text") & ~withheld(manifest, aligned_text=config.data.aligned_text)
+    has = {"image": manifest.present("image_path"), "text": text}
+    drawn = np.logical_and.reduce([has[name] for name in wanted])
+    kept, what = rows[drawn[rows]], " and ".join(wanted)
+    if not kept.size:
+        raise UserError(f"data.require: no row of split {config.data.split!r} has {what}")
+    return kept, drawn, [f"{len(kept)} of {len(rows)} rows have {what}; only they are drawn (data.require)"]
 
 
 def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
@@ -124,20 +144,45 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
     return weights, [f"an epoch draws {said}, other datasets once"]
 
 
-def withheld(manifest: Manifest) -> np.ndarray:
+def withheld(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
     """Rows in a test split of a downstream task (column `downstream_test`): their text is not trained on, bool (rows,).
 
-    So a text that tells the label is never seen with a frame that a probe is tested on (paper, appendix).
+    So a text that tells the label is never seen with a frame that a probe is tested on (paper, appendix). Without
+    `aligned_text` also the rows whose touch several sensors or units felt (Table 6, "w/o Text in TacQuad").
     """
+    tested = _downstream(manifest)
+    return tested if aligned_text else tested | _aligned(manifest)
+
+
+def _aligned(manifest: Manifest) -> np.ndarray:
+    return felt_twice(*(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit")))
+
+
+def _say_withheld(manifest: Manifest, config: Config, rows: np.ndarray) -> list[str]:
+    text, tested = manifest.present("text")[rows], _downstream(manifest)[rows]
+    notes = []
+    if (text & tested).any():
+        count = int((text & tested).sum())
+        notes.append(f"the text of {count} rows is withheld: they are in a test split of a downstream task")
+    if not config.data.aligned_text:
+        count = int((text & _aligned(manifest)[rows]).sum())
+        notes.append(
+            f"the text of {count} of {int(text.sum())} rows is withheld: other sensors or units felt the same touch "
+            "(data.aligned_text)"
+        )
+    return notes
+
+
+def _downstream(manifest: Manifest) -> np.ndarray:
     if _WITHHELD not in manifest.table.column_names:
         return np.zeros(len(manifest), bool)
     word = pc.utf8_lower(manifest.table[_WITHHELD].cast(pa.string()))
     return ~np.asarray(pc.is_in(pc.fill_null(word, ""), value_set=pa.array(_NOT_SET)))
 
 
-def captions(manifest: Manifest, rows: np.ndarray) -> list[str]:
-    """The different captions of `rows` that may be trained on, in order."""
-    kept = rows[~withheld(manifest)[rows]]
+def captions(manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True) -> list[str]:
+    """The different captions of `rows` that may be trained on (see `withheld`), in order."""
+    kept = rows[~withheld(manifest, aligned_text=aligned_text)[rows]]
     return sorted(pc.unique(manifest.column("text").take(kept)).drop_null().to_pylist())
 
 
@@ -165,6 +210,7 @@ class _Finder(NamedTuple):
     rows: np.ndarray
     sensor: np.ndarray
     weights: np.ndarray | None
+    drawn: np.ndarray | None  # rows of the manifest that may end a window, None: any
     found: dict[int, np.ndarray]  # clips by their length
 
     def modalities(self) -> tuple[np.ndarray, np.ndarray]:
@@ -173,8 +219,10 @@ class _Finder(NamedTuple):
         if self.config.stage == 1:
             return none, none
         image = self.manifest.present("image_path") if model.image else none
-        text = self.manifest.present("text") & ~withheld(self.manifest) if model.text else none
-        return image, text
+        if not model.text:
+            return image, none
+        kept = ~withheld(self.manifest, aligned_text=self.config.data.aligned_text)
+        return image, self.manifest.present("text") & kept
 
     def windows(self, kind: int, length: int) -> np.ndarray:
         if kind == STILL:
@@ -184,6 +232,8 @@ class _Finder(NamedTuple):
             good = np.ones(len(clips), bool)
             for frame in clips.T:
                 good &= self.sensor[frame] >= 0
+            if self.drawn is not None:
+                good &= self.drawn[clips[:, -1]]
             self.found[length] = clips if good.all() else clips[good]
         return self.found[length]
 
@@ -207,7 +257,7 @@ class _Finder(NamedTuple):
 
         notes = []
         keys = Keys(codes("touch", own=True), self.sensor, codes("unit"), codes("object"), codes("dataset"))
-        stills, clips = self._pairs(STILL, keys), self._pairs(CLIP, keys)
+        stills, clips = self._pairs(STILL, keys), self._pairs(CLIP, keys) if self.config.data.clip_share else None
         if stills is None:
             notes.append(
                 "no touch was felt by two sensors or units (column 'touch'): there is no cross-sensor matching"

@@ -17,7 +17,7 @@ from anytouch_jax.config import UserError
 
 SPLITS = ("train", "val", "test", "background", "unused")
 REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
-PATHS = ("path", "image_path", "background_path", "field_path")
+PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 
 _READERS = 2  # columns of a Parquet file that are read at once: more need more memory
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
@@ -33,6 +33,7 @@ SCHEMA: dict[str, pa.DataType] = {
     "touch": _TEXT,
     "object": _TEXT,
     "image_path": _TEXT,
+    "image2_path": _TEXT,
     "text": _TEXT,
     "background_path": _TEXT,
     "field_path": _TEXT,

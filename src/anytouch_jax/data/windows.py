@@ -18,11 +18,11 @@ def windows(
     repeated: Callable[[int, int], Exception] | None = None,
     ends: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Row ids i64 (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
+    """Row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
 
-    `sequence` i64 (rows,) codes, `frame` i64 (rows,), `stride` i64 (rows,) (that of t counts). A row whose window
-    has a gap has no window, nor has one that is not in `ends`, bool (rows,). Raises `repeated(first row, second row)`
-    when a sequence holds a frame twice.
+    They are i32, beyond 2^31 rows i64. `sequence` i64 (rows,) codes, `frame` i64 (rows,), `stride` i64 (rows,) (that of
+    t counts). A row whose window has a gap has no window, nor has one that is not in `ends`, bool (rows,). Raises
+    `repeated(first row, second row)` when a sequence holds a frame twice.
     """
     if length < 1:
         raise ValueError(f"a clip has at least one frame, not {length}")
@@ -31,7 +31,8 @@ def windows(
     if twice.size and length > 1:
         one, two = sorted(int(at if order is None else order[at]) for at in (twice[0], twice[0] + 1))
         raise repeated(one, two) if repeated else ValueError(f"rows {one} and {two} are the same frame")
-    found, count = np.empty((len(key), length), np.int64), 0
+    kind = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # millions of windows are held
+    found, count = np.empty((len(key), length), kind), 0
     for start in range(0, len(key), _BLOCK):
         here = np.arange(start, min(start + _BLOCK, len(key)))
         rows = here if order is None else order[here]

@@ -16,8 +16,9 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import jax
@@ -42,6 +43,7 @@ Tree = Any
 
 _UNFINISHED = re.compile(r"\d{8,}\..+")  # being written or removed, by us or by Orbax
 _SHOWN = 5  # names listed in one error message
+_PATIENCE = 30.0  # seconds for a save whose other processes may be lost
 
 
 def _is_news(record: logging.LogRecord) -> bool:
@@ -141,6 +143,19 @@ class Checkpoints:
         """Finish the running save and its housekeeping. Raises CheckpointError when the save failed."""
         self.wait()
         self._worker.shutdown()
+
+    def leave(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """`close` at the end of a context; after an error in one of several processes, without waiting for the others.
+
+        Its running save is then given half a minute, or nothing where another process is lost: it could not end.
+        """
+        if error is None or jax.process_count() == 1:
+            self.close()
+            return
+        if self._pending is not None and not isinstance(error, jax.errors.JaxRuntimeError):
+            with suppress(Exception):
+                self._pending[1].result(timeout=_PATIENCE)
+        self._worker.shutdown(wait=False, cancel_futures=True)
 
     def _finish(self, target: Path, response: Any, content: dict[str, Any]) -> None:
         """On the worker thread: when the arrays are on disk, write the record, rename, remove what is not kept."""

@@ -29,12 +29,14 @@ __all__ = [
     "clip_to_stage1",
     "detect_layout",
     "detect_model",
+    "inflate",
     "match_sensors",
     "merge_stage2",
     "model_of",
     "read_weights",
     "release_names",
     "release_shapes",
+    "serve_unseen",
     "to_params",
     "to_release",
     "write_safetensors",
@@ -109,6 +111,8 @@ def to_release(params: Params, model: Model, *, allow_extra: bool = False) -> di
         raise WeightsError(
             "the matching MLP of recipe paper has no counterpart in the authors' files; allow extra keys to store it"
         )
+    if model.patch_encoder != "shared":
+        raise WeightsError("the authors' files have one patch encoder for all sensors; this model has one for each")
     if model.sensors[-1] != UNIVERSAL:
         raise WeightsError(
             f"the authors' files keep the universal tokens in the last row; here it is {model.sensors[-1]!r}"
@@ -148,7 +152,7 @@ def clip_to_stage1(weights: Weights, model: Model, params: Params, *, divide: bo
     response to a still is then three times CLIP's. `divide` makes it CLIP's. Raises WeightsError.
     """
     tower = dataclasses.replace(model, image=model.touch, text=None, match_head="none", lora_rank=0)
-    return _inflated(params, to_params(weights, tower)["image"], divide)
+    return inflate(params, to_params(weights, tower)["image"], divide=divide)
 
 
 def merge_stage2(
@@ -165,7 +169,7 @@ def merge_stage2(
     if stage1 is not None:
         merged = _grafted(merged, {part: stage1[part] for part in ("touch", "decoder")})
     elif clip is not None:
-        merged = _inflated(merged, clip["image"], divide)
+        merged = inflate(merged, clip["image"], divide=divide)
     return merged
 
 
@@ -175,6 +179,28 @@ def match_sensors(tokens: np.ndarray, stored: Sequence[str], wanted: Sequence[st
     A sensor that is not stored starts from the universal tokens, which were trained to serve it.
     """
     return np.stack([tokens[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
+
+
+def serve_unseen(touch: Params, model: Model, seen: Sequence[str], *, universal_drawn: bool) -> Params:
+    """A touch encoder whose rows of sensors never `seen` in training are the universal ones (Sec. 3.5: at inference).
+
+    Where training never drew the universal row either (`universal_drawn`), that row is the mean of those seen. Covers
+    the sensor tokens, and the patch kernels where each sensor has its own.
+    """
+    rows = [row for row, name in enumerate(model.sensors) if name in seen and name != UNIVERSAL]
+    unseen = [row for row in range(len(model.sensors)) if row not in rows]
+    if not rows:
+        return touch
+
+    def served(table: np.ndarray) -> np.ndarray:
+        table = np.array(table)
+        table[unseen] = table[model.universal_row] if universal_drawn else table[rows].mean(axis=0)
+        return table
+
+    touch = touch | {"sensor_tokens": served(touch["sensor_tokens"])}
+    if model.patch_encoder == "sensor":
+        touch |= {"patch": {"kernel": served(touch["patch"]["kernel"])}}
+    return touch
 
 
 def _by_key(wanted: Sequence[Entry]) -> dict[str, Entry]:
@@ -272,8 +298,8 @@ def _grafted(params: Params, parts: Params) -> Params:
     return {**params, **parts}
 
 
-def _inflated(params: Params, image: Params, divide: bool) -> Params:
-    """`params` with the touch encoder from an image tower; sensor tokens stay."""
+def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
+    """`params` with the touch encoder from the image tower `image`, see `clip_to_stage1`; sensor tokens stay."""
     frames = len(params["touch"]["patch"]["kernel"])
     kernel = np.asarray(image["patch"]["kernel"])
     kernel = np.repeat(kernel[None], frames, axis=0) / np.float32(frames if divide else 1)

@@ -13,10 +13,11 @@ PROJECTIONS = ("query", "key", "value", "out")
 def param_shapes(model: Model) -> dict[str, Shape]:
     """Name -> shape of every parameter of a model."""
     pixels, rows, width, deep = 3 * model.patch**2, model.patches + 1, model.touch.width, model.decoder.width
+    own = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
     tree: dict[str, object] = {
         "touch": {
             **_vision_shapes(model.touch, rows, model.embed),
-            "patch": {"kernel": (model.frames, pixels, width)},
+            "patch": {"kernel": (*own, model.frames, pixels, width)},
             "sensor_tokens": (len(model.sensors), model.sensor_tokens, width),
         },
         "decoder": {
@@ -51,6 +52,8 @@ def param_shapes(model: Model) -> dict[str, Shape]:
         tree["matcher"] = _dense_shapes(model.embed, 1)
     elif model.match_head == "mlp":
         tree["matcher"] = {"up": _dense_shapes(model.embed, model.embed), "down": _dense_shapes(model.embed, 1)}
+    if model.force_head:
+        tree["force"] = _dense_shapes(model.embed, 2)
     return flatten(tree, is_leaf=lambda node: isinstance(node, tuple))
 
 

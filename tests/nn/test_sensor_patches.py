@@ -1,0 +1,129 @@
+"""Patch encoders of the sensors' own (T3): who learns from whom, and what a sensor never seen is served by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_models import full_model, tiny_config, touch_model
+
+from anytouch_jax import baselines
+from anytouch_jax.io.release import WeightsError, serve_unseen, to_release
+from anytouch_jax.io.shapes import param_shapes
+from anytouch_jax.io.tree import flatten
+from anytouch_jax.nn.functional import build
+
+RNG = np.random.default_rng(0)
+SHARED, OWN = touch_model(), touch_model(patch_encoder="sensor")
+CLIP = jnp.asarray(RNG.standard_normal((3, 3, 28, 28, 3)), jnp.float32)
+
+
+def parameters(model, seed=0):
+    return build(model).init(jax.random.key(seed))
+
+
+def encode(model, params, clip, sensor):
+    return build(model).apply(params, "encode", clip, jnp.asarray(sensor))
+
+
+def test_a_batch_of_one_sensor_trains_its_own_patch_encoder_alone():
+    params = parameters(OWN)
+    loss = jax.jit(jax.grad(lambda p, clip, sensor: jnp.sum(encode(OWN, p, clip, sensor) ** 2)))
+    for clip in (CLIP, CLIP[:, :1]):
+        for sensor, used in (([3, 3, 3], [3]), ([0, 9, 0], [0, 9])):
+            grad = loss(params, clip, jnp.asarray(sensor))["touch"]["patch"]["kernel"]
+            assert np.flatnonzero(np.abs(np.asarray(grad)).max(axis=(1, 2, 3))).tolist() == used
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_equal_kernels_are_a_shared_one(frames):
+    params = parameters(SHARED)
+    kernel = params["touch"]["patch"]["kernel"]
+    each = jnp.broadcast_to(kernel, (10, *kernel.shape))
+    own = params | {"touch": params["touch"] | {"patch": {"kernel": each}}}
+    z = encode(OWN, own, CLIP[:, :frames], [0, 4, 9])
+    np.testing.assert_allclose(z, encode(SHARED, params, CLIP[:, :frames], [0, 4, 9]), atol=1e-5)
+
+
+def test_sensors_differ_by_their_patch_encoders_without_tokens():
+    model = replace(OWN, sensor_tokens=0)
+    z = encode(model, parameters(model), jnp.repeat(CLIP[:1], 3, axis=0), [0, 3, 3])
+    assert np.abs(np.asarray(z[0] - z[1])).max() > 1e-3
+    np.testing.assert_allclose(z[1], z[2], atol=1e-6)
+    model = replace(SHARED, sensor_tokens=0)  # neither: nothing tells them apart
+    z = encode(model, parameters(model), jnp.repeat(CLIP[:1], 2, axis=0), [0, 3])
+    np.testing.assert_allclose(z[0], z[1], atol=1e-6)
+
+
+def test_a_row_outside_the_table_is_nan_not_the_last_sensor():
+    model = replace(OWN, sensor_tokens=0)
+    z = np.asarray(encode(model, parameters(model), CLIP, [0, 10, 3]))
+    assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
+
+
+def test_each_kernel_starts_at_the_size_of_a_shared_one():
+    shared, own = (np.asarray(parameters(model)["touch"]["patch"]["kernel"]) for model in (SHARED, OWN))
+    assert own.shape == (10, *shared.shape) and not np.array_equal(own[0], own[1])
+    np.testing.assert_allclose(np.abs(own).max(), np.abs(shared).max(), rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [OWN, replace(OWN, sensor_tokens=0), touch_model(force_head=True), full_model(image=None), full_model(text=None)],
+)
+def test_the_shapes_written_down_are_those_of_the_network(model):
+    wanted = {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
+    assert {name: tuple(shape) for name, shape in param_shapes(model).items()} == wanted
+
+
+def test_the_default_network_has_the_parameters_it_had():
+    names = set(flatten(build(tiny_config(1).model).abstract()))
+    assert names == {n for n in param_shapes(touch_model()) if not n.startswith("force")} and len(names) == 51
+
+
+def test_the_authors_files_have_no_place_for_several_patch_encoders():
+    with pytest.raises(WeightsError, match="one patch encoder for all sensors"):
+        to_release(parameters(OWN), OWN)
+
+
+# Sensors that training never saw -------------------------------------------------------------------------------------
+
+
+def touch(model):
+    return jax.tree.map(np.asarray, parameters(model)["touch"])
+
+
+def test_sensors_never_seen_are_served_by_the_universal_row():
+    before = touch(OWN)
+    after = serve_unseen(before, OWN, ["gelsight", "digit"], universal_drawn=True)
+    for a, b in (
+        (after["sensor_tokens"], before["sensor_tokens"]),
+        (after["patch"]["kernel"], before["patch"]["kernel"]),
+    ):
+        np.testing.assert_array_equal(a[[0, 1, 9]], b[[0, 1, 9]])
+        for row in range(2, 9):
+            np.testing.assert_array_equal(a[row], b[9])
+    np.testing.assert_array_equal(after["position"], before["position"])
+
+
+def test_without_universal_tokens_they_are_served_by_the_mean_of_those_seen():
+    before = touch(SHARED)
+    after = serve_unseen(before, SHARED, ["gelsight", "digit"], universal_drawn=False)
+    np.testing.assert_array_equal(after["sensor_tokens"][:2], before["sensor_tokens"][:2])
+    for row in range(2, 10):
+        np.testing.assert_allclose(after["sensor_tokens"][row], before["sensor_tokens"][:2].mean(0), rtol=1e-6)
+    np.testing.assert_array_equal(after["patch"]["kernel"], before["patch"]["kernel"])
+
+
+def test_a_model_that_saw_no_known_sensor_stays_as_it_is():
+    before = touch(SHARED)
+    assert serve_unseen(before, SHARED, ["universal"], universal_drawn=True) is before
+
+
+def test_t3_is_a_model_that_is_built():
+    model = baselines.apply("t3", tiny_config(1)).model
+    assert param_shapes(model)["touch/patch/kernel"] == (10, 3, 147, 16)
+    assert param_shapes(model)["touch/sensor_tokens"] == (10, 0, 16)

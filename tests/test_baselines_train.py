@@ -1,0 +1,52 @@
+"""Every baseline runs: a step of each kind, a checkpoint, an encoder of a sensor it knows and of one it does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from runs import arrays_of, read_metrics, run_config, train
+from touch_world import make_touches
+
+from anytouch_jax import baselines
+from anytouch_jax.evaluate.features import load_encoder
+from anytouch_jax.io import checkpoint
+from anytouch_jax.io.tree import flatten
+
+STILLS = np.random.default_rng(0).integers(0, 256, (2, 28, 28, 3), np.uint8)
+EVERY = [(name, stage) for name, one in baselines.BASELINES.items() for stage in one.stages]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two sensors at the same places, four frames each, some with photograph and caption, all with force."""
+    folder = tmp_path_factory.mktemp("touches")
+    return make_touches(folder, touches={"train": 8}, frames=4, each=2, sensors=("digit", "gelslim"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "stage"), EVERY)
+def test_a_baseline_trains_and_embeds(data, tmp_path, compiled_once, name, stage):
+    config = baselines.apply(name, run_config(data, stage, batch=4, steps=4))
+    # The parameters of one still and one clip step are what two steps of the alternating order move.
+    result = train(replace(config, optim=replace(config.optim, warmup=1)), tmp_path / "r", stop_after=2)
+    lines = read_metrics(tmp_path / "r")
+    assert all(np.isfinite(line["loss"]) and not line["skipped"] for line in lines) and len(lines) == 2
+    assert all(np.isfinite(array).all() for key, array in arrays_of(result).items())
+    told = set().union(*lines)
+    assert ("match" in told) == (stage == 2 and config.model.match_head != "none")
+    assert ("next_frame" in told) == (stage == 1 and name not in ("t3", "static_only", "no_dynamic"))
+    assert ("force" in told) == (name == "force_heads" and stage == 1)
+    assert ("differences" in told) == (name == "frame_differences" and stage == 1)
+    if stage == 2:
+        assert ("touch_to_text" in told) == (name not in ("unitouch", "no_text"))
+        assert ("touch_to_vision" in told) == (name != "no_vision")
+    encoder = load_encoder(tmp_path / "r")
+    z = [encoder.embed(STILLS, sensor) for sensor in ("digit", "duragel", "universal")]
+    assert all(one.shape == (2, 12) and np.isfinite(one).all() for one in z)
+    np.testing.assert_array_equal(z[1], z[2])  # duragel has a row of its own, which nothing has trained
+    told_apart = bool(np.abs(z[0] - z[1]).max() > 0)
+    assert told_apart == (name != "tlv_link")  # without tokens all sensors are one
+    stored = flatten(checkpoint.load_params(tmp_path / "r")[0])
+    assert ("force/kernel" in stored) == (name == "force_heads" and stage == 1)

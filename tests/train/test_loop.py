@@ -184,6 +184,100 @@ def test_metrics_are_fetched_while_the_next_step_runs(tmp_path, monkeypatch):
     assert events.count("fetch") == events.count("step") == 6
 
 
+class Clock:
+    """Time that passes only when it is told to."""
+
+    now = 100.0
+
+    def perf_counter(self):
+        return self.now
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_the_time_that_a_step_waits_for_its_batch_is_written(tmp_path, monkeypatch, busy):
+    """A batch takes 3 s and the rest of a step 1 s. Where the step before still runs, nothing waits."""
+    clock = Clock()
+
+    def batches(start, stop):
+        for item in toy_batches(start, stop):
+            clock.now += 3
+            yield item
+
+    def put(batch, sharding):
+        clock.now += 1
+        return put_batch(batch, sharding)
+
+    put_batch = loop.put_batch
+    monkeypatch.setattr(loop, "put_batch", put)
+    monkeypatch.setattr(loop, "time", clock)
+    monkeypatch.setattr(loop, "_ended", lambda metrics: not busy)
+    run(tmp_path, toy_config(save_every=0), batches=batches, stop_after=4)
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    # A line is written when the next batch has come: the first one tells of two batches, the last one of none.
+    assert [line["wait"] for line in lines] == ([3, 0, 0, 0] if busy else [6, 3, 3, 0])
+    assert [line["wait_share"] for line in lines] == ([3 / 8, 0, 0, 0] if busy else [0.75, 0.75, 0.75, 0])
+
+
+def test_a_step_has_ended_when_its_metrics_are_there():
+    there = jax.block_until_ready(jnp.ones(3) + 1)
+    assert loop._ended({"loss": there})
+
+    class Running:
+        def is_ready(self):
+            return False
+
+    assert not loop._ended({"loss": there, "grad_norm": Running()})
+
+
+class Unread:
+    """An array that may be fetched; whoever looks at it on the host fails."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def is_ready(self):
+        return self.value.is_ready()
+
+
+def test_nothing_but_the_late_fetch_looks_at_a_result(tmp_path, monkeypatch):
+    hide, show = (lambda tree: jax.tree.map(Unread, tree)), (lambda tree: jax.tree.map(lambda x: x.value, tree))
+    fetch, compiled = jax.device_get, loop._Loop.compile
+
+    def hidden(self, state, loss_fn):
+        step = compiled(self, state, loss_fn)
+        first = iter([state])
+        return lambda state, *rest: hide(step(next(first, None) or show(state), *rest))
+
+    monkeypatch.setattr(jax, "device_get", lambda tree: fetch(show(tree)))
+    monkeypatch.setattr(loop._Loop, "compile", hidden)
+    monkeypatch.setattr(loop._Loop, "save", lambda self, done, state: self.log() or done)
+    result = run(tmp_path, toy_config(save_every=0), stop_after=4)
+    assert [row["step"] for row in rows(tmp_path)] == [0, 1, 2, 3]
+    with pytest.raises(TypeError):
+        float(result.state.step)
+
+
+@pytest.mark.parametrize("fsdp", [1, 4])
+def test_no_step_compiles_after_the_first_of_its_kind(tmp_path, caplog, fsdp):
+    """Neither with checkpoints between nor, for a second time, after a resume."""
+    seen = []
+
+    def batches(start, stop):
+        for step, batch, info in toy_batches(start, stop):
+            seen.append((step, sum("XLA compilation of jit(step)" in record.message for record in caplog.records)))
+            yield step, batch, info
+
+    with jax.log_compiles():
+        config = toy_config(fsdp=fsdp)
+        for stop in (6, 8):
+            seen.clear()
+            run(tmp_path, config, params=toy_params(8192), batches=batches, stop_after=stop)
+            counts = dict(seen)
+            kinds = [counts[step + 1] - counts[step] for step in range(min(counts), stop - 1)]
+            # A program for stills and one for clips, then nothing.
+            assert all(kinds[:2] if stop == 6 else kinds[:1]) and not any(kinds[2:]), seen
+
+
 def test_nothing_is_transferred_unasked(tmp_path):
     with jax.transfer_guard("disallow"):
         run(tmp_path, toy_config(save_every=0), stop_after=4)

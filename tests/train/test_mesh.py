@@ -1,34 +1,25 @@
 from __future__ import annotations
 
-import json
-import os
-import socket
-import subprocess
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import AxisType, PartitionSpec
-from train_toy import toy_batch, toy_batches, toy_config, toy_loss, toy_params
+from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
 from anytouch_jax.config import ConfigError
-from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import (
     batch_sharding,
     enable_compilation_cache,
-    initialize_distributed,
+    gathering,
     make_mesh,
     put_batch,
+    put_state,
     replicated,
     state_sharding,
 )
 from anytouch_jax.train.optim import moments, optimizer
 from anytouch_jax.train.step import init_state, make_step
-
-SRC = Path(__file__).parents[2] / "src"
 
 
 def test_the_mesh_takes_all_devices_and_leaves_placement_to_jit():
@@ -52,6 +43,7 @@ def test_parameters_are_cut_on_their_largest_divisible_axis():
         "odd": (512, 129),
         "prime": (509, 131),
         "small": (4, 4),
+        "packed": (2**18,),
         "scalar": (),
     }
     abstract = {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in shapes.items()}
@@ -61,6 +53,7 @@ def test_parameters_are_cut_on_their_largest_divisible_axis():
         "odd": PartitionSpec("fsdp"),
         "prime": PartitionSpec(),
         "small": PartitionSpec(),
+        "packed": PartitionSpec(),
         "scalar": PartitionSpec(),
     }
     assert {place.spec for place in state_sharding(abstract, make_mesh()).values()} == {PartitionSpec()}
@@ -104,14 +97,36 @@ def test_one_two_and_four_devices_agree():
         assert held.updates == 3 and np.abs(held.mu).max() > 0
 
 
-def test_no_cluster_is_joined_unless_asked():
-    assert initialize_distributed({}) is False
-    with pytest.raises(ConfigError, match="JAX_NUM_PROCESSES must be a number, not ''"):
-        initialize_distributed({"JAX_COORDINATOR_ADDRESS": "localhost:1"})
-    with pytest.raises(ConfigError, match="JAX_PROCESS_ID must be a number, not 'one'"):
-        initialize_distributed(
-            {"JAX_COORDINATOR_ADDRESS": "localhost:1", "JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": "one"}
-        )
+def test_sharded_parameters_are_gathered_once_and_their_gradients_come_back_cut():
+    mesh, shared = make_mesh(fsdp=4), make_mesh()
+    params = {"kernel": jnp.ones((8, 16)), "bias": jnp.ones(16)}
+    places = state_sharding(params, mesh, small=0)
+    assert places["kernel"].spec == PartitionSpec(None, "fsdp") and places["bias"].spec == PartitionSpec()
+
+    def loss(params, x):
+        return jnp.mean(jnp.tanh(x @ params["kernel"] + params["bias"][None])), {}
+
+    assert gathering(loss, shared) is loss  # nothing is added where nothing is cut
+    grads = jax.jit(jax.grad(gathering(loss, mesh), has_aux=True), out_shardings=(places, replicated(mesh)))
+    x = jax.device_put(np.arange(64, dtype=np.float32).reshape(8, 8) / 64, batch_sharding(mesh))
+    compiled = grads.lower(jax.device_put(params, places), x).compile()
+    text = compiled.as_text()
+    assert text.count(" all-gather(") == 1 and " all-to-all(" not in text and " collective-permute(" not in text
+    found, wanted = (
+        compiled(jax.device_put(params, places), x)[0],
+        jax.grad(loss, has_aux=True)(params, np.asarray(x))[0],
+    )
+    assert {shard.data.shape for shard in found["kernel"].addressable_shards} == {(8, 4)}
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), found, wanted)
+
+
+def test_a_hosts_tree_is_copied_to_its_places():
+    mesh = make_mesh(fsdp=2)
+    tree = {"kernel": np.arange(64, dtype=np.float32).reshape(8, 8), "step": np.int32(3)}
+    placed = put_state(tree, state_sharding(tree, mesh, small=0))
+    tree["kernel"][:] = -1
+    assert {shard.data.shape for shard in placed["kernel"].addressable_shards} == {(8, 4)}
+    np.testing.assert_array_equal(placed["kernel"], np.arange(64).reshape(8, 8))
 
 
 def test_the_compilation_cache_has_a_default_place(tmp_path, monkeypatch):
@@ -124,58 +139,3 @@ def test_the_compilation_cache_has_a_default_place(tmp_path, monkeypatch):
         assert enable_compilation_cache(tmp_path / "file" / "below") is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
-
-
-TWO = """
-import sys, json, jax
-sys.path.insert(0, {tests!r})
-jax.config.update("jax_num_cpu_devices", 1)
-from anytouch_jax.train.mesh import initialize_distributed
-assert initialize_distributed()
-import train_toy
-from anytouch_jax.train.loop import fit
-assert jax.process_count() == 2 and jax.device_count() == 2
-rank = jax.process_index()
-def batches(start, stop):
-    for step, batch, info in train_toy.toy_batches(start, stop):
-        half = slice(4 * rank, 4 * rank + 4)
-        yield step, type(batch)(batch.clip[half], batch.sensor[half]), info
-result = fit(train_toy.toy_config(steps=4), params=train_toy.toy_params(), loss_fn=train_toy.toy_loss,
-             batches=batches, run_dir={run!r})
-assert result.step == 4
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_train_as_one(tmp_path):
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    script = TWO.format(tests=str(Path(__file__).parent), run=str(tmp_path / "two"))
-    base = os.environ | {
-        "PYTHONPATH": str(SRC),
-        "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
-        "JAX_NUM_PROCESSES": "2",
-    }
-    children = [
-        subprocess.Popen(
-            [sys.executable, "-c", script], env=base | {"JAX_PROCESS_ID": str(rank)}, stderr=subprocess.PIPE
-        )
-        for rank in range(2)
-    ]
-    outcomes = [child.communicate(timeout=120)[1].decode() for child in children]
-    assert [child.returncode for child in children] == [0, 0], outcomes
-    fit(
-        toy_config(steps=4),
-        params=toy_params(),
-        loss_fn=toy_loss,
-        batches=toy_batches,
-        run_dir=tmp_path / "one",
-        mesh=make_mesh(1),
-        say=lambda sentence: None,
-    )
-    rows = [
-        [json.loads(line)["loss"] for line in (tmp_path / name / "metrics.jsonl").read_text().splitlines()]
-        for name in ("one", "two")
-    ]
-    np.testing.assert_allclose(rows[0], rows[1], rtol=1e-5)

@@ -44,5 +44,10 @@ def test_a_silent_process_shows_no_bar_even_on_a_terminal(monkeypatch):
     assert sys.stderr.getvalue() == ""
 
 
+def test_the_summary_tells_of_waiting_for_data_when_it_is_much():
+    assert summary(row(3, wait_share=0.049)) == summary(row(3)) == "loss 0.5000  30 samples/s"
+    assert summary(row(3, wait_share=0.31)).endswith("  waits for data 31%")
+
+
 def test_the_summary_tells_of_trouble():
     assert summary(row(3, loss=None, skipped_batches=2)) == "loss not finite  30 samples/s  skipped 2"

@@ -143,7 +143,7 @@ def layout_of(work: Workload, devices: int, fsdp: int) -> Layout:
         _placed(make_batch(work), batch_sharding(mesh)),
         _placed(jax.eval_shape(lambda: jax.random.key(0)), replicated(mesh)),
     )
-    step = jax.jit(step_of(work.config), donate_argnums=0, out_shardings=(places, replicated(mesh)))
+    step = jax.jit(step_of(work.config, mesh), donate_argnums=0, out_shardings=(places, replicated(mesh)))
     start = time.perf_counter()
     program = step.lower(*args).compile()
     memory: Any = program.memory_analysis()

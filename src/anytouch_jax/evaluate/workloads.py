@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
@@ -20,6 +21,7 @@ from anytouch_jax.config import Config, Model, preset
 from anytouch_jax.evaluate import flops
 from anytouch_jax.nn.functional import build
 from anytouch_jax.ops import losses
+from anytouch_jax.train.mesh import gathering
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step
 
@@ -157,10 +159,11 @@ def abstract_state(config: Config) -> Tree:
     return jax.eval_shape(partial(init_state, config=config), build(config.model).abstract())
 
 
-def step_of(config: Config) -> Callable[..., Any]:
+def step_of(config: Config, mesh: Mesh | None = None) -> Callable[..., Any]:
     """The training step of a configuration, as `train.loop.fit` builds it: (state, batch, key) -> (state, metrics)."""
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
-    loss_fn = partial(loss, net=build(config.model), config=config)
+    loss_fn: Callable[..., Any] = partial(loss, net=build(config.model), config=config)
+    loss_fn = loss_fn if mesh is None else gathering(loss_fn, mesh)
     return make_step(loss_fn, optimizer(config), total_steps=config.run.steps)
 
 

@@ -16,13 +16,24 @@ from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, UserError, to_json
 from anytouch_jax.io.checkpoint import Checkpoints
-from anytouch_jax.train.mesh import batch_sharding, donated, make_mesh, put_batch, replicated, state_sharding
+from anytouch_jax.train.mesh import (
+    batch_sharding,
+    donated,
+    gathering,
+    make_mesh,
+    put_batch,
+    put_state,
+    replicated,
+    state_sharding,
+)
 from anytouch_jax.train.optim import optimizer
+from anytouch_jax.train.processes import Ballot, check_shared, told_by_first, whole
 from anytouch_jax.train.record import Record, open_run, writing
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
 
 Tree = Any
+_SIGNAL = "signal"  # beside the metrics of a step: what its ballot says
 # batches(start, stop) -> (step, batch, what the loader wants in the log) for each step of the range
 Item = tuple[int, Any, Mapping[str, Any]]
 Batches = Callable[[int, int], Iterator[Item]]
@@ -67,8 +78,9 @@ def fit(
 
     `params` are the first parameters (shapes only matter on resume); `stop_after` ends early, after that many steps in
     all, without changing the schedule. `on_report(step, params, batch)` draws figures; it must not keep the arrays.
-    SIGTERM and Ctrl-C finish the step, save and return. Raises UserError: other settings than the run was started
-    with, too many skipped steps in a row, a full disk, a checkpoint that cannot be read.
+    SIGTERM and Ctrl-C finish the step, save and return; of several processes one may get the signal, and all do so a
+    step later. Raises UserError: other settings than the run was started with, too many skipped steps in a row, a full
+    disk, a checkpoint that cannot be read, a folder that not all processes see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
     say = say or to_stderr
@@ -77,6 +89,7 @@ def fit(
         open_run(run_dir, config)
     else:
         say = silent
+    check_shared(run_dir / "figures")
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
         with writing(run_dir / "checkpoints"):
@@ -86,7 +99,7 @@ def fit(
                 config_json=to_json(config),
                 metadata=dict(metadata or {}),
             )
-        stack.callback(checkpoints.close)
+        stack.push(checkpoints.leave)
         state, start = _first_state(config, params, checkpoints, mesh)
         if start:
             say(f"going on from the checkpoint of step {start}")
@@ -120,7 +133,9 @@ class _Loop:
         self.row: dict[str, Any] = {}
         self.losses: list[float] = []  # since the last checkpoint: its mean decides which one is the best
         self.traces = 0
-        self.clock = time.perf_counter()
+        self.ballot = Ballot(mesh) if jax.process_count() > 1 else None
+        self.told: signal.Signals | None = None  # with several processes: the signal that one of them got
+        self.clock, self.waited = time.perf_counter(), 0.0
 
     def run(
         self,
@@ -138,9 +153,11 @@ class _Loop:
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
         done, saved, reported, placed = start, start, start, None
         with contextlib.closing(_checked(batches, start, stop)) as feed:
-            for step, batch, info in feed:
+            for step, batch, info in self.awaited(feed):
                 placed = put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key)
+                if self.ballot:
+                    metrics = metrics | {_SIGNAL: self.ballot.cast(int(interrupt[0]) if interrupt else 0)}
                 self.log()  # of the step before, while this one runs
                 self.pending = (step, metrics, {"samples": _rows(batch)} | dict(info))
                 done = step + 1
@@ -148,22 +165,36 @@ class _Loop:
                     saved = self.save(done, state)
                 if figures > 0 and done % figures == 0:
                     reported = self.report(done, state, placed)
-                if interrupt:
+                if self.signalled(interrupt):
                     break
         if saved < done:
             self.save(done, state)
         with writing(self.record.path.parent / "checkpoints"):
             self.checkpoints.wait()
-        if figures > 0 and reported < done and not interrupt:
+        signalled = self.signalled(interrupt)
+        if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
-        if interrupt:
-            self.bar.say(f"stopped by {interrupt[0].name} after step {done}; saved, the same command goes on from here")
-        signalled = interrupt[0] if interrupt else None
+        if signalled:
+            self.bar.say(f"stopped by {signalled.name} after step {done}; saved, the same command goes on from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
+
+    def awaited(self, feed: Iterator[Item]) -> Iterator[Item]:
+        """The feed, with its waiting counted: the time until a batch came, where the step before had ended by then."""
+        asked = time.perf_counter()
+        for item in feed:
+            if self.pending is None or _ended(self.pending[1]):
+                self.waited += time.perf_counter() - asked
+            yield item
+            asked = time.perf_counter()
+
+    def signalled(self, interrupt: list[signal.Signals]) -> signal.Signals | None:
+        """The signal that ends the run: our own, or with several processes the one that all of them know of."""
+        return self.told if self.ballot else next(iter(interrupt), None)
 
     def compile(self, state: TrainState, loss_fn: LossFn) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
         """The step under jit: the state keeps its place; each structure of a batch is traced once."""
         config = self.config
+        loss_fn = gathering(loss_fn, self.mesh)
         step = make_step(loss_fn, optimizer(config), total_steps=config.run.steps, accumulate=config.optim.accumulate)
 
         @functools.wraps(step)
@@ -180,9 +211,16 @@ class _Loop:
             return
         (step, metrics, info), self.pending = self.pending, None
         numbers = jax.device_get(metrics)
+        if number := int(numbers.pop(_SIGNAL, 0)):
+            self.told = signal.Signals(number)
         now = time.perf_counter()
-        rate = {"samples_per_second": info["samples"] / max(now - self.clock, 1e-9)}
-        self.clock = now
+        elapsed = max(now - self.clock, 1e-9)
+        rate = {
+            "samples_per_second": info["samples"] / elapsed,
+            "wait": self.waited,
+            "wait_share": self.waited / elapsed,
+        }
+        self.clock, self.waited = now, 0.0
         front = {"loss": numbers["loss"]}
         self.row = self.record.write(step, front | numbers | info | rate)
         if self.row["loss"] is not None:
@@ -212,7 +250,7 @@ class _Loop:
         if self.on_report is not None:
             self.log()
             try:
-                self.on_report(done, merge(state.trainable, state.frozen), batch)
+                self.on_report(done, whole(merge(state.trainable, state.frozen)), whole(batch))
             except Exception as error:
                 self.bar.say(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
@@ -223,16 +261,14 @@ def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: M
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
     places = state_sharding(shapes, mesh)
-    latest = checkpoints.latest()
-    if latest is not None:
+    latest = told_by_first(checkpoints.latest() or 0)
+    if latest:
         shaped = [
             jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)
             for x, place in zip(jax.tree.leaves(shapes), jax.tree.leaves(places), strict=True)
         ]
         return checkpoints.restore(jax.tree.unflatten(jax.tree.structure(shapes), shaped), latest), latest
-    # A copy: the step donates its state, and must not delete the caller's own parameters.
-    held = jax.device_put(params, state_sharding(params, mesh), may_alias=False)
-    return jax.jit(init, out_shardings=places)(held), 0
+    return jax.jit(init, out_shardings=places)(put_state(params, state_sharding(params, mesh))), 0
 
 
 def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
@@ -251,6 +287,11 @@ def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, N
         close = getattr(source, "close", None)
         if close is not None:
             close()
+
+
+def _ended(metrics: Mapping[str, Any]) -> bool:
+    """Whether the step that gives these metrics is done; asks without waiting."""
+    return all(value.is_ready() for value in metrics.values())
 
 
 def _rows(batch: Any) -> int:

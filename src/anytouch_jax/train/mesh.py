@@ -1,9 +1,9 @@
-"""Devices: the mesh, how batches and parameters are laid out on it, and runs of several processes."""
+"""Devices: the mesh, and how batches and parameters are laid out on it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +48,45 @@ def replicated(mesh: Mesh) -> NamedSharding:
 def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> Tree:
     """A sharding for each array of a state: over "fsdp" on its largest divisible axis; copies where that axis is 1.
 
-    Arrays of fewer than `small` elements, or without a divisible axis, are copied to each device.
+    Arrays of fewer than `small` elements, or without a divisible axis, are copied to each device. So are vectors:
+    a long one is the optimiser's, packed from many small arrays (`pack`), and to cut it would send each of them about.
     """
     parts = mesh.shape["fsdp"]
 
     def place(leaf: Any) -> NamedSharding:
         divisible = [(size, axis) for axis, size in enumerate(leaf.shape) if size % parts == 0]
-        if parts == 1 or not divisible or np.prod(leaf.shape) < small:
+        if parts == 1 or not divisible or len(leaf.shape) < 2 or np.prod(leaf.shape) < small:
             return replicated(mesh)
         _, axis = max(divisible)
         return NamedSharding(mesh, PartitionSpec(*[None] * axis, "fsdp"))
 
     return jax.tree.map(place, abstract_state)
+
+
+def put_state(tree: Tree, places: Tree) -> Tree:
+    """Copy a host's tree to the devices, each array to its place; every process has the same tree and gives its part.
+
+    A copy also where it could be shared: the step donates its state, and must not delete the caller's own arrays.
+    """
+    if jax.process_count() == 1:
+        return jax.device_put(tree, places, may_alias=False)
+    host = jax.tree.map(np.asarray, tree)  # not device_put: it would compare every array among all processes
+    return jax.tree.map(lambda x, place: jax.make_array_from_callback(x.shape, place, x.__getitem__), host, places)
+
+
+def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+    """`loss_fn(params, ...)` with sharded parameters made whole just before their use; as it is without "fsdp".
+
+    Else XLA's partitioner cuts activations along the axis of a parameter, and exchanges those: twice the bytes. State
+    and optimiser stay cut (ZeRO, Rajbhandari et al., 2020); whole parameters and gradients are there during a step.
+    """
+    if mesh.shape["fsdp"] == 1:
+        return loss_fn
+
+    def gathered(params: Tree, *rest: Any) -> Any:
+        return loss_fn(jax.lax.with_sharding_constraint(params, replicated(mesh)), *rest)
+
+    return gathered
 
 
 def donated() -> tuple[int, ...]:
@@ -84,25 +111,6 @@ def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
     if processes == 1:
         return jax.device_put(batch, sharding)
     return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch)
-
-
-def initialize_distributed(environ: Mapping[str, str] = os.environ) -> bool:
-    """Join the processes of a run when JAX_COORDINATOR_ADDRESS (host:port) is set, and tell whether it was.
-
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID go with it. Raises ConfigError when one lacks or is not a number. Must run
-    before anything asks for a device.
-    """
-    address = environ.get("JAX_COORDINATOR_ADDRESS")
-    if not address:
-        return False
-    numbers = {}
-    for name in ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID"):
-        value = environ.get(name, "")
-        if not value.isdigit():
-            raise ConfigError(f"JAX_COORDINATOR_ADDRESS is set, so {name} must be a number, not {value!r}")
-        numbers[name] = int(value)
-    jax.distributed.initialize(address, numbers["JAX_NUM_PROCESSES"], numbers["JAX_PROCESS_ID"])
-    return True
 
 
 def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 Say = Callable[[str], None]
+_WORTH_TELLING = 0.05  # share of its time that a run may wait for data before the user hears of it
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ def summary(row: Mapping[str, Any]) -> str:
     """The few numbers of a line of metrics that a user watches."""
     loss = "not finite" if row["loss"] is None else f"{row['loss']:.4f}"
     skipped = f"  skipped {row['skipped_batches']}" if row["skipped_batches"] else ""
-    return f"loss {loss}  {row['samples_per_second']:.0f} samples/s{skipped}"
+    waits = f"  waits for data {row['wait_share']:.0%}" if row.get("wait_share", 0) >= _WORTH_TELLING else ""
+    return f"loss {loss}  {row['samples_per_second']:.0f} samples/s{skipped}{waits}"
 
 
 @contextlib.contextmanager

@@ -1,0 +1,20 @@
+#!/bin/bash
+# On every machine, with its own number; the first is number 0, and its address is reachable from all:
+#   COORDINATOR=node1:29400 PROCESSES=2 PROCESS=0 experiments/launch/by_hand.sh --stage 1 --data data.parquet --run /shared/run
+# Without PROCESS all of them run here, one CPU device each: to try a run of several processes on one machine.
+set -eu
+export JAX_COORDINATOR_ADDRESS="${COORDINATOR:-localhost:29400}" JAX_NUM_PROCESSES="${PROCESSES:-2}"
+anytouch="${ANYTOUCH:-.venv/bin/anytouch}"
+if [ -n "${PROCESS:-}" ]; then
+    JAX_PROCESS_ID="$PROCESS" exec "$anytouch" train "$@"
+fi
+export JAX_PLATFORMS=cpu
+for ((process = 1; process < JAX_NUM_PROCESSES; process++)); do
+    JAX_PROCESS_ID="$process" "$anytouch" train "$@" &
+done
+status=0
+JAX_PROCESS_ID=0 "$anytouch" train "$@" || status=$?
+while [ -n "$(jobs -pr)" ]; do
+    wait -n || status=$?
+done
+exit "$status"

@@ -1,0 +1,10 @@
+#!/bin/bash
+# HOSTS=node1:8,node2:8 PROCESSES=16 experiments/launch/openmpi.sh --stage 1 --data data.parquet --run runs/stage1
+# Start it on the first of HOSTS: process 0 runs there. Open MPI 4 and 5; without HOSTS all processes run here.
+set -eu
+processes="${PROCESSES:-2}" port="${PORT:-29400}"
+address="$(hostname):$port"
+[ -n "${HOSTS:-}" ] || address="localhost:$port"
+# MPI only starts the processes. What they say to each other goes by NCCL, or by gloo on CPUs.
+exec mpirun -np "$processes" ${HOSTS:+--host "$HOSTS"} --bind-to none \
+    -x JAX_COORDINATOR_ADDRESS="$address" -x PATH "${ANYTOUCH:-.venv/bin/anytouch}" train "$@"

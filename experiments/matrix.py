@@ -1,0 +1,114 @@
+"""The matrix of experiments: `make experiments [QUICK=1] [MINUTES=75]`, or `.venv/bin/python experiments/matrix.py`.
+
+Runs what is not done yet, one JSON file a run, and renders `experiments/results/README.md` from all of them. What is
+run stands in `study/plan.py`, what it costs in `study/budget.py`; `--plan` prints both. The same command again goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from study import budget, plan
+
+from anytouch_jax.config import UserError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def options(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plan", action="store_true", help="print every run with its minutes and stop")
+    parser.add_argument("--render", action="store_true", help="only render the tables from the JSON files")
+    parser.add_argument("--quick", action="store_true", help="toy sizes: does it work? results go beside the data")
+    parser.add_argument("--minutes", type=float, help="stop before a run that would not fit")
+    parser.add_argument("--chunk", help="i/n: only part i of n, of about equal cost")
+    parser.add_argument("--only", nargs="+", help="only these questions")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=0,1")
+    parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
+    parser.add_argument("--out", type=Path, help="folder of README.md and matrix/ (default: experiments/results)")
+    parser.add_argument("--real", type=Path, help="manifest of real touch (default: ../shared/real_touch/manifest.csv)")
+    return parser.parse_args(argv)
+
+
+def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
+    """The sizes asked for. Raises UserError for a name or a number that is none."""
+    size: Any = plan.QUICK if quick else plan.FULL
+    fields = {field.name: getattr(size, field.name) for field in dataclasses.fields(size)}
+    for change in changes:
+        name, _, text = change.partition("=")
+        if name not in fields or name in ("name", "toy"):
+            raise UserError(f"--set {change}: choose among {', '.join(n for n in fields if n not in ('name', 'toy'))}")
+        try:
+            value = tuple(map(int, text.split(","))) if name == "seeds" else type(fields[name])(text)
+        except ValueError:
+            raise UserError(f"--set {change}: {text!r} is no number") from None
+        size = dataclasses.replace(size, **{name: value})
+    return size if not changes or quick else dataclasses.replace(size, name="changed")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    asked = options(argv)
+    try:
+        return run(asked)
+    except UserError as error:
+        print(f"matrix: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on", file=sys.stderr)
+        return 130
+
+
+def run(asked: argparse.Namespace) -> int:
+    size = size_of(asked.quick, asked.set)
+    folder = asked.work or ROOT / "runs" / ("matrix-quick" if asked.quick else "matrix")
+    out = asked.out or (folder / "results" if asked.quick else ROOT / "experiments" / "results")
+    real = (asked.real or ROOT.parent / "shared" / "real_touch" / "manifest.csv").resolve()
+    leaves = plan.leaves(size, real=real.exists())
+    if asked.only:
+        wrong = sorted(set(asked.only) - {leaf.question for leaf in leaves})
+        if wrong:
+            raise UserError(f"there is no question {wrong[0]!r}; choose among {', '.join(budget.SCORES)}")
+        leaves = [leaf for leaf in leaves if leaf.question in asked.only]
+    if asked.chunk:
+        number, _, of = asked.chunk.partition("/")
+        if not (number.isdigit() and of.isdigit() and 1 <= int(number) <= int(of)):
+            raise UserError(f"--chunk {asked.chunk}: write it as 2/4")
+        leaves = budget.chunk(leaves, int(number), int(of))
+    if asked.plan:
+        from study.execute import is_done
+
+        print("\n".join(budget.lines(leaves, {one.file for one in leaves if is_done(one, out / "matrix")})))
+        return 0
+    return _execute(asked, leaves, folder, out, real)
+
+
+def _execute(asked: argparse.Namespace, leaves: Sequence[plan.Leaf], folder: Path, out: Path, real: Path) -> int:
+    from study import report
+    from study.execute import execute
+    from study.work import Work
+
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    failed: dict[str, str] = {}
+    if not asked.render:
+        enable_compilation_cache()
+        if not real.exists():
+            print(f"there is no {real}: the question `real` is not run")
+        work = Work(folder, real=real if real.exists() else None)
+        result = execute(leaves, work, out / "matrix", minutes=asked.minutes)
+        failed = result.failed
+        made, found, left = (len(part) for part in result[:3])
+        print(f"{made} runs made, {found} were there, {left} left, {len(failed)} failed")
+    print(report.write(out / "matrix", out))
+    for name, error in failed.items():
+        print(f"failed: {name}: {error}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,197 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Pouring by touch alone
+#
+# A cylinder with 100 g of beads is held by two fingers, one of them a GelSight Mini. Three actions (pour, wait,
+# retract) tilt it by 0.25 degrees five times a second. Pour out 60 g, then retract, with nothing but tactile frames.
+# The paper did it with a robot; here cylinder, beads, gel and camera are simulated, and bead size, friction, grip,
+# stiffness, first pose and sensor differ from run to run. A run begins with the grip on the standing cylinder: nothing
+# else tells how soft the gel and how firm the grip is. Then it is lifted, and the actions begin. An expert that sees
+# the scales demonstrates; a small MLP over features of four segments (the last two, the first of the lifted cylinder
+# and that of the standing one) imitates it, the encoder frozen or fine-tuned.
+#
+# `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3" .venv/bin/python experiments/pouring.py`, or
+# `make pouring RUNS=...`. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without
+# a path an untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only),
+# `anytouch`. A row without a run is left out, aloud. What is finished is not done again. QUICK=1 is a trial of minutes;
+# TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS, TUNE (steps of fine-tuning), MODES and OUT in the environment
+# change the size and the place.
+
+# %%
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.config import UserError, preset
+from anytouch_jax.evaluate import plots, pouring, pouring_policy, pouring_table
+from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
+from anytouch_jax.evaluate.image_tower import image_tower_encoder
+from anytouch_jax.sim.pouring import Task
+from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.record import write_atomic
+
+enable_compilation_cache()
+
+QUICK = os.environ.get("QUICK", "") not in ("", "0")
+
+
+def setting(name: str, full: int, quick: int) -> int:
+    return int(os.environ.get(name) or (quick if QUICK else full))
+
+
+RUNS = dict(word.split("=", 1) for word in os.environ.get("RUNS", "").split())
+SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
+MODES = (os.environ.get("MODES") or ("frozen" if QUICK else "frozen,fine-tuned")).split(",")
+TRIALS, DEMOS, TUNE = setting("TRIALS", 10, 10), setting("DEMOS", 40, 12), setting("TUNE", 150, 20)
+OUT = Path(os.environ.get("OUT") or "experiments/results")
+FOLDER, PAGE = OUT / ("pouring-quick" if QUICK else "pouring"), OUT / ("pouring-quick.md" if QUICK else "pouring.md")
+TASK = Task()
+
+unknown = set(RUNS) - set(pouring_table.PAPER) | set(MODES) - set(pouring_table.MODES)
+if unknown:
+    raise UserError(f"RUNS names {', '.join(pouring_table.PAPER)} and MODES frozen, fine-tuned; not {unknown}")
+
+# %% [markdown]
+# ## The rows
+#
+# Every row of a seed learns from the same demonstrations and is tried on the same runs, so that rows can be compared
+# run by run.
+
+
+# %%
+def encoder_of(name: str, seed: int) -> Encoder | None:
+    if name in RUNS:
+        return image_tower_encoder(RUNS[name]) if name == "none" else load_encoder(RUNS[name])
+    if name == "static" and "anytouch" in RUNS:
+        return load_encoder(RUNS["anytouch"])
+    if name == "none":
+        known = next((load_encoder(path).config for path in RUNS.values()), preset("tiny"))
+        return random_encoder(known, seed)
+    return None
+
+
+SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS}
+
+
+def settings_of(mode: str) -> dict[str, Any]:
+    return SETTINGS | ({"tune_steps": TUNE} if mode == "fine-tuned" else {})
+
+
+def finished(path: Path, settings: dict[str, Any], source: str) -> bool:
+    """Whether a row is there with these settings; one of another encoder or size is done again."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return False
+    return bool(found.get("settings") == settings and found.get("source") == source)
+
+
+FOLDER.mkdir(parents=True, exist_ok=True)
+
+
+def do_seed(seed: int) -> None:
+    learning = pouring_policy.Learning(seed=seed, tune_steps=TUNE)
+    setups, keys = pouring.draw_runs(TASK, seed + pouring_policy.UNSEEN, TRIALS)
+    shown: dict[int, pouring.Trials] = {}
+
+    def demonstrations(side: int) -> pouring.Trials:
+        if side not in shown:
+            shown.clear()
+            shown[side] = pouring_policy.demonstrate(TASK, seed, DEMOS, side=side)
+        return shown[side]
+
+    def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float) -> None:
+        path = FOLDER / f"{name}-{mode}-{seed}.json"
+        write_atomic(path, pouring_table.record(name, mode, seed, trials, TASK, source, settings_of(mode)))
+        mean = pouring.error(trials.poured, TASK.target).mean
+        print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {time.time() - since:.0f} s", flush=True)
+
+    bounds = {
+        "blind": lambda: pouring_policy.learn_blind(TASK, seed, DEMOS, learning),
+        "count": lambda: pouring.best_counter(TASK, *pouring.draw_runs(TASK, seed, DEMOS)),
+        "expert": lambda: pouring.Expert(TASK),
+    }
+    for name, make in bounds.items():
+        if not finished(FOLDER / f"{name}-bound-{seed}.json", SETTINGS, name):
+            since = time.time()
+            write(name, "bound", pouring.run(TASK, setups, keys, make()), name, since)
+    for name in pouring_table.PAPER:
+        encoder, stills = encoder_of(name, seed), name not in pouring_table.DYNAMIC
+        if encoder is None:
+            if seed == SEEDS[0]:
+                print(f"no run is given for row {name}: it is left out")
+            continue
+        source = RUNS.get(name) or RUNS["anytouch"] if name != "none" or name in RUNS else "untrained"
+        todo = [m for m in MODES if not finished(FOLDER / f"{name}-{m}-{seed}.json", settings_of(m), source)]
+        if not todo:
+            continue
+        since, side = time.time(), encoder.config.model.image_size
+        policy = pouring_policy.learn_frozen(encoder, demonstrations(side), learning, stills=stills)
+        if "frozen" in todo:
+            write(name, "frozen", pouring.run(TASK, setups, keys, policy, side=side), source, since)
+        if "fine-tuned" in todo:
+            since = time.time()
+            tuned = pouring_policy.fine_tune(policy, demonstrations(side), learning)
+            write(name, "fine-tuned", pouring.run(TASK, setups, keys, tuned, side=side), source, since)
+
+
+if not os.environ.get("TABLE"):
+    for seed in SEEDS:
+        do_seed(seed)
+
+# %% [markdown]
+# ## One demonstration, seen
+#
+# Frames of the gel while the cylinder empties, and their change from the standing cylinder: the lifted weight draws the
+# markers along, and they come back as it leaves.
+
+# %%
+figures = OUT / "figures"
+one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
+last = int(one.steps[0]) - 1
+moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
+assert one.frames is not None
+change = [one.frames[m, 0].astype(np.float32) - one.frames[2, 0].astype(np.float32) for m in moments]
+standing = ["standing", *(f"{one.mass[m, 0]:.0f} g left, {one.tilt[m, 0]:.0f} deg" for m in moments[1:])]
+plots.sample_grid(
+    figures / "pouring_frames.png",
+    [[one.frames[m, 0] for m in moments], [np.clip(128 + 2 * c, 0, 255).astype(np.uint8) for c in change]],
+    ["frame", "change x 2"],
+    standing,
+)
+pouring.write_film(figures / "pouring.gif", one, TASK)
+
+# %% [markdown]
+# ## The table
+
+# %%
+rows = pouring_table.read_rows(FOLDER)
+pouring_table.draw(figures / "pouring.png", rows)
+text = f"""# Pouring by touch alone (simulated)
+
+{len(rows[0].runs)} runs a row ({len(SEEDS)} seeds of learning, {len(rows[0].runs) // len(SEEDS)} trials each); mean
+|poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
+compared. Differences are paired, run by run.
+
+{pouring_table.table(rows)}
+![errors](figures/pouring.png)
+![frames](figures/pouring_frames.png)
+![film](figures/pouring.gif)
+
+Made by `make pouring`, from the JSON in `{FOLDER.name}/`.
+"""
+write_atomic(PAGE, text)
+print(text)

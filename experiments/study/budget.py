@@ -1,0 +1,114 @@
+"""What the matrix costs, and how it is cut.
+
+Rates of two slow CPU cores at preset tiny: stage 1 0.65 s a step of 64; stage 2 2.4 s a step of 32, of which the touch
+to align 0.6 s, photographs 0.35 s, text 0.15 s and the three touches of a match 1.3 s; 100 simulated frames a second
+and 20 s to compile a sensor; about 25 s to start and end a training; a run's scores 15 to 120 s. At full size, for a
+seed of the questions that claim a sign: 9 stages 1 of 150 steps of 48 (98 s each, 15 min), 8 stages 2 of 85 steps of
+24 with matching (174 s, 23 min) and 7 without (94 s, 11 min), 29 runs to score (16 min): 65 min. Three seeds, 33 min
+for what is run with the first alone, and 11 min for the data come to just under four hours; five chunks, each of which
+makes its data again, stay below 75 minutes. `matrix.py --plan` prints the sum for any size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from . import plan
+from .plan import Leaf, Scenes, Size, Training
+
+START = 25.0  # s to compile, read and save
+FRAMES = 100.0  # simulated a second
+SENSOR = 20.0  # s to compile a sensor
+SCORES: Mapping[str, float] = {
+    "q1": 20, "q2": 15, "q3": 45, "ablations": 20, "dynamics": 75, "grasp": 20, "restricted": 15, "new_sensor": 120,
+    "real": 150,
+}  # fmt: skip
+_TOY = 0.12  # a toy's share of these
+
+
+def of_training(one: Training) -> float:
+    """Seconds of one stage."""
+    config = one.config
+    batch, steps = config.data.batch_size, config.run.steps
+    if config.stage == 1:
+        step = 0.65 * batch / 64
+    else:
+        parts = (0.6, 0.35 * bool(config.model.image), 0.15 * bool(config.model.text), 1.3 * matches(one))
+        step = sum(parts) * batch / 32
+    toy = config.model.image_size < 100
+    return (START + steps * step) * (_TOY if toy else 1.0)
+
+
+def matches(one: Training) -> bool:
+    """Whether its data have touches felt twice, and it has a head for them."""
+    return one.config.model.match_head != "none" and bool({"aligned", plan.REAL} & set(one.config.data.manifests))
+
+
+def of_scenes(one: Scenes, size: Size) -> float:
+    """Seconds of one data set."""
+    return len(one.sensors) * (SENSOR + one.touches * size.frames / FRAMES)
+
+
+def of_scores(leaf: Leaf) -> float:
+    """Seconds of the scores of a run whose model is there."""
+    return SCORES[leaf.question] * (_TOY * 2 if leaf.size.toy else 1.0)
+
+
+def missing(leaf: Leaf, ready: Iterable[str]) -> tuple[list[Scenes], list[Training]]:
+    """The data sets and trainings that a run needs and whose names or keys are not `ready`, in order."""
+    have = set(ready)
+    return (
+        [one for one in plan.scenes(leaf.size) if one.name not in have],
+        [one for one in leaf.trainings if one.key not in have],
+    )
+
+
+def cost(leaf: Leaf, ready: Iterable[str]) -> float:
+    """Seconds that a run takes with what is `ready`."""
+    sets, trainings = missing(leaf, ready)
+    return sum(of_scenes(one, leaf.size) for one in sets) + sum(map(of_training, trainings)) + of_scores(leaf)
+
+
+def costs(leaves: Sequence[Leaf]) -> list[float]:
+    """Seconds of each run where those before it are done."""
+    ready: set[str] = set()
+    found = []
+    for leaf in leaves:
+        found.append(cost(leaf, ready))
+        ready |= {one.name for one in plan.scenes(leaf.size)} | {one.key for one in leaf.trainings}
+    return found
+
+
+def chunk(leaves: Sequence[Leaf], number: int, of: int) -> list[Leaf]:
+    """Part `number` (from 1) of `of` parts, in order, of about the same cost each; together they are all runs.
+
+    A part that is made elsewhere makes again what it shares with the parts before it.
+    """
+    if not 1 <= number <= of:
+        raise ValueError(f"chunk {number} of {of}: count from 1")
+    seconds = costs(leaves)
+    total, done, part = sum(seconds), 0.0, []
+    for leaf, one in zip(leaves, seconds, strict=True):
+        middle = done + one / 2
+        if min(of, int(of * middle / total) + 1) == number:
+            part.append(leaf)
+        done += one
+    return part
+
+
+def lines(leaves: Sequence[Leaf], done: Iterable[str] = ()) -> list[str]:
+    """The plan for people: each run with its minutes, what it shares, and the sum. `done`: files that are there."""
+    there, seen = set(done), set[str]()
+    found, seconds = [], costs(leaves)
+    for leaf, one in zip(leaves, seconds, strict=True):
+        keys = [training.key for training in leaf.trainings]
+        shared = sum(key in seen for key in keys)
+        seen |= set(keys)
+        share = f"{len(keys) - shared} to train, {shared} shared" if keys else "nothing to train"
+        mark = "done" if leaf.file in there else f"{one / 60:5.1f} min"
+        found.append(f"{leaf.question:11} {leaf.name:32} seed {leaf.seed}  {mark:>9}  {share}")
+    left = sum(one for leaf, one in zip(leaves, seconds, strict=True) if leaf.file not in there)
+    found.append(
+        f"{len(leaves)} runs, {len(seen)} trainings, {sum(seconds) / 60:.0f} min; {left / 60:.0f} min are left"
+    )
+    return found

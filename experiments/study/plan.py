@@ -1,0 +1,232 @@
+"""What is run: for each question of the paper its runs, as a graph of data -> stage 1 -> stage 2 -> scores.
+
+A `Training` is its configuration, its data and the training that it starts from; two that are equal are one, so what
+can be shared is shared without being said. Nothing here computes.
+
+Data, after the paper's: `own` is the data set of each sensor by itself (touches nobody else felt), `aligned` its
+coarse TacQuad (by hand, four sensors at one place), `other` a data set never trained on, of other objects. Objects
+held out are held out in both `own` and `aligned`. `own` also has DuraGel, which only the runs `seen` train on: it is
+the unseen sensor, as Taxim and TACTO are in the paper.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+from anytouch_jax import baselines
+from anytouch_jax.config import UNIVERSAL, Config, Stack, preset
+
+SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in which Table 1 adds them
+UNSEEN = "duragel"
+RESTRICTED = ("gelsight", "digit")  # of the control of Table 2
+REAL = "real"
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large everything is. Touches of each data set, objects, frames a touch, pixels; steps and batches.
+
+    `toy` shrinks the network too. `seeds` are those of questions whose sign is claimed; the others take the first.
+    """
+
+    name: str = "full"
+    own: int = 500
+    aligned: int = 240
+    other: int = 400
+    objects: int = 250
+    frames: int = 10
+    pixels: int = 128
+    steps1: int = 150
+    batch1: int = 48
+    steps2: int = 85
+    batch2: int = 24
+    rate1: float = 1e-3
+    rate2: float = 5e-4
+    seeds: tuple[int, ...] = (0, 1, 2)
+    refits: int = 5
+    max_rows: int = 1500
+    toy: bool = False
+
+
+FULL = Size()
+QUICK = Size(
+    "quick", own=60, aligned=24, other=48, objects=24, pixels=64, steps1=6, batch1=16, steps2=4, batch2=8, seeds=(0,),
+    refits=2, max_rows=300, toy=True,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """One simulated data set: a folder of that name."""
+
+    name: str
+    sensors: tuple[str, ...]
+    touches: int
+    grade: Literal["fine", "coarse"]
+    seed: int
+    held_out: float
+
+
+@dataclass(frozen=True)
+class Training:
+    """One stage of one model. `config.data.manifests` are names (see `work.Places`), not files."""
+
+    config: Config
+    init: Training | None = None
+
+    @cached_property
+    def key(self) -> str:
+        """The name of its run folder: equal trainings have equal keys, and others never."""
+        text = repr(chosen(self.config)) + (self.init.key if self.init else "")
+        return f"stage{self.config.stage}-seed{self.config.run.seed}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+
+    @property
+    def chain(self) -> tuple[Training, ...]:
+        """What it starts from, and itself."""
+        return (*(self.init.chain if self.init else ()), self)
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One run of a question: the model `name` with a seed, scored. What is scored hangs on the question alone.
+
+    `model` None: nothing is trained. `tower`: the image tower of `model` serves as touch encoder.
+    """
+
+    question: str
+    name: str
+    seed: int
+    model: Training | None
+    size: Size
+    tower: bool = False
+
+    @property
+    def file(self) -> str:
+        """The name of its JSON file."""
+        return f"{self.question}-{self.name}-{self.seed}.json"
+
+    @property
+    def trainings(self) -> tuple[Training, ...]:
+        """In the order in which they must be done."""
+        return self.model.chain if self.model else ()
+
+    @cached_property
+    def identity(self) -> str:
+        """What its result hangs on; a JSON with another identity is not this run's."""
+        about = (self.question, self.name, self.seed, self.tower, dataclasses.astuple(self.size))
+        parts = [repr(about), *(one.key for one in self.trainings)]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def chosen(config: Any) -> Any:
+    """The settings of a configuration that are not the default: a later version's new default is no other training."""
+    if not dataclasses.is_dataclass(config):
+        return config
+    fields = {field.name: (getattr(config, field.name), field) for field in dataclasses.fields(config)}
+    return {name: chosen(value) for name, (value, field) in fields.items() if value != field.default}
+
+
+def scenes(size: Size) -> tuple[Scenes, ...]:
+    """The simulated data sets. `own` and `aligned` share their objects and which of them are held out."""
+    return (
+        Scenes("own", (*SENSORS, UNSEEN), size.own, "fine", 0, 0.25),
+        Scenes("aligned", SENSORS, size.aligned, "coarse", 0, 0.25),
+        Scenes("other", (SENSORS[0], UNSEEN), size.other, "fine", 1, 0.5),
+    )
+
+
+def training(
+    size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True,
+    extra: Sequence[str] = (), data: dict[str, Any] | None = None,
+) -> Training:  # fmt: skip
+    """The last stage of a recipe (see `anytouch_jax.baselines`) on the data of `sensors`, and of `aligned`.
+
+    `extra` more manifests by name; `data` more settings of the data, for both stages.
+    """
+    manifests = (*(f"own/{name}" for name in sensors), *(("aligned",) if aligned else ()), *extra)
+    last: Training | None = None
+    for stage in baselines.find(recipe).stages:
+        config = _config(size, stage, seed, sensors, manifests)
+        config = replace(config, data=replace(config.data, **(data or {})))
+        last = Training(baselines.apply(recipe, config), last)
+    if last is None:
+        raise ValueError(f"{recipe} is not trained")
+    return last
+
+
+def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests: tuple[str, ...]) -> Config:
+    config = preset("tiny", stage=stage)
+    steps, batch, rate = (
+        (size.steps1, size.batch1, size.rate1) if stage == 1 else (size.steps2, size.batch2, size.rate2)
+    )
+    model = replace(config.model, sensors=(*sensors, UNIVERSAL))
+    if size.toy:
+        small = Stack(32, 2, 2, 64)
+        text = model.text and replace(model.text, stack=small)
+        image = model.image and small
+        model = replace(
+            model, image_size=56, embed=32, touch=small, decoder=Stack(16, 1, 2, 32), text=text, image=image
+        )
+    return replace(
+        config,
+        model=model,
+        data=replace(config.data, manifests=manifests, batch_size=batch),
+        optim=replace(config.optim, learning_rate=rate),
+        run=replace(config.run, seed=seed, steps=steps, save_every=100, keep=1, figure_every=0),
+    )
+
+
+def leaves(size: Size, *, real: bool = True) -> list[Leaf]:
+    """Every run of the matrix, in order: all questions with one seed, then with the next; `real` with real data."""
+    found: list[Leaf] = []
+    for number, seed in enumerate(size.seeds):
+        for question, name, model, tower in _of_seed(size, seed, first=number == 0, real=real):
+            found.append(Leaf(question, name, seed, model, size, tower))
+    return found
+
+
+def _of_seed(size: Size, seed: int, *, first: bool, real: bool) -> Iterator[tuple[str, str, Training | None, bool]]:
+    """(question, name, model, tower) of one seed; what makes no claim is run with the first seed alone."""
+
+    def own(recipe: str, **settings: Any) -> Training:
+        return training(size, recipe, seed, **settings)
+
+    whole = own("anytouch")
+    for name, recipe in (("masked", "no_stage2"), ("aligned", "no_matching"), ("matched", "anytouch")):
+        yield "q2", name, own(recipe), False
+    for name in ("unitouch", "tlv_link", "t3", "static_only", "anytouch"):
+        yield "q3", name, own(name), False
+    yield "q3", "no_pretraining", whole, True
+    for question in ("q2", "q3"):
+        yield question, "untrained", None, False
+        if first:
+            yield question, "pixels", None, False  # no seed of theirs
+    for name in ("anytouch", *ABLATIONS):
+        yield "ablations", name, own(name), False
+    yield "q1", "no_pretraining", whole, True
+    for count in range(1, len(SENSORS) + 1):
+        name = "+".join(SENSORS[:count])
+        yield "q1", name, own("no_matching", sensors=SENSORS[:count], aligned=False), False
+    for name in ("static_only", "anytouch"):
+        yield "dynamics", name, own(name), False
+    yield "grasp", "anytouch", whole, False
+    if first:
+        yield "new_sensor", "left_out", whole, False
+        yield "new_sensor", "seen", own("anytouch", sensors=(*SENSORS, UNSEEN)), False
+        for name in ("unitouch", "no_matching"):
+            yield "restricted", name, own(name, sensors=RESTRICTED, aligned=False), False
+        yield "dynamics", "no_flips", own("anytouch", data={"flip": 0.0}), False
+        for name in ("frame_differences", "force_heads"):
+            yield "dynamics", name, own(name), False
+    if real:
+        yield "real", "anytouch", own("anytouch", extra=(REAL,)), False
+
+
+ABLATIONS = (
+    "no_text", "no_vision", "no_text_aligned", "no_stage1", "no_stage2", "no_matching", "no_dynamic", "no_universal",
+)  # fmt: skip

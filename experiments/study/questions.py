@@ -1,0 +1,210 @@
+"""The questions, one by one: which columns their tables have, and which signs of the paper they test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from anytouch_jax.evaluate.sections import markdown
+
+from . import adaptation, paper, plan
+from .results import Column, Run, spread
+from .tables import Pair, Statement, Table, against, block, judge, sentence, title
+
+FOUR = (
+    Column("seen", "seen", "material"),
+    Column("seen sensor, other data", "seen, other data", "material"),
+    Column("unseen sensor", "unseen", "material"),
+    Column("unseen sensor, other data", "unseen, other data", "material"),
+)
+FOUR_PAPER = ("TAG", "Feel", "OF 1.0", "OF 2.0")
+SIX = (
+    Column("material", "seen", "material"),
+    Column("roughness", "seen", "roughness"),
+    Column("hardness", "seen", "hardness"),
+    *FOUR[1:],
+)
+SIX_PAPER = ("TAG material", "roughness", "hardness", "Feel", "OF 1.0", "OF 2.0")
+
+
+def dynamic(view: str) -> tuple[Column, ...]:
+    """The columns of the dynamic tasks under one view."""
+    return (
+        Column("slip", view, "slip"), Column("force (R2)", view, "force", "r2"), Column("twist", view, "twist"),
+        Column("slide", view, "slide"),
+    )  # fmt: skip
+
+
+SPACE = (
+    Column("top-1", "class token", "top-1", "share"),
+    Column("top-5", "class token", "top-5", "share"),
+    Column("silhouette by sensor", "class token", "silhouette by sensor", "silhouette by sensor", 1.0, -1, 3),
+    Column("silhouette by object", "class token", "silhouette by object", "silhouette by object", 1.0, 1, 3),
+    Column("alignment", "class token", "alignment", "alignment", 1.0, -1, 3),
+    Column("uniformity", "class token", "uniformity", "uniformity", 1.0, -1, 3),
+)
+ANY = "any"
+GRASP = (Column("during the grasp", "during", "grasp"), Column("after the grasp", "after", "grasp"))
+
+
+class Part(NamedTuple):
+    """A section of the results: its title, its Markdown, and the statements that it makes."""
+
+    title: str
+    text: str
+    statements: Sequence[Statement]
+
+
+def q1(runs: Sequence[Run]) -> Part:
+    """Table 1: every row against the row before; with all sensors against one, on the unseen one."""
+    table = Table("q1", (*paper.TABLE1,), FOUR, paper.TABLE1, FOUR_PAPER)
+    pairs = []
+    for before, name in zip(table.names, table.names[1:], strict=False):
+        expected = [a - b for a, b in zip(paper.TABLE1[name], paper.TABLE1[before], strict=True)]  # type: ignore[operator]
+        label = f"{title(name)} against {title(before)}"
+        pairs.append(Pair(label, name, before, expected, None if before == "no_pretraining" else (2, 3)))
+    first, last = table.names[1], table.names[-1]
+    expected = [a - b for a, b in zip(paper.TABLE1[last], paper.TABLE1[first], strict=True)]  # type: ignore[operator]
+    pairs.append(Pair("more sensors help the unseen one: four against one", last, first, expected, (2, 3)))
+    found = judge(runs, "q1", FOUR, pairs)
+    return Part("Q1: what each sensor's data adds (Table 1)", block(runs, table, found), found)
+
+
+def q2(runs: Sequence[Run]) -> Part:
+    """Figure 4 in numbers: what each component does to the space."""
+    names = ("pixels", "untrained", "masked", "aligned", "matched")
+    # The paper in words: masked modelling draws the touches of a sensor together; alignment blends the sensors;
+    # matching mixes them wholly. Signs are of what is better: to find the touch, not to be ordered by sensor.
+    gathers = (None, None, -1, None, None, None)
+    pairs = (
+        Pair("masked modelling gathers each sensor's touches", "masked", "untrained", gathers),
+        Pair("alignment begins to blend the sensors", "aligned", "masked", (1, 1, 1, 1, None, None), (0, 1)),
+        Pair("matching mixes them: it raises retrieval", "matched", "aligned", (1, 1, 1, 1, 1, None), (0, 1)),
+    )
+    found = judge(runs, "q2", SPACE, pairs)
+    table = Table("q2", names, SPACE)
+    return Part("Q2: the space of touches (Figure 4)", block(runs, table, found), found)
+
+
+def q3(runs: Sequence[Run]) -> Part:
+    """Tables 2 and 3 (static) and Table 4's models on dynamic tasks."""
+    names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
+    static = Table("q3", names, SIX, paper.TABLES23, SIX_PAPER)
+    rivals = [pair for pair in against(static, "anytouch", None) if pair.second in paper.TABLES23]
+    one = judge(runs, "q3", SIX, rivals)
+    moving = Table("q3", names, dynamic("clips"), paper.TABLE4, ("pouring, fine-tuned (g)", "frozen (g)"))
+    ahead = [
+        Pair(f"AnyTouch against {title(name)}", "anytouch", name, (1, 1, 1, 1))
+        for name in paper.TABLE4 if name != "anytouch"
+    ]  # fmt: skip
+    two = judge(runs, "q3", moving.columns, ahead)
+    text = (
+        f"Static tasks (Tables 2 and 3):\n\n{block(runs, static, one)}\n\n"
+        "Dynamic tasks, probes on clips; beside them the paper's pouring with a robot (Table 4,\n"
+        f"less is better):\n\n{block(runs, moving, two)}"
+    )
+    return Part("Q3: static and dynamic perception (Tables 2, 3, 4)", text, (*one, *two))
+
+
+def ablations(runs: Sequence[Run]) -> Part:
+    """Table 6."""
+    table = Table("ablations", (*paper.TABLE6,), FOUR, paper.TABLE6, FOUR_PAPER)
+    found = judge(runs, "ablations", FOUR, against(table, None, "anytouch"))
+    return Part("Ablations (Table 6)", block(runs, table, found), found)
+
+
+def restricted(runs: Sequence[Run]) -> Part:
+    """The control of Table 2: the rival's data for both."""
+    table = Table("restricted", ("unitouch", "no_matching"), SIX, paper.RESTRICTED, SIX_PAPER)
+    found = judge(runs, "restricted", SIX, against(table, "no_matching", None))
+    text = (
+        f"Both see {' and '.join(plan.RESTRICTED)} alone, without touches felt twice (so AnyTouch has no matching).\n\n"
+    )
+    return Part("The same restricted data (control of Table 2)", text + block(runs, table, found), found)
+
+
+def grasp(runs: Sequence[Run]) -> Part:
+    """Frames after the grasp beside frames during it."""
+    table = Table("grasp", ("anytouch",), GRASP, {"anytouch": paper.FEEL_AFTER}, ("Feel, during", "Feel, after"))
+    pair = Pair("frames after the grasp are easier than frames during it", "after", "during", (1,))
+    views = by_view(runs, "grasp", "anytouch", ("during", "after"))
+    found = judge(views, "grasp", (Column("held or slipped", ANY, "grasp"),), (pair,))
+    text = (
+        "A simulated recording has no gripper: the press stands for the closing (the frame in which it is done), the\n"
+        "end of the slide or twist for the lift, and a touch slipped when more than half of its contact slid half-way\n"
+        "through the motion.\n\n"
+    )
+    return Part("Feel: frames after the grasp beside frames during it", text + block(runs, table, found), found)
+
+
+def by_view(runs: Sequence[Run], question: str, name: str, views: Sequence[str]) -> list[Run]:
+    """The views of one model as runs of their own, so that they can be set against each other."""
+    found = []
+    for run in runs:
+        if (run.question, run.name) == (question, name):
+            for view in views:
+                rows = [row | {"view": ANY} for row in run.about["rows"] if row["view"] == view]
+                found.append(Run(question, view, run.seed, {"rows": rows}))
+    return found
+
+
+def new_sensor(runs: Sequence[Run]) -> Part:
+    """How much of the gap to a seen sensor a few frames close."""
+    lines, views = [], ["universal, 0 unlabelled"]
+    for frames in adaptation.FRAMES:
+        views += [f"fitted, {frames} unlabelled", f"universal, {frames} labelled", f"fitted, {frames} labelled"]
+    for view in views:
+        cells = []
+        for task in adaptation.TASKS:
+            found = spread(runs, "new_sensor", "left_out", Column(task, view, task))
+            cells.append("not run" if found is None else f"{found[0]:.1f}{_closed(runs, task, found[0])}")
+        lines.append((view, *cells))
+    top = [spread(runs, "new_sensor", "seen", Column(task, "seen", task)) for task in adaptation.TASKS]
+    lines.append(("trained on, all labelled", *("not run" if one is None else f"{one[0]:.1f}" for one in top)))
+    text = (
+        f"{plan.UNSEEN} is left out of training. Tokens: the universal ones as they are, or fitted with all else\n"
+        "frozen, by reconstruction of unlabelled frames or by the material that labelled ones show. Labelled frames\n"
+        "also stand among the training rows of the probe; without them it has learned from the other sensors alone.\n"
+        "In brackets: share of the gap to a model trained on the sensor that is closed (- where there is no gap).\n"
+        "One seed: no claim.\n\n"
+    )
+    return Part("A new sensor", text + markdown(("tokens, frames", *adaptation.TASKS), lines), ())
+
+
+def _closed(runs: Sequence[Run], task: str, value: float) -> str:
+    start = spread(runs, "new_sensor", "left_out", Column(task, "universal, 0 unlabelled", task))
+    goal = spread(runs, "new_sensor", "seen", Column(task, "seen", task))
+    if start is None or goal is None:
+        return ""
+    gap = goal[0] - start[0]
+    return " (-)" if gap < 1 else f" ({100 * (value - start[0]) / gap:.0f} %)"
+
+
+def dynamics(runs: Sequence[Run]) -> Part:
+    """Clips against stills, shuffled and repeated frames; what training makes of them."""
+    names = ("anytouch", "static_only", "no_flips", "frame_differences", "force_heads")
+    parts = [f"{what}:\n\n{block(runs, Table('dynamics', names, dynamic(view)), ())}" for view, what in VIEWS.items()]
+    views = by_view(runs, "dynamics", "anytouch", tuple(VIEWS))
+    others = [view for view in VIEWS if view != "clips"]
+    pairs = [Pair(f"AnyTouch, clips against {view}", "clips", view, (1, 1, 1, 1)) for view in others]
+    found = judge(views, "dynamics", dynamic(ANY), pairs)
+    trained = Pair("dynamic training against stills only, on clips", "anytouch", "static_only", (1, 1, 1, 1))
+    found += judge(runs, "dynamics", dynamic("clips"), (trained,))
+    text = (
+        "Twist and slide are directions of the picture as it is. Training flips touches, and the positive of a match\n"
+        "apart from its anchor, which asks the encoder to overlook directions; a probe sees frames unflipped. The\n"
+        "row without flips shows what that costs.\n\n"
+    )
+    return Part("Dynamics", text + "\n\n".join(parts) + "\n\n" + "\n".join(map(sentence, found)), found)
+
+
+VIEWS = {
+    "clips": "Clips of three frames",
+    "stills": "Stills (the last frame)",
+    "shuffled": "Clips, frames shuffled",
+    "repeated": "Clips, the last frame repeated",
+}
+OF: Mapping[str, Callable[[Sequence[Run]], Part]] = {
+    "q1": q1, "q2": q2, "q3": q3, "ablations": ablations, "restricted": restricted, "grasp": grasp,
+    "new_sensor": new_sensor, "dynamics": dynamics,
+}  # fmt: skip

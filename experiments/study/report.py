@@ -1,0 +1,77 @@
+"""`experiments/results/README.md`, rendered from the JSON files of the runs alone, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.train.record import write_atomic
+
+from . import pictures, questions, real_table
+from .questions import Part
+from .results import CLAIM, Run, read
+from .tables import tally
+
+_INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
+again from them without running anything. Every number is the mean over seeds of training, with its 95 % interval over
+seeds (Student's t; with one seed that of the run itself, over test objects). Accuracies are in %, by a linear probe of
+frozen features on objects never touched in training. Protocol `honest`: the penalty is chosen without the test set.
+
+A sign is that of the difference of two rows, seed by seed. It *agrees* when the interval leaves zero out on the paper's
+side, is *undecided* when zero lies within, and is not claimed below {CLAIM} seeds. The data are simulated, the network
+is preset tiny, trained for minutes: compared is the direction of an effect, never the paper's absolute numbers, which
+stand beside ours as printed there. Columns: *seen* is a data set trained on (as TAG); *seen sensor, other data* one
+never trained on (as Feel); *unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0)."""
+
+
+def parts(runs: Sequence[Run]) -> dict[str, Part]:
+    """The sections, by question."""
+    return {name: make(runs) for name, make in (*questions.OF.items(), ("real", real_table.real))}
+
+
+def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
+    """The whole page."""
+    found = parts(runs)
+    by_name = {path.stem: path for path in figures}
+    lines = [
+        "# The paper's questions, answered",
+        _INTRO,
+        tally({p.title: p.statements for p in found.values() if p.statements}),
+    ]
+    sizes = sorted({str(run.about.get("size")) for run in runs})
+    if sizes not in ([], ["full"]):
+        lines.append(f"**Sizes in these results: {', '.join(sizes)}. Numbers of toy sizes mean nothing.**")
+    for name, part in found.items():
+        lines += [f"## {part.title}", part.text]
+        if name in by_name:
+            lines.append(f"![{part.title}](figures/{by_name[name].name})")
+    return "\n\n".join([*lines, "## The runs", provenance(runs)]) + "\n"
+
+
+def provenance(runs: Sequence[Run]) -> str:
+    """How many runs, what they cost, where they ran."""
+    rows = []
+    for question in dict.fromkeys(run.question for run in runs):
+        several = [run for run in runs if run.question == question]
+        trained = {one["key"]: one["seconds"] for run in several for one in run.about["trained"]}
+        seconds = (sum(trained.values()), sum(run.about["seconds"] for run in several))
+        names = ", ".join(f"`{run.name}-{run.seed}`" for run in several)
+        rows.append((question, str(len(several)), str(len(trained)), *(f"{one / 60:.1f}" for one in seconds), names))
+    every = {one["key"]: one["seconds"] for run in runs for one in run.about["trained"]}
+    total = (sum(every.values()) + sum(run.about["seconds"] for run in runs)) / 60
+    machines = sorted({run.about["machine"].split("; load")[0] for run in runs})
+    versions = sorted({f"{run.about['version']} ({run.about['source']})" for run in runs})
+    notes = f"{len(runs)} runs, {len(every)} trainings, {total:.0f} minutes without the data. Version (hash of its "
+    notes += f"source): {', '.join(versions) or '-'}. Machine: {' | '.join(machines) or '-'}."
+    head = ("question", "runs", "trainings", "training, min", "scores, min", "files")
+    return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"
+
+
+def write(folder: Path, out: Path) -> Path:
+    """Render the JSON files in `folder` to `out`/README.md and `out`/figures; gives back the page."""
+    runs = read(folder)
+    figures = pictures.draw_all(runs, out / "figures")
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(out / "README.md", text(runs, figures))
+    return out / "README.md"

@@ -1,0 +1,136 @@
+"""Reading the JSON files of the runs, and what paired seeds say of a sign."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from anytouch_jax.config import UserError
+
+CLAIM = 3  # seeds from which a sign is claimed
+Seeds = dict[int, float]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One JSON file."""
+
+    question: str
+    name: str
+    seed: int
+    about: Mapping[str, Any]
+
+    def row(self, column: Column, protocol: str = "honest") -> Mapping[str, Any] | None:
+        """The row of a column, if it was measured."""
+        for one in self.about["rows"]:
+            key = one["view"], one["task"], one["metric"], one["protocol"]
+            if key == (column.view, column.task, column.metric, protocol) and one["mean"] is not None:
+                return one  # type: ignore[no-any-return]
+        return None
+
+
+class Column(NamedTuple):
+    """What a column of a table reads: `view`, `task` and `metric` of a row; `factor` brings it to what is printed.
+
+    `better` is -1 where less is better.
+    """
+
+    title: str
+    view: str
+    task: str
+    metric: str = "accuracy"
+    factor: float = 100.0
+    better: int = 1
+    digits: int = 1
+
+
+class Change(NamedTuple):
+    """A difference over seeds: mean and 95 % interval (of Student's t), and what is to be said of its sign."""
+
+    word: str
+    mean: float | None = None
+    low: float | None = None
+    high: float | None = None
+    seeds: int = 0
+
+
+def read(folder: Path) -> list[Run]:
+    """The runs of a folder, in the order of their files. Raises UserError for a file that is none."""
+    found = []
+    for path in sorted(folder.glob("*.json")):
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+            found.append(Run(about["question"], about["name"], int(about["seed"]), about))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path} is no result of a run ({error!r}); remove it, and make it again") from None
+    return found
+
+
+def values(runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest") -> Seeds:
+    """{seed: value as it is printed} of a cell."""
+    return {
+        run.seed: column.factor * float(row["mean"])
+        for run in runs
+        if (run.question, run.name) == (question, name) and (row := run.row(column, protocol)) is not None
+    }
+
+
+def interval(several: Sequence[float]) -> tuple[float | None, float | None]:
+    """95 % interval of the mean over seeds, by Student's t; (None, None) below two."""
+    if len(several) < 2:
+        return None, None
+    half = float(stats.t.ppf(0.975, len(several) - 1) * np.std(several, ddof=1) / np.sqrt(len(several)))
+    return float(np.mean(several)) - half, float(np.mean(several)) + half
+
+
+def spread(
+    runs: Sequence[Run], question: str, name: str, column: Column
+) -> tuple[float, float | None, float | None] | None:
+    """Mean of a cell and its interval: over seeds, with one seed that of the run itself (over test objects)."""
+    found = values(runs, question, name, column)
+    if not found:
+        return None
+    mean, (low, high) = float(np.mean(list(found.values()))), interval(list(found.values()))
+    if len(found) == 1:
+        run = next(one for one in runs if (one.question, one.name) == (question, name))
+        row = run.row(column) or {}
+        low, high = (None if row.get(side) is None else column.factor * row[side] for side in ("low", "high"))
+    return mean, low, high
+
+
+def change(first: Seeds, second: Seeds, expected: float | None, better: int = 1) -> Change:
+    """`first` minus `second`, seed by seed, against the sign `expected` (of what is better, None: none is known).
+
+    "agrees" and "disagrees" need an interval that leaves zero out, and CLAIM seeds; otherwise "undecided", "1 seed, no
+    claim", or "not run".
+    """
+    seeds = sorted(first.keys() & second.keys())
+    if not seeds:
+        return Change("not run")
+    several = [better * (first[seed] - second[seed]) for seed in seeds]
+    mean, (low, high) = float(np.mean(several)), interval(several)
+    shown = [None if one is None else better * one for one in (mean, low, high)]
+    sides = shown if better > 0 else [shown[0], shown[2], shown[1]]
+    if len(seeds) < CLAIM:
+        word = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}, no claim"
+    elif not expected:
+        word = "no sign in the paper"
+    elif low is None or high is None or low <= 0 <= high:
+        word = "undecided"
+    else:
+        word = "agrees" if np.sign(mean) == np.sign(expected) else "disagrees"
+    return Change(word, *sides, len(seeds))  # type: ignore[arg-type]
+
+
+def together(changes: Sequence[tuple[Seeds, Seeds, int]], expected: float | None) -> Change:
+    """The mean of several changes, seed by seed, over those cells that both sides have: what a whole row says."""
+    whole = [(a, b, better) for a, b, better in changes if a and b]
+    seeds = set.intersection(*(a.keys() & b.keys() for a, b, _ in whole)) if whole else set()
+    first = {seed: float(np.mean([better * (a[seed] - b[seed]) for a, b, better in whole])) for seed in seeds}
+    return change(first, dict.fromkeys(first, 0.0), expected)

@@ -1,0 +1,185 @@
+"""The tables of the paper from the JSON files of the runs, the paper's numbers beside ours, and whether signs agree."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from anytouch_jax.evaluate.sections import markdown
+
+from . import paper
+from .results import CLAIM, Change, Column, Run, change, spread, together, values
+
+TITLES = {
+    "untrained": "untrained encoder", "pixels": "raw pixels, no encoder",
+    "no_pretraining": "no tactile pre-training (image tower)",
+    "anytouch": "AnyTouch", "unitouch": "UniTouch-style", "tlv_link": "TLV-Link-style", "t3": "T3-style",
+    "static_only": "AnyTouch, stills only", "no_text": "w/o text", "no_vision": "w/o vision",
+    "no_text_aligned": "w/o text in the aligned set", "no_stage1": "w/o stage 1", "no_stage2": "w/o stage 2",
+    "no_matching": "w/o cross-sensor matching", "no_dynamic": "w/o dynamic perception",
+    "no_universal": "w/o universal tokens", "masked": "+ masked modelling", "aligned": "+ alignment",
+    "matched": "+ matching", "no_flips": "AnyTouch, touches never flipped",
+    "frame_differences": "AnyTouch, frame differences too", "force_heads": "AnyTouch, force heads too",
+    "left_out": "left out of training", "seen": "trained on",
+}  # fmt: skip
+
+
+class Table(NamedTuple):
+    """What a table shows of a question: models, columns, the paper's rows for some of them, its column names."""
+
+    question: str
+    names: Sequence[str]
+    columns: Sequence[Column]
+    paper: Mapping[str, paper.Row] = {}
+    paper_titles: Sequence[str] = ()
+
+
+class Pair(NamedTuple):
+    """A sign to be tested: `first` against `second`; `expected` a sign for each column (None: the paper has none).
+
+    `whole` are the numbers of the columns whose mean stands for the row; None is all of them.
+    """
+
+    label: str
+    first: str
+    second: str
+    expected: Sequence[float | None]
+    whole: Sequence[int] | None = None
+
+
+class Statement(NamedTuple):
+    """What is said of a pair: of the row as a whole (the mean of `over`), and of its columns {title: change}."""
+
+    label: str
+    row: Change
+    columns: Mapping[str, Change]
+    over: Sequence[str] = ()
+
+
+def judge(runs: Sequence[Run], question: str, columns: Sequence[Column], pairs: Sequence[Pair]) -> list[Statement]:
+    """The statements of a table."""
+    found = []
+    for pair in pairs:
+        sides = [
+            (values(runs, question, pair.first, one), values(runs, question, pair.second, one), one.better)
+            for one in columns
+        ]
+        by_column = {
+            column.title: change(first, second, expected, better)
+            for column, (first, second, better), expected in zip(columns, sides, pair.expected, strict=True)
+        }
+        whole = [i for i in (range(len(columns)) if pair.whole is None else pair.whole) if pair.expected[i]]
+        over = [columns[i].title for i in whole]
+        if len(whole) == 1:
+            row = by_column[over[0]]
+        else:
+            row = together([sides[i] for i in whole], sum(np.sign(pair.expected[i] or 0) for i in whole) or None)
+        found.append(Statement(pair.label, row, by_column, over))
+    return found
+
+
+def against(table: Table, first: str | None, second: str | None, *, flip: float = 1.0) -> list[Pair]:
+    """Pairs of every other model of a table with `first` (or `second`) held: the paper's differences are expected."""
+    found = []
+    for name in table.names:
+        one, two = first or name, second or name
+        if one == two:
+            continue
+        ours, theirs = (table.paper.get(model, (None,) * len(table.columns)) for model in (one, two))
+        expected = [None if a is None or b is None else flip * float(a - b) for a, b in zip(ours, theirs, strict=True)]
+        found.append(Pair(f"{title(one)} against {title(two)}", one, two, expected))
+    return found
+
+
+def title(name: str) -> str:
+    """A model's name for people."""
+    return TITLES.get(name, name.replace("+", ", "))
+
+
+def block(runs: Sequence[Run], table: Table, statements: Sequence[Statement]) -> str:
+    """The table, the published protocol beside it, and the statements, as Markdown."""
+    parts = [_ours(runs, table)]
+    published = _published(runs, table)
+    if published:
+        parts.append(published)
+    if statements:
+        parts.append("\n".join(map(sentence, statements)))
+    return "\n\n".join(parts)
+
+
+def _ours(runs: Sequence[Run], table: Table) -> str:
+    head = ["model", "seeds", *(column.title for column in table.columns)]
+    head += [f"paper: {one}" for one in table.paper_titles]
+    lines = []
+    for name in table.names:
+        seeds = {run.seed for run in runs if (run.question, run.name) == (table.question, name)}
+        cells = [cell(runs, table.question, name, column) for column in table.columns]
+        if not seeds:
+            cells = ["not run"] * len(table.columns)
+        theirs = table.paper.get(name, (None,) * len(table.paper_titles))
+        lines.append((title(name), str(len(seeds)), *cells, *("-" if one is None else f"{one:.2f}" for one in theirs)))
+    return markdown(head, lines)
+
+
+def _published(runs: Sequence[Run], table: Table) -> str:
+    """Means under the published protocol; nothing where no run has it."""
+    lines = []
+    for name in table.names:
+        found = [values(runs, table.question, name, column, "published") for column in table.columns]
+        if any(found):
+            pairs = zip(found, table.columns, strict=True)
+            cells = [f"{np.mean(list(one.values())):.{column.digits}f}" if one else "-" for one, column in pairs]
+            lines.append((title(name), *cells))
+    if not lines:
+        return ""
+    head = ("published protocol (chosen on test)", *(column.title for column in table.columns))
+    return markdown(head, lines)
+
+
+def cell(runs: Sequence[Run], question: str, name: str, column: Column) -> str:
+    """Mean and interval of a cell."""
+    found = spread(runs, question, name, column)
+    if found is None:
+        return "-"
+    mean, low, high = found
+    between = "" if low is None or high is None else f" ({low:.{column.digits}f} to {high:.{column.digits}f})"
+    return f"{mean:.{column.digits}f}{between}"
+
+
+def sentence(one: Statement) -> str:
+    """A statement as a line of a list."""
+    if all(part.word == "not run" for part in one.columns.values()):
+        return f"- {one.label}: **not run**."
+    columns = "; ".join(f"{name} {_shown(part)}" for name, part in one.columns.items())
+    row = one.row
+    if row.word == "not run":  # nothing that the paper has a sign for
+        return f"- {one.label}: **no sign in the paper**. By column: {columns}."
+    word = {"agrees": "the sign agrees", "disagrees": "the sign does not agree"}.get(row.word, row.word)
+    if len(one.columns) == 1:
+        return f"- {one.label}: **{word}**, {_signed(row)}."
+    over = "all columns together" if len(one.over) == len(one.columns) else " and ".join(one.over)
+    return f"- {one.label}: **{word}**, {over} {_signed(row)}. By column: {columns}."
+
+
+def _shown(one: Change) -> str:
+    return "not run" if one.mean is None else f"{_signed(one)}, {one.word}"
+
+
+def _signed(one: Change) -> str:
+    if one.mean is None:
+        return "-"
+    between = "" if one.low is None or one.high is None else f" ({one.low:+.2f} to {one.high:+.2f})"
+    return f"{one.mean:+.2f}{between}"
+
+
+def tally(statements: Mapping[str, Sequence[Statement]]) -> str:
+    """How many rows of each table agree."""
+    words = ("agrees", "disagrees", "undecided", "no claim", "not run")
+    lines = []
+    for name, several in statements.items():
+        counts = Counter("no claim" if "claim" in one.row.word else one.row.word for one in several)
+        lines.append((name, *(str(counts.get(word, 0)) for word in words)))
+    return markdown(("rows of", "sign agrees", "does not", "undecided", f"fewer than {CLAIM} seeds", "not run"), lines)

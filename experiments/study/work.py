@@ -1,0 +1,133 @@
+"""The work of a run on disk: data sets are simulated and cut, stages trained, encoders scored.
+
+Under one folder: the data sets by name, `trained/<key>` a run folder each, `cache` features by content. `done.json` in
+a folder says that it is finished; one without it is gone on with.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import anytouch_jax
+from anytouch_jax.config import Config, UserError, to_json
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import machine
+from anytouch_jax.evaluate.features import Encoder
+from anytouch_jax.pretrain import pretrain
+from anytouch_jax.sim.dataset import simulate
+from anytouch_jax.sim.scene import Scenes as Simulated
+from anytouch_jax.train.record import write_atomic
+
+from . import cuts, plan, scores
+from .plan import Leaf, Scenes, Size, Training
+
+Say = Callable[[str], None]
+DONE = "done.json"
+
+
+class Work:
+    """`execute.Work` in the folder `folder`; `real` is the manifest of real touch, or None where there is none."""
+
+    def __init__(self, folder: Path, *, real: Path | None = None, say: Say = print) -> None:
+        self.folder, self.real, self.say = folder, real, say
+
+    def ready(self, leaf: Leaf) -> set[str]:
+        sets = {one.name for one in plan.scenes(leaf.size) if (self.folder / one.name / DONE).exists()}
+        return sets | {one.key for one in leaf.trainings if (self.run_of(one) / DONE).exists()}
+
+    def run_of(self, one: Training) -> Path:
+        """The run folder of a training."""
+        return self.folder / "trained" / one.key
+
+    def manifest(self, name: str) -> Path:
+        """The file of a manifest by its name in a plan: a data set, data set/sensor, or `real`."""
+        if name == plan.REAL:
+            if self.real is None:
+                raise UserError("there is no real data: name its manifest with REAL=")
+            return self.real
+        dataset, _, part = name.partition("/")
+        return self.folder / dataset / (f"{part}.parquet" if part else cuts.WHOLE)
+
+    def make(self, one: Scenes, size: Size) -> None:
+        start, folder = time.perf_counter(), self.folder / one.name
+        wanted = Simulated(
+            touches=one.touches, sensors=one.sensors, seed=one.seed, grade=one.grade, frames=size.frames,
+            objects=min(size.objects, one.touches), held_out=one.held_out, size=size.pixels,
+        )  # fmt: skip
+        simulate(wanted, folder)
+        cuts.cut_all(folder)
+        self._finish(folder, {"seconds": round(time.perf_counter() - start, 1)})
+
+    def train(self, one: Training) -> None:
+        start, run = time.perf_counter(), self.run_of(one)
+        init = self.run_of(one.init) if one.init else None
+        result = pretrain(self.resolved(one.config), run, init=init, say=lambda _: None)
+        if result.interrupted is not None:
+            raise KeyboardInterrupt
+        self._finish(run, {"seconds": round(time.perf_counter() - start, 1), "resumed_at_step": result.resumed})
+        self._forget()
+
+    def resolved(self, config: Config) -> Config:
+        """A plan's configuration with the names of manifests made files."""
+        files = tuple(str(self.manifest(name)) for name in config.data.manifests)
+        return replace(config, data=replace(config.data, manifests=files))
+
+    def score(self, leaf: Leaf) -> dict[str, Any]:
+        start = time.perf_counter()
+        found = scores.score(leaf, self)
+        self._forget()
+        trained = [
+            {"key": one.key, "stage": one.config.stage, "config": json.loads(to_json(one.config))}
+            | json.loads((self.run_of(one) / DONE).read_text())
+            for one in leaf.trainings
+        ]
+        names = {name for one in leaf.trainings for name in one.config.data.manifests}
+        return {
+            "size": leaf.size.name,
+            "steps": [leaf.size.steps1, leaf.size.steps2],
+            "trained": trained,
+            "data": {name: content_hash(self.manifest(name)) for name in sorted(names | set(found.pop("data")))},
+            "version": anytouch_jax.__version__,
+            "source": source_hash(),
+            "machine": machine.describe().sentence(),
+            "seconds": round(time.perf_counter() - start, 1),
+        } | found
+
+    def encoder(self, leaf: Leaf) -> Encoder:
+        """The encoder of a run."""
+        return scores.encoder_of(leaf, self)
+
+    def _finish(self, folder: Path, about: dict[str, Any]) -> None:
+        write_atomic(folder / DONE, json.dumps(about) + "\n")
+        self.say(f"  {folder.name}: {about['seconds']:.0f} s")
+
+    def _forget(self) -> None:
+        """Programs of one training are of no use to the next and hold their memory."""
+        jax.clear_caches()
+        gc.collect()
+
+
+@cache
+def content_hash(path: Path) -> str:
+    """The content hash of a manifest."""
+    return manifests.read(path).content_hash
+
+
+@cache
+def source_hash() -> str:
+    """A hash of the package's source: which code made a result, with or without a version control."""
+    root = Path(anytouch_jax.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

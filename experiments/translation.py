@@ -1,0 +1,271 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # One sensor's touch as another would feel it
+#
+# The paper's appendix "Cross-sensor generation": images of a DuraGel painted from those of a GelSight Mini, and the
+# 20 x 20 field of a Tac3D (displacement and force) regressed from a GelSight Mini or a DIGIT, on fine-aligned pairs.
+# How well it goes is a measure of the encoder. Here the pairs are simulated: one device of each sensor, mounted
+# straight, one motion for all of them frame by frame; a quarter of the objects, by whole pairs of primitive and
+# texture, is only ever tested on. Training stops where the error on the objects of a third split is smallest.
+#
+#     make translation RUNS="anytouch=runs/stage2 t3=runs/t3"
+#
+# `RUNS` names the encoders, name=run folder or weights file; one that is not there is replaced by a random encoder and
+# called so. Each is compared with two plain references trained on the same pairs: copying the mean training target,
+# and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
+#
+# What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
+# is made of these files alone. `WORK=` and `OUT=` in the environment are where data and results go; `TOUCHES=`,
+# `STEPS=`, `SEEDS=` and `TUNE=` (frozen, fine or both with a comma) change the size.
+
+# %%
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.config import preset
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import generation, pairs
+from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
+from anytouch_jax.evaluate.generation_figures import picture_grid
+from anytouch_jax.evaluate.generator import Fit
+from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.nn.translation import Translation
+from anytouch_jax.sim.dataset import simulate
+from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.record import write_atomic
+
+QUICK = os.environ.get("QUICK", "") not in ("", "0")
+NAME = "translation_quick" if QUICK else "translation"
+WORK = Path(os.environ.get("WORK") or "runs/translation")
+OUT = Path(os.environ.get("OUT") or "experiments/results")
+RUNS = dict(word.split("=", 1) for word in (os.environ.get("RUNS") or "anytouch=runs/stage2 t3=runs/t3").split())
+TOUCHES = int(os.environ.get("TOUCHES") or (24 if QUICK else 400))
+STEPS = int(os.environ.get("STEPS") or (40 if QUICK else 600))
+SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
+TUNE = (os.environ.get("TUNE") or "frozen").split(",")
+TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
+PIXELS = "pixels"
+RUN_FILES = OUT / NAME
+enable_compilation_cache()
+
+# %% [markdown]
+# ## The pairs
+#
+# 60 objects (24 in a trial), several touches of each. The names of the objects say texture, material and primitive.
+
+# %%
+scenes = Scenes(
+    touches=TOUCHES, objects=24 if QUICK else 60, sensors=("gelsight_mini", "digit", "duragel", "tac3d"),
+    seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
+)  # fmt: skip
+PAIRS = WORK / f"pairs-{TOUCHES}"
+
+# %% [markdown]
+# ## What the encoders may be trained on
+#
+# The paper takes the coarse data of the same objects out of pre-training. `without_objects` does so by name: it keeps
+# the rows whose object is in no split of the pairs. `REMAINING="coarse.parquet ..." make translation` writes
+# `coarse_remaining.parquet` beside each and stops; train the encoders on that.
+
+
+# %%
+def write_remaining(path: Path) -> Path:
+    """The manifest without the objects of the pairs, beside the one given."""
+    whole = manifests.read(path)
+    kept = pairs.without_objects(whole, manifests.read(PAIRS / "manifest.parquet"))
+    target = path.with_name(f"{path.stem}_remaining{path.suffix}")
+    manifests.write(kept, target)
+    print(f"{target}: {len(kept)} of {len(whole)} rows are of objects that the pairs do not have")
+    return target
+
+
+def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
+    """How many objects of the pairs the encoder was trained on, as far as its manifests are still there."""
+    files = [Path(path) for path in encoder.config.data.manifests]
+    if not files or not all(file.is_file() for file in files):
+        return "unknown"
+    seen = manifests.read(files)
+    trained = {seen.value(int(row), "object") for row in seen.rows_of("train")}
+    return str(len(trained & set(table.column("object").to_pylist()) - {None}))
+
+
+# %% [markdown]
+# ## One run
+#
+# A frozen encoder (or one trained along, `TUNE=fine`), a fresh ViT decoder or MLP, and for images a critic: the same
+# encoder with an MLP. Error: mean squared error of normalised pixels, or of each channel of the field in deviations.
+
+
+# %%
+def settings(source: str, target: str, name: str, encoder: Encoder | None, tune: str, seed: int) -> dict[str, Any]:
+    return {
+        "from": source, "to": target, "name": name, "encoder": encoder.source if encoder else PIXELS,
+        "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
+    }  # fmt: skip
+
+
+def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Path) -> None:
+    """Train, score on objects never seen, and write the JSON of a run; the first seed also draws its pictures."""
+    (x, y), val, (test_x, test_y), shown = data
+    begun = time.perf_counter()
+    shape = None if encoder else Translation(preset("tiny").model, field=y.shape[1:] if y.dtype != np.uint8 else ())
+    made, losses = generation.fit(
+        encoder, x, y, source=about["from"], target=about["to"], val=val, options=Fit(**about["fit"]), shape=shape
+    )
+    seconds = time.perf_counter() - begun
+    away = made(test_x).astype(np.float64) - test_y
+    record = {
+        "settings": about,
+        "error": float(generation.errors(made, test_x, test_y).mean()),
+        "mean_target": float(generation.mean_errors(made, test_y).mean()),
+        "train_error": losses[-1]["error"],
+        "rms": [float(value) for value in np.sqrt((away**2).mean(axis=tuple(range(away.ndim - 1))))],
+        "pairs": [len(x), len(val[0]), len(test_x)],
+        "seconds": round(seconds, 1),
+    }
+    if about["fit"]["seed"] == SEEDS[0]:
+        picture_grid(file.with_suffix(".png"), made, test_x[shown], test_y[shown])
+    write_atomic(file, json.dumps(record, indent=2) + "\n")
+    print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
+
+
+def encoders(table: manifests.Manifest) -> dict[str, tuple[Encoder, str]]:
+    """Every encoder of RUNS by the name that it has in the table, with the objects that it knows of the pairs."""
+    found = {}
+    for number, (name, path) in enumerate(RUNS.items()):
+        if Path(path).exists():
+            encoder = load_encoder(path)
+            found[name] = (encoder, overlap(encoder, table))
+        else:
+            print(f"there is no run {path}: {name} is replaced by a random encoder")
+            found[f"{name} (random encoder)"] = (random_encoder(preset("tiny"), number), "0")
+    return found
+
+
+def is_done(file: Path, about: dict[str, Any]) -> bool:
+    return file.exists() and json.loads(file.read_text())["settings"] == about
+
+
+# %%
+def all_runs() -> None:
+    """Every run that is not there yet, task by task: frames are read once a task."""
+    simulate(scenes, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
+    table = manifests.read(PAIRS / "manifest.parquet")
+    if os.environ.get("REMAINING"):
+        for word in os.environ["REMAINING"].split():
+            write_remaining(Path(word))
+        raise SystemExit(0)
+    RUN_FILES.mkdir(parents=True, exist_ok=True)
+    known = encoders(table)
+    write_atomic(RUN_FILES / "overlap.json", json.dumps({name: count for name, (_, count) in known.items()}) + "\n")
+    plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]
+    for source, target in TASKS:
+        todo = []
+        for seed in SEEDS:
+            for name, encoder, tune in plans:
+                about = settings(source, target, name, encoder, tune, seed)
+                stem = re.sub(r"[^a-z0-9_]+", "-", f"{source}-{target}-{name}-{tune}-{seed}".lower())
+                if not is_done(RUN_FILES / f"{stem}.json", about):
+                    todo.append((about, encoder, RUN_FILES / f"{stem}.json"))
+        if not todo:
+            continue
+        split = pairs.find_pairs(table, source, target)
+        train, val, test = (pairs.read_pairs(table, part, preset("tiny").model.image_size) for part in split)
+        force = [table.value(int(row), "label.force") for row in split.test.source]
+        shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
+        for about, encoder, file in todo:
+            one_run(about, encoder, (train, val, test, shown), file)
+
+
+all_runs()
+
+# %% [markdown]
+# ## The table, from the JSON of the runs
+
+# %%
+TITLES = {"gelsight_mini": "GelSight Mini", "digit": "DIGIT", "duragel": "DuraGel", "tac3d": "Tac3D"}
+records = [json.loads(file.read_text()) for file in sorted(RUN_FILES.glob("*-*.json"))]
+known_objects = json.loads((RUN_FILES / "overlap.json").read_text())
+
+
+def row_name(record: dict[str, Any]) -> str:
+    about = record["settings"]
+    if about["name"] == PIXELS:
+        return "U-Net / MLP on pixels, from scratch"
+    return f"{about['name']}, {'fine-tuned' if about['fit']['tune'] == 'fine' else 'frozen'}"
+
+
+def of(task: tuple[str, str], name: str) -> list[dict[str, Any]]:
+    return [r for r in records if (r["settings"]["from"], r["settings"]["to"]) == task and row_name(r) == name]
+
+
+def spread(values: list[float]) -> str:
+    if not values:
+        return "-"
+    return f"{np.mean(values):.4f}" + (f" +- {np.std(values, ddof=1):.4f}" if len(values) > 1 else "")
+
+
+names = sorted({row_name(record) for record in records}, key=lambda name: ("pixels" in name, name))
+cells = [(name, *(spread([r["error"] for r in of(task, name)]) for task in TASKS)) for name in names]
+means = [spread([r["mean_target"] for r in of(task, name)][:1]) for task in TASKS for name in names[:1]]
+cells.append(("mean of the training targets", *means))
+head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
+
+# %% [markdown]
+# In units: grey levels (0..255) for images, mm of displacement and mN of force for fields.
+
+
+# %%
+def in_units(found: list[dict[str, Any]]) -> str:
+    if not found:
+        return "-"
+    rms = np.sqrt(np.mean([np.square(r["rms"]) for r in found], axis=0))
+    length = lambda part: float(np.sqrt(np.sum(np.square(part))))  # noqa: E731
+    if len(rms) == 3:
+        return f"{length(rms) / np.sqrt(3):.2f}"
+    return f"{length(rms[:3]):.4f} mm, {1e3 * length(rms[3:]):.2f} mN"
+
+
+physical = [(name, *(in_units(of(task, name)) for task in TASKS)) for name in names]
+first = records[0]
+lines = [
+    "# One sensor's touch as another would feel it",
+    "",
+    f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, {first['pairs'][2]} of "
+    f"objects never seen to test on; {first['settings']['fit']['steps']} steps; mean and deviation over "
+    f"{len({r['settings']['fit']['seed'] for r in records})} seeds. By `make translation`.",
+    "",
+    markdown(head, cells),
+    "",
+    "Images: normalised pixels (ImageNet's mean and deviation). Fields: each of the six channels in deviations over "
+    "the training fields. The paper, on its own recordings (units not stated): T3 0.2261, 0.0167, 0.0155; AnyTouch "
+    "0.2159, 0.0151, 0.0144.",
+    "",
+    "The same in units, root mean square of a pixel (0..255), or of a point's displacement and force:",
+    "",
+    markdown(("", *head[1:]), physical),
+    "",
+    "Objects of the pairs that an encoder was trained on: "
+    + ", ".join(f"{name} {count}" for name, count in known_objects.items())
+    + ".",
+    "",
+]
+write_atomic(OUT / f"{NAME}.md", "\n".join(lines))
+print("\n".join(lines))

@@ -1,0 +1,96 @@
+"""The command `matrix.py`: sizes, the plan, what it refuses; and (slow) the whole way at the smallest size."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import matrix
+import pytest
+import synthetic
+from study import plan
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_plan_is_printed_with_what_is_done(tmp_path, capsys):
+    leaves = plan.leaves(plan.QUICK, real=False)
+    synthetic.write(tmp_path / "matrix", leaves[:2])
+    words = ["--plan", "--quick", "--out", str(tmp_path), "--real", str(tmp_path / "none.csv")]
+    assert matrix.main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(leaves) + 1
+    assert [" done " in line for line in lines[:3]] == [True, True, False]
+    assert matrix.main([*words, "--only", "q1", "q2"]) == 0
+    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()[:-1]} == {"q1", "q2"}
+
+
+def test_chunks_of_the_command_are_all_of_it(tmp_path, capsys):
+    lines = []
+    for part in ("1/2", "2/2"):
+        assert matrix.main(["--plan", "--out", str(tmp_path), "--real", str(tmp_path / "no"), "--chunk", part]) == 0
+        lines += [line.split()[:4] for line in capsys.readouterr().out.splitlines()[:-1]]
+    whole = [[leaf.question, leaf.name, "seed", str(leaf.seed)] for leaf in plan.leaves(plan.FULL, real=False)]
+    assert lines == whole
+
+
+def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
+    leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "grasp"]
+    synthetic.write(tmp_path / "matrix", leaves)
+    assert matrix.main(["--render", "--out", str(tmp_path), "--work", str(tmp_path / "never")]) == 0
+    text = (tmp_path / "README.md").read_text()
+    assert capsys.readouterr().out.strip() == str(tmp_path / "README.md") and not (tmp_path / "never").exists()
+    assert "| AnyTouch | 3 | 50.0 (50.0 to 50.0) | 50.0 (50.0 to 50.0) | 80.53 | 99.00 |" in text
+
+
+def test_sizes_can_be_changed():
+    size = matrix.size_of(False, ["steps1=7", "seeds=3,4", "rate1=0.01"])
+    assert (size.steps1, size.seeds, size.rate1, size.name) == (7, (3, 4), 0.01, "changed")
+    assert matrix.size_of(True, []) == plan.QUICK and matrix.size_of(False, []) == plan.FULL
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--set", "depth=3"], "--set depth=3: choose among own, "),
+        (["--set", "steps1=many"], "'many' is no number"),
+        (["--only", "q9"], "there is no question 'q9'; choose among q1"),
+        (["--chunk", "3/2"], "--chunk 3/2: write it as 2/4"),
+        (["--chunk", "half"], "write it as 2/4"),
+    ],
+)
+def test_mistakes_are_one_sentence(words, sentence, capsys):
+    assert matrix.main(["--plan", *words]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("matrix: ") and sentence in error and len(error.splitlines()) == 1
+
+
+def test_make_calls_it():
+    assert shutil.which("make") is not None
+    words = ["make", "-n", "experiments", "QUICK=1", "MINUTES=10", "ONLY=q1 q2"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("experiments/matrix.py --quick --minutes 10 --only q1 q2")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
+    words = ["--quick", "--set", "own=24", "aligned=8", "other=24", "objects=24", "frames=6", "steps1=2", "steps2=2"]
+    words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
+    words += ["--real", str(tmp_path / "none.csv")]
+    assert matrix.main(words) == 0, capsys.readouterr().err
+    files = sorted(path.name for path in (tmp_path / "out" / "matrix").iterdir())
+    names = ("q2-aligned", "q2-masked", "q2-matched", "q2-pixels", "q2-untrained", "grasp-anytouch")
+    assert files == sorted(f"{name}-0.json" for name in names)
+    stored = json.loads((tmp_path / "out" / "matrix" / "q2-matched-0.json").read_text())
+    assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"]["run"]["steps"] == 2
+    assert all(len(value) == 64 for value in stored["data"].values()) and stored["machine"] and stored["source"]
+    assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(stored["points"]) > 4
+    trained = sorted((tmp_path / "work" / "trained").iterdir())
+    assert len(trained) == 3  # one stage 1, two stages 2
+    capsys.readouterr()
+    assert matrix.main(words) == 0  # all is there
+    assert "0 runs made, 6 were there, 0 left, 0 failed" in capsys.readouterr().out
+    assert "toy sizes mean nothing" in (tmp_path / "out" / "README.md").read_text()

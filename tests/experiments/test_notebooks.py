@@ -1,0 +1,72 @@
+"""The pages of `experiments/`, each from top to bottom: over made-up results (quick), over a tiny matrix (slow)."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import synthetic
+from study import plan
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = {
+    "q1_sensors": "q1", "q2_space": "q2", "q3_perception": "q3", "ablations": "ablations", "new_sensor": "new_sensor",
+    "dynamics": "dynamics",
+}  # fmt: skip
+
+
+def visit(name, monkeypatch, results, figures):
+    monkeypatch.setenv("RESULTS", str(results))
+    monkeypatch.setenv("FIGURES", str(figures))
+    return runpy.run_path(str(ROOT / "experiments" / f"{name}.py"))
+
+
+@pytest.fixture(scope="module")
+def made_up(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made_up")
+    synthetic.write(folder, plan.leaves(plan.FULL, real=False))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name", ["q2_space", *(pytest.param(one, marks=pytest.mark.slow) for one in PAGES if one != "q2_space")]
+)
+def test_a_page_shows_its_picture_and_its_finding(name, made_up, tmp_path, monkeypatch, capsys):
+    found = visit(name, monkeypatch, made_up, tmp_path)
+    out = capsys.readouterr().out
+    assert found["path"] == tmp_path / f"{PAGES[name]}.png" and found["path"].stat().st_size > 5000
+    assert (found["text"] in out and "3 seeds" in out) or name == "new_sensor"
+    assert len(out.splitlines()) > 12
+
+
+def test_a_page_without_results_says_what_to_do(tmp_path, monkeypatch, capsys):
+    visit("ablations", monkeypatch, tmp_path, tmp_path)
+    assert "`make experiments ONLY=ablations` makes them" in capsys.readouterr().out
+
+
+def test_every_page_is_a_percent_script():
+    for name in PAGES:
+        text = (ROOT / "experiments" / f"{name}.py").read_text()
+        assert text.startswith("# ---\n# jupyter:") and "# %% [markdown]\n# # " in text
+        assert "make experiments ONLY=" in text and "# ## Picture" in text and "# ## Finding" in text
+
+
+@pytest.mark.slow
+def test_pages_become_notebooks_and_html(made_up, tmp_path, monkeypatch):
+    monkeypatch.setenv("RESULTS", str(made_up))
+    monkeypatch.setenv("FIGURES", str(tmp_path))
+    source = ROOT / "experiments" / "q2_space.py"
+    notebook = tmp_path / "q2_space.ipynb"
+    subprocess.run(
+        [sys.executable, "-m", "jupytext", "--to", "ipynb", "--output", notebook, source],
+        check=True,
+        capture_output=True,
+    )
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "experiments"))
+    words = ["--to", "html", "--execute", "--ExecutePreprocessor.timeout=300", notebook]
+    subprocess.run([sys.executable, "-m", "nbconvert", *words], check=True, capture_output=True)
+    html = (tmp_path / "q2_space.html").read_text()
+    assert "data:image/png;base64" in html and "matching mixes them" in html

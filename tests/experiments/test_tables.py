@@ -1,0 +1,187 @@
+"""What is said of signs, and the page that is rendered from JSON files alone."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import synthetic
+from study import plan, report
+from study.paper import TABLE6
+from study.results import Column, change, interval, read, spread, together, values
+
+from anytouch_jax.config import UserError
+
+LEAVES = plan.leaves(plan.FULL)
+THREE = {0: 50.0, 1: 52.0, 2: 54.0}
+
+
+def test_the_interval_is_students():
+    low, high = interval([1.0, 2.0, 3.0])  # sd 1, t(0.975, 2) = 4.3027
+    assert (low, high) == pytest.approx((2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), abs=1e-4)
+    assert interval([1.0]) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("second", "expected", "word"),
+    [
+        ({0: 45.0, 1: 47.0, 2: 49.1}, 1, "agrees"),
+        ({0: 45.0, 1: 47.0, 2: 49.1}, -1, "disagrees"),
+        ({0: 45.0, 1: 52.5, 2: 55.0}, 1, "undecided"),
+        ({0: 45.0, 1: 47.0, 2: 49.1}, None, "no sign in the paper"),
+        ({0: 45.0, 1: 47.0}, 1, "2 seeds, no claim"),
+        ({2: 45.0, 7: 1.0}, 1, "1 seed, no claim"),
+        ({7: 1.0}, 1, "not run"),
+        ({}, 1, "not run"),
+    ],
+)
+def test_what_is_said_of_a_sign(second, expected, word):
+    assert change(THREE, second, expected).word == word
+
+
+def test_changes_are_paired_by_seed():
+    found = change(THREE, {2: 53.0, 0: 49.0, 1: 51.0}, 1)  # 1 in each seed, while the seeds differ by 4
+    assert (found.word, found.mean, found.low, found.high, found.seeds) == ("agrees", 1.0, 1.0, 1.0, 3)
+
+
+def test_where_less_is_better_the_sign_turns():
+    less = {0: 48.0, 1: 50.1, 2: 52.0}
+    assert change(less, THREE, 1, better=-1).word == "agrees" and change(less, THREE, -1, better=-1).word == "disagrees"
+    found = change(less, THREE, 1, better=-1)
+    assert found.mean == pytest.approx(-5.9 / 3) and found.low < found.mean < found.high < 0
+
+
+def test_a_row_is_the_mean_of_its_columns():
+    worse = {seed: value - 3 for seed, value in THREE.items()}
+    found = together([(THREE, worse, 1), (THREE, worse, -1), (THREE, THREE, 1), (THREE, {}, 1)], 1)
+    assert found.mean == pytest.approx(0.0) and found.seeds == 3
+    assert together([(THREE, worse, 1), (THREE, THREE, 1)], 1) == ("agrees", 1.5, 1.5, 1.5, 3)
+    assert together([(THREE, {}, 1)], 1).word == "not run"
+
+
+def noisy(gain):
+    """Every seed has a level of its own; `gain(question, name)` is what a model is better by, 0.3 points of noise."""
+
+    def mean(question, name, seed, view, task):
+        noise = 0.003 * ((seed * 7 + len(name) * 5 + len(view) * 3 + len(task)) % 3 - 1)
+        return 0.4 + 0.05 * seed + gain(question, name) + noise
+
+    return mean
+
+
+@pytest.fixture
+def rendered(tmp_path):
+    def render(gain, leaves=LEAVES):
+        synthetic.write(tmp_path, leaves, noisy(gain))
+        runs = read(tmp_path)
+        return report.text(runs), runs
+
+    return render
+
+
+def section(text, title):
+    return re.search(rf"^## {re.escape(title)}$(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL).group(1)
+
+
+def test_ablations_that_hurt_agree(rendered):
+    text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"))
+    lines = [line for line in section(text, "Ablations (Table 6)").splitlines() if line.startswith("- ")]
+    assert len(lines) == len(TABLE6) - 1 == 8
+    for line in lines:
+        assert "**the sign agrees**" in line, line
+    stage1 = next(line for line in lines if "w/o stage 1" in line)  # OF 2.0 rises by 0.06 in the paper
+    assert re.search(r"unseen sensor, other data -5\.\d+ \([^)]*\), disagrees", stage1)
+    assert "| Ablations (Table 6) | 8 | 0 | 0 | 0 | 0 |" in text
+
+
+def test_ablations_that_help_do_not_agree_and_others_are_undecided(rendered):
+    text, _ = rendered(lambda question, name: 0.05 * (name == "no_text"))
+    lines = section(text, "Ablations (Table 6)")
+    assert "- w/o text against AnyTouch: **the sign does not agree**" in lines
+    assert "| Ablations (Table 6) | 0 | 1 | 7 | 0 | 0 |" in text
+
+
+def test_what_was_not_run_is_said(rendered):
+    leaves = [leaf for leaf in LEAVES if leaf.name != "no_universal" and leaf.question != "real"]
+    text, _ = rendered(lambda question, name: 0.0, leaves)
+    lines = section(text, "Ablations (Table 6)")
+    assert "- w/o universal tokens against AnyTouch: **not run**." in lines
+    assert "| w/o universal tokens | 0 | not run | not run |" in lines
+    assert "**Not run.**" in section(text, "Real touch")
+
+
+def test_one_seed_makes_no_claim(rendered):
+    text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"), [one for one in LEAVES if one.seed == 0])
+    lines = [line for line in section(text, "Ablations (Table 6)").splitlines() if line.startswith("- ")]
+    assert all("**1 seed, no claim**" in line for line in lines)
+    assert "agrees" not in "".join(lines)
+
+
+def test_numbers_are_those_of_the_files_and_of_the_paper(rendered):
+    text, runs = rendered(lambda question, name: 0.05 * (name == "anytouch"))
+    column = Column("seen", "seen", "material")
+    found = list(values(runs, "ablations", "anytouch", column).values())
+    low, high = interval(found)
+    row = next(line for line in section(text, "Ablations (Table 6)").splitlines() if line.startswith("| AnyTouch |"))
+    assert row.startswith(f"| AnyTouch | 3 | {sum(found) / 3:.1f} ({low:.1f} to {high:.1f}) |")
+    assert row.endswith("| 80.82 | 80.53 | 49.62 | 76.02 |")
+    single = spread([one for one in runs if one.seed == 1], "ablations", "anytouch", column)
+    assert single == pytest.approx((found[1], found[1] - 5, found[1] + 5))  # of the run itself
+
+
+def test_every_question_has_its_signs(rendered):
+    order = ["untrained", "no_pretraining", *plan.SENSORS, "masked", "aligned", "matched", "anytouch"]
+    gains = {name: 0.03 * place for place, name in enumerate(order)}
+    text, runs = rendered(lambda question, name: gains.get(name.split("+")[-1], 0.0))
+    found = report.parts(runs)
+    # Silhouette by sensor rises with the gains here, which is worse: in the paper masked modelling does that.
+    assert [one.row.word for one in found["q2"].statements] == ["agrees"] * 3
+    assert found["q2"].statements[1].columns["silhouette by sensor"].word == "disagrees"
+    assert found["q1"].statements[-1].row.word == "agrees"  # more sensors help the unseen one
+    assert found["q1"].statements[1].columns["seen"].word == "disagrees"  # it falls in the paper
+    assert {one.row.word for one in found["q3"].statements} == {"agrees"}
+    assert {one.row.word for one in found["restricted"].statements} == {"1 seed, no claim"}
+    assert "### " not in text and text.count("\n## ") == 10
+
+
+def test_shares_of_the_gap(tmp_path):
+    def mean(question, name, seed, view, task):
+        if name == "seen":
+            return 0.8
+        return {"universal, 0 unlabelled": 0.6, "fitted, 18 labelled": 0.7, "fitted, 100 labelled": 0.82}.get(view, 0.5)
+
+    leaves = [leaf for leaf in LEAVES if leaf.question == "new_sensor"]
+    synthetic.write(tmp_path, leaves, mean)
+    text = report.parts(read(tmp_path))["new_sensor"].text
+    rows = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
+    assert "70.0 (50 %)" in rows["fitted, 18 labelled"] and "82.0 (110 %)" in rows["fitted, 100 labelled"]
+    assert "60.0 (0 %)" in rows["universal, 0 unlabelled"] and "80.0" in rows["trained on, all labelled"]
+
+
+def test_real_touch_is_above_only_when_every_interval_is(tmp_path):
+    leaves = [leaf for leaf in LEAVES if leaf.question == "real"]
+
+    def mean(question, name, seed, view, task):
+        return {"object": 0.08, "slip, objects left out": 0.04 + 0.01 * seed}[task] if " - " in view else 0.5
+
+    synthetic.write(tmp_path, leaves, mean)
+    words = {one.label: one.row.word for one in report.parts(read(tmp_path))["real"].statements}
+    assert words["object: above raw pixels"] == words["object: above an untrained encoder"] == "agrees"
+    assert words["slip, objects left out: above raw pixels"] == "undecided"  # seed 0: 0.04 - 0.05 < 0
+
+
+def test_a_file_that_is_no_result_is_named(tmp_path):
+    (tmp_path / "q1-x-0.json").write_text('{"question": "q1"}')
+    with pytest.raises(UserError, match=r"q1-x-0\.json is no result of a run"):
+        read(tmp_path)
+
+
+def test_toy_sizes_are_said_aloud(tmp_path):
+    synthetic.write(tmp_path, plan.leaves(plan.QUICK)[:3])
+    assert "toy sizes mean nothing" in report.text(read(tmp_path))
+
+
+def test_an_empty_folder_renders(tmp_path):
+    (tmp_path / "matrix").mkdir()
+    text = report.write(tmp_path / "matrix", tmp_path).read_text()
+    assert "0 runs" in text and "**not run**" in text

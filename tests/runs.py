@@ -19,6 +19,7 @@ from anytouch_jax.config import Config
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.pretrain import pretrain
 from anytouch_jax.train.loop import FitResult
+from anytouch_jax.train.record import TIMING
 
 COLUMNS = (
     "path", "sensor", "sequence", "frame_index", "split", "touch", "object", "image_path", "text", "label.object",
@@ -77,9 +78,9 @@ def train(config: Config, run: Path, said: list[str] | None = None, **options: A
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The lines of metrics.jsonl without the one field that differs between equal runs."""
+    """The lines of metrics.jsonl without the fields that differ between equal runs."""
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [{name: value for name, value in line.items() if name != "samples_per_second"} for line in lines]
+    return [{name: value for name, value in line.items() if name not in TIMING} for line in lines]
 
 
 def arrays_of(result: FitResult) -> dict[str, np.ndarray]:

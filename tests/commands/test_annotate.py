@@ -107,6 +107,15 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
         assert anytouch(*words).status == 0 and len(server.heads) == 3
 
 
+def test_an_estimate_needs_no_key(anytouch, mistake, touches, monkeypatch):
+    monkeypatch.delenv("OPENAI_API_KEY")
+    words = ("annotate", touches, "--url", "https://api.example.org/v1")
+    said = anytouch(*words, "--estimate")
+    assert said.status == 0 and "3 questions" in said.out and "OPENAI_API_KEY" not in said.err
+    assert "is not an http or https address" in mistake(*words[:2], "--url", "example", "--estimate")
+    assert "set the environment variable OPENAI_API_KEY" in mistake(*words, "--yes")
+
+
 def test_failures_are_told_counted_and_the_rest_is_kept(anytouch, touches, tmp_path):
     (tmp_path / "see1.png").write_bytes(b"no picture")
     with serve() as server:

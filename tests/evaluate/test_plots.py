@@ -144,6 +144,34 @@ def test_the_front_of_a_pareto_plot(tmp_path: Path, drawn: list[Any]) -> None:
             plots.pareto(tmp_path / "q.png", bad)
 
 
+def test_names_of_a_pareto_plot_lie_on_nothing(tmp_path: Path, drawn: list[Any]) -> None:
+    rng = np.random.default_rng(0)
+    crowd = {f"variant number {i}": (1.0 + 0.02 * rng.random(), 1e-6 * (1 + 0.3 * rng.random())) for i in range(12)}
+    plots.pareto(tmp_path / "p.png", crowd | {"far": (0.5, 1e-2)})
+    axis = drawn[0].axes[0]
+    renderer = drawn[0].canvas.get_renderer()
+    boxes = {}
+    for text in axis.texts:
+        text.update_positions(renderer)
+        boxes[text.get_text()] = type(text).__mro__[1].get_window_extent(text)  # without the line to the point
+    assert len(boxes) == 13
+    names = list(boxes)
+    for i, one in enumerate(names):
+        inside = boxes[one]
+        assert axis.bbox.x0 - 1 <= inside.x0 and inside.x1 <= axis.bbox.x1 + 1
+        assert not any(boxes[one].overlaps(boxes[two]) for two in names[i + 1 :])
+        for x, y in axis.transData.transform(list(crowd.values())):
+            assert not inside.contains(x, y)
+
+
+def test_a_folder_that_is_a_file_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write .*a\.png"):
+        plots.write_bytes(tmp_path / "file" / "a.png", b"new")
+    with pytest.raises(UserError, match=r"cannot write .*a\.png"):
+        plots.write_bytes(tmp_path / "file" / "deep" / "a.png", b"new")
+
+
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         plots.bars(tmp_path / name, {"x": {"a": Bar(0.2)}})

@@ -15,9 +15,10 @@ from touch_world import SENSORS, make_touches
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import plots
+from anytouch_jax.evaluate.matching import MatchScore
 from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, demo_report, write_report
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval
-from anytouch_jax.evaluate.sections import Section, markdown, retrieval_section, samples_section
+from anytouch_jax.evaluate.sections import Section, markdown, matching_section, retrieval_section, samples_section
 
 NAMES = (RANDOM, "stage 1", "stage 2")
 
@@ -161,6 +162,18 @@ def test_the_table_of_retrieval(touched: Path, tmp_path: Path) -> None:
     assert empty.figure is None and not none and "nothing scored" in empty.notes
 
 
+def test_the_section_of_matching_shows_both_ways() -> None:
+    found = [
+        MatchScore("any", 0.8, 0.7, 0.9, 0.85, 0.65, 300, 60),
+        MatchScore("same_sensor", 0.6, 0.5, 0.7, 0.7, 0.5, 9, 3),
+    ]
+    section = matching_section(found, ["a note"])
+    lines = section.table.splitlines()
+    assert lines[2] == "| of any sensor | 80.0 % (70.0 to 90.0) | 0.850 | 65.0 % | 300 |" and len(lines) == 4
+    assert section.notes == "- a note" and section.figure is None
+    assert matching_section([], ["not scored"]).table == ""
+
+
 @pytest.fixture(scope="module")
 def demo(touched: Path, tiny_run: Path, tmp_path_factory: Any) -> tuple[Path, list[str]]:
     """The report of a tiny run on the small world; the same run stands for both stages."""
@@ -175,7 +188,7 @@ def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
     titles = re.findall(r"^## (.+)$", text, re.MULTILINE)
     assert titles == [
         "Data and runs", "Samples, coarse", "Samples, fine", "Losses", "Reconstructions and next frames",
-        "The space of touches", "Cross-sensor retrieval", "Probes",
+        "The space of touches", "Cross-sensor retrieval", "Cross-sensor matching", "Probes",
     ]  # fmt: skip
     names = [one.name for one in pictures_of(path)]
     assert names == [
@@ -207,6 +220,8 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
         assert best["stage 1"] == best["stage 2"]  # one run in both places
         assert best[PIXELS] > 0.25  # the world's textures are plain to see
     assert numbers["retrieval"]["differences"]["fine"]["stage 1"] == [0, 0, 0]
+    none = {"found": [], "notes": ["not scored: the run has no matching head; give one of stage 2"]}
+    assert numbers["matching"] == none and none["notes"][0] in path.read_text()
     probes = numbers["probes"]["found"]
     assert set(probes) == {"hardness", "indenter", "force"} and "indenter" in LABELS
     assert [one["probe"] for one in probes["hardness"]] == [*NAMES, PIXELS]

@@ -31,6 +31,7 @@ def recordings(scenes, number=0):
         ({"touches": 0}, "touches must be at least 1"),
         ({"vision": 1.5}, "vision is a share"),
         ({"grade": "rough"}, "grade is fine or coarse"),
+        ({"units": "two"}, "units is each or one, not two"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused(change, sentence):
@@ -55,6 +56,23 @@ def test_objects_take_turns_and_a_seed_decides():
     assert again.object == touches[7].object and np.array_equal(again.place, touches[7].place)
     other = scene.draw_touch(replace(SCENES, seed=4), 7, SPLITS)
     assert not np.array_equal(other.place, again.place)
+
+
+def test_one_device_of_each_sensor_mounted_straight():
+    one = replace(SCENES, units="one")
+    several = [recordings(one, number) for number in range(4)]
+    plain = [recordings(SCENES, number) for number in range(4)]
+    for sensor in SCENES.sensors:
+        first = several[0][sensor].unit
+        for later in several[1:]:
+            assert all(np.array_equal(a, b) for a, b in zip(first, later[sensor].unit, strict=True))
+        assert (first.mirror == 1).all() and first.rotation == 0 and not first.offset.any()
+        assert not np.array_equal(first.tint, plain[0][sensor].unit.tint)
+        # nothing else of a recording knows of it
+        for a, b in zip(several, plain, strict=True):
+            for name in ("start", "motion", "depth", "tilt", "has_photo", "has_text", "seed"):
+                np.testing.assert_array_equal(getattr(a[sensor], name), getattr(b[sensor], name))
+    assert not np.array_equal(several[0]["digit"].unit.tint, several[0]["duragel"].unit.tint)
 
 
 def test_another_sensor_in_the_list_changes_nothing():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import warnings
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL, Config, UserError, from_json
+from anytouch_jax.config import UNIVERSAL, Config, Model, UserError, from_json
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.io import checkpoint, release
@@ -67,10 +68,7 @@ class Encoder:
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {clips.dtype} "
                 f"{clips.shape}; data.transforms.touch_evaluation resizes them"
             )
-        if clips.shape[1] != 1 and clips.shape[1] < self.config.model.frames:
-            raise UserError(
-                f"a clip needs {self.config.model.frames} frames or more (or 1, a still), not {clips.shape[1]}"
-            )
+        check_frames(self.config.model, clips.shape[1])
         rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
         if rows.shape != (len(clips),):
             raise UserError(f"sensor rows must be one for each of the {len(clips)} touches, not {rows.shape}")
@@ -84,7 +82,7 @@ class Encoder:
     def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
         key = (pooling, join)
         if key not in self._compiled:
-            self._compiled[key] = jax.jit(partial(_features, net=self.net, pooling=pooling, join=join))
+            self._compiled[key] = jax.jit(partial(touch_features, net=self.net, pooling=pooling, join=join))
         return self._compiled[key]
 
     @cached_property
@@ -92,7 +90,16 @@ class Encoder:
         return {}
 
 
-def _features(params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join) -> jax.Array:
+def check_frames(model: Model, frames: int) -> None:
+    """Raise UserError unless a touch may have so many frames: 1 (a still), or as many as the model's clips or more."""
+    if frames != 1 and frames < model.frames:
+        raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
+
+
+def touch_features(
+    params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
+) -> jax.Array:
+    """Features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,), to be traced: see `Encoder.embed`."""
     clips = normalise_touch(clips)
     parts = []
     if pooling in ("class", "both"):
@@ -105,14 +112,19 @@ def _features(params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, poo
 def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     """The encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
 
-    Only the touch encoder is kept. Raises UserError when there is none.
+    Only the touch encoder is kept. A sensor that a run was not trained on is served by the universal tokens (Sec. 3.5),
+    whether or not the table has its name. Raises UserError when there is no touch encoder.
     """
     path = Path(path)
     if not path.exists():
         raise UserError(f"no run folder or weights file at {path}")
     if path.is_dir():
-        params, config_json, _ = checkpoint.load_params(path, step)
+        params, config_json, about = checkpoint.load_params(path, step)
         config = from_json(config_json)
+        if "touch" in params and "seen" in about:
+            drawn = config.objective.universal_start + config.objective.universal_end > 0
+            served = release.serve_unseen(params["touch"], config.model, about["seen"], universal_drawn=drawn)
+            params = params | {"touch": served}
     else:
         weights = release.read_weights(path)
         model = release.model_of(path, weights)
@@ -129,7 +141,8 @@ def random_encoder(config: Config, seed: int = 0) -> Encoder:
 
 
 def _touch_only(config: Config) -> Config:
-    return replace(config, model=replace(config.model, image=None, text=None, match_head="none", lora_rank=0))
+    bare = replace(config.model, image=None, text=None, match_head="none", lora_rank=0, force_head=False)
+    return replace(config, model=bare)
 
 
 @dataclass(frozen=True)
@@ -187,5 +200,6 @@ def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> Non
             np.savez(file, **arrays)
         os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # there may be no such folder
+            part.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None

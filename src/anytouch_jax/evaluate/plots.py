@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -17,10 +18,20 @@ from ..config import UserError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox, BboxBase
 
 Array = npt.NDArray[Any]
 TERMS = ("reconstruction", "next_frame", "align", "match")  # the parts of a loss worth a curve of their own
 _DPI = 110
+_SMALL = 8  # font size of names in a plot
+_NEAR = 4  # of its places (see below): so near that a name needs no line to its point
+# Offsets of a name from its point, nearest first: points to the side and up, and the side of the name that is there.
+_PLACES = [
+    (dx, base + sign * up, side)
+    for up in range(0, 181, 6)
+    for sign, base in ((1, 2), (-1, -12))
+    for dx, side in ((5, "left"), (-5, "right"))
+]
 _LEGEND = 12  # more names than that are colours without a key
 
 
@@ -51,7 +62,8 @@ def write_bytes(path: Path, data: bytes) -> None:
         part.write_bytes(data)
         os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # there may be no such folder
+            part.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}; free some space or choose another folder") from None
 
 
@@ -170,13 +182,49 @@ def pareto(
     axis.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=title)
     axis.plot(values[best, 0], values[best, 1], drawstyle="steps-post", color="C1", linewidth=1.2, zorder=1)
     axis.scatter(values[:, 0], values[:, 1], s=26, color=np.where(np.isin(np.arange(len(values)), best), "C1", "C0"))
-    for name, (at, error) in points.items():
-        axis.annotate(name, (at, error), xytext=(5, 4), textcoords="offset points", fontsize=8)
     for kind in (axis.xaxis.set_major_formatter, axis.xaxis.set_minor_formatter):
         kind("{x:g}")
     axis.margins(x=0.2, y=0.1)
     axis.grid(alpha=0.25, which="both")
+    _name_points(figure, axis, points)
     write_figure(path, figure)
+
+
+def _name_points(figure: Figure, axis: Axes, points: Mapping[str, tuple[float, float]]) -> None:
+    """Each name beside its point, at the nearest place inside that lies on no point and on no name before it."""
+    from matplotlib import transforms
+    from matplotlib.text import Text
+
+    figure.draw_without_rendering()  # lays the axes out: only then is known where the points lie
+    scale, frame = figure.dpi / 72, axis.bbox
+    dots = axis.transData.transform(list(points.values()))
+    taken = [transforms.Bbox.from_bounds(x - 3 * scale, y - 3 * scale, 6 * scale, 6 * scale) for x, y in dots]
+    for (name, point), (x, y) in zip(points.items(), dots, strict=True):
+        size = Text(text=name, fontsize=_SMALL, figure=figure).get_window_extent()
+
+        def box(place: tuple[int, int, str], x: float = x, y: float = y, size: Bbox = size) -> Bbox:
+            dx, dy, side = place
+            return transforms.Bbox.from_bounds(
+                x + dx * scale - (size.width if side == "right" else 0), y + dy * scale, size.width, size.height
+            )
+
+        fit = (place for place in _PLACES if _free(box(place), frame, taken))
+        dx, dy, side = chosen = next(fit, _PLACES[0])
+        taken.append(box(chosen))
+        line: dict[str, Any] | None = None
+        if _PLACES.index(chosen) >= _NEAR:
+            end = (float(side == "right"), float(dy < 0))
+            line = {"arrowstyle": "-", "color": "#999999", "linewidth": 0.6, "relpos": end, "shrinkA": 0}
+        text = axis.annotate(
+            name, point, xytext=(dx, dy), textcoords="offset points", fontsize=_SMALL, ha=side, va="bottom",
+            arrowprops=line,
+        )  # fmt: skip
+        text.set_in_layout(False)  # the layout is done
+
+
+def _free(box: Bbox, frame: BboxBase, taken: Sequence[Bbox]) -> bool:
+    inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
+    return inside and not any(box.overlaps(other) for other in taken)
 
 
 def front(values: Array) -> Array:

@@ -91,8 +91,8 @@ def read_task(options: Probe, say: Say) -> Task:
         kept &= np.array(_column(table, "sensor")) == options.sensor
     split = np.array(_column(table, "split"))
     kept &= np.isin(split, ("train", "val", "test"))
-    if options.frames > 1:
-        kept &= np.isin(np.arange(len(manifest)), manifest.clips(options.frames)[:, -1])
+    if (options.frames or 1) > 1:
+        kept &= np.isin(np.arange(len(manifest)), manifest.clips(options.frames or 1)[:, -1])
     rows = np.flatnonzero(kept)
     if not rows.size:
         raise UserError(f"no row has a label in {options.label!r} after the filters")
@@ -137,7 +137,7 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
         config: Config = encoders[0][1].config if encoders else preset("tiny")
         encoders.append(("random encoder", random_encoder(config)))
     for name, encoder in encoders:
-        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames, options.pooling, say=say)
+        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames or 1, options.pooling, say=say)
         if not np.array_equal(rows, task.rows):
             raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
         yield name, values

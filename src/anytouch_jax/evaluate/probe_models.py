@@ -34,9 +34,7 @@ class Linear:
         start: Linear | None = None,
         scaling: Scaling = "column",
     ):
-        self.mean, self.scale = _standard(x, weights)
-        if scaling == "common":
-            self.scale = np.full_like(self.scale, np.sqrt(np.mean(self.scale**2)))
+        self.mean, self.scale = standard(x, weights, scaling)
         self.classes = np.unique(y)
         self.coef, self.intercept = np.zeros((1, x.shape[1]), np.float32), np.zeros(1, np.float32)
         self.unfinished = False
@@ -73,17 +71,27 @@ def path(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "col
         yield model
 
 
-def _standard(x: Array, weights: Array | None = None) -> tuple[Array, Array]:
-    """Mean and standard deviation by column, summed in float64; a constant column gets deviation 1."""
-    shares = np.full(len(x), 1 / len(x)) if weights is None else weights / weights.sum(dtype=np.float64)
-    mean = (shares @ x).astype(np.float32)
-    scale = np.sqrt(shares @ (x - mean) ** 2)
+def standard(x: Array, weights: Array | None = None, scaling: Scaling = "column") -> tuple[Array, Array]:
+    """Mean and standard deviation by column, summed in float64; a constant column gets deviation 1.
+
+    `scaling` common: one deviation for all columns, the root of their mean variance.
+    """
+    if weights is None:
+        mean = x.mean(0, dtype=np.float64).astype(np.float32)
+        variance = np.mean((x - mean) ** 2, 0, dtype=np.float64)
+    else:
+        shares = weights / weights.sum(dtype=np.float64)
+        mean = (shares @ x).astype(np.float32)
+        variance = shares @ (x - mean) ** 2
+    if scaling == "common":
+        variance = np.full_like(variance, variance.mean())
+    scale = np.sqrt(variance)
     return mean, np.where(scale > 1e-6 * np.abs(mean), scale, 1.0).astype(np.float32)
 
 
-def ridge(x: Array, y: Array, scored: Array, penalties: Sequence[float]) -> list[Array]:
+def ridge(x: Array, y: Array, scored: Array, penalties: Sequence[float], scaling: Scaling = "column") -> list[Array]:
     """Predictions for `scored`, one array a penalty, from one eigendecomposition of the covariance."""
-    mean, scale = _standard(x)
+    mean, scale = standard(x, scaling=scaling)
     x, scored = ((one - mean).astype(np.float64) / scale for one in (x, scored))
     values, vectors = np.linalg.eigh(x.T @ x / len(x))
     turned, ahead = vectors.T @ (x.T @ (y - y.mean()) / len(x)), scored @ vectors

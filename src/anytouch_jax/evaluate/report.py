@@ -19,13 +19,14 @@ import numpy.typing as npt
 from ..config import FIELD_SENSORS, UserError
 from ..data import manifest as manifests
 from ..data.manifest import Manifest
-from . import baseline, plots, probe, results, retrieval, space
+from . import baseline, matching, plots, probe, results, retrieval, space
 from .contacts import background_difference, contact_vector, deepest_rows
 from .features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from .sections import (
     Section,
     losses_section,
     markdown,
+    matching_section,
     probes_section,
     reconstructions_section,
     retrieval_section,
@@ -143,7 +144,9 @@ def demo_report(
     say("report: t-SNE is drawn")
     section, numbers["retrieval"] = _retrieval(study, out, gallery_size)
     sections.append(section)
-    say("report: retrieval is scored")
+    section, numbers["matching"] = _matching(study, Path(stage2))
+    sections.append(section)
+    say("report: retrieval and matching are scored")
     section, numbers["probes"] = _probes(study, out)
     sections.append(section)
     numbers["seconds"] = round(time.perf_counter() - clock, 1)
@@ -241,6 +244,18 @@ def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, 
                 notes.append(f"{grade}, gallery {kind}: not scored: {error}")
     section, changes = retrieval_section(found, "stage 2", notes, out)
     return section, {"found": found, "differences": changes, "notes": notes}
+
+
+def _matching(study: _Study, run: Path) -> tuple[Section, dict[str, Any]]:
+    """The matcher of stage 2 on the test rows."""
+    found: list[matching.MatchScore] = []
+    notes: list[str] = []
+    try:
+        features = study.test(study.classes["stage 2"])
+        found = matching.score_matching(run, study.manifest, study.test(study.rows), features)
+    except UserError as error:
+        notes.append(f"not scored: {error}")
+    return matching_section(found, notes), {"found": found, "notes": notes}
 
 
 def _fewest(table: Manifest, rows: Array) -> int:

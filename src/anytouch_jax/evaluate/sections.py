@@ -17,7 +17,7 @@ from ..data.images import decode
 from ..data.manifest import Manifest
 from ..io import checkpoint
 from ..nn.functional import build
-from . import plots, results, retrieval
+from . import matching, plots, results, retrieval
 from .contacts import deepest_rows
 from .features import text_column
 from .figures import reconstruction_panels, write_png
@@ -218,6 +218,17 @@ def retrieval_section(
     )
     listed = "\n".join(f"- {note}" for note in notes)
     return Section("Cross-sensor retrieval", text, table, path if panels else None, listed), changes
+
+
+def matching_section(found: Sequence[matching.MatchScore], notes: Sequence[str]) -> Section:
+    """How the matcher of stage 2 tells touches of one place from touches of others, both ways."""
+    text = (
+        "Did two touches, by two sensors, come from the same place (Eq. 5)? Positives and negatives count alike. "
+        "Negatives are drawn from any sensor, which the two sensors alone partly give away, and from the positive's, "
+        "where they give away nothing. In brackets: 95 % over objects drawn anew."
+    )
+    listed = "\n".join(f"- {note}" for note in notes)
+    return Section("Cross-sensor matching", text, markdown(*matching.table(found)) if found else "", notes=listed)
 
 
 _COLUMNS = (("matched", False), ("matched", True), ("by chance", False), ("by chance", True))

@@ -85,6 +85,8 @@ def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, 
 def _claim(scenes: Scenes, out: Path) -> None:
     """Note the settings in the folder, or check that they are those of the folder."""
     settings = {"version": VERSION} | dataclasses.asdict(scenes)
+    if scenes.units == "each":  # data sets older than this setting go on
+        del settings["units"]
     text, file = json.dumps(settings, indent=2) + "\n", out / SETTINGS
     if file.exists():
         if file.read_text() == text:
@@ -94,7 +96,8 @@ def _claim(scenes: Scenes, out: Path) -> None:
         except json.JSONDecodeError:
             held = {}
         now = json.loads(text)
-        other = [f"{name} {held.get(name)!r}, not {now[name]!r}" for name in now if held.get(name) != now[name]]
+        pairs = {name: (held.get(name), now.get(name)) for name in (*now, *held)}
+        other = [f"{name} {one!r}, not {two!r}" for name, (one, two) in pairs.items() if one != two]
         raise UserError(f"{out} holds a data set with {'; '.join(other)}: give another folder, or the same options")
     if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")
@@ -164,7 +167,7 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> 
         "sensor": recording.sensor,
         "split": touch.split,
         "dataset": f"simulated-{scenes.grade}",
-        "unit": f"{recording.sensor}-{touch.split}-{touch.number:06d}",
+        "unit": f"{recording.sensor}-{f'{touch.split}-{touch.number:06d}' if scenes.units == 'each' else scenes.seed}",
         "stride": 1,
         "touch": f"{touch.number:06d}",
         "object": thing.name,

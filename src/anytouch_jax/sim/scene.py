@@ -24,7 +24,8 @@ Motion = Literal["hold", "slide", "twist"]
 
 RATE = 30.0  # frames a second
 FIELDS = ("displacement", "pressure", "shear")
-_OBJECTS, _TOUCH, _RECORDING, _PHOTO, _CAPTION = 1, 2, 3, 4, 5  # tags that keep the random streams of a seed apart
+# Tags that keep the random streams of a seed apart.
+_OBJECTS, _TOUCH, _RECORDING, _PHOTO, _CAPTION, _UNIT = 1, 2, 3, 4, 5, 6
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Scenes:
     with tilt, twist, offset, speed and motion of each sensor's own, only the place is shared. `depth` mm, the range of
     the deepest press; `vision` and `text`, the shares of recordings that have a photograph and a caption; `held_out`,
     the share of objects never touched in training, by whole (primitive, texture) pairs; `fields` of FIELDS are written
-    beside the images. Raises UserError for what cannot be simulated.
+    beside the images. `units` each: every recording by a device of its own; one: one device of each sensor for all,
+    mounted straight, as on the paper's calibrated platform. Raises UserError for what cannot be simulated.
     """
 
     touches: int = 400
@@ -51,6 +53,7 @@ class Scenes:
     held_out: float = 0.25
     fields: tuple[str, ...] = ()
     size: int = 224
+    units: Literal["each", "one"] = "each"
 
     def __post_init__(self) -> None:
         for name in self.sensors:
@@ -73,6 +76,8 @@ class Scenes:
                 raise UserError(f"{name} is a share between 0 and 1, not {getattr(self, name):g}")
         if self.grade not in ("fine", "coarse") or self.fidelity not in ("exact", "fast"):
             raise UserError(f"grade is fine or coarse and fidelity exact or fast, not {self.grade} and {self.fidelity}")
+        if self.units not in ("each", "one"):
+            raise UserError(f"units is each or one, not {self.units}")
 
 
 class Touch(NamedTuple):
@@ -157,6 +162,8 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     """The clip of `touch` by `sensor`, with a unit of its own; other sensors do not change the draws."""
     rng = np.random.default_rng([scenes.seed, _RECORDING, touch.number, list(SENSORS).index(sensor)])
     unit = draw_unit(SENSORS[sensor], rng)
+    if scenes.units == "one":
+        unit = device(scenes, sensor)
     gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
     if scenes.grade == "coarse":
         gesture = _draw_gesture(scenes, rng, gesture)
@@ -168,6 +175,13 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     has_photo, has_text = (bool(rng.random() < share) for share in (scenes.vision, scenes.text))
     seed = int(rng.integers(2**31))
     return Recording(touch, sensor, unit, start, motion, depth, tilt, gesture, has_photo, has_text, seed)
+
+
+def device(scenes: Scenes, sensor: str) -> Unit:
+    """The one unit of `sensor` in a data set of units "one": not mirrored, not turned, not moved."""
+    rng = np.random.default_rng([scenes.seed, _UNIT, list(SENSORS).index(sensor)])
+    straight = {"mirror": np.ones(2, np.float32), "rotation": np.float32(0), "offset": np.zeros(2, np.float32)}
+    return draw_unit(SENSORS[sensor], rng)._replace(**straight)
 
 
 def trajectory(frames: int, gesture: Gesture) -> tuple[Array, Array]:

@@ -1,0 +1,98 @@
+"""`anytouch probe --tasks` and `--benchmark`: the battery for several runs and the controls, as a table and as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from anytouch_jax.config import UserError, preset
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import battery
+from anytouch_jax.evaluate.benchmarks import benchmark_of
+from anytouch_jax.evaluate.features import load_encoder, random_encoder
+from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.evaluate.tasks import available
+
+if TYPE_CHECKING:
+    from anytouch_jax.options import Probe
+
+RAW = "raw pixels"
+
+
+def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
+    """Every run and control on every task: {"manifest": hash, "data", "runs": {name: config}, "results": [...]}.
+
+    Raises UserError: both a benchmark and tasks, nothing to probe, and as `battery.run`.
+    """
+    table = manifests.read([str(path) for path in options.data])
+    tasks, settings, paper = _asked(options, table)
+    encoders = {str(path): load_encoder(path) for path in options.run}
+    if options.controls:
+        first = next(iter(encoders.values()), None)
+        encoders["random encoder"] = random_encoder(first.config if first else preset("tiny"))
+    if not encoders:
+        raise UserError("nothing to probe: give --run, or keep the controls")
+    names = ("train_sensors", "test_sensors", "train_units", "test_units")
+    sides = {name: _names(getattr(options, name)) for name in names}
+    shared: dict[str, Any] = {name: getattr(options, name) for name in ("cache", "seeds", "order", "max_rows")} | sides
+    found: list[dict[str, Any]] = []
+    for name, encoder in encoders.items():
+        found += [{"features": name} | one for one in battery.run(encoder, table, tasks, **shared, **settings)]
+        say(f"probed {name}")
+    if options.controls:
+        plain = {name: settings[name] for name in ("protocols", "frames") if name in settings}
+        found += [{"features": RAW} | one for one in battery.raw(table, tasks, **shared, **plain)]
+        say(f"probed {RAW}")
+    runs = {name: dataclasses.asdict(encoder.config) for name, encoder in encoders.items()}
+    return {"manifest": table.content_hash, "data": [str(path) for path in options.data], "paper": paper,
+            "seeds": options.seeds, "sides": sides, "runs": runs, "results": found}  # fmt: skip
+
+
+def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], float | None]:
+    """Tasks, their settings for `battery.run`, and the paper's accuracy of a benchmark."""
+    if options.benchmark and options.tasks:
+        raise UserError("give --benchmark, which has its own settings, or --tasks, not both")
+    if options.benchmark:
+        one = benchmark_of(options.benchmark)
+        return [one.task], one.settings(), one.paper
+    names = available(table) if options.tasks == "all" else _names(options.tasks)
+    protocols = ("honest", "published") if options.protocol == "published" else ("honest",)
+    settings = {"pooling": options.pooling, "join": options.join, "protocols": protocols,
+                "head_names": tuple(_names(options.heads) or ())}  # fmt: skip
+    return names or (), settings | ({"frames": options.frames} if options.frames else {}), None
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return tuple(one.strip() for one in text.split(",") if one.strip()) if text else None
+
+
+def to_table(found: dict[str, Any]) -> str:
+    """The results of `run_battery` as Markdown, the notes below."""
+    head = ("features", "task", "head", "protocol", "score", "95 %", "chance", "train", "test (groups)")
+    rows, notes = [], dict[str, None]()
+    for one in found["results"]:
+        r2 = one["metric"] == "r2"
+        score = f"R2 {one['mean']:.3f}, {one['mae']:.3g} {one['unit']}" if r2 else f"{100 * one['mean']:.1f} %"
+        chance = f"{one['chance_mae']:.3g} {one['unit']}" if r2 else f"{100 * one['chance']:.1f} %"
+        size = f"{one['test']} ({one['groups']})"
+        rows.append((one["features"], one["task"], one["head"], one["protocol"], score, _interval(one),
+                     chance, str(one["train"]), size))  # fmt: skip
+        notes |= dict.fromkeys(f"- {one['task']}: {note}" for note in one["notes"])
+    if found["paper"] is not None:
+        notes[f"- the paper reports {100 * found['paper']:.2f} % for AnyTouch, its epoch chosen on test"] = None
+    return "\n\n".join([markdown(head, rows), *(["\n".join(notes)] if notes else [])]) + "\n"
+
+
+def _interval(one: dict[str, Any]) -> str:
+    if one["low"] is None:
+        return "-"
+    return f"{one['low']:.3f} to {one['high']:.3f}" if one["metric"] == "r2" else (
+        f"{100 * one['low']:.1f} to {100 * one['high']:.1f}"
+    )  # fmt: skip
+
+
+def to_json(found: dict[str, Any]) -> str:
+    """The results of `run_battery` as JSON."""
+    return json.dumps(found, indent=2, allow_nan=False)

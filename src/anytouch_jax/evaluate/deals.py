@@ -1,0 +1,144 @@
+"""Who is fitted on, who chooses, who is tested: whole groups on one side, dealt anew by every seed; and intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import UserError
+from .results import Protocol
+
+Array = npt.NDArray[Any]
+
+FOLDS = 5
+DRAWS = 1000
+
+
+class Cut(NamedTuple):
+    """Row numbers to fit on, to choose on (none: published), and to test on."""
+
+    fit: Array
+    val: Array
+    test: Array
+
+
+class Rows(NamedTuple):
+    """What a deal needs of each row: `y`, `groups`; bool (n,): whether by the manifest's split it may teach (`pool`:
+    train and val) or be tested (`test`), and by its sensor and unit likewise (`fits`, `tests`).
+
+    `measured`: y is a number, not a class.
+    """
+
+    y: Array
+    groups: Array
+    pool: Array
+    test: Array
+    fits: Array
+    tests: Array
+    measured: bool = False
+
+
+def scheme(rows: Rows) -> tuple[Literal["split", "folds"], Array, str]:
+    """How honest tests are cut: by the manifest's split, or in folds over the returned rows bool (n,); and why.
+
+    The split is kept where it parts the groups. Where classes of test are never learned (objects left out), the test
+    rows alone are cut in folds; where groups are on both sides, all rows are.
+    """
+    learned, tested = rows.pool & rows.fits, rows.test & rows.tests
+    if not rows.measured and not np.isin(rows.y[tested], rows.y[learned]).any():
+        return "folds", rows.test, "no class of test is in train: folds over the test rows, whole groups left out"
+    shared = np.intersect1d(rows.groups[learned], rows.groups[tested])
+    if len(shared):
+        why = f"{len(shared)} groups are in train and test: folds over all rows instead, whole groups left out"
+        return "folds", rows.pool | rows.test, why
+    return "split", rows.pool | rows.test, ""
+
+
+def cuts(rows: Rows, seed: int, protocol: Protocol) -> list[Cut]:
+    """The cuts of one seed: one by the manifest's split, or FOLDS that test every row once.
+
+    honest: a fifth of the groups that may teach chooses, the rest is fitted on. published: the manifest's own split,
+    whatever it shares, and all that may teach is fitted on; where it shares no class, the folds, chosen on test.
+    Raises UserError with too few groups.
+    """
+    if protocol not in ("honest", "published"):
+        raise UserError(f"unknown protocol {protocol!r}; choose honest or published")
+    rng = np.random.default_rng([11, seed])
+    how, used, _ = scheme(rows)
+    if how == "split" or (protocol == "published" and np.any(used & rows.pool)):
+        learned, tested = np.flatnonzero(rows.pool & rows.fits), np.flatnonzero(rows.test & rows.tests)
+        return [_parted(rows, learned, tested, rng, protocol)]
+    numbers = np.flatnonzero(used & (rows.fits | rows.tests))
+    fold, found = dealt(rows, numbers, rng), []
+    for one in range(int(fold.max()) + 1):
+        learned, tested = numbers[(fold != one) & rows.fits[numbers]], numbers[(fold == one) & rows.tests[numbers]]
+        if len(learned) and len(tested):
+            found.append(_parted(rows, learned, tested, rng, protocol))
+    return found
+
+
+def _parted(rows: Rows, pool: Array, test: Array, rng: np.random.Generator, protocol: Protocol) -> Cut:
+    if protocol == "published":
+        return Cut(pool, pool[:0], test)
+    fold = dealt(rows, pool, rng)
+    return Cut(pool[fold != 0], pool[fold == 0], test)
+
+
+def dealt(rows: Rows, numbers: Array, rng: np.random.Generator, count: int = FOLDS) -> Array:
+    """The fold i64 of each of the rows `numbers`: groups are dealt in turn, class by class. Raises UserError."""
+    names, first, ids = np.unique(rows.groups[numbers], return_index=True, return_inverse=True)
+    if len(names) < 2:
+        raise UserError(f"all rows to learn from are of one group, {str(names[0])!r}; two are the least to choose on")
+    count = min(count, len(names))
+    by_class = np.zeros(len(names)) if rows.measured else rows.y[numbers][first]
+    order = np.lexsort((rng.permutation(len(names)), by_class))
+    fold = np.empty(len(names), np.int64)
+    fold[order] = (np.arange(len(names)) + rng.integers(count)) % count
+    return fold[ids]
+
+
+class Sums(NamedTuple):
+    """One seed's test rows: `groups` (n,), and what is summed over them, f64 (n, sums)."""
+
+    groups: Array
+    sums: Array
+
+
+def accuracy_of(sums: Array) -> Array:
+    """(..., [right, 1]) -> accuracy."""
+    return np.asarray(sums[..., 0] / sums[..., 1])
+
+
+def r2_of(sums: Array) -> Array:
+    """(..., [squared error, absolute error, truth, truth squared, 1]) -> 1 - squared error / variance."""
+    spread = sums[..., 3] - sums[..., 2] ** 2 / sums[..., 4]
+    return np.asarray(1 - sums[..., 0] / np.where(spread > 1e-12 * sums[..., 3], spread, np.nan))
+
+
+def mae_of(sums: Array) -> Array:
+    """Sums as in `r2_of` -> mean absolute error."""
+    return np.asarray(sums[..., 1] / sums[..., 4])
+
+
+def interval(tested: Sequence[Sums], value: Any) -> tuple[float | None, float | None]:
+    """95 % percentile interval of `value` (sums -> number) of the mean over seeds, drawing groups and seeds anew.
+
+    The seeds share the drawn groups, as they share the test rows. (None, None) with fewer than two groups.
+    """
+    names = np.unique(np.concatenate([one.groups for one in tested]))
+    if len(names) < 2:
+        return None, None
+    totals = np.zeros((len(tested), len(names), tested[0].sums.shape[1]))
+    for total, one in zip(totals, tested, strict=True):
+        np.add.at(total, np.searchsorted(names, one.groups), one.sums)
+    rng = np.random.default_rng(0)
+    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), DRAWS)
+    chosen = rng.multinomial(len(tested), np.full(len(tested), 1 / len(tested)), DRAWS) / len(tested)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.stack([value(times @ total) for total in totals], 1)
+    drawn = np.where(chosen > 0, chosen * values, 0).sum(1)
+    low, high = np.percentile(drawn[np.isfinite(drawn)], [2.5, 97.5])
+    return float(low), float(high)

@@ -1,0 +1,309 @@
+"""Imitation learning of the pouring task: features of the last segments -> pour, wait or retract (a small MLP).
+
+The encoder is frozen (its features are computed once) or fine-tuned with the MLP. A blind policy has the same MLP and
+knows only the time and its own actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+import optax
+
+from ..config import UserError
+from ..nn.functional import Net
+from ..objectives import normalise_touch
+from ..sim.pouring import ACTIONS, WAIT, Setup, State, Task
+from .features import Encoder
+from .pouring import FRAMES, SENSOR, START, Expert, Trials, draw_runs, run
+
+Array = npt.NDArray[Any]
+Params = Any
+UNSEEN = 10_000  # added to a seed: runs that no demonstration met
+LATEST = 80  # moments, 20 degrees
+LAG = 3  # moments from the segment before to the last one
+LIFTED = START - FRAMES + 1  # the number of the first segment of the lifted cylinder; number 0 is of the standing one
+
+
+@dataclass(frozen=True)
+class Learning:
+    """How a policy learns: `steps` of AdamW at `rate` on batches of `batch` moments, `width` hidden units.
+
+    Fine-tuning goes on for `tune_steps` on `tune_batch` moments at `tune_rate` (the encoder's; the MLP's is a tenth of
+    `rate`).
+    """
+
+    steps: int = 1500
+    rate: float = 1e-3
+    batch: int = 256
+    width: int = 128
+    decay: float = 1e-2
+    tune_steps: int = 150
+    tune_batch: int = 16
+    tune_rate: float = 1e-4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "width", "tune_steps", "tune_batch"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} of the policy's learning must be at least 1, not {getattr(self, name)}")
+
+
+class Head(NamedTuple):
+    """The MLP over inputs (n, d): `mean`, `scale` (d,) of the inputs, weights and biases of its layers."""
+
+    mean: Any
+    scale: Any
+    layers: tuple[tuple[Any, Any], ...]
+
+
+def demonstrate(
+    task: Task, seed: int, count: int, *, side: int | None, late: int = LATEST, patient: bool = True, chunk: int = 10
+) -> Trials:
+    """`count` runs of the expert, with frames of `side` pixels, or without (None).
+
+    The hand is late by 0 to `late` moments, drawn for each run: runs that all end at the target would teach to retract
+    only where one is retracting already (noise in demonstrations: Laskey et al. 2017).
+    """
+    setups, keys = draw_runs(task, seed, count)
+    hand = np.random.default_rng([seed, count, late]).integers(0, late + 1, count)
+    parts = []
+    for start in range(0, count, chunk):
+        part = slice(start, start + chunk)
+        some: Setup = jax.tree.map(lambda x, part=part: x[part], setups)
+        expert, film = Expert(task, patient=patient), side is not None
+        parts.append(run(task, some, keys[part], expert, side=side or 8, film=film, late=hand[part]))
+    return joined(parts)
+
+
+def joined(parts: Sequence[Trials]) -> Trials:
+    """Several batches of trials as one; the shorter ones are padded with their last moment."""
+    longest = max(len(part.actions) for part in parts)
+
+    def over_time(name: str) -> Any:
+        arrays = [getattr(part, name) for part in parts]
+        if arrays[0] is None:
+            return None
+        return np.concatenate([np.concatenate([x, np.repeat(x[-1:], longest - len(x), 0)]) for x in arrays], 1)
+
+    found = {name: over_time(name) for name in Trials._fields[2:]}
+    return Trials(*(np.concatenate([getattr(part, name) for part in parts]) for name in Trials._fields[:2]), **found)
+
+
+def features(encoder: Encoder, trials: Trials, *, stills: bool, batch: int = 64) -> Array:
+    """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end."""
+    if trials.frames is None:
+        raise UserError("these demonstrations have no frames; record them with a picture size")
+    where = np.argwhere(trials.taken[FRAMES - 1 :])
+    ahead = 1 if stills else FRAMES
+    found = np.zeros((*trials.taken[FRAMES - 1 :].shape, encoder.config.model.embed), np.float32)
+    for start in range(0, len(where), batch):
+        part = where[start : start + batch]
+        padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
+        found[tuple(part.T)] = encoder.embed(_clips(trials.frames, padded, ahead), SENSOR)[: len(part)]
+    return found
+
+
+def _clips(frames: Array, where: Array, ahead: int) -> Array:
+    """Segments (n, ahead, ...) that end at moments `where` (n, 2): number of the segment, run."""
+    ends = where[:, 0] + FRAMES - 1
+    return np.stack([frames[ends - back, where[:, 1]] for back in range(ahead - 1, -1, -1)], 1)
+
+
+def inputs(now: Any, before: Any, lifted: Any, standing: Any, xp: Any = np) -> Any:
+    """What the MLP is given (..., 4 E): changes between the features of four segments.
+
+    The last two, the first of the lifted cylinder, whose beads are known, and that of the standing one, the tare.
+    """
+    return xp.concatenate([now - standing, lifted - standing, now - lifted, now - before], -1)
+
+
+def input_table(z: Array) -> Array:
+    """`inputs` (S - LIFTED, B, 4 E) at the moments of choice, from features (S, B, E) of all segments."""
+    now = z[LIFTED:]
+    before = now[np.maximum(np.arange(len(now)) - LAG, 0)]
+    return np.asarray(inputs(now, before, *(np.broadcast_to(z[i], now.shape) for i in (LIFTED, 0))))
+
+
+def blind_inputs(actions: Array) -> Array:
+    """Time and counts of the own actions so far (S, B, 4), from actions (S, B); nothing of the run itself."""
+    chosen = np.eye(len(ACTIONS), dtype=np.float32)[actions]
+    before = np.cumsum(chosen, 0) - chosen
+    time = np.broadcast_to(np.arange(len(actions), dtype=np.float32)[:, None, None], (*actions.shape, 1))
+    return np.concatenate([time, before], -1) / 100
+
+
+def forward(head: Head, x: Any) -> jax.Array:
+    """Logits (n, 3) of the actions."""
+    x = (x - head.mean[None]) / head.scale[None]
+    for weight, bias in head.layers[:-1]:
+        x = jax.nn.gelu(x @ weight + bias[None], approximate=False)
+    weight, bias = head.layers[-1]
+    return x @ weight + bias[None]
+
+
+_forward = jax.jit(forward)
+
+
+def new_head(x: Array, learning: Learning) -> Head:
+    """An untrained MLP for inputs like `x` (n, d), which it standardises."""
+    mean, spread = x.mean(0), x.std(0)
+    sizes = (x.shape[1], learning.width, learning.width, len(ACTIONS))
+    keys = jax.random.split(jax.random.key(learning.seed), len(sizes) - 1)
+    shapes = list(zip(sizes[:-1], sizes[1:], keys, strict=True))
+    layers = tuple((jax.random.normal(key, (a, b)) * (1 / a) ** 0.5, jnp.zeros(b)) for a, b, key in shapes)
+    return Head(jnp.asarray(mean), jnp.asarray(np.where(spread > 1e-6, spread, 1.0)), layers)
+
+
+def imitation_loss(logits: jax.Array, choices: jax.Array) -> jax.Array:
+    """Mean cross-entropy of logits (n, 3) against the expert's choices (n,)."""
+    return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, choices))
+
+
+def imitate(x: Array, actions: Array, learning: Learning) -> tuple[Head, float]:
+    """Train the MLP on inputs (n, d) and actions (n,); also the last mean loss. Raises UserError on inputs of NaN."""
+    if not np.isfinite(x).all():
+        raise UserError("the policy's inputs are not finite; look at the encoder's weights")
+    head = new_head(x, learning)
+    optimiser = optax.adamw(optax.cosine_decay_schedule(learning.rate, learning.steps), weight_decay=learning.decay)
+    data = (jnp.asarray(x, jnp.float32), jnp.asarray(actions))
+
+    @jax.jit
+    def train(layers: Any, data: Any) -> tuple[Any, jax.Array]:
+        def step(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            layers, state = carry
+            ids = jax.random.randint(key, (learning.batch,), 0, len(data[0]))
+
+            def loss(layers: Any) -> jax.Array:
+                return imitation_loss(forward(head._replace(layers=layers), data[0][ids]), data[1][ids])
+
+            value, slope = jax.value_and_grad(loss)(layers)
+            change, state = optimiser.update(slope, state, layers)
+            return (optax.apply_updates(layers, change), state), value
+
+        keys = jax.random.split(jax.random.key(learning.seed + 1), learning.steps)
+        (layers, _), losses = jax.lax.scan(step, (layers, optimiser.init(layers)), keys)
+        return layers, jnp.mean(losses[-max(1, learning.steps // 10) :])
+
+    layers, last = train(head.layers, data)
+    return head._replace(layers=layers), float(last)
+
+
+class Touch:
+    """A policy that sees tactile frames only: an encoder and the MLP over its last features."""
+
+    looks = True
+
+    def __init__(self, encoder: Encoder, head: Head, *, stills: bool) -> None:
+        self._encoder, self._head, self._stills = encoder, head, stills
+
+    def begin(self, count: int) -> None:
+        """Forget the frames and features of the last runs."""
+        self._frames: list[Array] = []
+        self._z: list[Array] = []
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,) from the frames so far; it waits until it has seen a segment."""
+        assert frames is not None
+        self._frames = [*self._frames[-FRAMES + 1 :], frames]
+        if len(self._frames) < FRAMES:
+            return np.full(len(frames), WAIT)
+        stack = np.stack(self._frames[-1:] if self._stills else self._frames, 1)
+        self._z.append(self._encoder.embed(stack, SENSOR))
+        if len(self._z) <= LIFTED:
+            return np.full(len(frames), WAIT)
+        before = self._z[max(len(self._z) - 1 - LAG, LIFTED)]
+        x = inputs(self._z[-1], before, self._z[LIFTED], self._z[0])
+        return np.asarray(_forward(self._head, x)).argmax(-1)
+
+
+class Blind:
+    """The same MLP, told only the time and its own actions."""
+
+    looks = False
+
+    def __init__(self, head: Head) -> None:
+        self._head = head
+
+    def begin(self, count: int) -> None:
+        """Time is 0 again."""
+        self._x: Array = np.zeros((count, 1 + len(ACTIONS)), np.float32)
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,) from the time and the counts of its actions."""
+        chosen = np.asarray(_forward(self._head, self._x)).argmax(-1)
+        chosen = np.where(self._x[:, 0] * 100 < START - 0.5, WAIT, chosen)
+        self._x = self._x + np.concatenate([np.ones((len(chosen), 1)), np.eye(len(ACTIONS))[chosen]], 1) / 100
+        self._x = self._x.astype(np.float32)
+        return chosen
+
+
+def learn_blind(task: Task, seed: int, count: int, learning: Learning) -> Blind:
+    """A blind policy from `count` demonstrations of an expert that never waits.
+
+    To wait is to answer what is seen: a blind policy would learn that it has poured too early to stop, as it never
+    waited.
+    """
+    trials = demonstrate(task, seed, count, side=None, patient=False, chunk=count)
+    taken = trials.taken[START:]
+    return Blind(imitate(blind_inputs(trials.actions)[START:][taken], trials.choices[START:][taken], learning)[0])
+
+
+def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool) -> Touch:
+    """A policy over frozen features, from demonstrations with frames."""
+    z = features(encoder, trials, stills=stills)
+    taken = trials.taken[START:]
+    head, _ = imitate(input_table(z)[taken], trials.choices[START:][taken], learning)
+    return Touch(encoder, head, stills=stills)
+
+
+def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
+    """Go on from a policy over frozen features with the encoder's parameters trained too."""
+    assert trials.frames is not None
+    encoder, head, stills = policy._encoder, policy._head, policy._stills
+    ahead = 1 if stills else FRAMES
+    where = np.argwhere(trials.taken[START:])
+    step, state, params = _tuner(encoder, head, learning)
+    rng = np.random.default_rng(learning.seed)
+    for _ in range(learning.tune_steps):
+        at = where[rng.integers(len(where), size=learning.tune_batch)]
+        now, lifted = at[:, 0] + LIFTED, np.full(len(at), LIFTED)
+        numbers = (now, np.maximum(now - LAG, LIFTED), lifted, 0 * lifted)
+        clips = [_clips(trials.frames, np.stack([number, at[:, 1]], 1), ahead) for number in numbers]
+        params, state = step(params, state, np.concatenate(clips), trials.choices[at[:, 0] + START, at[:, 1]])
+    tuned = replace(encoder, params=params["encoder"], source=f"{encoder.source}, fine-tuned")
+    return Touch(tuned, head._replace(layers=params["head"]), stills=stills)
+
+
+def _tuner(encoder: Encoder, head: Head, learning: Learning) -> tuple[Callable[..., tuple[Params, Any]], Any, Params]:
+    """The compiled step of fine-tuning, its optimiser's state and its parameters."""
+    params = {"encoder": encoder.params, "head": head.layers}
+    optimiser = optax.multi_transform(
+        {"encoder": optax.adamw(learning.tune_rate), "head": optax.adamw(learning.rate / 10)},
+        {"encoder": "encoder", "head": "head"},
+    )
+    sensor = encoder.sensor_row(SENSOR)
+    apply = partial(_tuned_logits, net=encoder.net, head=head, sensor=sensor)
+
+    @jax.jit
+    def step(params: Params, state: Any, clips: jax.Array, actions: jax.Array) -> tuple[Params, Any]:
+        slope = jax.grad(lambda p: imitation_loss(apply(p, clips), actions))(params)
+        change, state = optimiser.update(slope, state, params)
+        return optax.apply_updates(params, change), state
+
+    return step, optimiser.init(params), params
+
+
+def _tuned_logits(params: Params, clips: jax.Array, *, net: Net, head: Head, sensor: int) -> jax.Array:
+    """Logits (n, 3) of 4 n clips: of n moments the last segments, those before, the lifted and the standing ones."""
+    rows = jnp.full(len(clips), sensor, jnp.int32)
+    z = net.apply(params["encoder"], "encode", normalise_touch(clips), rows, "mean").astype(jnp.float32)
+    now, before, lifted, standing = jnp.split(z, 4)
+    return forward(head._replace(layers=params["head"]), inputs(now, before, lifted, standing, jnp))

@@ -1,0 +1,168 @@
+"""The pouring table in the paper's form, made from the JSON of its rows alone (Sec. Q3, table "real-world pouring")."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import UserError
+from ..sim.pouring import Task
+from .pouring import Error, Trials, error
+from .results import mean_interval
+from .sections import markdown
+
+Array = npt.NDArray[Any]
+MODES = ("fine-tuned", "frozen")
+TITLES = {
+    "none": "no tactile pre-training",
+    "t3": "T3-style",
+    "static": "AnyTouch, static only",
+    "anytouch": "AnyTouch",
+    "blind": "blind: time and own actions",
+    "count": "blind: the best number of pours",
+    "expert": "expert: sees the scales",
+}
+PAPER = {"none": (5.22, 49.1), "t3": (2.33, 9.74), "static": (2.45, 9.60), "anytouch": (1.56, 8.22)}
+BLIND = ("blind", "count")
+DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the others see stills
+CLAIMS = (("anytouch", "static"), ("anytouch", "t3"), ("static", "none"), ("t3", "none"), ("anytouch", "none"))
+
+
+class Row(NamedTuple):
+    """One row and mode over all its seeds: `poured` g of each run, `runs` names them ("seed/number")."""
+
+    name: str
+    mode: str
+    poured: Array
+    runs: tuple[str, ...]
+    target: float
+    sources: tuple[str, ...]
+    settings: str
+
+    @property
+    def wrong(self) -> Array:
+        """|poured - target| (n,) g."""
+        return np.abs(self.poured - self.target)
+
+
+def record(
+    name: str, mode: str, seed: int, trials: Trials, task: Task, source: str, settings: Mapping[str, Any]
+) -> str:
+    """The JSON of a row's trials with one seed."""
+    found = error(trials.poured, task.target)
+    values = {
+        "row": name, "mode": mode, "seed": seed, "target": task.target, "source": source, "settings": dict(settings),
+        "poured": [round(float(x), 3) for x in trials.poured], "steps": [int(x) for x in trials.steps],
+        "mean_error": round(found.mean, 3),
+    }  # fmt: skip
+    return json.dumps(values, indent=2) + "\n"
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """The rows of a folder of JSON files. Raises UserError for one that cannot be read, or none at all."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            one = json.loads(path.read_text(encoding="utf-8"))
+            found.setdefault((one["row"], one["mode"]), []).append(one)
+        except (ValueError, KeyError, TypeError) as bad:
+            raise UserError(f"{path} is not the result of a pouring row ({bad}); remove it and run again") from None
+    if not found:
+        raise UserError(f"no result of a pouring row in {folder}; run experiments/pouring.py")
+    return [_row(name, mode, parts) for (name, mode), parts in found.items()]
+
+
+def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
+    settings = {json.dumps(part["settings"], sort_keys=True) for part in parts}
+    if len(settings) > 1:
+        raise UserError(f"the seeds of row {name} ({mode}) were run with different settings; remove the old results")
+    parts = sorted(parts, key=lambda part: part["seed"])
+    runs = tuple(f"{part['seed']}/{number}" for part in parts for number in range(len(part["poured"])))
+    poured = np.concatenate([np.asarray(part["poured"], np.float64) for part in parts])
+    sources = tuple(dict.fromkeys(part["source"] for part in parts))
+    return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop())
+
+
+def difference(a: Row, b: Row) -> Error:
+    """Mean of the error of `a` minus that of `b` over the runs both have, g, with its paired 95 % interval."""
+    shared = [run for run in a.runs if run in b.runs]
+    if not shared:
+        raise UserError(f"rows {a.name} and {b.name} have no run in common; run them with the same seeds")
+    change = np.array([a.wrong[a.runs.index(run)] - b.wrong[b.runs.index(run)] for run in shared])
+    return Error(float(change.mean()), *mean_interval(change, np.arange(len(change))))
+
+
+def verdict(change: Error) -> str:
+    """What the interval of a difference says of a claim that it is below zero."""
+    if change.high is not None and change.high < 0:
+        return "agrees"
+    return "reversed" if change.low is not None and change.low > 0 else "not decided"
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown: mean errors beside the paper's, then each of the paper's orders with its paired difference."""
+    by = {(row.name, row.mode): row for row in rows}
+    lines = []
+    for name, title in TITLES.items():
+        if not any(row.name == name for row in rows):
+            continue
+        cells = []
+        for number, mode in enumerate(MODES):
+            row = by.get((name, mode)) or by.get((name, "bound"))
+            cells += [_words(error(row.poured, row.target)) if row else "-", _paper(name, number)]
+        lines.append((title, "yes" if name in DYNAMIC else "no" if name in PAPER else "-", *cells))
+    head = ("policy", "sees segments", "fine-tuned, g", "paper", "frozen, g", "paper")
+    parts = [markdown(head, lines)]
+    claims = [_claim(by, mode, better, worse) for mode in MODES for better, worse in CLAIMS]
+    claims += [_claim(by, mode, name, bound) for mode in MODES for name in PAPER for bound in BLIND]
+    found = [claim for claim in claims if claim]
+    if found:
+        parts.append(markdown(("smaller error, as claimed", "than", "mode", "difference, g (95 %)", "sign"), found))
+    return "\n\n".join(parts) + "\n"
+
+
+def _claim(by: Mapping[tuple[str, str], Row], mode: str, better: str, worse: str) -> tuple[str, ...] | None:
+    a, b = by.get((better, mode)), by.get((worse, "bound" if worse in BLIND else mode))
+    if a is None or b is None:
+        return None
+    change = difference(a, b)
+    return TITLES[better], TITLES[worse], mode, _words(change, "+.1f"), verdict(change)
+
+
+def _paper(name: str, mode: int) -> str:
+    return f"{PAPER[name][mode]:g}" if name in PAPER else "-"
+
+
+def _words(found: Error, form: str = ".1f") -> str:
+    if found.low is None or found.high is None:
+        return f"{found.mean:{form}}"
+    return f"{found.mean:{form}} ({found.low:{form}} to {found.high:{form}})"
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Every run's poured mass by row, and the row's mean error, as PNG."""
+    from matplotlib.figure import Figure
+
+    from .plots import write_figure
+
+    places = [(name, mode) for name in TITLES for mode in (*MODES, "bound")]
+    order = sorted(rows, key=lambda row: places.index((row.name, row.mode)))
+    figure = Figure(figsize=(7.5, 0.8 + 0.42 * len(order)), layout="constrained")
+    axis = figure.subplots()
+    for place, row in enumerate(order):
+        jitter = 0.5 * (np.arange(len(row.poured)) / max(len(row.poured) - 1, 1) - 0.5)
+        colour = f"C{list(TITLES).index(row.name)}"
+        axis.scatter(row.poured, place + jitter, s=14, color=colour, alpha=0.8, linewidths=0)
+    names = [f"{TITLES[row.name]}{'' if row.mode == 'bound' else ', ' + row.mode}" for row in order]
+    errors = [f"{name} ({row.wrong.mean():.1f} g)" for name, row in zip(names, order, strict=True)]
+    axis.set_yticks(range(len(order)), errors)
+    axis.axvline(order[0].target, color="#222222", linewidth=1)
+    axis.set(xlabel="poured, g (mean error in brackets)", xlim=(-2, 102))
+    axis.invert_yaxis()
+    axis.grid(axis="x", alpha=0.25)
+    write_figure(path, figure)

@@ -1,0 +1,37 @@
+"""`anytouch pour`: masses, mean errors beside both bounds, a film; mistakes in one sentence."""
+
+import json
+
+import pytest
+from PIL import Image
+
+
+def test_a_run_pours(anytouch, tiny_run, tmp_path):
+    out = tmp_path / "deep" / "pour"
+    said = anytouch("pour", "--run", tiny_run, "--trials", 2, "--demos", 2, "--steps", 20, "--out", out)
+    assert said.status == 0, said.err
+    lines = said.out.splitlines()
+    masses = [float(line.split("|")[2]) for line in lines if line.startswith(("| 1 |", "| 2 |"))]
+    found = json.loads((out / "pour.json").read_text())
+    assert masses == pytest.approx(found["poured"]["touch"], abs=0.06) and all(0 <= m <= 100 for m in masses)
+    means = {name: sum(abs(m - 60) for m in some) / 2 for name, some in found["poured"].items()}
+    for name in ("touch", "blind", "count", "expert"):
+        line = next(line for line in lines if line.startswith(f"{name}: mean error "))
+        assert float(line.split()[3]) == pytest.approx(means[name], abs=0.06) and "95 %" in line
+    assert means["expert"] < 5
+    with Image.open(out / "pour.gif") as film:
+        assert film.n_frames > 3
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--run", "nowhere"], "nowhere"),
+        (["--run", "x", "--trials", "0"], "--trials must be at least 1"),
+        (["--run", "x", "--demos", "0"], "--demos must be at least 1"),
+        (["--run", "x", "--steps", "0"], "--steps must be at least 1"),
+    ],
+)
+def test_mistakes_are_one_sentence(anytouch, words, sentence):
+    said = anytouch("pour", *words)
+    assert said.status == 1 and sentence in said.err and len(said.err.strip().splitlines()) == 1

@@ -1,0 +1,269 @@
+"""Pouring closed loop: the expert, imitation on a signal that can be learned, the blind policy, film and table."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_models import tiny_config
+
+from anytouch_jax.config import UserError
+from anytouch_jax.evaluate import pouring, pouring_policy, pouring_table
+from anytouch_jax.evaluate.features import random_encoder
+from anytouch_jax.evaluate.pouring_policy import Learning
+from anytouch_jax.sim.pouring import POUR, RETRACT, WAIT, Task
+
+TASK, SIDE = Task(), 28
+FAST = Learning(steps=600, width=32, tune_steps=2, tune_batch=4)
+
+
+@pytest.fixture(scope="module")
+def told() -> pouring.Trials:
+    """Demonstrations without frames: the flow alone."""
+    return pouring_policy.demonstrate(TASK, 0, 20, side=None, late=0, chunk=20)
+
+
+@pytest.fixture(scope="module")
+def late() -> pouring.Trials:
+    """The same, by a late hand: what policies learn from."""
+    return pouring_policy.demonstrate(TASK, 0, 20, side=None, chunk=20)
+
+
+@pytest.fixture(scope="module")
+def shown() -> pouring.Trials:
+    """Two short demonstrations with frames."""
+    return pouring_policy.demonstrate(replace(TASK, limit=9), 0, 2, side=SIDE)
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    return random_encoder(tiny_config())
+
+
+def test_the_expert_pours_the_target(told):
+    wrong = np.abs(told.poured - TASK.target)
+    assert wrong.mean() < 1.5 and wrong.max() < 6
+    assert set(np.unique(told.actions[told.taken])) == {POUR, WAIT, RETRACT}
+    for run in range(len(told.poured)):
+        mine = told.actions[: told.steps[run], run]
+        assert (mine[:5] == WAIT).all() and (mine[-12:] == RETRACT).all()
+        assert (np.diff(told.mass[: told.steps[run], run]) <= 0).all()
+    assert told.steps.std() > 5
+
+
+def test_the_same_seed_is_the_same_run_in_any_company(told):
+    alone = pouring_policy.demonstrate(TASK, 0, 3, side=None, late=0, chunk=3)
+    np.testing.assert_array_equal(alone.poured, told.poured[:3])
+    longest = len(alone.actions)
+    taken = alone.taken
+    np.testing.assert_array_equal(alone.actions[taken], told.actions[:longest, :3][taken])
+    other = pouring_policy.demonstrate(TASK, 1, 3, side=None, late=0, chunk=3)
+    assert np.abs(other.tilt[0] - alone.tilt[0]).min() > 1e-3
+
+
+def test_a_late_hand_changes_what_is_done_and_not_what_is_told(told, late):
+    assert (told.choices == told.actions).all()
+    for run in range(20):
+        mine = late.choices[: late.steps[run], run], late.actions[: late.steps[run], run]
+        first = int((mine[0] == RETRACT).argmax())
+        assert (mine[0][first:] == RETRACT).all() and (mine[0][:first] == mine[1][:first]).all()
+        over = int((mine[1][first:] == RETRACT).argmax())
+        assert (mine[1][first : first + over] == POUR).all() and (mine[1][first + over :] == RETRACT).all()
+        same = min(first, told.steps[run])
+        np.testing.assert_array_equal(late.mass[:same, run], told.mass[:same, run])
+    assert late.poured.std() > 5 and late.poured.min() > 59
+
+
+def test_a_blind_policy_pours_but_cannot_know():
+    blind = pouring_policy.learn_blind(TASK, 0, 20, FAST)
+    setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
+    found = pouring.run(TASK, setups, keys, blind)
+    assert 4 < pouring.error(found.poured, TASK.target).mean < 30
+    assert found.poured.std() > 4  # the runs differ, it does not
+
+
+def test_counting_is_the_best_it_can_be_and_no_more(told):
+    counter = pouring.best_counter(TASK, *pouring.draw_runs(TASK, 0, 20))
+    setups, keys = pouring.draw_runs(TASK, 0, 20)
+    errors = {}
+    for more in (-24, 0, 24):
+        found = pouring.run(TASK, setups, keys, pouring.Counter(counter.pours + more))
+        errors[more] = pouring.error(found.poured, TASK.target).mean
+        assert ((found.actions == POUR) & found.taken).sum(0).max() == counter.pours + more
+    assert 4 < errors[0] < min(errors[-24], errors[24])
+
+
+class Seer:
+    """A policy over a toy signal: the mass with noise, through the same inputs and MLP as touch."""
+
+    looks = False
+
+    def __init__(self, head) -> None:
+        self._head = head
+
+    def begin(self, count):
+        self._z = []
+
+    def act(self, frames, state):
+        self._z.append(toy(np.asarray(state.mass), len(self._z)))
+        if len(self._z) < 6:
+            return np.full(len(state.mass), WAIT)
+        z = np.stack(self._z[2:])
+        return np.asarray(pouring_policy.forward(self._head, pouring_policy.input_table(z)[-1])).argmax(-1)
+
+
+def toy(mass, step):
+    noise = np.random.default_rng(step).normal(0, 1, (len(mass), 4))
+    return (np.stack([mass, np.sqrt(np.maximum(mass, 0)), mass**2 / 100, 0 * mass], -1) + noise).astype(np.float32)
+
+
+def test_imitation_learns_a_toy_signal_and_beats_blind(late):
+    z = np.stack([toy(mass, step) for step, mass in enumerate(late.mass)])[2:]
+    taken = late.taken[5:]
+    head, loss = pouring_policy.imitate(
+        pouring_policy.input_table(z)[taken], late.choices[5:][taken], replace(FAST, steps=1500)
+    )
+    assert loss < 0.5 * np.log(3)
+    setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
+    seen = pouring.run(TASK, setups, keys, Seer(head))
+    blind = pouring.run(TASK, setups, keys, pouring_policy.learn_blind(TASK, 0, 20, FAST))
+    assert pouring.error(seen.poured, TASK.target).mean < 4
+    assert np.mean(np.abs(seen.poured - 60) < np.abs(blind.poured - 60)) > 0.6
+
+
+def test_inputs_are_changes_from_the_standing_and_the_lifted_cylinder():
+    z = np.arange(10, dtype=np.float32)[:, None, None] ** 2 * np.ones((1, 2, 1), np.float32)
+    table = pouring_policy.input_table(z)
+    assert table.shape == (7, 2, 4)
+    np.testing.assert_array_equal(table[5, 1], [64, 9, 64 - 9, 64 - 25])  # segment 8
+    np.testing.assert_array_equal(table[0, 0], [9, 9, 0, 0])
+    np.testing.assert_array_equal(table[1, 0], [16, 9, 7, 7])
+
+
+def test_blind_inputs_hold_time_and_own_actions_only():
+    actions = np.array([[WAIT], [POUR], [POUR], [RETRACT]])
+    found = pouring_policy.blind_inputs(actions)[:, 0] * 100
+    np.testing.assert_allclose(found, [[0, 0, 0, 0], [1, 0, 1, 0], [2, 1, 1, 0], [3, 2, 1, 0]], atol=1e-4)
+
+
+def test_the_loss_by_hand():
+    logits, choices = jnp.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]]), jnp.array([1, 0])
+    assert float(pouring_policy.imitation_loss(logits, choices)) == pytest.approx(np.log(3) / 2, rel=1e-6)
+
+
+def test_features_of_demonstrations_are_those_of_the_encoder(shown, encoder):
+    z = pouring_policy.features(encoder, shown, stills=False, batch=8)
+    assert z.shape == (7, 2, 12)
+    clip = shown.frames[2:5, 1][None]
+    np.testing.assert_allclose(z[2, 1], encoder.embed(clip, "gelsight_mini")[0], atol=1e-5)
+    still = pouring_policy.features(encoder, shown, stills=True, batch=8)
+    np.testing.assert_allclose(still[2, 1], encoder.embed(shown.frames[4, 1], "gelsight_mini")[0], atol=1e-5)
+    assert np.abs(still - z).max() > 1e-4
+
+
+def test_touch_sees_in_a_run_what_it_learned_from(shown, encoder):
+    """The closed loop feeds the MLP the same inputs as the table of the demonstrations."""
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
+    z = pouring_policy.features(encoder, shown, stills=False, batch=8)
+    logits = pouring_policy.forward(policy._head, pouring_policy.input_table(z).reshape(8, -1))
+    policy.begin(2)
+    acted = [policy.act(frames, None) for frames in shown.frames]
+    assert (np.stack(acted[:5]) == WAIT).all()
+    np.testing.assert_array_equal(np.stack(acted[5:]), np.asarray(logits).argmax(-1).reshape(4, 2))
+
+
+def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encoder):
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
+    before = jax.tree.map(np.array, encoder.params)
+    tuned = pouring_policy.fine_tune(policy, shown, FAST)
+    moved = jax.tree.map(lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()), tuned._encoder.params, before)
+    assert max(jax.tree.leaves(moved)) > 1e-5
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, encoder.params), before)
+    found = pouring.run(replace(TASK, limit=9), *pouring.draw_runs(TASK, 3, 2), tuned, side=SIDE)
+    assert found.poured.shape == (2,) and found.frames is None
+
+
+def test_without_a_look_nothing_is_drawn(monkeypatch):
+    monkeypatch.setattr(pouring, "hold", lambda *a, **k: pytest.fail("contact was solved"))
+    monkeypatch.setattr(pouring, "look", lambda *a, **k: pytest.fail("a frame was drawn"))
+    setups, keys = pouring.draw_runs(TASK, 0, 2)
+    assert pouring.run(replace(TASK, limit=4), setups, keys, pouring.Expert(TASK)).frames is None
+
+
+def test_mistakes_are_one_sentence(told, encoder):
+    with pytest.raises(UserError, match="no frames"):
+        pouring_policy.features(encoder, told, stills=True)
+    with pytest.raises(UserError, match="not finite"):
+        pouring_policy.imitate(np.full((4, 2), np.nan), np.zeros(4, int), FAST)
+    with pytest.raises(UserError, match="tune_steps"):
+        Learning(tune_steps=0)
+
+
+def test_the_film_shows_every_page(shown, tmp_path):
+    pouring.write_film(tmp_path / "deep" / "run.gif", shown, TASK, every=3)
+    with Image.open(tmp_path / "deep" / "run.gif") as film:
+        assert film.n_frames == 4 and film.size == (440, 180)
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(3)
+        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - first).mean() > 0.2
+
+
+# The table.
+
+
+def write(folder, name, mode, poured, seed=0, **settings):
+    trials = pouring.Trials(np.asarray(poured), np.full(len(poured), 9), *[np.zeros((1, 1))] * 5, None)
+    text = pouring_table.record(name, mode, seed, trials, TASK, "runs/x", {"trials": len(poured)} | settings)
+    (folder / f"{name}-{mode}-{seed}.json").write_text(text)
+
+
+def test_the_table_says_what_the_intervals_say(tmp_path):
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0, 1, (3, 10))
+    for seed in range(3):
+        write(tmp_path, "anytouch", "frozen", 62 + noise[seed] / 4, seed)
+        write(tmp_path, "static", "frozen", 66 + noise[seed], seed)
+        write(tmp_path, "none", "frozen", 66 + noise[seed] + rng.normal(0, 0.5, 10), seed)
+        write(tmp_path, "t3", "frozen", 75 + noise[seed], seed)
+        write(tmp_path, "blind", "bound", 72 + noise[seed], seed)
+    rows = pouring_table.read_rows(tmp_path)
+    text = pouring_table.table(rows)
+    mean = np.abs(2 + noise / 4).mean()
+    assert f"| AnyTouch | yes | - | 1.56 | {mean:.1f} (" in text and ") | 8.22 |" in text
+    lines = [line for line in text.splitlines() if line.count("|") > 5]
+    signs = {tuple(c.strip() for c in line.split("|")[1:4]): line.split("|")[5].strip() for line in lines}
+    assert signs[("AnyTouch", "AnyTouch, static only", "frozen")] == "agrees"
+    assert signs[("AnyTouch, static only", "no tactile pre-training", "frozen")] == "not decided"
+    assert signs[("T3-style", "no tactile pre-training", "frozen")] == "reversed"
+    assert signs[("AnyTouch", "blind: time and own actions", "frozen")] == "agrees"
+    assert "expert" not in text and "fine-tuned | 10" not in text
+    pouring_table.draw(tmp_path / "table.png", rows)
+    with Image.open(tmp_path / "table.png") as drawn:
+        assert drawn.size[0] > 500
+
+
+def test_differences_are_paired_run_by_run(tmp_path):
+    write(tmp_path, "anytouch", "frozen", [60, 70, 80])
+    write(tmp_path, "static", "frozen", [61, 71, 81])
+    write(tmp_path, "static", "frozen", [0, 0, 0], seed=1)
+    rows = {row.name: row for row in pouring_table.read_rows(tmp_path)}
+    found = pouring_table.difference(rows["anytouch"], rows["static"])
+    assert (found.mean, found.low, found.high) == (-1, -1, -1)
+    assert len(rows["static"].runs) == 6
+
+
+def test_a_broken_or_mixed_result_is_named(tmp_path):
+    with pytest.raises(UserError, match="no result"):
+        pouring_table.read_rows(tmp_path)
+    write(tmp_path, "static", "frozen", [60.0])
+    write(tmp_path, "static", "frozen", [60.0, 61.0], seed=1)
+    with pytest.raises(UserError, match="different settings"):
+        pouring_table.read_rows(tmp_path)
+    (tmp_path / "static-frozen-1.json").write_text(json.dumps({"row": "static"}))
+    with pytest.raises(UserError, match="static-frozen-1"):
+        pouring_table.read_rows(tmp_path)

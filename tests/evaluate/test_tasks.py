@@ -1,0 +1,181 @@
+"""Which rows a task takes, what their labels and groups are, and what flips do to directions."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # battery_world.py
+
+from battery_world import row, simulated, table
+
+from anytouch_jax.config import UserError
+from anytouch_jax.evaluate import tasks
+from anytouch_jax.evaluate.tasks import TASKS, Task, available, mirrored, select
+from anytouch_jax.sim import scene
+
+WORLD = simulated()
+FRAME = np.asarray(WORLD.column("frame_index"))
+
+
+def cells(found: tasks.Selection, name: str) -> list:
+    return [WORLD.value(int(one), name) for one in found.rows[:, 0]]
+
+
+def test_a_press_is_the_deepest_frame_of_each_recording():
+    found = select(WORLD, TASKS["material"])
+    assert found.rows.shape == (24 * 2 * 2, 1)
+    assert len(set(cells(found, "sequence"))) == 96 and set(FRAME[found.rows[:, 0]]) == {2}
+    np.testing.assert_array_equal(found.labels, cells(found, "label.material"))
+    np.testing.assert_array_equal(found.groups, [f"object {name}" for name in cells(found, "object")])
+    np.testing.assert_array_equal(found.split, cells(found, "split"))
+
+
+def test_contact_is_what_presses_and_ends_a_clip():
+    found = select(WORLD, TASKS["force"])
+    assert set(FRAME[found.rows[:, 0]]) == {2, 3, 4}  # frame 0 does not press, 0 and 1 end no clip of three
+    assert found.labels.dtype == np.float64
+    np.testing.assert_allclose(found.labels, cells(found, "label.force"))
+    few = select(WORLD, Task("f", "label.force", "regression", which="contact"))
+    assert set(FRAME[few.rows[:, 0]]) == {1, 2, 3, 4}
+
+
+def test_moving_is_the_frame_that_slips_most_else_at_two_thirds():
+    found = select(WORLD, TASKS["twist"])
+    twist = cells(found, "label.twist")
+    np.testing.assert_array_equal(found.labels, twist)
+    assert set(twist) == {"clockwise", "counterclockwise"}  # "none" takes no part
+    still = [WORLD.value(int(r), "label.slip") == 0 for r in found.rows[:, 0]]
+    assert any(still) and not all(still)
+    assert set(FRAME[found.rows[:, 0]]) == {3}  # 2/3 of 4 is 2.67
+    assert len(found.rows) == len(set(cells(found, "sequence"))) == 64
+
+
+@pytest.mark.parametrize("name", ["slip", "force", "twist", "slide"])
+def test_stills_and_clips_of_a_dynamic_task_take_the_same_rows(name):
+    for other in (1, 3):
+        np.testing.assert_array_equal(select(WORLD, TASKS[name]).rows, select(WORLD, TASKS[name], other).rows)
+    longer = select(WORLD, TASKS[name], 5)
+    assert set(FRAME[longer.rows[:, 0]]) == {4}
+
+
+def test_slip_is_a_share_above_a_half_or_a_mark():
+    found = select(WORLD, TASKS["slip"])
+    np.testing.assert_array_equal(found.labels == "yes", np.array(cells(found, "label.slip")) > 0.5)
+    marked = table([row(sequence="a", frame_index=i, label__slip=1, label__contact_score=9.0) for i in range(3)])
+    assert select(marked, TASKS["slip"]).labels.tolist() == ["yes"]
+
+
+def test_a_file_with_scores_takes_scored_contact_only():
+    scores = (9.0, 7.0, None)
+    rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact_score=s)
+            for i, s in enumerate(scores)]  # fmt: skip
+    assert select(table(rows), TASKS["object"]).rows.tolist() == [[0]]
+    plain = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball") for i in range(3)]
+    assert len(select(table(plain), TASKS["object"]).rows) == 3  # nothing is known of contact: all take part
+    marked = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact=i) for i in range(2)]
+    assert select(table(marked), TASKS["object"]).rows.tolist() == [[1]]
+
+
+def test_groups_fall_back_to_the_recording():
+    rows = [
+        row(sequence="v/1", label__object="a", grasp_group="g1", touch="t1"),
+        row(sequence="v/2", label__object="a", touch="t1"),
+        row(sequence="v/3", label__object="a"),
+    ]
+    assert select(table(rows), TASKS["object"]).groups.tolist() == ["grasp_group g1", "touch t1", "sequence v/3"]
+    video = Task("x", "label.object", groups=("recording",))
+    assert select(table(rows), video).groups.tolist() == ["recording v"] * 3
+
+
+def test_what_cannot_be_asked_is_one_sentence():
+    with pytest.raises(UserError, match=r"'label\.success'; it has label\.object, label\.material"):
+        select(WORLD, TASKS["grasp"])
+    with pytest.raises(UserError, match=r"holds 0\.1, a measured quantity"):
+        select(WORLD, Task("x", "label.slip"))
+    with pytest.raises(UserError, match=r"'label\.twist' holds text"):
+        select(WORLD, Task("x", "label.twist", "regression"))
+    with pytest.raises(UserError, match="no task 'colour'; choose among material"):
+        tasks.task_of("colour")
+    with pytest.raises(UserError, match="no row of split train, val or test has a label and contact"):
+        select(table([row(label__material="x", label__contact=0)]), TASKS["material"])
+    with pytest.raises(UserError, match="index the data set again"):
+        select(WORLD, Task("x", "label.material", listed="rough"))
+
+
+def test_the_authors_lists_decide_whichever_manifest_it_is():
+    tests = ("material", "rough", "material+rough", None)
+    rows = [row(path=f"{i}.png", sequence=f"v/{i}", split="train", label__rough=i % 2, downstream_test=t)
+            for i, t in enumerate(tests)]  # fmt: skip
+    found = select(table(rows), Task("r", "label.rough", which="all", listed="rough"))
+    assert found.split.tolist() == ["train", "test", "test", "train"]
+
+
+def grasps() -> list[dict]:
+    rows = []
+    for grasp, fingers in (("mug/0", "BA"), ("mug/1", "A"), ("pan/0", "AB")):
+        for finger in fingers:
+            for phase in ("during", "after"):
+                if (grasp, finger, phase) != ("pan/0", "B", "after"):
+                    rows.append(row(
+                        path=f"{grasp}/{phase}{finger}.png", sequence=f"{grasp}/{phase}/{finger}", unit=finger,
+                        split="train" if phase == "during" else "unused", object=grasp[:3],
+                        touch=grasp if phase == "during" else None, label__success=1 if phase == "during" else None,
+                    ))  # fmt: skip
+    return rows
+
+
+def test_two_fingers_of_a_grasp_stand_side_by_side():
+    world = table(grasps())
+    found = select(world, TASKS["grasp"])
+    names = [[world.value(int(one), "sequence") for one in pair] for pair in found.rows]
+    assert sorted(names) == [["mug/0/during/A", "mug/0/during/B"], ["pan/0/during/A", "pan/0/during/B"]]
+    assert found.notes == ("1 touches without two fingers left out",)
+    assert sorted(found.groups) == ["object mug", "object pan"]
+    one = table([grasps()[0]])
+    with pytest.raises(UserError, match="two fingers of one touch"):
+        select(one, TASKS["grasp"])
+
+
+def test_frames_after_the_grasp_keep_the_label_and_split_of_it():
+    world = table(grasps())
+    found = select(world, TASKS["grasp_after"])
+    assert [[world.value(int(one), "sequence") for one in pair] for pair in found.rows] == [
+        ["mug/0/after/A", "mug/0/after/B"]
+    ]
+    assert (found.labels.tolist(), found.split.tolist()) == (["1"], ["train"])
+    assert "1 grasps without both frames after left out" in found.notes
+
+
+def test_available_names_what_the_manifest_can_answer():
+    assert available(WORLD) == ("material", "object", "slip", "force", "twist", "slide")
+    assert available(table(grasps())) == ("grasp", "grasp_after")
+
+
+@pytest.mark.parametrize("label", tasks.DIRECTIONS)
+def test_flips_of_a_direction_are_a_group(label):
+    values = {"label.twist": TASKS["twist"].classes, "label.slide": TASKS["slide"].classes}[label]
+    for value, across, down in itertools.product(values, (False, True), (False, True)):
+        once = mirrored(label, value, across=across, down=down)
+        assert once in values and mirrored(label, once, across=across, down=down) == value
+        assert mirrored(label, mirrored(label, value, across=across), down=down) == once
+    assert mirrored(label, "none", across=True) == "none"
+    assert mirrored("label.material", "right", across=True) == "right"
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_flips_are_those_of_a_mirrored_sensor(number):
+    """The simulator's own mirror, which it draws into the picture, changes the labels as `mirrored` says."""
+    scenes = scene.Scenes(touches=12, sensors=("digit",), seed=3, objects=12)
+    touch = scene.draw_touch(scenes, number, ("train",) * 12)
+    recording = scene.draw_recording(scenes, touch, "digit")
+    plain = scene.directions(recording)
+    for across, down in itertools.product((False, True), repeat=2):
+        sign = np.array([-1.0 if across else 1.0, -1.0 if down else 1.0], np.float32)
+        unit = recording.unit._replace(mirror=np.asarray(recording.unit.mirror) * sign)
+        turned = scene.directions(recording._replace(unit=unit))
+        assert turned == {name: mirrored(name, plain[name], across=across, down=down) for name in plain}

@@ -66,7 +66,8 @@ def anytouch(*words: Any) -> None:
 
 # %%
 TRAIN1 = ["--preset", "tiny", "--steps", STEPS1, "--batch", 64, "--optim.learning-rate", 5e-4]
-TRAIN2 = ["--preset", "tiny", "--steps", STEPS2, "--batch", 32, "--optim.learning-rate", 2e-4]
+TRAIN2 = ["--preset", "tiny", "--steps", STEPS2, "--batch", 32, "--optim.learning-rate", 5e-4]
+TRAIN2 += ["--model.temperature", 0.2]  # untrained towers: a sharp softmax only punishes them
 
 
 def prepare(grade: str, seed: int) -> tuple[Path, Path]:

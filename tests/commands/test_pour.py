@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 
+@pytest.mark.slow
 def test_a_run_pours(anytouch, tiny_run, tmp_path):
     out = tmp_path / "deep" / "pour"
     said = anytouch("pour", "--run", tiny_run, "--trials", 2, "--demos", 2, "--steps", 20, "--out", out)

@@ -20,11 +20,24 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Stack, UserError
 from anytouch_jax.evaluate import generation
 from anytouch_jax.evaluate.features import random_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
-from anytouch_jax.evaluate.generator import FILE, Design, Fit, Generator, features, load, nameless, predict, save
+from anytouch_jax.evaluate.generator import (
+    FILE,
+    Design,
+    Fit,
+    Generator,
+    encoded,
+    features,
+    load,
+    nameless,
+    pooled,
+    predict,
+    save,
+)
 from anytouch_jax.io.tensors import write_safetensors
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.translation import Conv, Translation, UNet, doubled, halved, thumbnail_side
+from anytouch_jax.objectives import normalise_touch
 
 X, Y, FIELDS = arrays(24)
 ENCODER = random_encoder(tiny_config())
@@ -142,6 +155,26 @@ def test_the_critic_pays_for_a_steep_slope_at_real_touches():
     slope = jax.grad(lambda x: jnp.sum(one.critic.apply(state.critic["head"], x)))(real)
     expected = 1.5 * np.mean(np.sum(np.square(slope), axis=1))
     np.testing.assert_allclose(losses[3.0] - losses[0.0], expected, rtol=1e-3)
+
+
+def test_each_network_moves_against_the_other():
+    """With the critic's weight alone, a step makes what is painted look more real; the critic's step, less."""
+    one = design(adversarial=1e6, learning_rate=1e-4, penalty=0.0)
+    params = generation.start(one, ENCODER, X, Y)
+    state, still = generation.begin(one, params)
+    x = np.asarray(features(one, params["encoder"], X[:8]))
+    y = np.asarray(normalise_touch(Y[:8]))
+    judged = lambda pixels: pooled(one, encoded(one, params["encoder"], pixels, "duragel"))  # noqa: E731
+    batch, rates = generation.Batch(x, y, np.asarray(judged(y))), generation.rates(one, params["fixed"], 1)
+    after, _ = generation._step(nameless(one))(state, still, batch, rates)
+
+    def looks(made, critic, real=None):
+        out = predict(one, made | still, x) if real is None else real
+        return float(one.critic.apply(critic["head"], judged(out)).mean())
+
+    assert looks(after.made, state.critic) > looks(state.made, state.critic)
+    gap = lambda critic: looks(None, critic, y) - looks(state.made, critic)  # noqa: E731
+    assert gap(after.critic) > gap(state.critic)
 
 
 def test_equal_seeds_give_equal_generators_and_others_do_not(made):

@@ -22,8 +22,8 @@
 # and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
 # What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
-# is made of these files alone. `WORK=` and `OUT=` in the environment are where data and results go; `TOUCHES=`,
-# `STEPS=`, `SEEDS=` and `TUNE=` (frozen, fine or both with a comma) change the size.
+# is made of these files alone (`TABLE=1`: nothing but that). `WORK=` and `OUT=` in the environment are where data and
+# results go; `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` (frozen, fine or both with a comma) change the size.
 
 # %%
 from __future__ import annotations
@@ -194,7 +194,8 @@ def all_runs() -> None:
             one_run(about, encoder, (train, val, test, shown), file)
 
 
-all_runs()
+if not os.environ.get("TABLE"):
+    all_runs()
 
 # %% [markdown]
 # ## The table, from the JSON of the runs
@@ -245,11 +246,12 @@ def in_units(found: list[dict[str, Any]]) -> str:
 
 physical = [(name, *(in_units(of(task, name)) for task in TASKS)) for name in names]
 first = records[0]
+steps = sorted({r["settings"]["fit"]["steps"] for r in records})  # more than one: some runs are of another size
 lines = [
     "# One sensor's touch as another would feel it",
     "",
     f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, {first['pairs'][2]} of "
-    f"objects never seen to test on; {first['settings']['fit']['steps']} steps; mean and deviation over "
+    f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
     f"{len({r['settings']['fit']['seed'] for r in records})} seeds. By `make translation`.",
     "",
     markdown(head, cells),

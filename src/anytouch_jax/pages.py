@@ -1,4 +1,4 @@
-"""Large pages for large arrays: the arrays of a step come fresh from the system, and page by page that takes half of it.
+"""Large pages for large arrays: a step takes its memory fresh from the system, page by page, half of its time.
 
 A step of preset small asks the system for 4 GB. In pages of 4 KiB the kernel is called a million times for them; with
 glibc's `glibc.malloc.hugetlb=1` (since 2.35) it is asked for pages of 2 MiB. glibc reads this when a process starts.

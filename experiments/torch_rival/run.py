@@ -81,7 +81,8 @@ def given(work: Workload) -> tuple[Any, np.ndarray]:
 def batch_file(work: Workload, path: Path) -> None:
     batch, noise = given(work)
     part = batch if not hasattr(batch, "align") else batch.align or batch.match
-    arrays = {k: v.astype(np.int64) if v.dtype == np.int32 else v for k, v in part._asdict().items()}
+    present = {k: v for k, v in part._asdict().items() if v is not None}
+    arrays = {k: v.astype(np.int64) if v.dtype == np.int32 else v for k, v in present.items()}
     release.write_safetensors(path, {**arrays, "noise": noise}, {})
 
 

@@ -12,8 +12,9 @@
 # On objects never touched in training (whole pairs of primitive and texture are held out):
 #
 # 1. **Retrieval.** The same touch by another sensor and another unit, among 50 touches that resemble it most in
-#    position, depth and force. Stage 2 against stage 1 alone, an untrained encoder, background-differenced pixels, and
-#    the vector (contact area, centroid, force). For fine data (one motion for all sensors) and coarse data (by hand).
+#    position, depth and force, after each sensor's mean feature was subtracted. Stage 2 against stage 1 alone, an
+#    untrained encoder, background-differenced pixels, and the vector (contact area, centroid, force). For fine data
+#    (one motion for all sensors) and coarse data (by hand).
 # 2. **A sensor left out.** GelSlim is not in the sensor table of the trained encoders: its touches get the universal
 #    tokens. Linear probes on its features, for labels that captions name (hardness, roughness, material) and for one
 #    that they do not (indenter).
@@ -79,8 +80,16 @@ def prepare(grade: str, seed: int) -> tuple[Path, Path]:
     one, two = (WORK / f"{grade}-{seed}-stage{stage}" for stage in (1, 2))
     data = ["--data", scenes / "manifest.parquet", "--seed", seed, "--model.sensors", *TABLE]
     anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
+    finished(one, STEPS1)
     anytouch("train", "--stage", 2, "--run", two, "--init", one, *TRAIN2, *data)
+    finished(two, STEPS2)
     return one, two
+
+
+def finished(run: Path, steps: int) -> None:
+    """A signal ends training politely; what is half trained must not be scored."""
+    if not (run / "checkpoints" / f"{steps:08d}").is_dir():
+        raise SystemExit(f"{run} was stopped before its {steps} steps; the same command goes on")
 
 
 def features(runs: tuple[Path, Path], seed: int, table: Any, rows: np.ndarray, pooling: Any) -> dict[str, np.ndarray]:
@@ -99,7 +108,7 @@ def retrieve(grade: str, seed: int, runs: tuple[Path, Path]) -> list[retrieval.R
     rows = deepest_rows(table, table.rows_of("test"))
     found = features(runs, seed, table, rows, "class")
     found |= {"pixels": background_difference(table, rows), "vector": contact_vector(table, rows)}
-    scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(False,), metrics={"vector": "euclidean"})
+    scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(True,), metrics={"vector": "euclidean"})
     return [one for one in scored if one.query_sensor == retrieval.ALL]
 
 

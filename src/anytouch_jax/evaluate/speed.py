@@ -191,10 +191,7 @@ def step_calls(programs: Sequence[Program], state: Tree) -> list[Callable[[], ob
 
 def embed_calls(programs: Sequence[Program], touch: Tree) -> list[Callable[[], object]]:
     """A call takes pixels from the host and brings features back, as a control loop would."""
-    return [
-        partial(lambda p: np.asarray(p.call({"touch": touch}, p.batch.clip, p.batch.sensor)), program)
-        for program in programs
-    ]
+    return [partial(lambda p: np.asarray(p.call({"touch": touch}, *p.batch[:2])), program) for program in programs]
 
 
 def _row(program: Program, times: Any, base: Any, peaks: Mapping[str, float], wrong: Mapping[str, float]) -> Row:

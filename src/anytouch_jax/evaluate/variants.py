@@ -127,7 +127,7 @@ def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
         args = (state, batch, jax.eval_shape(lambda: jax.random.key(0)))
         batch = jax.device_put(batch)
     else:
-        function, args = jax.jit(embed_of(work.config)), (state, batch.clip, batch.sensor)
+        function, args = jax.jit(embed_of(work.config)), (state, *batch[:2])
     with cold(), traced_as(variant):
         start = time.perf_counter()
         lowered = function.lower(*args)

@@ -2,7 +2,7 @@
 # `make` alone lists the targets.
 
 PYTHON ?= python3
-# Large pages: half the time of a step on a CPU (src/anytouch_jax/pages.py).
+# Large pages: a million page faults a step less (src/anytouch_jax/pages.py).
 export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 VENV   := .venv
 PY     := $(VENV)/bin/python

@@ -1,7 +1,8 @@
-"""Large pages for large arrays: a step takes its memory fresh from the system, page by page, half of its time.
+"""Large pages for large arrays: the arrays of a step come fresh from the system, which hands them out page by page.
 
 A step of preset small asks the system for 4 GB. In pages of 4 KiB the kernel is called a million times for them; with
-glibc's `glibc.malloc.hugetlb=1` (since 2.35) it is asked for pages of 2 MiB. glibc reads this when a process starts.
+glibc's `glibc.malloc.hugetlb=1` (since 2.35), which asks for pages of 2 MiB, fifty thousand times. That saves nothing
+on a quiet machine and half of the step on a busy one (experiments/results/speed.md). glibc reads it at the start.
 """
 
 from __future__ import annotations

@@ -35,29 +35,12 @@ def _same(one, two):
         np.testing.assert_array_equal(a, b)
 
 
-def _rich():
-    """Clips of two sensors that touch the same places, some with pictures and captions."""
-    rows = []
-    for i in range(8):
-        for k in range(6):
-            row = {
-                "sequence": f"s{i}", "frame_index": k, "sensor": "digit" if i % 2 else "gelslim",
-                "touch": f"place{i // 2}.{k}", "object": f"o{i // 2}", "unit": f"u{i % 2}",
-            }  # fmt: skip
-            rows.append(
-                row
-                | ({"image_path": f"v{i}{k}.png"} if i < 3 else {})
-                | ({"text": f"caption {i}"} if i % 3 == 2 else {})
-            )
-    return rows
-
-
 # Determinism -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("stage", "recipe"), [(1, "paper"), (1, "release"), (2, "paper"), (2, "release")])
-def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, settings, stage, recipe):
-    manifest = make(_rich())
+def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, settings, rich, stage, recipe):
+    manifest = make(rich)
     config = settings(stage, recipe, plain=False, threads=1)
     loader = Loader(manifest, config)
     first = list(loader.stream(0, 6))
@@ -323,8 +306,8 @@ def _check_align(batch, rows, read_back, tokenizer):
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
 @pytest.mark.parametrize("devices", [1, 4])
-def test_images_and_texts_sit_in_their_slots(make, settings, read_back, recipe, devices):
-    rows = _rich()
+def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, recipe, devices):
+    rows = rich
     loader = Loader(make(rows), settings(2, recipe, batch_size=8), devices=devices)
     alone = Loader(make(rows), settings(2, recipe, batch_size=8))
     frames = {"still": 1, "clip": 4 if recipe == "release" else 3}
@@ -415,8 +398,8 @@ def _check_match(match, rows, read_back, size, frames):
     return anchor[:, -1].tolist()
 
 
-def test_matching_triples_in_both_recipes(make, settings, read_back):
-    rows = _rich()
+def test_matching_triples_in_both_recipes(make, settings, read_back, rich):
+    rows = rich
     manifest = make(rows)
     loader = Loader(manifest, settings(2, batch_size=6))
     anchors = {"still": [], "clip": []}
@@ -467,8 +450,8 @@ def test_pairs_of_stills_only_match_stills_in_clip_steps(make, settings, read_ba
     assert sorted(seen[:12]) == list(range(6, 18))  # its own epoch goes on through both kinds
 
 
-def test_a_bad_partner_replaces_the_triple(make, settings, read_back):
-    rows = _rich()
+def test_a_bad_partner_replaces_the_triple(make, settings, read_back, rich):
+    rows = rich
     manifest = make(rows)
     manifest.file(7).unlink()
     for step in range(40):

@@ -1,10 +1,15 @@
-"""Running the plan: what is finished is not done again, what does not fit in the time is left for the next call."""
+"""Running the plan: what is finished is not done again, what does not fit in the time is left for the next call.
+
+Several processes may run it in one folder at once: what one has claimed the others leave to it, and they wait only when
+there is nothing else to do.
+"""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -15,6 +20,7 @@ from . import budget
 from .plan import Leaf, Scenes, Size, Training
 
 Say = Callable[[str], None]
+PAUSE = 5.0  # s until what others work on is looked at again
 
 
 class Work(Protocol):
@@ -22,6 +28,9 @@ class Work(Protocol):
 
     def ready(self, leaf: Leaf) -> set[str]:
         """Names of the data sets and keys of the trainings that are finished."""
+
+    def claim(self, name: str) -> AbstractContextManager[bool]:
+        """Keep other processes from `name` meanwhile; False where one of them works on it."""
 
     def make(self, one: Scenes, size: Size) -> None:
         """Make a data set, or finish it."""
@@ -58,48 +67,70 @@ def execute(
     minutes: float | None = None,
     say: Say = print,
     clock: Callable[[], float] = time.monotonic,
+    pause: Callable[[float], None] = time.sleep,
 ) -> Outcome:
     """Do the runs in order, a JSON each; stop before one that would not fit in `minutes`.
 
     How long things take is estimated by `budget`, corrected by what they took in this call. A run that fails is told
     and left out; the others go on. Raises UserError when not even the first run fits.
     """
-    start = clock()
-    planned = 0.0
+    start, planned = clock(), 0.0
     result = Outcome([], [], [], {})
-    for number, leaf in enumerate(leaves):
-        if is_done(leaf, out):
-            result.found.append(leaf.file)
-            continue
-        expected = budget.cost(leaf, work.ready(leaf))
-        spent = clock() - start
-        pace = max(1.0, spent / planned) if planned else 1.0
-        if minutes is not None and spent + pace * expected > 60 * minutes:
-            rest = [one.file for one in leaves[number:] if not is_done(one, out)]
-            if not result.made and not result.failed:
-                raise UserError(
-                    f"{leaf.file} takes about {expected / 60:.0f} minutes with what it needs, and MINUTES is "
-                    f"{minutes:g}; give more"
-                )
-            say(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
-            return result._replace(left=rest)
-        say(f"{leaf.file}: about {pace * expected / 60:.1f} min")
-        try:
-            _one(leaf, work, out)
-            result.made.append(leaf.file)
-        except UserError as error:
-            say(f"{leaf.file} failed: {error}")
-            result.failed[leaf.file] = str(error)
-        planned += expected
+    waiting, told = list(leaves), set[str]()
+    while waiting:
+        later: list[Leaf] = []  # another process works on these, or on what they need
+        for leaf in waiting:
+            if is_done(leaf, out):
+                result.found.append(leaf.file)
+                continue
+            expected, spent = budget.cost(leaf, work.ready(leaf)), clock() - start
+            seconds = expected * (max(1.0, spent / planned) if planned else 1.0)
+            if minutes is not None and spent + seconds > 60 * minutes:
+                if not (result.made or result.failed or told):
+                    raise UserError(
+                        f"{leaf.file} takes about {expected / 60:.0f} minutes with what it needs, and MINUTES is "
+                        f"{minutes:g}; give more"
+                    )
+                rest = [one.file for one in leaves if one.file not in result.failed and not is_done(one, out)]
+                say(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
+                return result._replace(left=rest)
+            with work.claim(leaf.file) as mine:
+                if mine and leaf.file not in told:
+                    say(f"{leaf.file}: about {seconds / 60:.1f} min")
+                    told.add(leaf.file)
+                try:
+                    done = mine and (is_done(leaf, out) or _one(leaf, work, out))
+                except UserError as error:
+                    say(f"{leaf.file} failed: {error}")
+                    result.failed[leaf.file] = str(error)
+                    done = None
+            planned += expected - (0.0 if done else budget.cost(leaf, work.ready(leaf)))
+            if done:
+                result.made.append(leaf.file)
+            elif done is not None:
+                later.append(leaf)
+        if len(later) == len(waiting):
+            pause(PAUSE)
+        waiting = later
     return result
 
 
-def _one(leaf: Leaf, work: Work, out: Path) -> None:
+def _one(leaf: Leaf, work: Work, out: Path) -> bool:
+    """Make what a run still needs, then the run; False where another process is about to make a part of it."""
+    for one in budget.missing(leaf, work.ready(leaf))[0]:
+        with work.claim(one.name) as mine:
+            if mine and one.name not in work.ready(leaf):
+                work.make(one, leaf.size)
     sets, trainings = budget.missing(leaf, work.ready(leaf))
-    for one in sets:
-        work.make(one, leaf.size)
+    if sets:
+        return False
     for training in trainings:
-        work.train(training)
+        with work.claim(training.key) as mine:
+            if not mine:
+                return False
+            if training.key not in work.ready(leaf):
+                work.train(training)
     about = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity}
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
+    return True

@@ -6,11 +6,13 @@ a folder says that it is finished; one without it is gone on with.
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -57,6 +59,19 @@ class Work:
             return self.real
         dataset, _, part = name.partition("/")
         return self.folder / dataset / (f"{part}.parquet" if part else cuts.WHOLE)
+
+    @contextmanager
+    def claim(self, name: str) -> Iterator[bool]:
+        """A lock on `name` that dies with the process; whether it was free."""
+        path = self.folder / "claims" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                yield False
+            else:
+                yield True
 
     def make(self, one: Scenes, size: Size) -> None:
         start, folder = time.perf_counter(), self.folder / one.name

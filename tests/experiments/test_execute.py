@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 
 import pytest
 from study import budget, plan
-from study.execute import execute
+from study.execute import PAUSE, execute
+from study.work import Work
 
 from anytouch_jax.config import UserError
 
@@ -22,6 +24,10 @@ class Notes:
         self.done: set[str] = set()
         self.calls: list[str] = []
         self.time, self.slow, self.fail, self.stop_at = 0.0, slow, fail, stop_at
+        self.elsewhere: set[str] = set()  # what another process works on
+
+    def claim(self, name):
+        return nullcontext(name not in self.elsewhere)
 
     def ready(self, leaf):
         return self.done
@@ -125,3 +131,32 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path):
     result, said = run(Notes(fail="no_text"), tmp_path)
     assert list(result.failed.values()) == ["no such column"] and "no_text-0.json failed" in "\n".join(said)
     assert len(result.made) == len(LEAVES) - 1 and not (tmp_path / "ablations-no_text-0.json").exists()
+
+
+def test_what_another_process_works_on_is_left_to_it(tmp_path):
+    work, training = Notes(), LEAVES[0].trainings[0]
+    need = [leaf for leaf in LEAVES if training in leaf.trainings]
+    work.elsewhere = {"aligned", training.key, LEAVES[-1].file}
+
+    def pause(seconds):  # meanwhile the other one finishes a thing
+        assert seconds == PAUSE and work.elsewhere
+        name = "aligned" if "aligned" in work.elsewhere else min(work.elsewhere)
+        work.elsewhere.remove(name)
+        if name == LEAVES[-1].file:
+            (tmp_path / name).write_text(json.dumps({"identity": LEAVES[-1].identity}))
+        else:
+            work.done.add(name)
+
+    result, _ = run(work, tmp_path, pause=pause)
+    assert 1 < len(need) < len(LEAVES) - 1 and LEAVES[-1] not in need
+    assert result.found == [LEAVES[-1].file] and sorted(result.made) == sorted(leaf.file for leaf in LEAVES[:-1])
+    assert not {"aligned", training.key, LEAVES[-1].file} & set(work.calls)  # (`Notes` fails when a thing is made twice)
+    assert {leaf.file for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
+
+
+def test_a_claim_is_one_process_alone_and_ends_with_it(tmp_path):
+    one, other = Work(tmp_path), Work(tmp_path)
+    with one.claim("own") as first, other.claim("own") as second, other.claim("aligned") as third:
+        assert first and not second and third
+    with other.claim("own") as again:
+        assert again

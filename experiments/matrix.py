@@ -29,7 +29,7 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="toy sizes: does it work? results go beside the data")
     parser.add_argument("--minutes", type=float, help="stop before a run that would not fit")
     parser.add_argument("--chunk", help="i/n: only part i of n, of about equal cost")
-    parser.add_argument("--jobs", type=int, default=1, help="processes side by side (a third more an hour on two cores)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes side by side (two: a third more an hour)")
     parser.add_argument("--only", nargs="+", help="only these questions")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=0,1")
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")

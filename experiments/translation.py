@@ -187,11 +187,16 @@ def all_runs() -> None:
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
-        train, val, test = (pairs.read_pairs(table, part, preset("tiny").model.image_size) for part in split)
+        differences = {encoder.subtracts for _, encoder, _ in todo if encoder} or {False}
+        data = {
+            less: [pairs.read_pairs(table, part, preset("tiny").model.image_size, subtract=less) for part in split]
+            for less in differences
+        }
         force = [table.value(int(row), "label.force") for row in split.test.source]
         shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
         for about, encoder, file in todo:
-            one_run(about, encoder, (train, val, test, shown), file)
+            less = encoder.subtracts if encoder else max(differences)  # the reference sees what the encoders see
+            one_run(about, encoder, (*data[less], shown), file)
 
 
 if not os.environ.get("TABLE"):

@@ -1,12 +1,10 @@
 """What the matrix costs, and how it is cut.
 
-Rates of two slow CPU cores at preset tiny: stage 1 0.65 s a step of 64; stage 2 2.4 s a step of 32, of which the touch
-to align 0.6 s, photographs 0.35 s, text 0.15 s and the three touches of a match 1.3 s; 100 simulated frames a second
-and 20 s to compile a sensor; about 25 s to start and end a training; a run's scores 15 to 120 s. At full size, for a
-seed of the questions that claim a sign: 9 stages 1 of 150 steps of 48 (98 s each, 15 min), 8 stages 2 of 85 steps of
-24 with matching (174 s, 23 min) and 7 without (94 s, 11 min), 29 runs to score (16 min): 65 min. Three seeds, 33 min
-for what is run with the first alone, and 11 min for the data come to just under four hours; five chunks, each of which
-makes its data again, stay below 75 minutes. `matrix.py --plan` prints the sum for any size.
+Rates of two slow CPU cores at preset tiny with 112 pixels: stage 1 0.65 s a step of 64; stage 2 2.4 s a step of 32, of
+which the touch to align 0.6 s, photographs 0.35 s, text 0.15 s and the three touches of a match 1.3 s; in proportion to
+the tokens for smaller pictures; 100 simulated frames a second and 20 s to compile a sensor; about 25 s to start and end
+a training; a run's scores 15 to 120 s. `matrix.py --plan` prints the sum for any size; five chunks, each of which makes
+its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do 1.3 to 1.4 times as much an hour.
 """
 
 from __future__ import annotations
@@ -30,12 +28,13 @@ def of_training(one: Training) -> float:
     """Seconds of one stage."""
     config = one.config
     batch, steps = config.data.batch_size, config.run.steps
+    picture = (config.model.patches + 6) / 70  # tokens beside those of 112 pixels
     if config.stage == 1:
-        step = 0.65 * batch / 64
+        step = 0.65 * picture * batch / 64
     else:
-        parts = (0.6, 0.35 * bool(config.model.image), 0.15 * bool(config.model.text), 1.3 * matches(one))
-        step = sum(parts) * batch / 32
-    toy = config.model.image_size < 100
+        parts = (0.6, 0.35 * bool(config.model.image), 1.3 * matches(one))
+        step = (sum(parts) * picture + 0.15 * bool(config.model.text)) * batch / 32
+    toy = config.model.touch.width < 100
     return (START + steps * step) * (_TOY if toy else 1.0)
 
 

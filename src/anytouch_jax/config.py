@@ -191,6 +191,8 @@ class Data:
     what the recipe does (the release: RELEASE_WEIGHTS, for the datasets that are there). `negatives`: of matching,
     from any sensor or from the positive's, so that the sensor alone does not tell them apart. `require`: draw only
     rows that have these. `aligned_text`: train on the text of rows whose touch other sensors or units felt too.
+    `background` "subtract": touches are shown less the picture of the untouched gel (`background_path`), on middle
+    grey: what is left is the contact, not the unit's own tint, lights and dots. Beyond the paper (its successor does).
     """
 
     manifests: tuple[str, ...] = ()
@@ -203,6 +205,7 @@ class Data:
     negatives: Literal["any", "same_sensor"] = "any"
     require: tuple[Literal["image", "text"], ...] = ()
     aligned_text: bool = True
+    background: Literal["keep", "subtract"] = "keep"
     flip: float = 0.5
     jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)
     rotation: float = 20.0

@@ -89,6 +89,8 @@ class Embed:
     """Only this split of a manifest."""
     sensor: str = "universal"
     """Sensor of a folder or a video; one that the model does not know gets the universal tokens."""
+    background: Path | None = None
+    """Picture of the untouched gel of a folder, a video or a camera, for an encoder trained on differences from it."""
     frames: int = 1
     """Frames of a clip that ends at each row: 1 (stills), 3, or more (segments of three)."""
     pooling: Literal["class", "mean", "both"] = "class"

@@ -80,6 +80,8 @@ class Translate:
     """Sensor that is given."""
     to: str = "duragel"
     """Sensor that is wanted."""
+    background: Path | None = None
+    """Picture of the untouched gel, for an encoder trained on differences from it."""
     out: Path | None = None
     """File or folder to write (default: beside each image). With --fit: the folder of the translation."""
     generator: Path | None = None

@@ -150,7 +150,7 @@ def test_what_another_process_works_on_is_left_to_it(tmp_path):
     result, _ = run(work, tmp_path, pause=pause)
     assert 1 < len(need) < len(LEAVES) - 1 and LEAVES[-1] not in need
     assert result.found == [LEAVES[-1].file] and sorted(result.made) == sorted(leaf.file for leaf in LEAVES[:-1])
-    assert not {"aligned", training.key, LEAVES[-1].file} & set(work.calls)  # (`Notes` fails when a thing is made twice)
+    assert not {"aligned", training.key, LEAVES[-1].file} & set(work.calls)
     assert {leaf.file for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
 
 

@@ -96,7 +96,8 @@ def test_cost_counts_what_is_shared_once():
 
 
 def test_rates_are_those_of_the_page():
-    one = plan.training(dataclasses.replace(plan.FULL, steps1=100, batch1=64, steps2=100, batch2=32), "anytouch", 0)
+    size = dataclasses.replace(plan.FULL, image=112, steps1=100, batch1=64, steps2=100, batch2=32)
+    one = plan.training(size, "anytouch", 0)
     assert budget.of_training(one) == pytest.approx(25 + 240) and budget.of_training(one.init) == pytest.approx(25 + 65)
 
 

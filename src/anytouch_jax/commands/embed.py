@@ -55,6 +55,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
     embedded = stream.stream(
         encoder,
         source,
+        _sight(encoder, options),
         live=live,
         sensor=encoder.sensor_row(options.sensor, say),
         frames=options.frames,
@@ -82,6 +83,15 @@ def _print_line(one: Embedded) -> None:
     print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
 
 
+def _sight(encoder: Encoder, options: Embed) -> Any:
+    from anytouch_jax.data.images import decode
+    from anytouch_jax.evaluate.features import Sight
+
+    if encoder.subtracts and options.background is None:
+        say("this encoder sees touches less the untouched gel: the first frame is taken for that (else --background)")
+    return Sight(encoder, None if options.background is None else decode(options.background))
+
+
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     from anytouch_jax.data import manifest as manifests
     from anytouch_jax.evaluate import features
@@ -102,11 +112,10 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
 def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame."""
     from anytouch_jax.data.loader import frames_from_folder, frames_from_video
-    from anytouch_jax.data.transforms import touch_evaluation
     from anytouch_jax.evaluate import features
 
     read = frames_from_folder if options.input.is_dir() else frames_from_video
-    row, size = encoder.sensor_row(options.sensor, say), encoder.config.model.image_size
+    row, see = encoder.sensor_row(options.sensor, say), _sight(encoder, options)
     ring: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     values: list[np.ndarray] = []
@@ -121,7 +130,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
 
     for frame in read(options.input):
         count += 1
-        ring = [*ring, touch_evaluation([frame], size)[0]][-options.frames :]
+        ring = [*ring, see(frame)][-options.frames :]
         if len(ring) == options.frames:
             waiting.append(np.stack(ring))
         if len(waiting) == options.batch:

@@ -60,7 +60,8 @@ def _fit(options: Translate) -> int:
     split = pairs.find_pairs(table, options.source, options.to)
     encoder.sensor_row(options.source, say)
     say(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of objects never seen to test on")
-    (x, y), val, (test_x, test_y) = (pairs.read_pairs(table, part, encoder.config.model.image_size) for part in split)
+    size = encoder.config.model.image_size
+    (x, y), val, (test_x, test_y) = (pairs.read_pairs(table, part, size, subtract=encoder.subtracts) for part in split)
     made, losses = generation.fit(
         encoder, x, y, source=options.source, target=options.to, val=val, options=how, say=say
     )
@@ -75,7 +76,7 @@ def _fit(options: Translate) -> int:
 
 def _translate(options: Translate) -> int:
     from anytouch_jax.data.images import decode
-    from anytouch_jax.data.transforms import touch_evaluation
+    from anytouch_jax.data.transforms import subtract_background, touch_evaluation
     from anytouch_jax.evaluate import generator
 
     home = _home(options, options.generator, "generator")
@@ -87,8 +88,13 @@ def _translate(options: Translate) -> int:
         raise UserError("give an image to translate, or --fit to train a translation")
     targets = _targets(options, ".npy" if design.shape.field else ".png")
     size = design.shape.model.image_size
-    images = np.concatenate([touch_evaluation([decode(path)], size) for path in options.images])
-    for target, result in zip(targets, made(images), strict=True):
+    images = [decode(path) for path in options.images]
+    if design.subtracts:
+        if options.background is None:
+            raise UserError("this encoder sees touches less the untouched gel: name its picture by --background")
+        images = [subtract_background([one], decode(options.background))[0] for one in images]
+    seen = np.concatenate([touch_evaluation([one], size) for one in images])
+    for target, result in zip(targets, made(seen), strict=True):
         _write(target, result)
         print(target)
     return 0

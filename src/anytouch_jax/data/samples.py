@@ -14,6 +14,7 @@ from anytouch_jax.data.transforms import (
     TOUCH,
     VISION,
     augmentation_rng,
+    subtract_background,
     touch_evaluation,
     touch_transform,
     vision_evaluation,
@@ -43,6 +44,8 @@ class Reader:
         """
         size = self.config.model.image_size
         frames = [self._decode(row, "path") for row in rows]
+        if self.config.data.background == "subtract":
+            frames = subtract_background(frames, self._background(int(rows[-1])))
         if epoch is None or not (self.config.data.flip or any(self.config.data.jitter)):
             return touch_evaluation(frames, size, out)
         rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
@@ -60,6 +63,14 @@ class Reader:
     def caption(self, row: int) -> str:
         """The caption of a row."""
         return str(self.manifest.value(row, "text"))
+
+    def _background(self, row: int) -> np.ndarray:
+        if self.manifest.value(row, "background_path") is None:
+            raise SampleError(
+                f"{self.manifest.where(row)} has no background_path, which data.background subtract takes off; "
+                "name one, or train with --data.background keep"
+            )
+        return self._decode(row, "background_path")
 
     def _decode(self, row: int, column: str) -> np.ndarray:
         try:

@@ -16,7 +16,7 @@ from anytouch_jax.config import Data
 from anytouch_jax.data.images import ImageError, decode
 
 __all__ = [
-    "ImageError", "augmentation_rng", "colour_jitter", "decode",
+    "ImageError", "augmentation_rng", "colour_jitter", "decode", "subtract_background",
     "touch_evaluation", "touch_transform", "vision_evaluation", "vision_transform",
 ]  # fmt: skip
 
@@ -57,6 +57,17 @@ def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: 
     for target, frame in zip(out, frames, strict=True):
         _resize(frame, target)
     return out
+
+
+def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:
+    """Each of T frames u8 (h, w, 3) less the untouched gel, on middle grey: frame - background + 128, clipped to u8.
+
+    A background of another size is resized to the frames'.
+    """
+    height, width = frames[0].shape[:2]
+    if background.shape[:2] != (height, width):
+        background = cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA)
+    return [cv2.addWeighted(frame, 1.0, background, -1.0, 128.0) for frame in frames]
 
 
 def _resize(frame: np.ndarray, target: np.ndarray) -> None:

@@ -102,6 +102,7 @@ def encoded(
         "join": join,
         "order": order,
         "universal": universal,
+        "background": encoder.config.data.background,
     }
 
     def compute(rows: Array, frames: int) -> Array:

@@ -18,6 +18,7 @@ import numpy as np
 from anytouch_jax.config import UNIVERSAL, Config, Model, UserError, from_json
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.transforms import subtract_background, touch_evaluation
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
@@ -51,12 +52,18 @@ class Encoder:
         say(f"sensor {name!r} is not in this model's table ({', '.join(model.sensors)}): using the universal tokens")
         return model.universal_row
 
+    @property
+    def subtracts(self) -> bool:
+        """Whether it was trained on touches less the untouched gel (`data.background`), and wants those."""
+        return self.config.data.background == "subtract"
+
     def embed(
         self, clips: Any, sensor: str | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class", join: Join = "mean"
     ) -> np.ndarray:
         """Features (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or one (H, W, 3), at the model's size.
 
         `sensor` is a name for all, or rows i32 (B,). T is 1 (a still), 3 (a clip) or more: segments joined by `join`.
+        An encoder that `subtracts` wants them less the untouched gel: see `Sight`.
         `pooling`: the class token's embedding (what alignment trains), the mean over patch tokens, or both (B, 2E).
         Raises UserError for another shape or type.
         """
@@ -88,6 +95,21 @@ class Encoder:
     @cached_property
     def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
         return {}
+
+
+class Sight:
+    """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
+    u8 (h, w, 3), the picture of the untouched gel; the first frame serves where none is given."""
+
+    def __init__(self, encoder: Encoder, background: np.ndarray | None = None) -> None:
+        self._encoder, self._background = encoder, background
+
+    def __call__(self, frame: np.ndarray) -> np.ndarray:
+        """A frame u8 (h, w, 3) as u8 (size, size, 3)."""
+        if self._encoder.subtracts:
+            self._background = frame if self._background is None else self._background
+            frame = subtract_background([frame], self._background)[0]
+        return touch_evaluation([frame], self._encoder.config.model.image_size)[0]
 
 
 def check_frames(model: Model, frames: int) -> None:

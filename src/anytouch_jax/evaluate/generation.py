@@ -93,7 +93,8 @@ def fit(
     side = shape.model.image_size
     if images.shape[1:] != (side, side, 3) or (targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]):
         raise UserError(f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}")
-    design = Design(source, target, shape, None if encoder is None else encoder.source, options, len(images))
+    whence, less = (None, False) if encoder is None else (encoder.source, encoder.subtracts)
+    design = Design(source, target, shape, whence, options, len(images), less)
     params = start(design, encoder, images, targets)
     frozen = encoder is not None and options.tune == "frozen"
     known = in_batches(_features(nameless(design)), params["encoder"], images) if frozen else None

@@ -65,7 +65,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class Design:
-    """What a generator is: sensors, shapes, where its encoder came from (None: it reads pixels), how it was trained."""
+    """What a generator is: sensors, shapes, where its encoder came from (None: it reads pixels), how it was trained.
+
+    `subtracts`: source images are wanted less the untouched gel.
+    """
 
     source: str
     target: str
@@ -73,6 +76,7 @@ class Design:
     encoder: str | None
     fit: Fit
     pairs: int = 0
+    subtracts: bool = False
 
     @property
     def head(self) -> Part:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config import FIELD_SENSORS, UserError
+from anytouch_jax.config import FIELD_SENSORS, Config, Data, UserError, preset
 from anytouch_jax.data.edit import select
-from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import Manifest
-from anytouch_jax.data.transforms import touch_evaluation
+from anytouch_jax.data.samples import Reader
 
 FIELD = (20, 20, 6)  # points of a Tac3D; displacement x, y, z mm, force x, y, z N
 _THREADS = 2
@@ -110,19 +110,24 @@ def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:
     return select(manifest, np.array(kept))
 
 
-def read_pairs(manifest: Manifest, pairs: Pairs, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Source images u8 (n, size, size, 3), and the targets: images alike, or fields f32 (n, 20, 20, 6)."""
+def read_pairs(manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Source images u8 (n, size, size, 3), and the targets: images alike, or fields f32 (n, 20, 20, 6).
+
+    `subtract`: source images less their backgrounds, for an encoder that `subtracts`.
+    """
     field = len(pairs.target) and manifest.value(int(pairs.target[0]), "sensor") in FIELD_SENSORS
     targets = read_fields(manifest, pairs.target) if field else read_pixels(manifest, pairs.target, size)
-    return read_pixels(manifest, pairs.source, size), targets
+    return read_pixels(manifest, pairs.source, size, subtract=subtract), targets
 
 
-def read_pixels(manifest: Manifest, rows: np.ndarray, size: int) -> np.ndarray:
-    """Images u8 (n, size, size, 3) of manifest rows. Raises ImageError."""
+def read_pixels(manifest: Manifest, rows: np.ndarray, size: int, *, subtract: bool = False) -> np.ndarray:
+    """Images u8 (n, size, size, 3) of manifest rows, or what they are beside their backgrounds. Raises UserError."""
     out = np.empty((len(rows), size, size, 3), np.uint8)
+    model = replace(preset("tiny").model, image_size=size)
+    reader = Reader(manifest, Config(model, data=Data(background="subtract" if subtract else "keep")))
 
     def one(k: int) -> None:
-        touch_evaluation([decode(manifest.file(int(rows[k])))], size, out[k : k + 1])
+        reader.touch(rows[k : k + 1], None, out[k : k + 1])
 
     return _each(one, out)
 

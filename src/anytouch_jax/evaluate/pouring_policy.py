@@ -101,14 +101,22 @@ def features(encoder: Encoder, trials: Trials, *, stills: bool, batch: int = 64)
     """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end."""
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
-    where = np.argwhere(trials.taken[FRAMES - 1 :])
+    where, frames = np.argwhere(trials.taken[FRAMES - 1 :]), seen(encoder, trials.frames, trials.frames[0])
     ahead = 1 if stills else FRAMES
     found = np.zeros((*trials.taken[FRAMES - 1 :].shape, encoder.config.model.embed), np.float32)
     for start in range(0, len(where), batch):
         part = where[start : start + batch]
         padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
-        found[tuple(part.T)] = encoder.embed(_clips(trials.frames, padded, ahead), SENSOR)[: len(part)]
+        found[tuple(part.T)] = encoder.embed(_clips(frames, padded, ahead), SENSOR)[: len(part)]
     return found
+
+
+def seen(encoder: Encoder, frames: Array, first: Array) -> Array:
+    """Frames u8 (..., B, side, side, 3) as the encoder was trained to see them: as they are, or less the `first` ones
+    u8 (B, side, side, 3) of their runs, of the gel that holds the standing cylinder."""
+    if not encoder.subtracts:
+        return frames
+    return np.clip(frames.astype(np.int16) - first + 128, 0, 255).astype(np.uint8)
 
 
 def _clips(frames: Array, where: Array, ahead: int) -> Array:
@@ -206,12 +214,15 @@ class Touch:
 
     def begin(self, count: int) -> None:
         """Forget the frames and features of the last runs."""
+        self._first: Array | None = None
         self._frames: list[Array] = []
         self._z: list[Array] = []
 
     def act(self, frames: Array | None, state: State) -> Array:
         """Actions (B,) from the frames so far; it waits until it has seen a segment."""
         assert frames is not None
+        self._first = frames if self._first is None else self._first
+        frames = seen(self._encoder, frames, self._first)
         self._frames = [*self._frames[-FRAMES + 1 :], frames]
         if len(self._frames) < FRAMES:
             return np.full(len(frames), WAIT)

@@ -21,8 +21,7 @@ import jax
 import numpy as np
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.evaluate.features import Encoder, Join, Pooling, check_frames, touch_features
+from anytouch_jax.evaluate.features import Encoder, Join, Pooling, Sight, check_frames, touch_features
 
 PARTS = ("decode", "resize", "copy", "encoder")
 _PATIENCE = 2.0  # seconds that a camera is given to answer after the last frame that anybody wants
@@ -116,6 +115,7 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
 def stream(
     encoder: Encoder,
     source: Source,
+    see: Sight | None = None,
     *,
     live: bool,
     sensor: int,
@@ -126,14 +126,15 @@ def stream(
 ) -> Generator[Embedded]:
     """Embed what `source` shows, compiled before its first frame is read: the newest frame each time.
 
-    A clip is the last `frames` ones, `stride` apart; `sensor` is a row of the table. With `live` frames are dropped
-    rather than waited for. Close the iterator to stop: the source is released. Raises UserError for a wrong length.
+    `see` prepares a frame (default: `Sight(encoder)`). A clip is the last `frames` ones, `stride` apart; `sensor` is a
+    row of the table. With `live` frames are dropped rather than waited for. Close the iterator to stop: the source is
+    released. Raises UserError for a wrong length.
     """
     check_frames(encoder.config.model, frames)
     if stride < 1:
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
     embed = compile_for_one(encoder, sensor, frames, pooling, join)
-    return _stream(embed, source, live, encoder.config.model.image_size, frames, stride)
+    return _stream(embed, source, live, see or Sight(encoder), frames, stride)
 
 
 def compile_for_one(
@@ -150,11 +151,11 @@ def compile_for_one(
 
 
 def _stream(
-    embed: Callable[[jax.Array], jax.Array], source: Source, live: bool, side: int, frames: int, stride: int
+    embed: Callable[[jax.Array], jax.Array], source: Source, live: bool, see: Sight, frames: int, stride: int
 ) -> Generator[Embedded]:
     mailbox = Mailbox(replace=live)
     start = time.perf_counter()
-    reader = threading.Thread(target=_read, args=(source, live, side, frames, stride, mailbox), daemon=True)
+    reader = threading.Thread(target=_read, args=(source, live, see, frames, stride, mailbox), daemon=True)
     reader.start()
     try:
         while (clip := mailbox.take()) is not None:
@@ -172,7 +173,7 @@ def _stream(
             source.release()
 
 
-def _read(source: Source, live: bool, side: int, frames: int, stride: int, mailbox: Mailbox) -> None:
+def _read(source: Source, live: bool, see: Sight, frames: int, stride: int, mailbox: Mailbox) -> None:
     """The reader's thread: every frame once into the ring, and the newest clip into the mailbox."""
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
     number = 0
@@ -189,7 +190,7 @@ def _read(source: Source, live: bool, side: int, frames: int, stride: int, mailb
             decoded = time.perf_counter()
             if frame.ndim != 3 or frame.shape[2] != 3:
                 raise UserError(f"frame {number} has shape {frame.shape}; colour frames (height, width, 3) are wanted")
-            ring.append(touch_evaluation([frame], side)[0, ..., ::-1])
+            ring.append(see(frame[..., ::-1]))
             resized = time.perf_counter()
             if len(ring) == ring.maxlen:
                 decode = decoded - (grabbed if live else begin)

@@ -94,12 +94,15 @@ def execute(
                 rest = [one.file for one in leaves if one.file not in result.failed and not is_done(one, out)]
                 say(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
                 return result._replace(left=rest)
-            with work.claim(leaf.file) as mine:
-                if mine and leaf.file not in told:
+
+            def begin(leaf: Leaf = leaf, seconds: float = seconds) -> None:
+                if leaf.file not in told:
                     say(f"{leaf.file}: about {seconds / 60:.1f} min")
                     told.add(leaf.file)
+
+            with work.claim(leaf.file) as mine:
                 try:
-                    done = mine and (is_done(leaf, out) or _one(leaf, work, out))
+                    done = mine and (is_done(leaf, out) or _one(leaf, work, out, begin))
                 except UserError as error:
                     say(f"{leaf.file} failed: {error}")
                     result.failed[leaf.file] = str(error)
@@ -115,11 +118,15 @@ def execute(
     return result
 
 
-def _one(leaf: Leaf, work: Work, out: Path) -> bool:
-    """Make what a run still needs, then the run; False where another process is about to make a part of it."""
+def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
+    """Make what a run still needs, then the run; False where another process is about to make a part of it.
+
+    `begin` is called before there is something to do.
+    """
     for one in budget.missing(leaf, work.ready(leaf))[0]:
         with work.claim(one.name) as mine:
             if mine and one.name not in work.ready(leaf):
+                begin()
                 work.make(one, leaf.size)
     sets, trainings = budget.missing(leaf, work.ready(leaf))
     if sets:
@@ -129,7 +136,9 @@ def _one(leaf: Leaf, work: Work, out: Path) -> bool:
             if not mine:
                 return False
             if training.key not in work.ready(leaf):
+                begin()
                 work.train(training)
+    begin()
     about = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity}
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")

@@ -1,0 +1,122 @@
+"""Touches less the untouched gel (`data.background` subtract): in training, in probes, and in what users embed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from touch_world import make_touches
+
+from anytouch_jax.cli import main
+from anytouch_jax.config import Data, preset
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.evaluation import evaluation
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.loader import Loader, SampleError
+from anytouch_jax.data.transforms import subtract_background
+from anytouch_jax.evaluate import pouring_policy
+from anytouch_jax.evaluate.features import Encoder, Sight, embed_rows, load_encoder
+
+RNG = np.random.default_rng(0)
+GEL = RNG.integers(60, 200, (28, 28, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory):
+    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 4, "test": 2}, frames=4, size=28)
+
+
+def settings(touches, background="subtract", **data):
+    config = preset("tiny")
+    data = {"batch_size": 4, "flip": 0.0, "jitter": (0.0,) * 4, "clip_share": 0.0, "background": background} | data
+    return replace(config, model=replace(config.model, image_size=28), data=Data(manifests=(str(touches),), **data))
+
+
+@pytest.fixture(scope="module")
+def encoder(tiny_run):
+    """A trained encoder, told that it was trained on differences."""
+    found = load_encoder(tiny_run)
+    return replace(found, config=replace(found.config, data=replace(found.config.data, background="subtract")))
+
+
+def test_what_is_left_is_the_contact_on_middle_grey():
+    assert (np.stack(subtract_background([GEL, GEL], GEL)) == 128).all()
+    darker, brighter = np.clip(GEL.astype(int) - 30, 0, 255), np.clip(GEL.astype(int) + 200, 0, 255)
+    dark, bright = subtract_background(np.stack([darker, brighter]).astype(np.uint8), GEL)
+    assert (dark == 98).all() and (bright == np.minimum(128 + brighter - GEL, 255)).all()
+    tinted = subtract_background([np.clip(GEL.astype(int) + 25, 0, 255).astype(np.uint8)], (GEL + 25).astype(np.uint8))
+    assert (tinted[0] == 128).all()  # a unit's own colour is gone
+    large = cv2.resize(GEL, (56, 56), interpolation=cv2.INTER_NEAREST)
+    assert np.abs(subtract_background([GEL], large)[0].astype(int) - 128).max() <= 1
+
+
+def test_training_and_probes_read_the_same_differences(touches):
+    table = manifests.read(touches)
+    rows = table.rows_of("test")
+    (_, batch), *_ = evaluation(table, rows, settings(touches, batch_size=len(rows)))
+    for clip, row in zip(batch.clip, rows, strict=True):
+        frame, ground = decode(table.file(int(row))), decode(table.file(int(row), "background_path"))
+        np.testing.assert_array_equal(clip[0], np.clip(frame.astype(int) - ground + 128, 0, 255))
+    config = settings(touches)
+    seen = {tuple(one.reshape(-1)[:60]) for step in range(6) for one in Loader(table, config).batch(step).clip[:, 0]}
+    (_, everything), *_ = evaluation(
+        table, table.rows_of("train"), replace(config, data=replace(config.data, batch_size=48))
+    )
+    assert seen <= {tuple(one.reshape(-1)[:60]) for one in everything.clip[:, 0]} and len(seen) > 12
+    plain = Loader(table, settings(touches, "keep")).batch(0).clip
+    assert np.abs(plain.astype(int) - Loader(table, config).batch(0).clip).max() > 20
+
+
+def test_a_row_without_a_background_is_named_or_skipped(touches):
+    table = manifests.read(touches)
+    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    columns["background_path"][table.rows_of("test")[1]] = None
+    holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
+    rows = holed.rows_of("test")[:3]
+    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*train with --data.background keep"):
+        list(evaluation(holed, rows, settings(touches)))
+    ((ids, _),) = evaluation(holed, rows, settings(touches, on_bad_sample="skip"))
+    assert ids.tolist() == [rows[0], rows[2]]
+    assert len(list(evaluation(holed, rows, settings(touches, "keep")))) == 1
+
+
+def test_a_sight_takes_its_first_frame_for_the_background_unless_told(encoder):
+    frames = [GEL, np.clip(GEL + 20, 0, 255).astype(np.uint8)]
+    see = Sight(encoder)
+    assert [int(np.median(see(one))) for one in frames] == [128, 148]
+    told = Sight(encoder, frames[1])
+    assert [int(np.median(told(one))) for one in frames] == [108, 128]
+    plain = Sight(replace(encoder, config=replace(encoder.config, data=Data())))
+    np.testing.assert_array_equal(plain(GEL), GEL)
+
+
+def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
+    encoder, touches, tmp_path, monkeypatch, capsys
+):
+    table = manifests.read(touches)
+    row = int(table.rows_of("test")[-1])
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    shot = cv2.imread(str(table.file(row)))
+    cv2.imwrite(str(frames / "0.png"), shot)
+    ground = table.file(row, "background_path")
+    monkeypatch.setattr("anytouch_jax.evaluate.features.load_encoder", lambda _: encoder)
+    words = ["embed", "--run", "unused", "--input", str(frames), "--sensor", str(table.value(row, "sensor"))]
+    assert main([*words, "--out", str(tmp_path / "a.npz"), "--background", str(ground)]) == 0
+    assert "first frame" not in capsys.readouterr().err
+    _, wanted = embed_rows(encoder, table, np.array([row]))
+    np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
+    assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
+    assert "the first frame is taken for that" in capsys.readouterr().err
+    assert np.abs(np.load(tmp_path / "b.npz")["features"] - wanted).max() > 1e-3
+
+
+def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
+    frames = RNG.integers(100, 150, (3, 2, 28, 28, 3), np.uint8)
+    shown = pouring_policy.seen(encoder, frames, frames[0])
+    assert (shown[0] == 128).all() and shown.dtype == np.uint8
+    np.testing.assert_array_equal(shown[2, 1], frames[2, 1].astype(int) - frames[0, 1] + 128)
+    plain = Encoder(replace(encoder.config, data=Data()), encoder.params, "")
+    assert pouring_policy.seen(plain, frames, frames[0]) is frames

@@ -31,8 +31,8 @@ export-onnx: OUT ?= encoder.onnx
 export-onnx: FRAMES ?= 1
 
 # The schedules of the demo: minutes on two cores, not what a paper would train.
-DEMO1 := --preset tiny --steps 150 --batch 64 --optim.learning-rate 1e-3
-DEMO2 := --preset tiny --steps 60 --batch 32 --optim.learning-rate 5e-4
+DEMO1 := --preset tiny --steps 150 --batch 64 --optim.learning-rate 1e-3 --loader.background subtract
+DEMO2 := --preset tiny --steps 60 --batch 32 --optim.learning-rate 5e-4 --loader.background subtract --model.temperature 0.2
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile

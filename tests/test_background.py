@@ -75,7 +75,7 @@ def test_a_row_without_a_background_is_named_or_skipped(touches):
     columns["background_path"][table.rows_of("test")[1]] = None
     holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
     rows = holed.rows_of("test")[:3]
-    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*train with --data.background keep"):
+    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*train with --loader.background keep"):
         list(evaluation(holed, rows, settings(touches)))
     ((ids, _),) = evaluation(holed, rows, settings(touches, on_bad_sample="skip"))
     assert ids.tolist() == [rows[0], rows[2]]

@@ -20,7 +20,7 @@ _HOMES = {
     "train.optim": ["optimizer"],
     "train.loop": ["fit"],
     "pretrain": ["pretrain"],
-    "evaluate.features": ["Encoder", "load_encoder", "random_encoder"],
+    "evaluate.features": ["Encoder", "Sight", "load_encoder", "random_encoder"],
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -67,8 +67,8 @@ class Reader:
     def _background(self, row: int) -> np.ndarray:
         if self.manifest.value(row, "background_path") is None:
             raise SampleError(
-                f"{self.manifest.where(row)} has no background_path, which data.background subtract takes off; "
-                "name one, or train with --data.background keep"
+                f"{self.manifest.where(row)} has no background_path, which --loader.background subtract takes off; "
+                "name one, or train with --loader.background keep"
             )
         return self._decode(row, "background_path")
 

@@ -118,6 +118,7 @@ def export(
         "frames": frames,
         "image_size": model.image_size,
         "features": width,
+        "background": encoder.config.data.background,
         "pooling": pooling,
         "join": join,
         "sensors": {name: row for row, name in enumerate(model.sensors)},

@@ -1,0 +1,37 @@
+"""`experiments/long_clips.py` from top to bottom on a small world: every length is scored on the same moments."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+from touch_world import make_touches
+
+from anytouch_jax.data import manifest as manifests
+
+SCRIPT = Path(__file__).resolve().parents[2] / "experiments" / "long_clips.py"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_every_length_is_scored_on_the_same_moments(tmp_path, tiny_run, monkeypatch, capsys):
+    file = make_touches(tmp_path / "data", touches={"train": 16, "val": 8, "test": 8}, frames=8, size=28, each=2)
+    table = manifests.read(file)
+    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    number, frame = [int(name.split("/")[1]) for name in columns["sequence"]], columns["frame_index"]
+    columns["label.slip"] = [0.1 * k * (n % 2) for n, k in zip(number, frame, strict=True)]
+    columns["label.twist"] = [("clockwise", "counterclockwise")[n % 2] for n in number]
+    columns["label.slide"] = [("right", "left")[n // 2 % 2] for n in number]
+    manifests.write(manifests.from_columns(columns, file), file)
+    monkeypatch.setenv("RUN", str(tiny_run))
+    monkeypatch.setenv("DATA", str(file))
+    monkeypatch.setenv("OUT", str(tmp_path / "out"))
+    runpy.run_path(str(SCRIPT))
+    found = json.loads((tmp_path / "out" / "long_clips.json").read_text())
+    looks = found["looks"]
+    assert [one["frames"] for one in looks] == [1, 3, 5, 5, 5, 7, 7, 7] and looks[1]["ratio"] == 1
+    assert len({json.dumps([task["test"] for task in one["tasks"].values()]) for one in looks}) == 1
+    text = (tmp_path / "out" / "long_clips.md").read_text()
+    assert "| 7 | concat |" in text and (tmp_path / "out" / "figures" / "long_clips.png").exists()

@@ -406,3 +406,15 @@ def test_names_and_trees():
     for clash in ({"a": 1, "a/b": 2}, {"a/b": 2, "a": 1}):
         with pytest.raises(UserError, match="beginning of another"):
             nest(clash)
+
+
+def test_the_writes_after_the_one_that_failed_are_not_told_of():
+    told: list[str] = []
+    hook = checkpoint._without_echoes(lambda kind, error, trace: told.append(str(error)))
+    for error in (RuntimeError("Event loop is closed"), RuntimeError("no such thing"), OSError("Event loop is closed")):
+        hook(type(error), error, None)
+    assert told == ["no such thing", "Event loop is closed"]
+    words = "import sys; import anytouch_jax.io.checkpoint; "
+    words += "e = RuntimeError('Event loop is closed'); sys.excepthook(RuntimeError, e, None)"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

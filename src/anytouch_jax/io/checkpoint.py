@@ -14,7 +14,8 @@ import logging
 import math
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -52,6 +53,20 @@ def _is_news(record: logging.LogRecord) -> bool:
 
 # Orbax logs the traceback of every error of its threads although it also raises it; a full disk is one sentence here.
 logging.getLogger("absl").addFilter(_is_news)
+
+
+def _without_echoes(hook: Callable[..., Any]) -> Callable[..., Any]:
+    """An exception hook that leaves out what Tensorstore's threads say after the write that failed first: the other
+    writes of a checkpoint find nobody to tell any more, and each would print a traceback."""
+
+    def told(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if kind is not RuntimeError or str(error) != "Event loop is closed":
+            hook(kind, error, trace)
+
+    return told
+
+
+sys.excepthook = _without_echoes(sys.excepthook)
 
 
 class Checkpoints:

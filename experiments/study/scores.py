@@ -58,8 +58,7 @@ def _probes(
     table = manifests.read(work.folder / dataset / file)
     shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows, "cache": work.folder / "cache"}
     shared |= options
-    found = battery.run(encoder, table, tasks, **shared) if encoder else battery.raw(table, tasks, **shared)
-    return [{"view": view} | one for one in found]
+    return [{"view": view} | one for one in battery.run(encoder, table, tasks, **shared)]
 
 
 def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:

@@ -294,13 +294,13 @@ def test_universal_tokens_for_sensors_that_the_model_knows(encoder, pictures):
 
 
 def test_raw_pixels_see_the_force_and_their_own_cache(pictures, tmp_path):
-    (one,) = battery.raw(pictures, ["force"], seeds=1, cache=tmp_path)
+    (one,) = battery.run(None, pictures, ["force"], seeds=1, cache=tmp_path)
     assert one["mean"] > 0.9 and one["frames"] == 3
     (file,) = tmp_path.iterdir()
     stamp = file.stat().st_mtime_ns
-    assert battery.raw(pictures, ["force"], seeds=1, cache=tmp_path) == [one]
+    assert battery.run(None, pictures, ["force"], seeds=1, cache=tmp_path) == [one]
     assert file.stat().st_mtime_ns == stamp
-    (still,) = battery.raw(pictures, ["force"], seeds=1, frames=1)
+    (still,) = battery.run(None, pictures, ["force"], seeds=1, frames=1)
     assert (still["frames"], still["test"]) == (1, one["test"])
     store = battery_features.raw(pictures)
     assert store.get(np.array([[2]]), 1).shape == (1, 2 * 768) and store.get(np.array([[2]]), 3).shape == (1, 4 * 768)

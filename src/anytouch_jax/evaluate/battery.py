@@ -20,8 +20,7 @@ from sklearn.decomposition import PCA
 from ..config import UserError
 from ..data.manifest import Manifest
 from . import deals, heads, logistic
-from .battery_features import Order, Store, encoded
-from .battery_features import raw as raw_store
+from .battery_features import Order, Store, encoded, raw
 from .features import Encoder, Join, Pooling
 from .heads import HeadName, Problem, Recipe
 from .probe_models import Scaling, commonest
@@ -34,7 +33,7 @@ COMPONENTS = 200  # principal components of raw pixels
 
 
 def run(
-    encoder: Encoder,
+    encoder: Encoder | None,
     table: Manifest,
     tasks: Sequence[str | Task],
     *,
@@ -56,6 +55,10 @@ def run(
 ) -> list[dict[str, Any]]:
     """Probe frozen features of `encoder` on `tasks` (names of `tasks.TASKS`) of a manifest.
 
+    `encoder` None: pixels and their difference from the background, reduced to 200 principal components (fitted,
+    without labels, on the rows that are never tested; on all where the test is in folds), for which `pooling`, `join`
+    and `universal` mean nothing.
+
     One JSON-ready dict for each task, head and protocol: task, protocol, metric ("accuracy" in 0..1, or "r2"), mean
     (over seeds), low, high (95 % over seeds and test groups; None with fewer than two groups), values (one a seed),
     train, test (rows), classes (names; [] for a number), chance (accuracy of the commonest class of train; for r2 that
@@ -68,36 +71,14 @@ def run(
     content. `universal`: the universal tokens for all sensors; a sensor that the model lacks always gets them. `recipe`
     of the gradient-trained head. Raises UserError: unknown task, label not there, too few groups, nothing left to test.
     """
-    store = encoded(encoder, table, pooling=pooling, join=join, order=order, universal=universal, folder=cache)
     sides = Sides(train_sensors, test_sensors, train_units, test_units)
-    known = frozenset(encoder.config.model.sensors)
-    setting = Setting(seeds, frames, recipe, sides, order, max_rows, "column", known)
+    setting = Setting(seeds, frames, recipe, sides, order, max_rows, "common", None)
+    if encoder is None:
+        store = raw(table, order=order, folder=cache)
+    else:
+        store = encoded(encoder, table, pooling=pooling, join=join, order=order, universal=universal, folder=cache)
+        setting = setting._replace(scaling="column", known=frozenset(encoder.config.model.sensors))
     return _probe(store, table, tasks, setting, head_names, protocols)
-
-
-def raw(
-    table: Manifest,
-    tasks: Sequence[str | Task],
-    *,
-    cache: Path | None = None,
-    seeds: int = 5,
-    frames: int | None = None,
-    protocols: Sequence[Protocol] = ("honest",),
-    train_sensors: Sequence[str] | None = None,
-    test_sensors: Sequence[str] | None = None,
-    order: Order = "right",
-    max_rows: int | None = None,
-    train_units: Sequence[str] | None = None,
-    test_units: Sequence[str] | None = None,
-    head_names: Sequence[HeadName] = ("linear",),
-) -> list[dict[str, Any]]:
-    """As `run`, for pixels and their difference from the background, reduced to 200 principal components.
-
-    The components are fitted, without labels, on the rows that are never tested; on all where the test is in folds.
-    """
-    sides = Sides(train_sensors, test_sensors, train_units, test_units)
-    setting = Setting(seeds, frames, None, sides, order, max_rows, "common", None)
-    return _probe(raw_store(table, order=order, folder=cache), table, tasks, setting, head_names, protocols)
 
 
 class Sides(NamedTuple):

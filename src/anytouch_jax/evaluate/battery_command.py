@@ -43,7 +43,7 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
         say(f"probed {name}")
     if options.controls:
         plain = {name: settings[name] for name in ("protocols", "frames") if name in settings}
-        found += [{"features": RAW} | one for one in battery.raw(table, tasks, **shared, **plain)]
+        found += [{"features": RAW} | one for one in battery.run(None, table, tasks, **shared, **plain)]
         say(f"probed {RAW}")
     runs = {name: dataclasses.asdict(encoder.config) for name, encoder in encoders.items()}
     return {"manifest": table.content_hash, "data": [str(path) for path in options.data], "paper": paper,

@@ -43,6 +43,7 @@ SPACE = (
     Column("alignment", "class token", "alignment", "alignment", 1.0, -1, 3),
     Column("uniformity", "class token", "uniformity", "uniformity", 1.0, -1, 3),
 )
+STATIC = tuple(Column(task, "static", task) for task in ("material", "roughness", "hardness"))
 ANY = "any"
 GRASP = (Column("during the grasp", "during", "grasp"), Column("after the grasp", "after", "grasp"))
 
@@ -184,6 +185,7 @@ def dynamics(runs: Sequence[Run]) -> Part:
     """Clips against stills, shuffled and repeated frames; what training makes of them."""
     names = ("anytouch", "static_only", "no_flips", "frame_differences", "force_heads")
     parts = [f"{what}:\n\n{block(runs, Table('dynamics', names, dynamic(view)), ())}" for view, what in VIEWS.items()]
+    parts.append(f"Static tasks, from a still:\n\n{block(runs, Table('dynamics', names, STATIC), ())}")
     views = by_view(runs, "dynamics", "anytouch", tuple(VIEWS))
     others = [view for view in VIEWS if view != "clips"]
     pairs = [Pair(f"AnyTouch, clips against {view}", "clips", view, (1, 1, 1, 1)) for view in others]

@@ -112,7 +112,10 @@ def _dynamic(leaf: Leaf, work: Work, views: Sequence[str]) -> list[Row]:
 
 
 def _dynamics(leaf: Leaf, work: Work) -> dict[str, Any]:
-    return {"rows": _dynamic(leaf, work, tuple(_VIEWS)), "data": ["own"]}
+    """Dynamic tasks under every view, and what the same training makes of static ones."""
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS}
+    static = _probes(leaf, work, f"own/{cuts.WHOLE}", STATIC, "static", encoder_of(leaf, work), **sensors)
+    return {"rows": _dynamic(leaf, work, tuple(_VIEWS)) + static, "data": ["own"]}
 
 
 def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:

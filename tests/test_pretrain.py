@@ -209,6 +209,15 @@ def test_without_captions_and_photographs_stage_two_still_matches(world, tmp_pat
     assert line["match"] > 0 and line["align"] == 0 and result.step == 1
 
 
+def test_touches_shown_otherwise_than_to_stage_one_are_told_of(straight, world, tmp_path):
+    config = clips_only(run_config(world, 2))
+    other = replace(config, data=replace(config.data, background="subtract"))
+    for name, one, told in (("same", config, False), ("other", other, True)):
+        said: list[str] = []
+        train(one, tmp_path / name, said, init=straight[0], stop_after=0)
+        assert any("trained with --loader.background keep, this run with subtract" in line for line in said) == told
+
+
 # Sensors ------------------------------------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, Model, UserError, from_json
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, UserError, from_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import sources
 from anytouch_jax.data import text as texts
@@ -143,7 +143,7 @@ def _first_params(config: Config, net: Net, init: Any, clip: Any, say: Say) -> P
     if config.towers == "pretrained" and clip is None:
         raise UserError(_NO_CLIP)
     params = net.init(jax.random.key(config.run.seed))
-    first = None if init is None else _load(Path(init), config.model)
+    first = None if init is None else _load(Path(init), config, say)
     weights = None if clip is None else release.read_weights(_weights_file(Path(clip)))
     if config.stage == 2:
         if init is None:
@@ -155,13 +155,19 @@ def _first_params(config: Config, net: Net, init: Any, clip: Any, say: Say) -> P
     return params if first is None else release.merge_stage2(params, stage1=first)
 
 
-def _load(path: Path, model: Model) -> Params:
-    """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of `model`."""
+def _load(path: Path, config: Config, say: Say) -> Params:
+    """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of the model's."""
     if not path.exists():
         raise UserError(f"no run folder or weights file at {path}; train stage 1 first, or give another --init")
     if path.is_dir() and not any(path.glob("*.pth")):
         params, text, _ = checkpoint.load_params(path)
-        stored = from_json(text).model.sensors
+        before = from_json(text)
+        stored, shown = before.model.sensors, before.data.background
+        if shown != config.data.background:
+            say(
+                f"{path} was trained with --loader.background {shown}, this run with {config.data.background}: its "
+                "encoder has never seen touches like these"
+            )
     else:
         file = _weights_file(path)
         weights = release.read_weights(file)
@@ -169,7 +175,7 @@ def _load(path: Path, model: Model) -> Params:
         params, stored = release.to_params(weights, detected), detected.sensors
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
-    rows = release.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), stored, model.sensors)
+    rows = release.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), stored, config.model.sensors)
     return {"touch": params["touch"] | {"sensor_tokens": rows}, "decoder": params["decoder"]}
 
 

@@ -23,7 +23,7 @@ GOLDEN     ?= ../shared/golden
 WORKERS    ?= 2
 
 DEMO       ?= runs/demo
-PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics datasets
+PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics datasets pouring translation
 
 train-stage1: RUN ?= runs/stage1
 train-stage2 probe export-onnx: RUN ?= runs/stage2
@@ -115,14 +115,14 @@ export-onnx: $(ONNX)/.made
 export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]
 	$(PY) experiments/onnx_export/run.py --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
 
-experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=2 MINUTES=75 ONLY="q1 q2" RENDER=1 PLAN=1]
+experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=2 MINUTES=75 CHUNK=2/5 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
 	$(PY) experiments/matrix.py$(if $(QUICK), --quick)$(if $(JOBS), --jobs $(JOBS))$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(RENDER), --render)$(if $(PLAN), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
 notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..."]
 	@mkdir -p runs/notebooks
 	@for page in $(PAGES); do echo $$page; \
 	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$page.py && \
-	  PYTHONPATH=experiments $(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
+	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=experiments $(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
 	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
 
 clean: ## remove .venv, builds and caches; runs stay

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from study import page
 
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import machine, plots, probe, tasks
@@ -47,7 +48,7 @@ encoder, table = load_encoder(RUN), manifests.read(DATA)
 # %% [markdown]
 # ## The same moments for every length
 #
-# A task's moments that end a clip of the longest length, by the sensors that the encoder was trained on.
+# A task's moments that end a clip of the longest length, by the sensors in the encoder's table.
 
 
 # %%
@@ -102,7 +103,9 @@ def milliseconds(encoder: Encoder) -> list[float]:
 cost = milliseconds(encoder)
 record: list[dict[str, Any]] = []
 for (frames, join), ms in zip(LOOKS, cost, strict=True):
-    values = embed_rows(encoder, table, rows, frames, "both", join, say=lambda _: None)[1]  # type: ignore[arg-type]
+    read, values = embed_rows(encoder, table, rows, frames, "both", join, say=lambda _: None)  # type: ignore[arg-type]
+    if len(read) < len(rows):
+        raise SystemExit(f"{len(rows) - len(read)} rows cannot be read; `anytouch verify` says what is wrong with them")
     about = {"frames": frames, "join": join if frames > 3 else "-", "ms": ms, "ratio": ms / cost[1]}
     record.append(about | {"tasks": scores(values)})
     print({name: round(one["mean"], 3) for name, one in record[-1]["tasks"].items()}, frames, join, flush=True)
@@ -144,3 +147,4 @@ points = {
 }
 plots.pareto(OUT / "figures" / "long_clips.png", points, x="ms a clip", y="share of slips told wrongly")
 print(text)
+page.show(OUT / "figures" / "long_clips.png")

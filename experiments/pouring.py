@@ -30,16 +30,20 @@ from __future__ import annotations
 import json
 import os
 import time
+import zlib
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from study import page
 
-from anytouch_jax.config import UserError, preset
+from anytouch_jax.config import preset
 from anytouch_jax.evaluate import plots, pouring, pouring_policy, pouring_table
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
-from anytouch_jax.sim.pouring import Task
+from anytouch_jax.sim.pouring import VERSION, Task
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.record import write_atomic
 
@@ -52,7 +56,11 @@ def setting(name: str, full: int, quick: int) -> int:
     return int(os.environ.get(name) or (quick if QUICK else full))
 
 
-RUNS = dict(word.split("=", 1) for word in os.environ.get("RUNS", "").split())
+words = os.environ.get("RUNS", "").split()
+for word in words:
+    if "=" not in word or not Path(word.split("=", 1)[1]).exists():
+        raise SystemExit(f"RUNS: {word!r} is not name=path of a run that is there")
+RUNS = dict(word.split("=", 1) for word in words)
 SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
 MODES = (os.environ.get("MODES") or ("frozen" if QUICK else "frozen,fine-tuned")).split(",")
 TRIALS, DEMOS, TUNE = setting("TRIALS", 10, 10), setting("DEMOS", 40, 12), setting("TUNE", 150, 20)
@@ -62,7 +70,7 @@ TASK = Task()
 
 unknown = set(RUNS) - set(pouring_table.PAPER) | set(MODES) - set(pouring_table.MODES)
 if unknown:
-    raise UserError(f"RUNS names {', '.join(pouring_table.PAPER)} and MODES frozen, fine-tuned; not {unknown}")
+    raise SystemExit(f"RUNS names {', '.join(pouring_table.PAPER)} and MODES frozen, fine-tuned; not {unknown}")
 
 # %% [markdown]
 # ## The rows
@@ -72,6 +80,7 @@ if unknown:
 
 
 # %%
+@cache
 def encoder_of(name: str, seed: int) -> Encoder | None:
     if name in RUNS:
         return image_tower_encoder(RUNS[name]) if name == "none" else load_encoder(RUNS[name])
@@ -83,7 +92,16 @@ def encoder_of(name: str, seed: int) -> Encoder | None:
     return None
 
 
-SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS}
+def source_of(name: str, encoder: Encoder) -> str:
+    """What a row's encoder is, and a mark of its weights: a run that was trained anew is another encoder."""
+    if name not in RUNS and name == "none":
+        return "untrained"
+    parts = [np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(encoder.params)]
+    shown = "" if name in RUNS else f", {pouring_table.SHOWN}"
+    return f"{Path(RUNS.get(name) or RUNS['anytouch']).name} (weights {zlib.crc32(b''.join(parts)):08x}{shown})"
+
+
+SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS, "version": VERSION}
 
 
 def settings_of(mode: str) -> dict[str, Any]:
@@ -106,6 +124,7 @@ def do_seed(seed: int) -> None:
     learning = pouring_policy.Learning(seed=seed, tune_steps=TUNE)
     setups, keys = pouring.draw_runs(TASK, seed + pouring_policy.UNSEEN, TRIALS)
     shown: dict[int, pouring.Trials] = {}
+    grasps = cache(lambda side: pouring.hold(setups, side=side))
 
     def demonstrations(side: int) -> pouring.Trials:
         if side not in shown:
@@ -134,18 +153,26 @@ def do_seed(seed: int) -> None:
             if seed == SEEDS[0]:
                 print(f"no run is given for row {name}: it is left out")
             continue
-        source = RUNS.get(name) or RUNS["anytouch"] if name != "none" or name in RUNS else "untrained"
+        source = source_of(name, encoder)
         todo = [m for m in MODES if not finished(FOLDER / f"{name}-{m}-{seed}.json", settings_of(m), source)]
         if not todo:
             continue
         since, side = time.time(), encoder.config.model.image_size
         policy = pouring_policy.learn_frozen(encoder, demonstrations(side), learning, stills=stills)
         if "frozen" in todo:
-            write(name, "frozen", pouring.run(TASK, setups, keys, policy, side=side), source, since)
+            write(
+                name, "frozen", pouring.run(TASK, setups, keys, policy, side=side, grasps=grasps(side)), source, since
+            )
         if "fine-tuned" in todo:
             since = time.time()
             tuned = pouring_policy.fine_tune(policy, demonstrations(side), learning)
-            write(name, "fine-tuned", pouring.run(TASK, setups, keys, tuned, side=side), source, since)
+            write(
+                name,
+                "fine-tuned",
+                pouring.run(TASK, setups, keys, tuned, side=side, grasps=grasps(side)),
+                source,
+                since,
+            )
 
 
 if not os.environ.get("TABLE"):
@@ -160,31 +187,33 @@ if not os.environ.get("TABLE"):
 
 # %%
 figures = OUT / "figures"
-one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
-last = int(one.steps[0]) - 1
-moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
-assert one.frames is not None
-change = [one.frames[m, 0].astype(np.float32) - one.frames[2, 0].astype(np.float32) for m in moments]
-standing = ["standing", *(f"{one.mass[m, 0]:.0f} g left, {one.tilt[m, 0]:.0f} deg" for m in moments[1:])]
-plots.sample_grid(
-    figures / "pouring_frames.png",
-    [[one.frames[m, 0] for m in moments], [np.clip(128 + 2 * c, 0, 255).astype(np.uint8) for c in change]],
-    ["frame", "change x 2"],
-    standing,
-)
-pouring.write_film(figures / "pouring.gif", one, TASK)
+if not os.environ.get("TABLE") or not (figures / "pouring.gif").exists():
+    one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
+    last = int(one.steps[0]) - 1
+    moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
+    assert one.frames is not None
+    change = [one.frames[m, 0].astype(np.float32) - one.frames[2, 0].astype(np.float32) for m in moments]
+    standing = ["standing", *(f"{one.mass[m, 0]:.0f} g left, {one.tilt[m, 0]:.0f} deg" for m in moments[1:])]
+    plots.sample_grid(
+        figures / "pouring_frames.png",
+        [[one.frames[m, 0] for m in moments], [np.clip(128 + 2 * c, 0, 255).astype(np.uint8) for c in change]],
+        ["frame", "change x 2"],
+        standing,
+    )
+    pouring.write_film(figures / "pouring.gif", one, TASK)
 
 # %% [markdown]
 # ## The table
 
 # %%
 rows = pouring_table.read_rows(FOLDER)
+seeds = len({run.split("/")[0] for run in rows[0].runs})
 pouring_table.draw(figures / "pouring.png", rows)
 text = f"""# Pouring by touch alone (simulated)
 
-{len(rows[0].runs)} runs a row ({len(SEEDS)} seeds of learning, {len(rows[0].runs) // len(SEEDS)} trials each); mean
+{len(rows[0].runs)} runs a row ({seeds} seeds of learning, {len(rows[0].runs) // seeds} trials each); mean
 |poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
-compared. Differences are paired, run by run.
+compared. Differences are paired, run by run; a sign agrees when the interval and every seed say so.
 
 {pouring_table.table(rows)}
 ![errors](figures/pouring.png)
@@ -195,3 +224,5 @@ Made by `make pouring`, from the JSON in `{FOLDER.name}/`.
 """
 write_atomic(PAGE, text)
 print(text)
+for name in ("pouring.png", "pouring_frames.png"):
+    page.show(figures / name)

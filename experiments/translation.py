@@ -32,11 +32,15 @@ import json
 import os
 import re
 import time
-from dataclasses import asdict
+import zlib
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from study import page
+from study.results import interval
 
 from anytouch_jax.config import preset
 from anytouch_jax.data import manifest as manifests
@@ -55,7 +59,10 @@ QUICK = os.environ.get("QUICK", "") not in ("", "0")
 NAME = "translation_quick" if QUICK else "translation"
 WORK = Path(os.environ.get("WORK") or "runs/translation")
 OUT = Path(os.environ.get("OUT") or "experiments/results")
-RUNS = dict(word.split("=", 1) for word in (os.environ.get("RUNS") or "anytouch=runs/stage2 t3=runs/t3").split())
+words = (os.environ.get("RUNS") or "anytouch=runs/stage2 t3=runs/t3").split()
+if any("=" not in word for word in words):
+    raise SystemExit(f"RUNS: name=path for every run, not {' '.join(words)!r}")
+RUNS = dict(word.split("=", 1) for word in words)
 TOUCHES = int(os.environ.get("TOUCHES") or (24 if QUICK else 400))
 STEPS = int(os.environ.get("STEPS") or (40 if QUICK else 600))
 SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
@@ -114,9 +121,24 @@ def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
 
 
 # %%
-def settings(source: str, target: str, name: str, encoder: Encoder | None, tune: str, seed: int) -> dict[str, Any]:
+def seen_by(encoder: Encoder) -> tuple[int, bool]:
+    """The size of picture that an encoder is shown, and whether less the untouched gel."""
+    return encoder.config.model.image_size, encoder.subtracts
+
+
+def mark(encoder: Encoder | None) -> str:
+    """Where an encoder is from, and a mark of its weights: a run that was trained anew is another encoder."""
+    if encoder is None:
+        return PIXELS
+    parts = [np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(encoder.params)]
+    return f"{Path(encoder.source).name} (weights {zlib.crc32(b''.join(parts)):08x})"
+
+
+def settings(
+    source: str, target: str, name: str, encoder: Encoder | None, seen: tuple[int, bool], tune: str, seed: int
+) -> dict[str, Any]:
     return {
-        "from": source, "to": target, "name": name, "encoder": encoder.source if encoder else PIXELS,
+        "from": source, "to": target, "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
     }  # fmt: skip
 
@@ -125,15 +147,18 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
     """Train, score on objects never seen, and write the JSON of a run; the first seed also draws its pictures."""
     (x, y), val, (test_x, test_y), shown = data
     begun = time.perf_counter()
-    shape = None if encoder else Translation(preset("tiny").model, field=y.shape[1:] if y.dtype != np.uint8 else ())
+    field = () if y.dtype == np.uint8 else y.shape[1:]
+    shape = None if encoder else Translation(replace(preset("tiny").model, image_size=about["size"]), field=field)
     made, losses = generation.fit(
         encoder, x, y, source=about["from"], target=about["to"], val=val, options=Fit(**about["fit"]), shape=shape
     )
     seconds = time.perf_counter() - begun
     away = made(test_x).astype(np.float64) - test_y
+    each = generation.errors(made, test_x, test_y)
     record = {
         "settings": about,
-        "error": float(generation.errors(made, test_x, test_y).mean()),
+        "error": float(each.mean()),
+        "each": [round(float(value), 5) for value in each],
         "mean_target": float(generation.mean_errors(made, test_y).mean()),
         "train_error": losses[-1]["error"],
         "rms": [float(value) for value in np.sqrt((away**2).mean(axis=tuple(range(away.ndim - 1))))],
@@ -175,28 +200,27 @@ def all_runs() -> None:
     RUN_FILES.mkdir(parents=True, exist_ok=True)
     known = encoders(table)
     write_atomic(RUN_FILES / "overlap.json", json.dumps({name: count for name, (_, count) in known.items()}) + "\n")
+    plain = max(seen_by(one) for one, _ in known.values())  # the references see what the encoders see
     plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]
     for source, target in TASKS:
         todo = []
         for seed in SEEDS:
             for name, encoder, tune in plans:
-                about = settings(source, target, name, encoder, tune, seed)
+                about = settings(source, target, name, encoder, seen_by(encoder) if encoder else plain, tune, seed)
                 stem = re.sub(r"[^a-z0-9_]+", "-", f"{source}-{target}-{name}-{tune}-{seed}".lower())
                 if not is_done(RUN_FILES / f"{stem}.json", about):
                     todo.append((about, encoder, RUN_FILES / f"{stem}.json"))
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
-        differences = {encoder.subtracts for _, encoder, _ in todo if encoder} or {False}
         data = {
-            less: [pairs.read_pairs(table, part, preset("tiny").model.image_size, subtract=less) for part in split]
-            for less in differences
+            seen: [pairs.read_pairs(table, part, seen[0], subtract=seen[1]) for part in split]
+            for seen in {(about["size"], about["subtracts"]) for about, _, _ in todo}
         }
         force = [table.value(int(row), "label.force") for row in split.test.source]
         shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
         for about, encoder, file in todo:
-            less = encoder.subtracts if encoder else max(differences)  # the reference sees what the encoders see
-            one_run(about, encoder, (*data[less], shown), file)
+            one_run(about, encoder, (*data[about["size"], about["subtracts"]], shown), file)
 
 
 if not os.environ.get("TABLE"):
@@ -232,6 +256,23 @@ names = sorted({row_name(record) for record in records}, key=lambda name: ("pixe
 cells = [(name, *(spread([r["error"] for r in of(task, name)]) for task in TASKS)) for name in names]
 means = [spread([r["mean_target"] for r in of(task, name)][:1]) for task in TASKS for name in names[:1]]
 cells.append(("mean of the training targets", *means))
+
+
+def against(task: tuple[str, str], better: str, worse: str) -> str:
+    """Error of one row less that of another, seed by seed on the same pairs, with a 95 % interval over seeds."""
+    several = [{r["settings"]["fit"]["seed"]: r["error"] for r in of(task, name)} for name in (better, worse)]
+    change = [several[0][seed] - several[1][seed] for seed in sorted(several[0].keys() & several[1].keys())]
+    if not change:
+        return "-"
+    low, high = interval(change)
+    said = "" if low is None or high is None else f" ({low:+.4f} to {high:+.4f})"
+    word = "undecided" if low is None or high is None or low <= 0 <= high else "agrees" if high < 0 else "does not"
+    return f"{np.mean(change):+.4f}{said}, {word}"
+
+
+ours = next((name for name in names if name.startswith("anytouch")), None)
+rivals = [name for name in names if ours and name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
+claims = [(f"{ours} below {rival}", *(against(task, str(ours), rival) for task in TASKS)) for rival in rivals]
 head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
 
 # %% [markdown]
@@ -261,6 +302,7 @@ lines = [
     "",
     markdown(head, cells),
     "",
+    *([markdown(("is the paper's order found?", *head[1:]), claims), ""] if claims else []),
     "Images: normalised pixels (ImageNet's mean and deviation). Fields: each of the six channels in deviations over "
     "the training fields. The paper, on its own recordings (units not stated): T3 0.2261, 0.0167, 0.0155; AnyTouch "
     "0.2159, 0.0151, 0.0144.",
@@ -276,3 +318,5 @@ lines = [
 ]
 write_atomic(OUT / f"{NAME}.md", "\n".join(lines))
 print("\n".join(lines))
+for picture in sorted(RUN_FILES.glob("*.png")):
+    page.show(picture)

@@ -24,16 +24,21 @@ def runs(question: str) -> list[Run]:
     return found
 
 
+def show(path: Path) -> None:
+    """Show a picture in a notebook; else say where it is."""
+    if _in_jupyter():
+        from IPython.display import Image, display
+
+        display(Image(filename=str(path)))
+    else:
+        print(path)
+
+
 def picture(several: list[Run]) -> Path | None:
     """Draw and show the picture of a question's runs; None where there is nothing to draw."""
     folder = Path(os.environ.get("FIGURES") or tempfile.mkdtemp(prefix="anytouch-"))
     for path in pictures.draw_all(several, folder):
-        if _in_jupyter():
-            from IPython.display import Image, display
-
-            display(Image(filename=str(path)))
-        else:
-            print(path)
+        show(path)
         return path
     return None
 

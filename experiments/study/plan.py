@@ -4,9 +4,10 @@ A `Training` is its configuration, its data and the training that it starts from
 can be shared is shared without being said. Nothing here computes.
 
 Data, after the paper's: `own` is the data set of each sensor by itself (touches nobody else felt), `aligned` its
-coarse TacQuad (by hand, four sensors at one place), `other` a data set never trained on, of other objects. Objects
-held out are held out in both `own` and `aligned`. `own` also has DuraGel, which only the runs `seen` train on: it is
-the unseen sensor, as Taxim and TACTO are in the paper.
+coarse TacQuad (by hand, four sensors at one place), `other` a data set never trained on, of other individuals (more
+than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out are held out in both
+`own` and `aligned`. `own` also has DuraGel, which only the runs `seen` train on: it is the unseen sensor, as Taxim and
+TACTO are in the paper.
 """
 
 from __future__ import annotations
@@ -192,8 +193,10 @@ def leaves(size: Size, *, real: bool = True) -> list[Leaf]:
         for question, name, model, tower in _of_seed(size, seed, first=number == 0):
             found.append(Leaf(question, name, seed, model, size, tower))
     if real:
+        # A sensor of the pack is in none of these tables, and one frame in ten has no picture of the untouched gel.
+        real_data = {"background": "keep", "on_bad_sample": "skip"}
         for seed in size.seeds:
-            model = training(size, "anytouch", seed, extra=(REAL,), data={"background": "keep"})
+            model = training(size, "anytouch", seed, extra=(REAL,), data=real_data)
             found.append(Leaf("real", "anytouch", seed, model, size))
     return found
 

@@ -29,9 +29,11 @@ def real(runs: Sequence[Run]) -> Part:
         statements += [ahead(several, task, name) for name in (PIXELS, UNTRAINED)]
     text = (
         "Stages 1 and 2 on the simulated data and the training split of the pack; GelSight Mini with markers, frames\n"
-        "in contact, test recordings. The paper has no such probe: tested is that ours is above the controls by more\n"
-        "than the interval, in every seed. Fingers: trained on the units of one camera, tested on those of the other;\n"
-        "the two fingers of a grasp are on both sides, so this is another gel and camera, not another grasp.\n\n"
+        "in contact. Object: test recordings. Slip and fingers: recordings of all splits, so the encoder (not the\n"
+        "probe) has seen most of them, without labels, in pre-training. The paper has no such probe: tested is that\n"
+        "ours is above the controls by more than the interval, in every seed. Fingers: trained on the units of one\n"
+        "camera, tested on those of the other; the two fingers of a grasp are on both sides, so this is another gel\n"
+        "and camera, not another grasp.\n\n"
     )
     head = ("task", "features", "accuracy, mean over seeds", "95 % over test groups, by seed", "test frames")
     table = markdown(head, lines)

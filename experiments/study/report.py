@@ -22,7 +22,12 @@ A sign is that of the difference of two rows, seed by seed. It *agrees* when the
 side, is *undecided* when zero lies within, and is not claimed below {CLAIM} seeds. The data are simulated, the network
 is preset tiny, trained for minutes: compared is the direction of an effect, never the paper's absolute numbers, which
 stand beside ours as printed there. Columns: *seen* is a data set trained on (as TAG); *seen sensor, other data* one
-never trained on (as Feel); *unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0)."""
+never trained on (as Feel), whose objects are held out from the probe (their kinds may have been met in pre-training);
+*unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0). Recipes of one stage are trained for that stage's
+steps alone, AnyTouch for both. *No tactile pre-training* is the image tower of our AnyTouch: it never saw a touch, but
+was trained here towards touch, photographs and text; the paper's CLIP never met touch. Statements on dynamic tasks and
+on the grasp test the paper's claim, not a number of its."""
+CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not agree
 
 
 def parts(runs: Sequence[Run]) -> dict[str, Part]:
@@ -73,5 +78,7 @@ def write(folder: Path, out: Path) -> Path:
     runs = read(folder)
     figures = pictures.draw_all(runs, out / "figures")
     out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / "README.md", text(runs, figures))
+    causes = out / CAUSES
+    written = "\n" + causes.read_text(encoding="utf-8") if causes.exists() else ""
+    write_atomic(out / "README.md", text(runs, figures) + written)
     return out / "README.md"

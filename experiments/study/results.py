@@ -98,7 +98,7 @@ def spread(
         return None
     mean, (low, high) = float(np.mean(list(found.values()))), interval(list(found.values()))
     if len(found) == 1:
-        run = next(one for one in runs if (one.question, one.name) == (question, name))
+        run = next(one for one in runs if (one.question, one.name, one.seed) == (question, name, *found))
         row = run.row(column) or {}
         low, high = (None if row.get(side) is None else column.factor * row[side] for side in ("low", "high"))
     return mean, low, high

@@ -7,6 +7,7 @@ A view says of which data and how: `seen` (the sensors trained on), `seen, other
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -189,7 +190,12 @@ def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
 
 
 def _new_sensor(leaf: Leaf, work: Work) -> dict[str, Any]:
-    return {"rows": adaptation.rows(leaf, work, _probes), "data": ["own"]}
+    read = ["own/static", f"own/{plan.UNSEEN}"]
+    if leaf.name != "seen":
+        read += [
+            f"own/{Path(adaptation.labelled(work.folder / 'own', count)).stem}" for count in (0, *adaptation.FRAMES)
+        ]
+    return {"rows": adaptation.rows(leaf, work, _probes), "data": read}
 
 
 def _real(leaf: Leaf, work: Work) -> dict[str, Any]:

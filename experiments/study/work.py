@@ -6,6 +6,7 @@ a folder says that it is finished; one without it is gone on with.
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import gc
 import hashlib
@@ -44,7 +45,7 @@ class Work:
         self.folder, self.real, self.say = folder, real, say
 
     def ready(self, leaf: Leaf) -> set[str]:
-        sets = {one.name for one in plan.scenes(leaf.size) if (self.folder / one.name / DONE).exists()}
+        sets = {one.name for one in plan.scenes(leaf.size) if self._made(one, leaf.size)}
         return sets | {one.key for one in leaf.trainings if (self.run_of(one) / DONE).exists()}
 
     def run_of(self, one: Training) -> Path:
@@ -81,7 +82,12 @@ class Work:
         )  # fmt: skip
         simulate(wanted, folder)
         cuts.cut_all(folder)
-        self._finish(folder, {"seconds": round(time.perf_counter() - start, 1)})
+        self._finish(folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)})
+
+    def _made(self, one: Scenes, size: Size) -> bool:
+        """Whether a data set is there, and of this size (those made before sizes were noted count as fitting)."""
+        path = self.folder / one.name / DONE
+        return path.exists() and json.loads(path.read_text()).get("of", _of(one, size)) == _of(one, size)
 
     def train(self, one: Training) -> None:
         start, run = time.perf_counter(), self.run_of(one)
@@ -109,6 +115,7 @@ class Work:
         names = {name for one in leaf.trainings for name in one.config.data.manifests}
         return {
             "size": leaf.size.name,
+            "settings": dataclasses.asdict(leaf.size),
             "steps": [leaf.size.steps1, leaf.size.steps2],
             "trained": trained,
             "data": {name: content_hash(self.manifest(name)) for name in sorted(names | set(found.pop("data")))},
@@ -130,6 +137,10 @@ class Work:
         """Programs of one training are of no use to the next and hold their memory."""
         jax.clear_caches()
         gc.collect()
+
+
+def _of(one: Scenes, size: Size) -> str:
+    return repr((one, size.frames, size.objects, size.pixels))
 
 
 @cache

@@ -77,6 +77,11 @@ def _main(argv: Sequence[str] | None) -> int:
     except UserError as error:
         print(f"anytouch {args[0]}: {error}", file=sys.stderr)
         return 1
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # a disk, a folder, a name: never a programming error
+        print(f"anytouch {args[0]}: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -157,13 +162,13 @@ def _configure(options: Train) -> Config:
         config.data,
         manifests=tuple(str(path) for path in options.data),
         on_bad_sample=options.on_bad_sample,
-        batch_size=options.batch or config.data.batch_size,
+        batch_size=config.data.batch_size if options.batch is None else options.batch,
     )
     run = replace(
         config.run,
         seed=options.seed,
-        steps=options.steps or config.run.steps,
-        save_every=options.save_every or config.run.save_every,
+        steps=config.run.steps if options.steps is None else options.steps,
+        save_every=config.run.save_every if options.save_every is None else options.save_every,
         tensorboard=options.tensorboard,
     )
     return baselines.apply(options.baseline, replace(config, data=data, run=run))

@@ -18,24 +18,13 @@ from anytouch_jax.strict_json import build
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
 PresetName = Literal["tiny", "small", "base", "large"]
-
 UNIVERSAL = "universal"
 SENSORS = (
-    "gelsight",
-    "digit",
-    "gelslim",
-    "gelsight_mini",
-    "duragel",
-    "9dtact",
-    "allsight",
-    "tacto",
-    "taxim",
-    UNIVERSAL,
-)
+    "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
+)  # fmt: skip
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))  # how often the release draws these in an epoch
-
-# Mean and spread of RGB in 0..1, for touch images (ImageNet) and for ordinary images (CLIP), as the release.
+# Mean and spread of RGB in 0..1, for touch images (ImageNet) and for photographs (CLIP), as the release.
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
@@ -152,6 +141,10 @@ class Objective:
     differences: float = 0.0
     force: float = 0.0
 
+    def __post_init__(self) -> None:
+        if self.groups < 1 or not 0 <= self.mask_ratio <= 1:
+            raise ConfigError(f"groups must be 1 or more and mask_ratio 0 to 1, not {self.groups}, {self.mask_ratio}")
+
     @property
     def keep_ratio(self) -> float:
         """Share of the patches that stays visible."""
@@ -166,7 +159,8 @@ class Objective:
 
 @dataclass(frozen=True)
 class Optim:
-    """AdamW and its schedule (appendix "Implementation details"). `warmup` is in steps; None: see `Run`."""
+    """AdamW and its schedule (appendix "Implementation details"). `warmup` is in steps; None: an epoch, or a share of
+    the run where that is less. `ema`: decay of an average of the parameters, which is then what is used."""
 
     learning_rate: float = 2e-4
     min_rate: float = 0.0
@@ -179,6 +173,10 @@ class Optim:
     clip_norm: float | None = None
     ema: float | None = None
     accumulate: int = 1
+
+    def __post_init__(self) -> None:
+        if self.accumulate < 1:
+            raise ConfigError(f"accumulate must be 1 or more, not {self.accumulate}")
 
 
 @dataclass(frozen=True)
@@ -326,11 +324,10 @@ def preset(
         objective = replace(config.objective, centre=towers == "scratch" and recipe == "paper")
         config = replace(config, model=model, towers=towers, objective=objective)
     if recipe == "release":
+        shared = {"reconstruct": stage == 2, "universal_shared": stage == 2}
         config = replace(
             config,
-            objective=replace(
-                config.objective, touch_text_sum=True, reconstruct=stage == 2, universal_shared=stage == 2
-            ),
+            objective=replace(config.objective, touch_text_sum=True, **shared),
             optim=replace(config.optim, decay="cosine"),
             data=replace(config.data, order="random", split_steps=stage == 2),
         )

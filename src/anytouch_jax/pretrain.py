@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, UserError, from_json
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, SENSORS, Config, UserError, from_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import sources
 from anytouch_jax.data import text as texts
@@ -29,6 +30,7 @@ from anytouch_jax.train.watch import silent
 Params = dict[str, Any]
 Say = Callable[[str], None]
 SCRATCH_VOCABULARY = 2048
+RELEASED = SENSORS[:5]  # what the authors' weights were trained on
 _NO_CLIP = "towers=pretrained needs CLIP weights: --clip <folder or file>, with tokenizer.json beside them"
 
 
@@ -55,10 +57,12 @@ def pretrain(
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
     net = build(config.model)
     params = _first_params(config, net, init, clip, say)
+    _same_data(run, manifest)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
     for note in loader.notes:
         say(note)
+    config = _warmed(config, run, loader)
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
     return fit(
         config,
@@ -74,14 +78,33 @@ def pretrain(
     )
 
 
+def _warmed(config: Config, run: Path, loader: Loader) -> Config:
+    """Warm-up of one epoch (appendix "Implementation details"), or a share of the run where that is less."""
+    stored = run / "config.json"
+    if config.optim.warmup is not None or (stored.exists() and from_json(stored.read_text()).optim.warmup is None):
+        return config
+    return replace(config, optim=replace(config.optim, warmup=min(loader.steps_per_epoch, config.warmup)))
+
+
+def _same_data(run: Path, manifest: manifests.Manifest) -> None:
+    """Raise UserError where a run is gone on with on other rows than it was begun with: it would not be the same."""
+    with suppress(checkpoint.CheckpointError):  # nothing is trained yet
+        before = checkpoint.read_metadata(run).get("data")
+        if before not in (None, manifest.content_hash):
+            raise UserError(
+                f"the rows of the manifests have changed since {run} was begun; restore them, or begin another run "
+                f"with --init {run}"
+            )
+
+
 def _describe(
     config: Config, run: Path, init: Any, clip: Any, manifest: manifests.Manifest, loader: Loader
 ) -> dict[str, Any]:
     """What a checkpoint says of itself beside its config; `seen`: the sensors that it, or `init`, was trained on."""
     seen = set(loader.sensors_seen)
     for before in (run, init):  # a run that goes on may do so without --init
-        if before is not None and checkpoint.steps(Path(before) / "checkpoints"):
-            seen |= set(checkpoint.read_metadata(before).get("seen", ()))
+        if before is not None:
+            seen |= _seen_by(Path(before))
     return {
         "sensors": list(config.model.sensors),
         "seen": [name for name in config.model.sensors if name in seen],
@@ -94,12 +117,22 @@ def _describe(
     }
 
 
+def _seen_by(before: Path) -> set[str]:
+    """The sensors that a run or a weights file was trained on; the authors' own for a file that does not tell."""
+    if before.is_dir() and not any(before.glob("*.pth")):
+        with suppress(checkpoint.CheckpointError):  # nothing is trained yet
+            return set(checkpoint.read_metadata(before).get("seen", ()))
+        return set()
+    told = release.read_metadata(_weights_file(before)).get(release.SEEN_KEY)
+    return set(RELEASED if told is None else told.split(","))
+
+
 def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tuple[Config, Any]:
     """The tokenizer of stage 2: the run's own, the one asked for, CLIP's, or one trained on the captions."""
     if config.model.text is None:
         return config, None
-    own = run / "tokenizer.json"
-    if own.exists():
+    own, begun = run / "tokenizer.json", (run / "config.json").exists()
+    if own.exists() and begun:  # else it is left from a start that failed
         tokenizer = texts.load(own)
     elif config.data.tokenizer is not None:
         tokenizer = texts.load(config.data.tokenizer)
@@ -111,7 +144,7 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
         if not captions:
             return config, None
         tokenizer = texts.train(captions, SCRATCH_VOCABULARY)
-    if not own.exists():
+    if not begun:
         run.mkdir(parents=True, exist_ok=True)
         tokenizer.save(own)
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))

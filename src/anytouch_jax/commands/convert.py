@@ -19,16 +19,25 @@ def run(options: Convert) -> int:
     from anytouch_jax.io import checkpoint, release
 
     source: Path = options.source
+    about = {"source": str(source)}
     if source.is_dir():
-        params, text, _ = checkpoint.load_params(source)
-        model = from_json(text).model
+        params, text, told = checkpoint.load_params(source)
+        config = from_json(text)
+        model = config.model
+        about |= {release.BACKGROUND_KEY: config.data.background}
+        if "touch" in params and "seen" in told:
+            drawn = config.objective.universal_start + config.objective.universal_end > 0
+            touch = release.serve_unseen(params["touch"], model, told["seen"], universal_drawn=drawn)
+            params, about = params | {"touch": touch}, about | {release.SEEN_KEY: ",".join(told["seen"])}
     else:
+        kept = release.read_metadata(source)
+        about |= {key: kept[key] for key in (release.BACKGROUND_KEY, release.SEEN_KEY) if key in kept}
         weights = release.read_weights(source)
         model = release.model_of(source, weights)
         params = release.to_params(weights, model)
     if options.names == "release" and model.sensors[-1] != UNIVERSAL:
         params, model = _universal_last(params, model)
-    about = {"source": str(source), release.MODEL_KEY: to_json(model)}
+    about |= {release.MODEL_KEY: to_json(model)}
     if options.names == "own":
         checkpoint.export_safetensors(options.target, params, about)
     else:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import UserError
+from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Embed
 
 if TYPE_CHECKING:
@@ -23,6 +23,9 @@ def run(options: Embed) -> int:
     from anytouch_jax.evaluate import features
 
     encoder = features.load_encoder(options.run)
+    features.check_frames(encoder.config.model, options.frames)
+    if options.batch < 1:
+        raise UserError(f"--batch must be 1 or more, not {options.batch}")
     if options.stream:
         return _stream(encoder, options)
     if not options.input.exists():
@@ -89,6 +92,8 @@ def _sight(encoder: Encoder, options: Embed) -> Any:
 
     if encoder.subtracts and options.background is None:
         say("this encoder sees touches less the untouched gel: the first frame is taken for that (else --background)")
+    if options.background is not None and not encoder.subtracts:
+        say("--background is not used: this encoder sees touches as the camera gives them")
     return Sight(encoder, None if options.background is None else decode(options.background))
 
 
@@ -98,6 +103,12 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
 
     manifest = manifests.read(options.input)
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
+    fields = np.isin(features.text_column(manifest, "sensor")[rows], FIELD_SENSORS)
+    if fields.any():
+        say(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
+        rows = rows[~fields]
+    if options.background is not None:
+        say("--background is not used: a manifest names the backgrounds of its rows")
     usable = rows if options.frames == 1 else np.intersect1d(rows, manifest.clips(options.frames)[:, -1])
     if len(usable) < len(rows):
         say(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")

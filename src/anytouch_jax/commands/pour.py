@@ -47,14 +47,13 @@ def run(options: Pour) -> int:
     for name, one in results.items():
         print(f"{name}: mean error {sentence(one, task.target)}")
     if options.out is not None:
-        from anytouch_jax.train.record import write_atomic
+        from anytouch_jax.evaluate.plots import write_bytes
 
-        options.out.mkdir(parents=True, exist_ok=True)
         pouring.write_film(options.out / "pour.gif", trials, task)
         found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
         about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
         about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
-        write_atomic(options.out / "pour.json", json.dumps(about | {"poured": found}, indent=2) + "\n")
+        write_bytes(options.out / "pour.json", (json.dumps(about | {"poured": found}, indent=2) + "\n").encode())
         say(f"film and results in {options.out}")
     return 0
 
@@ -72,5 +71,10 @@ def _check(options: Pour) -> None:
     for name in ("trials", "demos"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, not {getattr(options, name)}")
+    if options.out is not None:
+        try:
+            options.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"cannot make the folder {options.out}: {error.strerror}") from None
     if options.steps is not None and options.steps < 1:
         raise UserError(f"--steps must be at least 1, not {options.steps}")

@@ -42,7 +42,7 @@ def _fit(options: Translate) -> int:
     from anytouch_jax.evaluate import generation, generator, pairs
     from anytouch_jax.evaluate.features import load_encoder
     from anytouch_jax.evaluate.generation_figures import picture_grid
-    from anytouch_jax.train.record import write_atomic
+    from anytouch_jax.evaluate.plots import write_bytes
 
     home = _home(options, options.out or options.generator, "out")
     if options.run is None or not options.data:
@@ -69,7 +69,7 @@ def _fit(options: Translate) -> int:
     generator.save(made, home)
     picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}
-    write_atomic(home / "report.json", json.dumps(report, indent=2) + "\n")
+    write_bytes(home / "report.json", (json.dumps(report, indent=2) + "\n").encode())
     print(f"{home}: error {ours.mean():.4f} on objects never seen (copying the mean target: {mean.mean():.4f})")
     return 0
 

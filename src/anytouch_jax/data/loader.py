@@ -56,6 +56,10 @@ class Loader:
     ) -> None:
         if config.data.batch_size < 1 or devices < 1:
             raise UserError(f"batch_size {config.data.batch_size} and devices {devices} must be at least 1")
+        if config.stage == 2 and config.data.batch_size % config.objective.groups:
+            raise UserError(
+                f"a batch of {config.data.batch_size} does not divide by objective.groups={config.objective.groups}"
+            )
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
         for name, number in (("devices", devices), ("batch_size", config.data.batch_size)):
             self._shard.check(number, name)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +23,7 @@ from anytouch_jax.data.transforms import (
     vision_transform,
 )
 
+_gel = lru_cache(256)(decode)  # one for many frames; nobody writes into it
 TRIES = 20  # bad samples in a row before a slot gives up
 _REPLACE = 51
 
@@ -70,11 +73,11 @@ class Reader:
                 f"{self.manifest.where(row)} has no background_path, which --loader.background subtract takes off; "
                 "name one, or train with --loader.background keep"
             )
-        return self._decode(row, "background_path")
+        return self._decode(row, "background_path", _gel)
 
-    def _decode(self, row: int, column: str) -> np.ndarray:
+    def _decode(self, row: int, column: str, how: Callable[[Path], np.ndarray] = decode) -> np.ndarray:
         try:
-            return decode(self.manifest.file(row, column))
+            return how(self.manifest.file(row, column))
         except UserError as error:
             raise SampleError(f"{self.manifest.where(row)}, column {column!r}: {error}") from None
 

@@ -98,9 +98,21 @@ def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray,
     rows = manifest.rows_of(split)
     sensor, notes = sensor_rows(manifest, config.model, rows, unknown=unknown)
     rows = rows[sensor[rows] >= 0]
+    files = ", ".join(map(str, manifest.files))
     if not rows.size:
-        files = ", ".join(map(str, manifest.files))
         raise ManifestError(f"{files}: split {split!r} has no row of a known sensor with images")
+    if config.data.background == "subtract":
+        bare = rows[~manifest.present("background_path")[rows]]
+        if len(bare) == len(rows) or (len(bare) and unknown == "error"):
+            raise ManifestError(
+                f"{manifest.where(int(bare[0]))} and {len(bare) - 1} other rows have no background_path, which "
+                "--loader.background subtract takes off; --on-bad-sample skip leaves such rows out"
+            )
+        if len(bare):
+            notes.append(f"left out {len(bare)} rows without background_path, which data.background subtract takes off")
+            sensor = sensor.copy()
+            sensor[bare] = -1
+            rows = rows[sensor[rows] >= 0]
     return rows, sensor, notes
 
 

@@ -62,12 +62,16 @@ def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: 
 def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:
     """Each of T frames u8 (h, w, 3) less the untouched gel, on middle grey: frame - background + 128, clipped to u8.
 
-    A background of another size is resized to the frames'.
+    A background of another size is resized to the frame's.
     """
-    height, width = frames[0].shape[:2]
-    if background.shape[:2] != (height, width):
-        background = cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA)
-    return [cv2.addWeighted(frame, 1.0, background, -1.0, 128.0) for frame in frames]
+
+    def less(frame: np.ndarray) -> np.ndarray:
+        height, width = frame.shape[:2]
+        same = background.shape[:2] == (height, width)
+        gel = background if same else cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA)
+        return cv2.addWeighted(frame, 1.0, gel, -1.0, 128.0)
+
+    return [less(frame) for frame in frames]
 
 
 def _resize(frame: np.ndarray, target: np.ndarray) -> None:

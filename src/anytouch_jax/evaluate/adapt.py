@@ -21,6 +21,7 @@ from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.evaluate.features import embed_rows, load_encoder, text_column
 from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses
 from anytouch_jax.train.record import Record, write_atomic
@@ -79,7 +80,7 @@ def adapt(
     clip, target = _read(manifest, config, fitted), classes[fitted]
     shown, on = _measured(manifest, sensor, classes, seed, fitted)
     core = replace(config, model=replace(config.model, image=None, text=None, match_head="none", lora_rank=0))
-    loss = _loss(build(core.model), core, row, prototypes)
+    loss = _loss(build(usable(core.model)), core, row, prototypes)
     small: Params = {name: params[name] for name in ("touch", "decoder", "force") if name in params}
     measure = partial(_mean, loss, clip=_read(manifest, config, shown), target=classes[shown])
     tokens, history = _fit(loss, small, row, clip, target, steps=steps, rate=rate, seed=seed)

@@ -104,6 +104,8 @@ def export(
     plain = replace(encoder, config=replace(encoder.config, model=replace(model, attention="xla")))
     data = _artefact(plain, frames, platforms, pooling, join)
     live = plain if model.attention == "cudnn" and _here() != "cuda" else encoder
+    side = model.image_size
+    less = ", less the untouched gel: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
     differs, width = _worst(live, data, frames, pooling, join)
     about = {
         "format": FORMAT,
@@ -113,7 +115,7 @@ def export(
         "source": encoder.source,
         "jax": jax.__version__,
         "platforms": list(platforms),
-        "input": f"frames: uint8 RGB (B, {frames}, {model.image_size}, {model.image_size}, 3); sensor: int32 (B,)",
+        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){less}; sensor: int32 (B,)",
         "output": f"features: float32 (B, {width}), not normalised",
         "frames": frames,
         "image_size": model.image_size,

@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL, Config, Model, UserError, from_json
+from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, from_json
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.transforms import subtract_background, touch_evaluation
 from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
 
@@ -150,7 +151,8 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     else:
         weights = release.read_weights(path)
         model = release.model_of(path, weights)
-        params, config = release.to_params(weights, model), Config(model)
+        shown: Any = release.read_metadata(path).get(release.BACKGROUND_KEY, "keep")
+        params, config = release.to_params(weights, model), Config(model, data=Data(background=shown))
     if "touch" not in params:
         raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
     return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path))
@@ -163,7 +165,7 @@ def random_encoder(config: Config, seed: int = 0) -> Encoder:
 
 
 def _touch_only(config: Config) -> Config:
-    bare = replace(config.model, image=None, text=None, match_head="none", lora_rank=0, force_head=False)
+    bare = replace(usable(config.model), image=None, text=None, match_head="none", lora_rank=0, force_head=False)
     return replace(config, model=bare)
 
 
@@ -202,6 +204,8 @@ def embed_rows(
     for found, part in evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"):
         ids.append(found)
         values.append(encoder.embed(part.clip, part.sensor, pooling=pooling, join=join)[: len(found)])
+    if not ids:
+        raise UserError(f"none of the {len(rows)} rows can be read; `anytouch verify` says what is wrong with them")
     return np.concatenate(ids), np.concatenate(values)
 
 

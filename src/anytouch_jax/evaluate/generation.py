@@ -101,13 +101,14 @@ def fit(
     real = in_batches(_judged(nameless(design)), params["encoder"], targets) if frozen and design.has_critic else None
     program = _step(nameless(design))
     val = None if val is None or not len(val[0]) else val
+    seen = in_batches(_features(nameless(design)), params["encoder"], val[0]) if frozen and val is not None else None
     state, still = begin(design, params)
     mean, scale = units(design, params["fixed"])
     losses: list[dict[str, float]] = []
     best, made = np.inf, state.made
     every = max(1, options.steps // 20)
     for step in range(options.steps):
-        rows = np.random.default_rng([options.seed, step]).integers(len(images), size=options.batch)
+        rows = np.random.default_rng([options.seed % 2**63, step]).integers(len(images), size=options.batch)
         y = (targets[rows].astype(np.float32) - mean) / scale
         batch = Batch(images[rows] if known is None else known[rows], y, None if real is None else real[rows])
         state, metrics = program(state, still, batch, rates(design, params["fixed"], step))
@@ -116,7 +117,9 @@ def fit(
             if not np.isfinite(losses[-1]["error"]):
                 raise UserError(f"the error is not finite at step {step + 1}; lower the learning rate")
             now = Generator(design, state.made | still)
-            losses[-1] |= {} if val is None else {"val": float(errors(now, *val).mean())}
+            if val is not None:
+                guess = now.normalised(val[0]) if seen is None else now.from_features(seen)
+                losses[-1]["val"] = float(_errors(now, guess, val[1]).mean())
             if val is None or losses[-1]["val"] < best:
                 best, made = losses[-1].get("val", np.inf), state.made
             if say is not None:

@@ -92,8 +92,9 @@ class Design:
 
     @property
     def has_critic(self) -> bool:
-        """Images from an encoder are judged where the weight is not 0; fields and references never."""
-        return self.encoder is not None and not self.shape.field and self.fit.adversarial > 0
+        """Images are judged by an encoder where the weight is not 0; fields and references never, nor where the encoder
+        `subtracts`: the targets are whole pictures, which it has never seen."""
+        return self.encoder is not None and not self.subtracts and not self.shape.field and self.fit.adversarial > 0
 
 
 def features(design: Design, encoder: Params | None, images: Array) -> Array:
@@ -159,6 +160,10 @@ class Generator:
             )
         return in_batches(_program(nameless(self.design)), self.params, images)
 
+    def from_features(self, x: np.ndarray) -> np.ndarray:
+        """The prediction f32 in the normalised units of the error, from what `features` gave."""
+        return in_batches(_heads(nameless(self.design)), self.params, x)
+
 
 def in_batches(run: Callable[[Any, Any], Any], params: Any, images: np.ndarray) -> np.ndarray:
     """`run(params, part)` of images part by part, the last part filled up: one shape, one compilation."""
@@ -182,6 +187,11 @@ def _program(design: Design) -> Any:
         return predict(design, params, features(design, params.get("encoder"), images))
 
     return jax.jit(run)
+
+
+@lru_cache(maxsize=8)
+def _heads(design: Design) -> Any:
+    return jax.jit(lambda params, x: predict(design, params, x))
 
 
 def save(generator: Generator, folder: str | Path) -> Path:

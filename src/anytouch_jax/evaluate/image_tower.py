@@ -11,6 +11,7 @@ import numpy as np
 from anytouch_jax.config import Config, UserError, from_json
 from anytouch_jax.evaluate.features import Encoder
 from anytouch_jax.io import checkpoint, release
+from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.lora import merge_lora
 
@@ -36,8 +37,8 @@ def image_tower_encoder(path: str | Path, *, step: int | None = None) -> Encoder
         raise UserError(f"{path} holds no image tower; give a stage-2 run with one, or CLIP weights")
     tower = merge_lora(params, config.model.lora_alpha)["image"]
     bare = replace(
-        config.model, touch=stack, sensor_tokens=0, patch_encoder="shared", image=None, text=None, match_head="none",
-        lora_rank=0, force_head=False,
+        usable(config.model), touch=stack, sensor_tokens=0, patch_encoder="shared", image=None, text=None,
+        match_head="none", lora_rank=0, force_head=False,
     )  # fmt: skip
     fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
     touch = release.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)

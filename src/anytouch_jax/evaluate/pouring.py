@@ -111,7 +111,7 @@ def best_counter(task: Task, setups: Setup, keys: jax.Array) -> Counter:
 
 def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
     """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
-    setups = [pouring.draw_setup(task, np.random.default_rng([seed, number])) for number in range(count)]
+    setups = [pouring.draw_setup(task, np.random.default_rng([seed % 2**63, number])) for number in range(count)]
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(count))
     return pouring.stack(setups), keys
 
@@ -126,9 +126,14 @@ def _advance(state: State, actions: jax.Array, setups: Setup, *, task: Task) -> 
     return jax.vmap(lambda state, action, setup: pouring.advance(state, action, setup, task))(state, actions, setups)
 
 
-@partial(jax.jit, static_argnames=("side",))
 def hold(setups: Setup, *, side: int) -> pouring_render.Grasp:
     """The grasps of stacked runs, for pictures of `side` pixels."""
+    pouring_render.prepare()
+    return _hold(setups, side=side)
+
+
+@partial(jax.jit, static_argnames=("side",))
+def _hold(setups: Setup, *, side: int) -> pouring_render.Grasp:
     return jax.vmap(lambda setup: pouring_render.hold(setup, side)[0])(setups)
 
 
@@ -137,7 +142,7 @@ def look(state: State, setups: Setup, grasps: pouring_render.Grasp, *, task: Tas
     """The frames u8 (B, side, side, 3) of stacked runs at this moment."""
 
     def one(state: State, setup: Setup, grasp: pouring_render.Grasp) -> jax.Array:
-        noise = jax.random.fold_in(state.key, 2)
+        noise = jax.random.fold_in(state.key, pouring.PIXELS)
         return pouring_render.picture(grasp, setup, pouring.load(state, setup, task), noise, side)
 
     return jax.vmap(one)(state, setups, grasps)
@@ -152,16 +157,17 @@ def run(
     side: int = 112,
     film: bool = False,
     late: Array | None = None,
+    grasps: pouring_render.Grasp | None = None,
 ) -> Trials:
     """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or for a `film`.
 
+    `grasps`: those of `hold` for these runs and `side`, where they are at hand.
     `late` (B,): a hand that goes on pouring for so many moments after it was told to retract, which then stays the
     choice. So demonstrations show what to do where the target is already passed.
     """
     drawn = controller.looks or film
-    if drawn:
-        pouring_render.prepare()
-    grasps = hold(setups, side=side) if drawn else None
+    if drawn and grasps is None:
+        grasps = hold(setups, side=side)
     state = _begin(setups, keys, task=task)
     count = len(state.mass)
     controller.begin(count)

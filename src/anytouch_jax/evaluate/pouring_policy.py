@@ -73,14 +73,25 @@ def demonstrate(
     only where one is retracting already (noise in demonstrations: Laskey et al. 2017).
     """
     setups, keys = draw_runs(task, seed, count)
-    hand = np.random.default_rng([seed, count, late]).integers(0, late + 1, count)
-    parts = []
+    hand = np.random.default_rng([seed % 2**63, count, late]).integers(0, late + 1, count)
+    expert = Expert(task, patient=patient)
+    plain = run(task, setups, keys, expert, late=hand)
+    if side is None:
+        return plain
+    # Runs of like length together: a batch is drawn until its longest has ended.
+    order, parts = np.argsort(plain.steps, kind="stable"), []
     for start in range(0, count, chunk):
-        part = slice(start, start + chunk)
+        part = order[start : start + chunk]
         some: Setup = jax.tree.map(lambda x, part=part: x[part], setups)
-        expert, film = Expert(task, patient=patient), side is not None
-        parts.append(run(task, some, keys[part], expert, side=side or 8, film=film, late=hand[part]))
-    return joined(parts)
+        parts.append(run(task, some, keys[part], expert, side=side, film=True, late=hand[part]))
+    return _picked(joined(parts), np.argsort(order))
+
+
+def _picked(trials: Trials, order: Array) -> Trials:
+    """The runs of trials in another order."""
+    over_time = {name: getattr(trials, name) for name in Trials._fields[2:]}
+    moved: dict[str, Any] = {name: None if x is None else x[:, order] for name, x in over_time.items()}
+    return Trials(trials.poured[order], trials.steps[order], **moved)
 
 
 def joined(parts: Sequence[Trials]) -> Trials:
@@ -101,13 +112,13 @@ def features(encoder: Encoder, trials: Trials, *, stills: bool, batch: int = 64)
     """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end."""
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
-    where, frames = np.argwhere(trials.taken[FRAMES - 1 :]), seen(encoder, trials.frames, trials.frames[0])
+    where = np.argwhere(trials.taken[FRAMES - 1 :])
     ahead = 1 if stills else FRAMES
     found = np.zeros((*trials.taken[FRAMES - 1 :].shape, encoder.config.model.embed), np.float32)
     for start in range(0, len(where), batch):
         part = where[start : start + batch]
         padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
-        found[tuple(part.T)] = encoder.embed(_clips(frames, padded, ahead), SENSOR)[: len(part)]
+        found[tuple(part.T)] = encoder.embed(_clips(encoder, trials.frames, padded, ahead), SENSOR)[: len(part)]
     return found
 
 
@@ -119,10 +130,11 @@ def seen(encoder: Encoder, frames: Array, first: Array) -> Array:
     return np.clip(frames.astype(np.int16) - first + 128, 0, 255).astype(np.uint8)
 
 
-def _clips(frames: Array, where: Array, ahead: int) -> Array:
-    """Segments (n, ahead, ...) that end at moments `where` (n, 2): number of the segment, run."""
-    ends = where[:, 0] + FRAMES - 1
-    return np.stack([frames[ends - back, where[:, 1]] for back in range(ahead - 1, -1, -1)], 1)
+def _clips(encoder: Encoder, frames: Array, where: Array, ahead: int) -> Array:
+    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `seen`."""
+    ends, runs = where[:, 0] + FRAMES - 1, where[:, 1]
+    first = frames[0, runs]
+    return np.stack([seen(encoder, frames[ends - back, runs], first) for back in range(ahead - 1, -1, -1)], 1)
 
 
 def inputs(now: Any, before: Any, lifted: Any, standing: Any, xp: Any = np) -> Any:
@@ -184,7 +196,7 @@ def imitate(x: Array, actions: Array, learning: Learning) -> tuple[Head, float]:
     data = (jnp.asarray(x, jnp.float32), jnp.asarray(actions))
 
     @jax.jit
-    def train(layers: Any, data: Any) -> tuple[Any, jax.Array]:
+    def train(layers: Any, head: Head, data: Any) -> tuple[Any, jax.Array]:  # (constants would be compiled anew)
         def step(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             layers, state = carry
             ids = jax.random.randint(key, (learning.batch,), 0, len(data[0]))
@@ -200,7 +212,7 @@ def imitate(x: Array, actions: Array, learning: Learning) -> tuple[Head, float]:
         (layers, _), losses = jax.lax.scan(step, (layers, optimiser.init(layers)), keys)
         return layers, jnp.mean(losses[-max(1, learning.steps // 10) :])
 
-    layers, last = train(head.layers, data)
+    layers, last = train(head.layers, head, data)
     return head._replace(layers=layers), float(last)
 
 
@@ -282,13 +294,13 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     ahead = 1 if stills else FRAMES
     where = np.argwhere(trials.taken[START:])
     step, state, params = _tuner(encoder, head, learning)
-    rng = np.random.default_rng(learning.seed)
+    rng = np.random.default_rng(learning.seed % 2**63)
     for _ in range(learning.tune_steps):
         at = where[rng.integers(len(where), size=learning.tune_batch)]
         now, lifted = at[:, 0] + LIFTED, np.full(len(at), LIFTED)
         numbers = (now, np.maximum(now - LAG, LIFTED), lifted, 0 * lifted)
-        clips = [_clips(trials.frames, np.stack([number, at[:, 1]], 1), ahead) for number in numbers]
-        params, state = step(params, state, np.concatenate(clips), trials.choices[at[:, 0] + START, at[:, 1]])
+        clips = [_clips(encoder, trials.frames, np.stack([number, at[:, 1]], 1), ahead) for number in numbers]
+        params, state = step(params, state, head, np.concatenate(clips), trials.choices[at[:, 0] + START, at[:, 1]])
     tuned = replace(encoder, params=params["encoder"], source=f"{encoder.source}, fine-tuned")
     return Touch(tuned, head._replace(layers=params["head"]), stills=stills)
 
@@ -301,11 +313,11 @@ def _tuner(encoder: Encoder, head: Head, learning: Learning) -> tuple[Callable[.
         {"encoder": "encoder", "head": "head"},
     )
     sensor = encoder.sensor_row(SENSOR)
-    apply = partial(_tuned_logits, net=encoder.net, head=head, sensor=sensor)
+    apply = partial(_tuned_logits, net=encoder.net, sensor=sensor)
 
     @jax.jit
-    def step(params: Params, state: Any, clips: jax.Array, actions: jax.Array) -> tuple[Params, Any]:
-        slope = jax.grad(lambda p: imitation_loss(apply(p, clips), actions))(params)
+    def step(params: Params, state: Any, head: Head, clips: jax.Array, actions: jax.Array) -> tuple[Params, Any]:
+        slope = jax.grad(lambda p: imitation_loss(apply(p, clips, head=head), actions))(params)
         change, state = optimiser.update(slope, state, params)
         return optax.apply_updates(params, change), state
 

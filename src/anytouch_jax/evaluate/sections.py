@@ -16,6 +16,7 @@ from ..data.evaluation import evaluation
 from ..data.images import decode
 from ..data.manifest import Manifest
 from ..io import checkpoint
+from ..nn.attention import usable
 from ..nn.functional import build
 from . import matching, plots, results, retrieval
 from .contacts import deepest_rows
@@ -131,13 +132,14 @@ def reconstructions_section(manifest: Manifest, run: Path, folder: Path, *, spli
     rows = manifest.rows_of(split)
     rows = rows[~np.isin(text_column(manifest, "sensor")[rows], FIELD_SENSORS)]
     frames = config.model.frames + 1
-    ends = np.intersect1d(manifest.clips(frames, split)[:, -1], rows)
+    moving = config.objective.next_frame and config.data.clip_share > 0  # else its head for clips was never trained
+    ends = np.intersect1d(manifest.clips(frames, split)[:, -1], rows) if moving else rows[:0]
     kind, frames = ("clip", frames) if len(ends) else ("still", 1)
     rows = _deepest_of_sensors(manifest, ends if len(ends) else rows)
     config = replace(config, data=replace(config.data, batch_size=len(rows), on_bad_sample="error"))
     _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))  # type: ignore[arg-type]
     params = {name: params[name] for name in ("touch", "decoder")}
-    image = reconstruction_panels(params, batch.clip, batch.sensor, net=build(config.model), config=config)
+    image = reconstruction_panels(params, batch.clip, batch.sensor, net=build(usable(config.model)), config=config)
     path = folder / "figures" / "reconstructions.png"
     write_png(path, image)
     names = ", ".join(text_column(manifest, "sensor")[rows])

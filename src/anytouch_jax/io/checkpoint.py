@@ -43,6 +43,7 @@ __all__ = [
 Tree = Any
 
 _UNFINISHED = re.compile(r"\d{8,}\..+")  # being written or removed, by us or by Orbax
+_AVERAGE = "opt_state/ema/"
 _SHOWN = 5  # names listed in one error message
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost
 
@@ -225,19 +226,22 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
     """(parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
 
     `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen`
-    of the state together; the optimiser's arrays are not read. Raises CheckpointError.
+    of the state together, their average where the run keeps one (optim.ema); the optimiser's other arrays are not read.
+    Raises CheckpointError.
     """
     target = resolve(Path(folder), step)
     record = checked(target)
     chosen = {
         name: np.zeros(like.shape, like.dtype)
         for name, like in _forms(record).items()
-        if name.split("/")[0] in ("trainable", "frozen")
+        if name.startswith(("trainable/", "frozen/", _AVERAGE))
     }
     if not chosen:
         raise CheckpointError(f"checkpoint {target} holds no parameters (nothing under trainable/ or frozen/)")
     found = chosen | _load(target, {name: like for name, like in chosen.items() if like.size})
-    return nest({name.split("/", 1)[1]: leaf for name, leaf in found.items()}), record["config"], _description(record)
+    trained = {name.split("/", 1)[1]: leaf for name, leaf in found.items() if not name.startswith(_AVERAGE)}
+    averaged = {name.removeprefix(_AVERAGE): leaf for name, leaf in found.items() if name.startswith(_AVERAGE)}
+    return nest(trained | averaged), record["config"], _description(record)
 
 
 def export_safetensors(path: str | Path, params: Tree, metadata: Mapping[str, str]) -> None:

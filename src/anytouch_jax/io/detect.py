@@ -14,7 +14,9 @@ from anytouch_jax.io.names import Layout
 from anytouch_jax.io.tensors import WeightsError, read_metadata
 
 Weights = Mapping[str, np.ndarray]
-MODEL_KEY = "anytouch_jax.model"  # metadata of our safetensors files: heads and activation leave no trace in shapes
+# Metadata of our safetensors files: heads and activation leave no trace in shapes, nor does what was seen in training.
+MODEL_KEY = "anytouch_jax.model"
+BACKGROUND_KEY, SEEN_KEY = "anytouch_jax.background", "anytouch_jax.seen"
 
 
 def detect_layout(weights: Weights) -> Layout:

@@ -15,16 +15,26 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, Model
-from anytouch_jax.io.detect import MODEL_KEY, detect_layout, detect_model, model_of
+from anytouch_jax.io.detect import BACKGROUND_KEY, MODEL_KEY, SEEN_KEY, detect_layout, detect_model, model_of
 from anytouch_jax.io.names import Entry, Layout, entries, is_left_out, unused
 from anytouch_jax.io.resize import resize_position
 from anytouch_jax.io.shapes import Shape, param_shapes
-from anytouch_jax.io.tensors import WeightsError, as_float32, existing, read_npz, read_safetensors, write_safetensors
+from anytouch_jax.io.tensors import (
+    WeightsError,
+    as_float32,
+    existing,
+    read_metadata,
+    read_npz,
+    read_safetensors,
+    write_safetensors,
+)
 from anytouch_jax.io.torch_file import read_torch
 from anytouch_jax.io.tree import flatten, nest
 
 __all__ = [
+    "BACKGROUND_KEY",
     "MODEL_KEY",
+    "SEEN_KEY",
     "WeightsError",
     "clip_to_stage1",
     "detect_layout",
@@ -33,6 +43,7 @@ __all__ = [
     "match_sensors",
     "merge_stage2",
     "model_of",
+    "read_metadata",
     "read_weights",
     "release_names",
     "release_shapes",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+from anytouch_jax.config import Model
 
 CACHE = 1_250_000  # bytes of logits at a time: what stays in a core's cache
 
@@ -25,6 +28,12 @@ def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, m
     keys = None if mask is None else mask[:, None, None, :]
     known: Literal["cudnn", "xla"] = "cudnn" if how == "cudnn" else "xla"
     return jax.nn.dot_product_attention(q, k, v, mask=keys, is_causal=causal, implementation=known)
+
+
+def usable(model: Model) -> Model:
+    """`model` with a form of attention that this machine has: what cuDNN trained can be used where there is none."""
+    there = model.attention != "cudnn" or jax.default_backend() == "gpu"
+    return model if there else replace(model, attention="auto")
 
 
 @jax.custom_vjp

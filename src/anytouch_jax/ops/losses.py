@@ -90,7 +90,7 @@ def centred(x: Array, present: Array) -> Array:
     """Unit vectors (B, E) from `x` less its mean over the rows that are `present` (B,)."""
     x = jnp.where(present[:, None], _wide(x), 0.0)
     mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present), 1)
-    return normalise(jnp.where(present[:, None], x - mean, 0.0))
+    return normalise(jnp.where(present[:, None], x - mean, 0.0), eps=1e-6)  # what spreads less than 1e-3 is rounding
 
 
 def alignment_loss(

@@ -29,6 +29,8 @@ FLOW, MARGIN = 1.03, 1.4  # constants of the slot law; the margin is in bead dia
 STAND = 3  # moments in which the gripped cylinder still stands on the table; then it is lifted to its first tilt
 EXPOSURE = 1 / 60  # s of one frame: blows shorter than this are averaged
 STEEPEST = math.radians(86)
+SHOCKS, PIXELS = 101, 102  # numbers of a state's chances beside those of `advance`, whose split gives 0, 1 and 2
+VERSION = 2  # of what a run gives for its seed
 
 
 @dataclass(frozen=True)
@@ -275,5 +277,5 @@ def load(state: State, setup: Setup, task: Task, *, shocks: bool = True) -> Load
     blow = GLASS * math.pi / 6 * setup.bead**3 * jnp.sqrt(2 * GRAVITY * setup.radius) * 1e-6 / EXPOSURE  # N a bead
     beads = state.rate * EXPOSURE / (GLASS * math.pi / 6 * setup.bead**3)
     spread = jnp.sqrt(beads * blow**2 + (state.moved * setup.jolt) ** 2)
-    draws = spread * jax.random.normal(jax.random.fold_in(state.key, 1), (4,))
+    draws = spread * jax.random.normal(jax.random.fold_in(state.key, SHOCKS), (4,))
     return Load(shear + draws[:2], twist + setup.radius / 2 * draws[2], normal + draws[3])

@@ -95,7 +95,8 @@ def skin(grasp: Grasp, setup: Setup, load: Load) -> tuple[Array, Array]:
     """
     place = jnp.interp(load.normal, grasp.forces, jnp.arange(len(LEVELS), dtype=jnp.float32))
     weights = jnp.maximum(1 - jnp.abs(place - jnp.arange(len(LEVELS))), 0)
-    c, s = jnp.cos(setup.unit.rotation), jnp.sin(setup.unit.rotation)
+    turned = setup.unit.rotation + setup.yaw  # of the cylinder's own directions on the gel
+    c, s = jnp.cos(turned), jnp.sin(turned)
     x, y = load.shear
     acting = jnp.stack([c * x - s * y, s * x + c * y, load.twist])
     drawn = jnp.sqrt(x**2 + y**2 + (load.twist / (2 / 3 * grasp.radius)) ** 2 + 1e-12)

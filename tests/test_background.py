@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from tiny_models import tiny_config
 from touch_world import make_touches
 
 from anytouch_jax.cli import main
@@ -18,6 +19,7 @@ from anytouch_jax.data.loader import Loader, SampleError
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.evaluate import pouring_policy
 from anytouch_jax.evaluate.features import Encoder, Sight, embed_rows, load_encoder
+from anytouch_jax.pretrain import pretrain
 
 RNG = np.random.default_rng(0)
 GEL = RNG.integers(60, 200, (28, 28, 3), np.uint8)
@@ -111,6 +113,44 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
     assert "the first frame is taken for that" in capsys.readouterr().err
     assert np.abs(np.load(tmp_path / "b.npz")["features"] - wanted).max() > 1e-3
+
+
+def test_training_says_at_once_which_rows_have_no_background(touches):
+    table = manifests.read(touches)
+    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    for row in table.rows_of("train")[:5]:
+        columns["background_path"][row] = None
+    holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
+    with pytest.raises(manifests.ManifestError, match=r"row 0 of .* and 4 other rows have no background_path"):
+        Loader(holed, settings(touches))
+    loader = Loader(holed, settings(touches, on_bad_sample="skip"))
+    assert any("left out 5 rows without background_path" in note for note in loader.notes)
+    columns["background_path"] = [None] * len(table)
+    with pytest.raises(manifests.ManifestError, match="have no background_path"):
+        Loader(
+            manifests.from_columns(columns, touches.parent / "none.parquet"), settings(touches, on_bad_sample="skip")
+        )
+
+
+def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
+    config = replace(tiny_config(1), data=settings(touches).data)
+    pretrain(replace(config, run=replace(config.run, steps=2, save_every=2, figure_every=0)), tmp_path / "r", say=str)
+    assert main(["convert", str(tmp_path / "r"), str(tmp_path / "w.safetensors")]) == 0
+    assert main(["convert", str(tmp_path / "w.safetensors"), str(tmp_path / "o.safetensors"), "--names", "own"]) == 0
+    run, *files = (load_encoder(tmp_path / name) for name in ("r", "w.safetensors", "o.safetensors"))
+    clips = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
+    for one in files:
+        assert one.subtracts and run.subtracts
+        for sensor in ("digit", "duragel", "universal"):  # duragel was not trained on
+            np.testing.assert_allclose(one.embed(clips, sensor), run.embed(clips, sensor), atol=1e-6)
+
+
+def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder, monkeypatch):
+    frames = RNG.integers(100, 150, (9, 2, 28, 28, 3), np.uint8)
+    where = np.array([[0, 1], [3, 0]])
+    clips = pouring_policy._clips(encoder, frames, where, 3)
+    np.testing.assert_array_equal(clips[1, 2], frames[5, 0].astype(int) - frames[0, 0] + 128)
+    np.testing.assert_array_equal(clips[0, 0], np.full_like(GEL, 128))
 
 
 def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):

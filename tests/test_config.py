@@ -15,6 +15,7 @@ from anytouch_jax.config import (
     ConfigError,
     Model,
     Objective,
+    Optim,
     Stack,
     TextTower,
     UserError,
@@ -159,6 +160,14 @@ def test_impossible_models_are_errors():
     with pytest.raises(ConfigError, match="multiple of heads 5"):
         Stack(192, 6, 5, 768)
     assert issubclass(ConfigError, UserError) and issubclass(UserError, ValueError)
+
+
+def test_numbers_out_of_range_are_errors():
+    for options in ({"groups": 0}, {"mask_ratio": 1.5}, {"mask_ratio": -0.1}):
+        with pytest.raises(ConfigError, match=r"groups must be 1 or more and mask_ratio 0 to 1"):
+            Objective(**options)
+    with pytest.raises(ConfigError, match="accumulate must be 1 or more, not 0"):
+        Optim(accumulate=0)
 
 
 def test_wrong_presets_are_errors():

@@ -7,9 +7,12 @@ import jax
 import numpy as np
 import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
+from touch_world import make_touches
 
 from anytouch_jax.config import SENSORS, UserError, from_json
+from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import text as texts
+from anytouch_jax.data.loader import Loader
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.optim import flatten_names
@@ -38,7 +41,8 @@ def clips_only(config):
 def test_a_run_folder(straight, world):
     run, result = straight
     assert (result.step, result.traces) == (4, 2)  # stills and clips
-    assert from_json((run / "config.json").read_text()) == run_config(world)
+    asked = run_config(world)
+    assert from_json((run / "config.json").read_text()) == replace(asked, optim=replace(asked.optim, warmup=1))
     lines = read_metrics(run)
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
     assert ["next_frame" in line for line in lines] == [False, True, False, True]
@@ -209,13 +213,43 @@ def test_without_captions_and_photographs_stage_two_still_matches(world, tmp_pat
     assert line["match"] > 0 and line["align"] == 0 and result.step == 1
 
 
-def test_touches_shown_otherwise_than_to_stage_one_are_told_of(straight, world, tmp_path):
-    config = clips_only(run_config(world, 2))
+def test_touches_shown_otherwise_than_to_stage_one_are_told_of(tmp_path):
+    file = make_touches(tmp_path / "touches", touches={"train": 8}, frames=4, size=28, each=2)
+    train(run_config(file), tmp_path / "one", stop_after=1)
+    config = clips_only(run_config(file, 2))
     other = replace(config, data=replace(config.data, background="subtract"))
     for name, one, told in (("same", config, False), ("other", other, True)):
         said: list[str] = []
-        train(one, tmp_path / name, said, init=straight[0], stop_after=0)
+        train(one, tmp_path / name, said, init=tmp_path / "one", stop_after=0)
         assert any("trained with --loader.background keep, this run with subtract" in line for line in said) == told
+
+
+def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
+    epoch = Loader(manifests.read(world), run_config(world)).steps_per_epoch
+    for steps, wanted in ((20 * epoch * 3, epoch), (20 * 2, min(epoch, 2))):
+        run = tmp_path / str(steps)
+        train(run_config(world, steps=steps), run, stop_after=0)
+        assert from_json((run / "config.json").read_text()).optim.warmup == wanted
+        train(run_config(world, steps=steps), run, stop_after=0)  # and goes on by the same command
+
+
+def test_a_run_is_not_gone_on_with_on_other_rows(world, tmp_path):
+    rows, file = [list(row.values()) for row in read_rows(world)], world.parent / "grown.csv"
+    write_manifest(file, rows[:-1])
+    train(run_config(file), tmp_path / "r", stop_after=1)
+    write_manifest(file, rows)
+    message = refused(run_config(file), tmp_path / "r")
+    assert "have changed since" in message and "--init" in message
+    write_manifest(file, rows[:-1])
+    assert train(run_config(file), tmp_path / "r", stop_after=2).step == 2
+
+
+def test_a_start_that_failed_leaves_no_tokenizer_behind_that_counts(straight, world, tmp_path):
+    run = tmp_path / "r"
+    refused(run_config(world, 2), run, init=tmp_path / "mistyped")
+    (run / "tokenizer.json").write_text("{}")  # of other data
+    train(run_config(world, 2), run, init=straight[0], stop_after=0)
+    assert texts.load(run / "tokenizer.json").vocab_size > 2
 
 
 # Sensors ------------------------------------------------------------------------------------------------------------

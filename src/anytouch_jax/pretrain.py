@@ -119,6 +119,8 @@ def _describe(
 
 def _seen_by(before: Path) -> set[str]:
     """The sensors that a run or a weights file was trained on; the authors' own for a file that does not tell."""
+    if not before.exists():
+        return set()
     if before.is_dir() and not any(before.glob("*.pth")):
         with suppress(checkpoint.CheckpointError):  # nothing is trained yet
             return set(checkpoint.read_metadata(before).get("seen", ()))

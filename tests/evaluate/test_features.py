@@ -216,3 +216,35 @@ def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(UserError, match="cannot write"):
         save_npz(tmp_path / "no" / "folder.npz", features, {})
+
+
+def test_a_run_of_cudnn_can_be_used_where_there_is_none(encoder, monkeypatch, tiny_run):
+    """The configuration of a run trained on a GPU asks for cuDNN's attention."""
+    stored = replace(encoder.config, model=replace(encoder.config.model, attention="cudnn"))
+    real = checkpoint.load_params
+    monkeypatch.setattr(checkpoint, "load_params", lambda *a: (real(*a)[0], to_json(stored), real(*a)[2]))
+    found = load_encoder(tiny_run)
+    assert found.config.model.attention == "auto"
+    np.testing.assert_array_equal(found.embed(CLIPS[:, 0], "digit"), encoder.embed(CLIPS[:, 0], "digit"))
+
+
+def test_a_run_that_keeps_an_average_is_used_by_it(tmp_path):
+    saver = checkpoint.Checkpoints(tmp_path / "checkpoints", keep=1, config_json="{}", metadata={})
+    state = {
+        "trainable": {"touch": {"a": np.ones(3, "f4")}},
+        "frozen": {"decoder": {"b": np.full(2, 5, "f4")}},
+        "opt_state": {"ema": {"touch": {"a": np.full(3, 7, "f4")}}, "mu": {"x": np.zeros(3, "f4")}},
+    }
+    saver.save(1, state, {"loss": 1})
+    saver.close()
+    params, _, _ = checkpoint.load_params(tmp_path)
+    assert params["touch"]["a"].tolist() == [7, 7, 7] and params["decoder"]["b"].tolist() == [5, 5]
+    assert set(params) == {"touch", "decoder"}
+
+
+def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
+    manifest = manifests.read(world)
+    lenient = replace(encoder, config=replace(encoder.config, data=replace(encoder.config.data, on_bad_sample="skip")))
+    blind = replace(lenient, config=replace(lenient.config, data=replace(lenient.config.data, background="subtract")))
+    with pytest.raises(UserError, match=r"none of the 2 rows can be read; `anytouch verify` says"):
+        embed_rows(blind, manifest, np.array([0, 1]))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from anytouch_jax.ops import losses
 from anytouch_jax.ops.losses import (
     alignment_loss,
     info_nce,
@@ -125,6 +126,20 @@ def test_alignment_without_a_modality_or_with_disjoint_sets():
     first, last = jnp.asarray([True, True, False, False]), jnp.asarray([False, False, True, True])
     _, metrics = alignment_loss(touch, image, text, first, last, scale, weights)
     assert metrics["vision_to_text"] == 0 and metrics["touch_to_vision"] > 0
+
+
+def test_centred_embeddings_that_are_all_one_are_nothing_not_noise():
+    """Rounding is not blown up to unit length, nor is its gradient."""
+    one = losses.normalise(jax.random.normal(jax.random.key(0), (1, 32)))
+    same = jnp.concatenate([jnp.repeat(one, 7, axis=0), jax.random.normal(jax.random.key(1), (57, 32))])
+    present = jnp.arange(64) < 7
+    assert float(jnp.abs(losses.centred(same, present)).max()) < 1e-3
+    other = losses.normalise(jax.random.normal(jax.random.key(2), (64, 32)))
+    loss = lambda x: losses.info_nce(losses.centred(x, present), other, jnp.asarray(14.0), present)  # noqa: E731
+    assert float(jnp.abs(jax.grad(loss)(same)).max()) < 1e4
+    spread = losses.normalise(jax.random.normal(jax.random.key(3), (64, 32)))
+    length = jnp.linalg.norm(losses.centred(spread, jnp.ones(64, bool)), axis=1)
+    np.testing.assert_allclose(length, 1.0, atol=1e-5)
 
 
 def test_reconstruction_counts_hidden_patches_and_the_whole_next_frame():

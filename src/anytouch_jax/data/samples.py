@@ -75,9 +75,9 @@ class Reader:
             )
         return self._decode(row, "background_path", _gel)
 
-    def _decode(self, row: int, column: str, how: Callable[[Path], np.ndarray] = decode) -> np.ndarray:
+    def _decode(self, row: int, column: str, how: Callable[[Path], np.ndarray] | None = None) -> np.ndarray:
         try:
-            return how(self.manifest.file(row, column))
+            return (how or decode)(self.manifest.file(row, column))
         except UserError as error:
             raise SampleError(f"{self.manifest.where(row)}, column {column!r}: {error}") from None
 

@@ -34,8 +34,8 @@ class Size:
 
     `image`: pixels that preset tiny sees, 84 instead of 112: 36 patches for 64, which lets three seeds of everything
     fit in the time. Touches are shown less the untouched gel (but for `real`, where one in ten has no picture of it),
-    and the softmax of untrained towers starts mild: a sharp one only punishes them. `toy` shrinks the network too. `seeds`
-    are those of questions whose sign is claimed; the others take the first.
+    and the softmax of untrained towers starts mild: a sharp one only punishes them. `toy` shrinks the network too.
+    `seeds` are those of questions whose sign is claimed; the others take the first.
     """
 
     name: str = "full"

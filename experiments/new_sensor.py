@@ -12,7 +12,7 @@
 # You have twenty frames of a sensor that AnyTouch never saw. Universal tokens serve it as they are (Sec. 3.5 of the
 # paper). Does it help to fit tokens of its own, with everything else frozen, and do labels of these frames help more?
 #
-#     anytouch adapt --run runs/stage2 --data mine.csv --sensor my_gel --frames 18 --out runs/my_gel
+#     anytouch adapt --run runs/stage1 --data mine.csv --sensor my_gel --frames 18 --out runs/my_gel
 #     make experiments ONLY=new_sensor
 #
 # DuraGel is left out of training. 0, 4, 18 and 100 of its frames are given, with or without labels; the dashed line

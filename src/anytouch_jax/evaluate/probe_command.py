@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from anytouch_jax.config import Config, UserError, preset
+from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.images import decode
 from anytouch_jax.evaluate import baseline, probe
@@ -89,6 +89,10 @@ def read_task(options: Probe, say: Say) -> Task:
         kept &= number > least
     if options.sensor is not None:
         kept &= np.array(_column(table, "sensor")) == options.sensor
+    fields = kept & np.isin(_column(table, "sensor"), FIELD_SENSORS)
+    if fields.any():
+        say(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
+        kept &= ~fields
     split = np.array(_column(table, "split"))
     kept &= np.isin(split, ("train", "val", "test"))
     if (options.frames or 1) > 1:

@@ -213,7 +213,8 @@ text = f"""# Pouring by touch alone (simulated)
 
 {len(rows[0].runs)} runs a row ({seeds} seeds of learning, {len(rows[0].runs) // seeds} trials each); mean
 |poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
-compared. Differences are paired, run by run; a sign agrees when the interval and every seed say so.
+compared. Differences are paired, run by run; a sign agrees when the interval and every seed say so. Settings:
+{rows[0].settings}.
 
 {pouring_table.table(rows)}
 ![errors](figures/pouring.png)

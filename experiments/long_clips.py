@@ -138,7 +138,7 @@ Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
 ![Slip against time](figures/long_clips.png)
 """
-about = {"run": str(RUN), "manifest": table.content_hash, "machine": machine.describe().sentence(), "looks": record}
+about = {"run": RUN.name, "manifest": table.content_hash, "machine": machine.describe().sentence(), "looks": record}
 OUT.mkdir(parents=True, exist_ok=True)
 write_atomic(OUT / "long_clips.json", json.dumps(about, indent=1) + "\n")
 write_atomic(OUT / "long_clips.md", text)

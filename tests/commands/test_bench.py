@@ -50,6 +50,9 @@ def test_loader_and_simulator(tmp_path):
     loads = numbers["Loader, preset tiny"]
     assert {(row["kind"], row["threads"]) for row in loads} >= {("clip", 1), ("still", 1), ("clip", 2)}
     assert all(row["difference"] == 0 and row["frames_per_second"] > 0 for row in loads)
+    beside = numbers["Loader beside plain decoding, and a large manifest"]
+    assert {row["variant"] for row in beside if "variant" in row} >= {"decode + resize", "all augmentations"}
+    assert [row["stage"] for row in beside if "stage" in row] == [1, 2]
     assert {row["fidelity"] for row in numbers["Simulator"]} == {"exact", "fast"}
 
 

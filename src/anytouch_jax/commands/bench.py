@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -122,11 +123,18 @@ def _simulator(options: Bench, _: str) -> list[Section]:
 
 
 def _loader(options: Bench, _: str) -> list[Section]:
-    from anytouch_jax.evaluate import speed_data
+    from anytouch_jax.evaluate import loading, speed_data
 
     say("loader: frames a second by threads")
     rows = speed_data.measure(options.preset, _batch(options) or 64, rounds=_rounds(options))
-    return [(f"Loader, preset {options.preset}", speed_data.to_markdown(rows), list(rows))]
+    toy = {"sizes": ((64, 48),), "pictures": 4, "rounds": 1, "pixels": 28, "rows": 2000}
+    small: dict[str, Any] = toy if options.quick else {}
+    with tempfile.TemporaryDirectory() as folder:
+        beside = loading.measure_loading(folder, say=say, **small)
+    return [
+        (f"Loader, preset {options.preset}", speed_data.to_markdown(rows), list(rows)),
+        ("Loader beside plain decoding, and a large manifest", beside.to_markdown(), [*beside.speeds, *beside.opened]),
+    ]
 
 
 _SECTIONS: dict[str, Callable[[Bench, str], list[Section]]] = {

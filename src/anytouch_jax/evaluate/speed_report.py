@@ -102,7 +102,7 @@ def points(rows: Sequence[Row]) -> dict[str, tuple[float, float]]:
 
 def as_dict(row: Any) -> dict[str, Any]:
     """A record as JSON takes it: a number that is not finite is null."""
-    values = dataclasses.asdict(row)
+    values = row._asdict() if isinstance(row, tuple) else dataclasses.asdict(row)  # type: ignore[attr-defined]
     if isinstance(row, Row):
         values |= {"samples_per_second": row.samples_per_second, "gflops": row.gflops}
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}

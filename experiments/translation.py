@@ -32,12 +32,10 @@ import json
 import os
 import re
 import time
-import zlib
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from study import page
 from study.results import interval
@@ -130,8 +128,7 @@ def mark(encoder: Encoder | None) -> str:
     """Where an encoder is from, and a mark of its weights: a run that was trained anew is another encoder."""
     if encoder is None:
         return PIXELS
-    parts = [np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(encoder.params)]
-    return f"{Path(encoder.source).name} (weights {zlib.crc32(b''.join(parts)):08x})"
+    return f"{Path(encoder.source).name} (weights {encoder.mark})"
 
 
 def settings(

@@ -38,11 +38,18 @@ class Pour:
 
     Example: anytouch pour --run runs/stage2 --trials 10 --out pour
 
-    Prints the mass of each trial and the mean error beside a blind policy and the expert; OUT gets a film and JSON.
+    Prints the mass of each trial and the mean error beside a blind policy and the expert; OUT gets a film, JSON and the
+    policy. With --recordings it learns from your own runs and is compared with the hand on those of split test.
     """
 
-    run: Path
+    run: Path | None = None
     """Run folder or weights file (.pth, .safetensors)."""
+    recordings: Path | None = None
+    """Manifest of recorded runs to learn from: a row a moment (five a second), label.action pour, wait or retract."""
+    record: Path | None = None
+    """Only write the expert's demonstrations to this folder, as images and manifest in the form of --recordings."""
+    size: int = 112
+    """Side of the recorded frames in pixels."""
     trials: int = 10
     """Runs of the learned policy, with cylinders, beads, grips and sensors that it has not met."""
     out: Path | None = None

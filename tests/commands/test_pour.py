@@ -36,3 +36,19 @@ def test_a_run_pours(anytouch, tiny_run, tmp_path):
 def test_mistakes_are_one_sentence(anytouch, words, sentence):
     said = anytouch("pour", *words)
     assert said.status == 1 and sentence in said.err and len(said.err.strip().splitlines()) == 1
+
+
+def test_without_a_run_one_is_asked_for(anytouch):
+    said = anytouch("pour", "--recordings", "x.parquet")
+    assert said.status == 1 and "give --run" in said.err and len(said.err.strip().splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_demonstrations_are_recorded_and_learned_from(anytouch, tiny_run, tmp_path):
+    demos, out = tmp_path / "demos", tmp_path / "policy"
+    assert anytouch("pour", "--record", demos, "--demos", 4, "--size", 28).status == 0
+    said = anytouch("pour", "--run", tiny_run, "--recordings", demos / "manifest.parquet", "--steps", 20, "--out", out)
+    assert said.status == 0, said.err
+    assert "3 runs of gelsight_mini to learn from, 1 of split test" in said.err
+    assert {"touch", "blind"} <= json.loads((out / "pour.json").read_text()).keys()
+    assert {path.name for path in out.iterdir()} == {"policy.npz", "encoder.safetensors", "pour.json"}

@@ -170,7 +170,7 @@ def test_touch_sees_in_a_run_what_it_learned_from(shown, encoder):
     """The closed loop feeds the MLP the same inputs as the table of the demonstrations."""
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
-    logits = pouring_policy.forward(policy._head, pouring_policy.input_table(z).reshape(8, -1))
+    logits = pouring_policy.forward(policy.head, pouring_policy.input_table(z).reshape(8, -1))
     policy.begin(2)
     acted = [policy.act(frames, None) for frames in shown.frames]
     assert (np.stack(acted[:5]) == WAIT).all()
@@ -181,7 +181,7 @@ def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encode
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     before = jax.tree.map(np.array, encoder.params)
     tuned = pouring_policy.fine_tune(policy, shown, FAST)
-    moved = jax.tree.map(lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()), tuned._encoder.params, before)
+    moved = jax.tree.map(lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()), tuned.encoder.params, before)
     assert max(jax.tree.leaves(moved)) > 1e-5
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, encoder.params), before)
     found = pouring.run(replace(TASK, limit=9), *pouring.draw_runs(TASK, 3, 2), tuned, side=SIDE)

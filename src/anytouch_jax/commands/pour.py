@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.commands.words import say
@@ -10,29 +11,89 @@ from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Pour
 
 if TYPE_CHECKING:
+    from anytouch_jax.evaluate.features import Encoder
     from anytouch_jax.evaluate.pouring import Trials
+    from anytouch_jax.evaluate.pouring_policy import Learning, Touch
 
 
 def run(options: Pour) -> int:
     """Record demonstrations, learn a policy over the run's features, pour; print the masses, write film and JSON."""
     _check(options)
-    from anytouch_jax.evaluate import pouring, pouring_policy
-    from anytouch_jax.evaluate.features import load_encoder
-    from anytouch_jax.evaluate.sections import markdown
-    from anytouch_jax.sim.pouring import Task
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
-    encoder = load_encoder(options.run)
+    if options.record is not None:
+        return _record(options, options.record)
+    return _simulated(options) if options.recordings is None else _recorded(options, options.recordings)
+
+
+def _record(options: Pour, folder: Path) -> int:
+    from anytouch_jax.evaluate import pouring_policy, pouring_recordings
+    from anytouch_jax.sim.pouring import Task
+
+    task = Task(markers=options.markers)
+    say(f"the expert pours {options.demos} times")
+    shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=options.size)
+    print(pouring_recordings.write(folder, shown, task))
+    return 0
+
+
+def _policy(options: Pour, encoder: Encoder, shown: Trials, sensor: str) -> tuple[Touch, Learning]:
+    """The policy learned from demonstrations, as the options say."""
+    from anytouch_jax.evaluate import pouring_policy
+
+    learning = pouring_policy.Learning(seed=options.seed, **({"steps": options.steps} if options.steps else {}))
+    say("learning from it")
+    policy = pouring_policy.learn_frozen(encoder, shown, learning, stills=options.stills, sensor=sensor)
+    return (pouring_policy.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning
+
+
+def _recorded(options: Pour, path: Path) -> int:
+    """Learn from recorded runs, and compare with the hand on those of split test."""
+    from anytouch_jax.evaluate import pouring_recordings
+    from anytouch_jax.evaluate.features import load_encoder
+    from anytouch_jax.evaluate.plots import write_bytes
+    from anytouch_jax.evaluate.sections import markdown
+    from anytouch_jax.sim.pouring import Task
+
+    encoder = load_encoder(str(options.run))
+    found = pouring_recordings.read(path, encoder.config.model.image_size)
+    shown, unseen = found.part(False), found.part(True)
+    say(f"{len(shown.steps)} runs of {found.sensor} to learn from, {len(unseen.steps)} of split test")
+    policy, learning = _policy(options, encoder, shown, found.sensor)
+    rate = Task().rate
+    rows = {
+        "touch": pouring_recordings.agreement(policy, unseen, rate),
+        "blind": pouring_recordings.agreement_blind(shown, unseen, learning, rate),
+    }
+    head = ("policy", "moments as the hand chose", "mean over actions", "turns back, off by (median)")
+    lines = [
+        (name, f"{100 * a.share:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s") for name, a in rows.items()
+    ]
+    print(markdown(head, lines))
+    if options.out is not None:
+        pouring_recordings.save_policy(options.out, policy)
+        about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
+        about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "sensor": policy.sensor}
+        found_text = json.dumps(about | {name: one._asdict() for name, one in rows.items()}, indent=2)
+        write_bytes(options.out / "pour.json", (found_text + "\n").encode())
+        say(f"policy and results in {options.out}")
+    return 0
+
+
+def _simulated(options: Pour) -> int:
+    from anytouch_jax.evaluate import pouring, pouring_policy, pouring_recordings
+    from anytouch_jax.evaluate.features import load_encoder
+    from anytouch_jax.evaluate.plots import write_bytes
+    from anytouch_jax.evaluate.sections import markdown
+    from anytouch_jax.sim.pouring import Task
+
+    encoder = load_encoder(str(options.run))
     side = encoder.config.model.image_size
     task = Task(markers=options.markers)
-    learning = pouring_policy.Learning(seed=options.seed, **({"steps": options.steps} if options.steps else {}))
     say(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=side)
-    say("learning from it")
-    policy = pouring_policy.learn_frozen(encoder, shown, learning, stills=options.stills)
-    if options.fine_tune:
-        policy = pouring_policy.fine_tune(policy, shown, learning)
+    policy, learning = _policy(options, encoder, shown, pouring.SENSOR)
     rivals: dict[str, pouring.Controller] = {
         "blind": pouring_policy.learn_blind(task, options.seed, options.demos, learning),
         "count": pouring.best_counter(task, *pouring.draw_runs(task, options.seed, options.demos)),
@@ -47,14 +108,13 @@ def run(options: Pour) -> int:
     for name, one in results.items():
         print(f"{name}: mean error {sentence(one, task.target)}")
     if options.out is not None:
-        from anytouch_jax.evaluate.plots import write_bytes
-
         pouring.write_film(options.out / "pour.gif", trials, task)
+        pouring_recordings.save_policy(options.out, policy)
         found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
         about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
         about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
         write_bytes(options.out / "pour.json", (json.dumps(about | {"poured": found}, indent=2) + "\n").encode())
-        say(f"film and results in {options.out}")
+        say(f"film, policy and results in {options.out}")
     return 0
 
 
@@ -68,6 +128,10 @@ def sentence(trials: Trials, target: float) -> str:
 
 
 def _check(options: Pour) -> None:
+    if options.run is None and options.record is None:
+        raise UserError("give --run, whose features the policy learns from, or --record to write demonstrations alone")
+    if options.size < 14:
+        raise UserError(f"--size must be at least 14 pixels, not {options.size}")
     for name in ("trials", "demos"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, not {getattr(options, name)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import warnings
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -57,6 +58,11 @@ class Encoder:
     def subtracts(self) -> bool:
         """Whether it was trained on touches less the untouched gel (`data.background`), and wants those."""
         return self.config.data.background == "subtract"
+
+    @cached_property
+    def mark(self) -> str:
+        """A checksum of the parameters: a run that was trained anew is another encoder."""
+        return f"{zlib.crc32(b''.join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(self.params))):08x}"
 
     def embed(
         self, clips: Any, sensor: str | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class", join: Join = "mean"

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import optax
 
 from ..config import UserError
+from ..data.transforms import touch_evaluation
 from ..nn.functional import Net
 from ..objectives import normalise_touch
 from ..sim.pouring import ACTIONS, WAIT, Setup, State, Task
@@ -108,7 +109,7 @@ def joined(parts: Sequence[Trials]) -> Trials:
     return Trials(*(np.concatenate([getattr(part, name) for part in parts]) for name in Trials._fields[:2]), **found)
 
 
-def features(encoder: Encoder, trials: Trials, *, stills: bool, batch: int = 64) -> Array:
+def features(encoder: Encoder, trials: Trials, *, stills: bool, sensor: str = SENSOR, batch: int = 64) -> Array:
     """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end."""
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
@@ -118,7 +119,7 @@ def features(encoder: Encoder, trials: Trials, *, stills: bool, batch: int = 64)
     for start in range(0, len(where), batch):
         part = where[start : start + batch]
         padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
-        found[tuple(part.T)] = encoder.embed(_clips(encoder, trials.frames, padded, ahead), SENSOR)[: len(part)]
+        found[tuple(part.T)] = encoder.embed(_clips(encoder, trials.frames, padded, ahead), sensor)[: len(part)]
     return found
 
 
@@ -217,12 +218,12 @@ def imitate(x: Array, actions: Array, learning: Learning) -> tuple[Head, float]:
 
 
 class Touch:
-    """A policy that sees tactile frames only: an encoder and the MLP over its last features."""
+    """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features."""
 
     looks = True
 
-    def __init__(self, encoder: Encoder, head: Head, *, stills: bool) -> None:
-        self._encoder, self._head, self._stills = encoder, head, stills
+    def __init__(self, encoder: Encoder, head: Head, *, stills: bool, sensor: str = SENSOR) -> None:
+        self.encoder, self.head, self.stills, self.sensor = encoder, head, stills, sensor
 
     def begin(self, count: int) -> None:
         """Forget the frames and features of the last runs."""
@@ -230,21 +231,22 @@ class Touch:
         self._frames: list[Array] = []
         self._z: list[Array] = []
 
-    def act(self, frames: Array | None, state: State) -> Array:
-        """Actions (B,) from the frames so far; it waits until it has seen a segment."""
+    def act(self, frames: Array | None, state: State | None = None) -> Array:
+        """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has seen a segment."""
         assert frames is not None
+        frames = np.stack([touch_evaluation([frame], self.encoder.config.model.image_size)[0] for frame in frames])
         self._first = frames if self._first is None else self._first
-        frames = seen(self._encoder, frames, self._first)
+        frames = seen(self.encoder, frames, self._first)
         self._frames = [*self._frames[-FRAMES + 1 :], frames]
         if len(self._frames) < FRAMES:
             return np.full(len(frames), WAIT)
-        stack = np.stack(self._frames[-1:] if self._stills else self._frames, 1)
-        self._z.append(self._encoder.embed(stack, SENSOR))
+        stack = np.stack(self._frames[-1:] if self.stills else self._frames, 1)
+        self._z.append(self.encoder.embed(stack, self.sensor))
         if len(self._z) <= LIFTED:
             return np.full(len(frames), WAIT)
         before = self._z[max(len(self._z) - 1 - LAG, LIFTED)]
         x = inputs(self._z[-1], before, self._z[LIFTED], self._z[0])
-        return np.asarray(_forward(self._head, x)).argmax(-1)
+        return np.asarray(_forward(self.head, x)).argmax(-1)
 
 
 class Blind:
@@ -279,21 +281,21 @@ def learn_blind(task: Task, seed: int, count: int, learning: Learning) -> Blind:
     return Blind(imitate(blind_inputs(trials.actions)[START:][taken], trials.choices[START:][taken], learning)[0])
 
 
-def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool) -> Touch:
-    """A policy over frozen features, from demonstrations with frames."""
-    z = features(encoder, trials, stills=stills)
+def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR) -> Touch:
+    """A policy over frozen features, from demonstrations with frames of `sensor`."""
+    z = features(encoder, trials, stills=stills, sensor=sensor)
     taken = trials.taken[START:]
     head, _ = imitate(input_table(z)[taken], trials.choices[START:][taken], learning)
-    return Touch(encoder, head, stills=stills)
+    return Touch(encoder, head, stills=stills, sensor=sensor)
 
 
 def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     """Go on from a policy over frozen features with the encoder's parameters trained too."""
     assert trials.frames is not None
-    encoder, head, stills = policy._encoder, policy._head, policy._stills
+    encoder, head, stills = policy.encoder, policy.head, policy.stills
     ahead = 1 if stills else FRAMES
     where = np.argwhere(trials.taken[START:])
-    step, state, params = _tuner(encoder, head, learning)
+    step, state, params = _tuner(encoder, encoder.sensor_row(policy.sensor), head, learning)
     rng = np.random.default_rng(learning.seed % 2**63)
     for _ in range(learning.tune_steps):
         at = where[rng.integers(len(where), size=learning.tune_batch)]
@@ -302,17 +304,18 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
         clips = [_clips(encoder, trials.frames, np.stack([number, at[:, 1]], 1), ahead) for number in numbers]
         params, state = step(params, state, head, np.concatenate(clips), trials.choices[at[:, 0] + START, at[:, 1]])
     tuned = replace(encoder, params=params["encoder"], source=f"{encoder.source}, fine-tuned")
-    return Touch(tuned, head._replace(layers=params["head"]), stills=stills)
+    return Touch(tuned, head._replace(layers=params["head"]), stills=stills, sensor=policy.sensor)
 
 
-def _tuner(encoder: Encoder, head: Head, learning: Learning) -> tuple[Callable[..., tuple[Params, Any]], Any, Params]:
+def _tuner(
+    encoder: Encoder, sensor: int, head: Head, learning: Learning
+) -> tuple[Callable[..., tuple[Params, Any]], Any, Params]:
     """The compiled step of fine-tuning, its optimiser's state and its parameters."""
     params = {"encoder": encoder.params, "head": head.layers}
     optimiser = optax.multi_transform(
         {"encoder": optax.adamw(learning.tune_rate), "head": optax.adamw(learning.rate / 10)},
         {"encoder": "encoder", "head": "head"},
     )
-    sensor = encoder.sensor_row(SENSOR)
     apply = partial(_tuned_logits, net=encoder.net, sensor=sensor)
 
     @jax.jit

@@ -1,0 +1,196 @@
+"""Recordings of pouring, of a robot or of the simulation, as demonstrations; and policies on disk.
+
+The form: a manifest whose sequences are runs, one row a moment of choice (five a second), `label.action` pour, wait or
+retract. In the first STAND moments of a run the fingers hold the cylinder while it still stands; then it is lifted. A
+column `label.choice` says what should have been done where that differs (a hand that was late). `split` test is
+learned by nobody.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import UserError
+from ..data import manifest as manifests
+from ..data.images import decode
+from ..data.manifest import Manifest
+from ..data.transforms import touch_evaluation
+from ..sim.pouring import ACTIONS, STAND, Task
+from .features import load_encoder, text_column
+from .plots import write_bytes
+from .pouring import SENSOR, START, Controller, Trials
+from .pouring_policy import Head, Learning, Touch, blind_inputs, forward, imitate
+
+Array = npt.NDArray[Any]
+POLICY, WEIGHTS = "policy.npz", "encoder.safetensors"
+
+
+class Recordings(NamedTuple):
+    """Runs as trials of B (masses are unknown: NaN), whether each is of the test split (B,), and their sensor."""
+
+    trials: Trials
+    test: Array
+    sensor: str
+
+    def part(self, test: bool) -> Trials:
+        """The runs of test, or those to learn from."""
+        keep = self.test == test
+        over_time = {name: getattr(self.trials, name) for name in Trials._fields[2:]}
+        cut: dict[str, Any] = {name: None if x is None else x[:, keep] for name, x in over_time.items()}
+        return Trials(self.trials.poured[keep], self.trials.steps[keep], **cut)
+
+
+def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -> Path:
+    """Write trials with frames as PNG files and `manifest.parquet`, the last `held_out` of the runs as split test.
+
+    Masses stand in `label.mass` (g), which no policy reads. Gives back the manifest's path. Raises UserError.
+    """
+    import cv2
+
+    if trials.frames is None:
+        raise UserError("these demonstrations have no frames; record them with a picture size")
+    rows: list[dict[str, Any]] = []
+    first_test = len(trials.steps) - round(held_out * len(trials.steps))
+    for run, steps in enumerate(trials.steps):
+        for moment in range(int(steps)):
+            name = f"run_{run:04d}/{moment:04d}.png"
+            png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[1]
+            write_bytes(folder / name, png.tobytes())
+            action, choice = (ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices))
+            rows.append(
+                {"path": name, "sensor": SENSOR, "sequence": f"run_{run:04d}", "frame_index": moment,
+                 "split": "test" if run >= first_test else "train", "label.action": action, "label.choice": choice,
+                 "label.mass": float(trials.mass[moment, run]), "dataset": f"pouring {task.target:g} g"}
+            )  # fmt: skip
+    path = folder / "manifest.parquet"
+    manifests.write(manifests.from_columns({name: [row[name] for row in rows] for name in rows[0]}, path), path)
+    return path
+
+
+def read(path: Path, side: int) -> Recordings:
+    """The runs of a manifest, frames resized to `side` pixels. Raises UserError: no labels, gaps, too short a run."""
+    table = manifests.read(path)
+    if not table.present("label.action").all():
+        raise UserError(f"{path}: label.action must be {', '.join(ACTIONS)} on every row")
+    sensors = np.unique(text_column(table, "sensor"))
+    if len(sensors) > 1:
+        raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
+    sequences = text_column(table, "sequence")
+    runs = [_ordered(table, np.flatnonzero(sequences == name), name) for name in np.unique(sequences)]
+    steps = np.array([len(rows) for rows in runs])
+    padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
+    order = np.stack(padded, 1)  # (S, B) row numbers
+    actions = _numbers(table, "label.action")
+    choices = _numbers(table, "label.choice") if "label.choice" in table.table.column_names else actions
+    frames = np.stack([np.stack([_frame(table, row, side) for row in rows]) for rows in order])
+    unknown = np.full(order.shape, np.nan)
+    trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
+    split = text_column(table, "split")
+    test = np.array([split[rows[0]] == "test" for rows in runs])
+    if not test.any() or test.all():
+        raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
+    return Recordings(trials, test, str(sensors[0]))
+
+
+def _ordered(table: Manifest, rows: Array, name: str) -> Array:
+    """The rows of a run in time. Raises UserError for a gap or a run without a moment of choice."""
+    number = np.array([table.value(int(row), "frame_index") for row in rows])
+    rows, number = rows[np.argsort(number)], np.sort(number)
+    stride = np.array([table.value(int(row), "stride") or 1 for row in rows])
+    gaps = np.flatnonzero(np.diff(number) != stride[1:])
+    if len(gaps):
+        raise UserError(f"run {name}: frame {number[gaps[0]]} is followed by {number[gaps[0] + 1]}, a gap or a repeat")
+    if len(rows) <= START:
+        raise UserError(f"run {name} has {len(rows)} frames; {STAND} standing ones, and more than {START} in all")
+    return rows
+
+
+def _numbers(table: Manifest, column: str) -> Array:
+    names = text_column(table, column)
+    unknown = sorted(set(names) - set(ACTIONS))
+    if unknown:
+        raise UserError(f"{column} {str(unknown[0])!r} is no action; use {', '.join(ACTIONS)}")
+    return np.array([ACTIONS.index(name) for name in names], np.int32)
+
+
+def _frame(table: Manifest, row: int, side: int) -> Array:
+    return touch_evaluation([decode(table.file(int(row)))], side)[0]
+
+
+class Agreement(NamedTuple):
+    """How a policy follows the hand on runs that it did not learn: the share of moments with the same action (mean of
+    runs), the mean share over the three actions, and |moment of turning back - the hand's| in s (median of runs)."""
+
+    share: float
+    balanced: float
+    turn: float
+
+
+def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
+    """Show the frames of recorded runs to a policy, as the hand's actions led to them; `rate` moments a second."""
+    assert trials.frames is not None
+    policy.begin(len(trials.steps))
+    said = np.stack([policy.act(frames, None) for frames in trials.frames])  # type: ignore[arg-type]
+    return compare(said, trials, rate)
+
+
+def agreement_blind(shown: Trials, unseen: Trials, learning: Learning, rate: float) -> Agreement:
+    """The agreement of the same MLP that is told the time and the hand's actions so far, not the touch."""
+    taken = shown.taken[START:]
+    head, _ = imitate(blind_inputs(shown.actions)[START:][taken], shown.choices[START:][taken], learning)
+    said = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
+    return compare(np.stack(said), unseen, rate)
+
+
+def compare(said: Array, trials: Trials, rate: float) -> Agreement:
+    """The agreement of actions `said` (S, B) with those that the hand chose."""
+    taken = trials.taken.copy()
+    taken[:START] = False
+    same = (said == trials.choices) & taken
+    by_action = [same[chosen].mean() for a in range(len(ACTIONS)) if (chosen := taken & (trials.choices == a)).any()]
+    back = ACTIONS.index("retract")
+    moment = np.arange(len(said))[:, None]
+    turns = [np.where((one == back) & taken, moment, trials.steps).min(0) for one in (said, trials.choices)]
+    late = np.abs(turns[0] - turns[1]) / rate
+    return Agreement(float((same.sum(0) / taken.sum(0)).mean()), float(np.mean(by_action)), float(np.median(late)))
+
+
+def save_policy(folder: Path, policy: Touch) -> None:
+    """Write the MLP to `policy.npz` and the encoder beside it, each in one move. Raises UserError."""
+    from ..config import to_json
+    from ..io import checkpoint, release
+
+    folder.mkdir(parents=True, exist_ok=True)
+    encoder, head = policy.encoder, policy.head
+    about = {release.MODEL_KEY: to_json(encoder.config.model), release.BACKGROUND_KEY: encoder.config.data.background}
+    checkpoint.export_safetensors(folder / WEIGHTS, encoder.params, about)
+    layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
+    layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
+    told = json.dumps({"stills": policy.stills, "sensor": policy.sensor, "encoder": encoder.mark})
+    data = io.BytesIO()
+    arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "scale": np.asarray(head.scale), **layers}
+    np.savez(data, about=np.asarray(told), **arrays)
+    write_bytes(folder / POLICY, data.getvalue())
+
+
+def load_policy(folder: Path | str) -> Touch:
+    """The policy that `save_policy` wrote. `begin(1)`, then `act(frame[None])` at every moment: 0 pour, 1 wait,
+    2 retract (`sim.pouring.ACTIONS`). Raises UserError when files are missing or do not belong together."""
+    folder = Path(folder)
+    encoder = load_encoder(folder / WEIGHTS)
+    try:
+        with np.load(folder / POLICY, allow_pickle=False) as file:
+            arrays, told = dict(file), json.loads(str(file["about"]))
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
+    if told["encoder"] != encoder.mark:
+        raise UserError(f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}; pour again")
+    count = sum(name.startswith("w/") for name in arrays)
+    layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
+    return Touch(encoder, Head(arrays["mean"], arrays["scale"], layers), stills=told["stills"], sensor=told["sensor"])

@@ -1,0 +1,150 @@
+"""Recorded runs of pouring: what is written is read, mistakes are named, a policy on disk acts as the one that learned.
+
+The recordings are those of the simulation: real ones have the same form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from tiny_models import tiny_config
+
+from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import pouring, pouring_policy, pouring_recordings
+from anytouch_jax.evaluate.features import random_encoder
+from anytouch_jax.evaluate.pouring_policy import Learning
+from anytouch_jax.sim.pouring import POUR, RETRACT, WAIT, Task
+
+SIDE, COUNT = 28, 4
+TASK = replace(Task(), limit=9)
+FAST = Learning(steps=20, width=8, tune_steps=2, tune_batch=4)
+
+
+@pytest.fixture(scope="module")
+def shown() -> pouring.Trials:
+    return pouring_policy.demonstrate(TASK, 0, COUNT, side=SIDE)
+
+
+@pytest.fixture(scope="module")
+def manifest(shown, tmp_path_factory):
+    return pouring_recordings.write(tmp_path_factory.mktemp("recordings"), shown, TASK)
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    config = tiny_config()
+    return random_encoder(replace(config, data=replace(config.data, background="subtract")))
+
+
+def changed(manifest, folder, **columns):
+    """The manifest with other columns, beside the same pictures."""
+    table = manifests.read(manifest)
+    cells = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    for name, change in columns.items():
+        cells[name] = change(cells[name])
+    path = manifest.parent / f"{folder}.parquet"
+    manifests.write(manifests.from_columns(cells, path), path)
+    return path
+
+
+def test_what_is_written_is_read(shown, manifest):
+    found = pouring_recordings.read(manifest, SIDE)
+    assert found.sensor == "gelsight_mini" and found.test.tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(found.trials.steps, shown.steps)
+    taken = shown.taken
+    for name in ("actions", "choices", "frames"):
+        np.testing.assert_array_equal(getattr(found.trials, name)[taken], getattr(shown, name)[taken])
+    assert np.isnan(found.trials.mass).all()  # no policy is told the scales
+    assert pq.read_table(manifest)["label.mass"].to_pylist()[0] == pytest.approx(float(shown.mass[0, 0]))
+
+
+def test_recordings_teach_what_the_demonstrations_teach(shown, manifest, encoder):
+    found = pouring_recordings.read(manifest, SIDE)
+    direct = pouring_policy.learn_frozen(
+        encoder, pouring_recordings.Recordings(shown, found.test, "").part(False), FAST, stills=False
+    )
+    read = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=False)
+    for a, b in zip(direct.head.layers, read.head.layers, strict=True):
+        np.testing.assert_array_equal(a[0], b[0])
+
+
+@pytest.mark.parametrize("stills", [False, True])
+def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder, tmp_path, stills):
+    found = pouring_recordings.read(manifest, SIDE)
+    policy = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=stills, sensor=found.sensor)
+    policy = pouring_policy.fine_tune(policy, found.part(False), FAST)
+    pouring_recordings.save_policy(tmp_path, policy)
+    again = pouring_recordings.load_policy(tmp_path)
+    said = []
+    for one in (policy, again):
+        one.begin(COUNT)
+        said.append(np.stack([one.act(frames) for frames in shown.frames]))
+    np.testing.assert_array_equal(*said)
+    assert again.stills == stills and again.sensor == "gelsight_mini" and again.encoder.subtracts
+
+
+def test_a_policy_takes_frames_of_the_camera(shown, encoder):
+    policy = pouring_policy.learn_frozen(encoder, shown, FAST, stills=False)
+    large = np.repeat(np.repeat(shown.frames[:, :1], 4, 2), 4, 3)
+    policy.begin(1)
+    wide = [policy.act(frames) for frames in large]
+    policy.begin(1)
+    np.testing.assert_array_equal(wide, [policy.act(frames) for frames in shown.frames[:, :1]])
+
+
+def test_agreement_with_the_hand(shown):
+    same = pouring_recordings.compare(shown.choices, shown, 5.0)
+    assert same == (1.0, 1.0, 0.0)
+    choices = np.full((20, 2), POUR)
+    choices[12:] = RETRACT
+    trials = pouring.Trials(np.zeros(2), np.array([20, 16]), choices, choices, *[np.zeros((20, 2))] * 3, None)
+    said = np.full((20, 2), POUR)
+    said[14:] = RETRACT  # two moments late in both runs, four fifths of a second at 5 a second... of 15 and of 11
+    found = pouring_recordings.compare(said, trials, 5.0)
+    assert found.share == pytest.approx((13 / 15 + 9 / 11) / 2)
+    assert found.balanced == pytest.approx((1 + 8 / 12) / 2)  # WAIT was never chosen
+    assert found.turn == pytest.approx(0.4)
+    never = pouring_recordings.compare(np.full((20, 2), WAIT), trials, 5.0)
+    assert never.share == 0 and never.turn == pytest.approx(((20 - 12) + (16 - 12)) / 2 / 5)
+
+
+def test_policies_are_compared_on_the_test_runs(manifest, encoder):
+    found = pouring_recordings.read(manifest, SIDE)
+    policy = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=False)
+    touch = pouring_recordings.agreement(policy, found.part(True), 5.0)
+    blind = pouring_recordings.agreement_blind(found.part(False), found.part(True), FAST, 5.0)
+    assert 0 <= touch.share <= 1 and 0 <= blind.share <= 1
+
+
+@pytest.mark.parametrize(
+    ("columns", "sentence"),
+    [
+        ({"label.action": lambda x: ["tilt", *x[1:]]}, "'tilt' is no action; use pour, wait, retract"),
+        ({"label.action": lambda x: [None, *x[1:]]}, "label.action must be"),
+        ({"frame_index": lambda x: [i + (i > 4) for i in x]}, "frame 4 is followed by 6, a gap or a repeat"),
+        ({"split": lambda x: ["train"] * len(x)}, "runs of split test are needed"),
+        ({"sensor": lambda x: ["digit", *x[1:]]}, "one sensor a policy, not digit, gelsight_mini"),
+        ({"sequence": lambda x: [f"{i // 3}" for i in range(len(x))]}, "has 3 frames; 3 standing ones"),
+    ],
+)
+def test_mistakes_are_named(manifest, columns, sentence):
+    path = changed(manifest, "wrong", **columns)
+    with pytest.raises(UserError, match=sentence.replace("?", r"\?")):
+        pouring_recordings.read(path, SIDE)
+
+
+def test_files_that_do_not_belong_together(shown, encoder, tmp_path):
+    policy = pouring_policy.learn_frozen(encoder, shown, FAST, stills=False)
+    pouring_recordings.save_policy(tmp_path / "one", policy)
+    other = pouring_policy.learn_frozen(random_encoder(tiny_config(), 1), shown, FAST, stills=False)
+    pouring_recordings.save_policy(tmp_path / "two", other)
+    (tmp_path / "one" / "encoder.safetensors").write_bytes((tmp_path / "two" / "encoder.safetensors").read_bytes())
+    with pytest.raises(UserError, match="another encoder"):
+        pouring_recordings.load_policy(tmp_path / "one")
+    (tmp_path / "two" / "policy.npz").write_bytes(b"no")
+    with pytest.raises(UserError, match="is no policy"):
+        pouring_recordings.load_policy(tmp_path / "two")

@@ -10,7 +10,7 @@ import numpy as np
 
 from anytouch_jax.evaluate import plots
 
-from . import adaptation, paper, questions
+from . import adaptation, paper, questions, real
 from .results import Column, Run, change, spread, values
 from .tables import title
 
@@ -34,6 +34,7 @@ def draw_all(runs: Sequence[Run], folder: Path) -> list[Path]:
         ("ablations", ablations),
         ("dynamics", dynamics),
         ("new_sensor", new_sensor),
+        ("real", real_touch),
     ):
         if any(run.question == name for run in runs):
             path = draw(runs, folder / f"{name}.png")
@@ -162,6 +163,28 @@ def new_sensor(runs: Sequence[Run], path: Path) -> Path:
         axis.set_xticks(range(len(counts)), list(map(str, counts)))
     axes[0].set_ylabel("accuracy, %")
     axes[-1].legend(frameon=False, fontsize=7)
+    plots.write_figure(path, figure)
+    return path
+
+
+def real_touch(runs: Sequence[Run], path: Path) -> Path:
+    """Tasks on real touch, a panel each: ours, an untrained encoder and raw pixels, a dot a seed with its interval."""
+    several = [run for run in runs if run.question == "real"]
+    tasks = list(dict.fromkeys(row["task"] for run in several for row in run.about["rows"]))
+    views = (real.OURS, real.UNTRAINED, real.PIXELS)
+    figure, axes = _panels(1, len(tasks), 3.0, 2.4)
+    for axis, task in zip(axes, tasks, strict=True):
+        for number, run in enumerate(several):
+            for row in run.about["rows"]:
+                if row["task"] == task and row["view"] in views:
+                    found = tuple(None if row[key] is None else 100 * row[key] for key in ("mean", "low", "high"))
+                    shift = 0.18 * (number - (len(several) - 1) / 2)
+                    ours = row["view"] == real.OURS
+                    _dot(axis, views.index(row["view"]) + shift, found, "C0" if ours else "#7a94b0")  # type: ignore[arg-type]
+        axis.set_title(task, fontsize=8)
+        axis.set(ylim=(len(views) - 0.5, -0.5), xlabel="accuracy, %")
+        axis.set_yticks(range(len(views)), views if axis is axes[0] else [], fontsize=8)
+        axis.grid(alpha=0.25)
     plots.write_figure(path, figure)
     return path
 

@@ -14,7 +14,7 @@ from study import plan
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {
     "q1_sensors": "q1", "q2_space": "q2", "q3_perception": "q3", "ablations": "ablations", "new_sensor": "new_sensor",
-    "dynamics": "dynamics",
+    "dynamics": "dynamics", "real_probes": "real",
 }  # fmt: skip
 
 
@@ -27,7 +27,7 @@ def visit(name, monkeypatch, results, figures):
 @pytest.fixture(scope="module")
 def made_up(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made_up")
-    synthetic.write(folder, plan.leaves(plan.FULL, real=False))
+    synthetic.write(folder, plan.leaves(plan.FULL))
     return folder
 
 

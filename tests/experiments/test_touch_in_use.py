@@ -1,0 +1,49 @@
+"""`experiments/pouring.py` and `translation.py` from top to bottom at a toy size, then again from their JSON alone."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "experiments"
+
+
+def visit(name, monkeypatch, **environment):
+    for key, value in environment.items():
+        monkeypatch.setenv(key, str(value))
+    return runpy.run_path(str(SCRIPTS / f"{name}.py"))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_pouring(tmp_path, tiny_run, monkeypatch, capsys):
+    size = {"QUICK": 1, "TRIALS": 2, "DEMOS": 2, "TUNE": 1, "MODES": "frozen,fine-tuned", "OUT": tmp_path}
+    visit("pouring", monkeypatch, RUNS=f"anytouch={tiny_run}", **size)
+    out = capsys.readouterr().out
+    assert "no run is given for row t3: it is left out" in out
+    names = {path.stem for path in (tmp_path / "pouring-quick").glob("*.json")}
+    learned = {f"{name}-{mode}-0" for name in ("none", "static", "anytouch") for mode in ("frozen", "fine-tuned")}
+    assert names == learned | {"blind-bound-0", "count-bound-0", "expert-bound-0"}
+    page = (tmp_path / "pouring-quick.md").read_text()
+    assert (tmp_path / "figures" / "pouring.gif").exists() and "expert" in page
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "pouring-quick").iterdir()}
+    visit("pouring", monkeypatch, TABLE=1)
+    assert (tmp_path / "pouring-quick.md").read_text() == page
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "pouring-quick").iterdir()}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_translation(tmp_path, tiny_run, monkeypatch, capsys):
+    size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "WORK": tmp_path / "work", "OUT": tmp_path}
+    visit("translation", monkeypatch, RUNS=f"anytouch={tiny_run} t3={tmp_path / 'none'}", **size)
+    assert "t3 is replaced by a random encoder" in capsys.readouterr().out
+    found = [json.loads(path.read_text()) for path in (tmp_path / "translation_quick").glob("*-*.json")]
+    assert len(found) == 9 and all(one["error"] > 0 for one in found)
+    page = (tmp_path / "translation_quick.md").read_text()
+    assert "mean of the training targets" in page and "t3 (random encoder), frozen" in page
+    visit("translation", monkeypatch, TABLE=1)
+    assert (tmp_path / "translation_quick.md").read_text() == page

@@ -29,47 +29,38 @@ class Matches:
     """
 
     def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False) -> None:
-        self.pool, self.same_sensor = pool, same_sensor
-        self._keys = Keys(*(key[pool] for key in keys))
-        touch = self._keys.touch
-        order = np.argsort(touch, kind="stable")
-        self._order = order.astype(np.int32) if len(order) < 1 << 31 else order  # millions of them are held
-        self._sorted = touch[self._order]
-        self._rows: dict[int | None, np.ndarray] = {}
-        self._usable = self._many_places() if same_sensor else np.ones(len(pool), bool)
-        thing = self._keys.object
+        self.pool, self.same_sensor, self._keys = pool, same_sensor, keys
+        mine = Keys(*(key[pool] for key in keys))  # not held: of millions of rows one copy is enough
+        touch, thing = mine.touch, mine.object
+        self._rows: dict[int, np.ndarray] = {}
+        self._usable = _many_places(mine) if same_sensor else np.ones(len(pool), bool)
         self.one_object = len(thing) > 0 and bool((thing == thing[0]).all() and thing[0] >= 0)
-        anchors = np.flatnonzero((touch >= 0) & self._has_partner())
-        felt = touch[touch >= 0]
-        many = felt.size > 0 and bool(
-            (felt != felt[0]).any()
-        )  # with one place only, a row of an unknown place may be it
-        known = many or same_sensor  # a usable partner's sensor felt another place
+        anchors = np.flatnonzero((touch >= 0) & _has_partner(mine, self._usable))
+        del mine, thing
+        order = np.argsort(touch, kind="stable")
+        self._order = order.astype(np.int32) if len(order) < 1 << 31 else order
+        self._sorted = touch[self._order]
+        # With one place only, a row of an unknown place may be it; a usable partner's sensor felt another one.
+        known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(self._sorted, touch.max(initial=-1))
         self.anchors = anchors if known else anchors[[self._negatives(int(a)).size > 0 for a in anchors]]
-
-    def _has_partner(self) -> np.ndarray:
-        touch, sensor, unit = self._keys.touch, self._keys.sensor, self._keys.unit
-        sensors, units = _distinct(touch, sensor), _distinct(touch, unit)
-        usable = _distinct(touch, np.where(self._usable, sensor, -1)) - self._usable
-        return np.where(sensors > 1, usable > 0, (units > 1) & (unit >= 0) & self._usable)
-
-    def _many_places(self) -> np.ndarray:
-        """Which rows are of a sensor that felt two known places or more: bool (rows,)."""
-        return _distinct(self._keys.sensor, self._keys.touch) > 1
 
     def draw(self, anchor: int, rng: np.random.Generator) -> tuple[int, int]:
         """(positive, negative) for `anchor`, as ids into `pool`: partner of another sensor, or else another unit;
         and, uniformly, a row that is surely another place, of another object where objects are known."""
-        keys = self._keys
-        low, high = np.searchsorted(self._sorted, keys.touch[anchor] + np.array([0, 1]))
+        keys, row = self._keys, self.pool[anchor]
+        low, high = np.searchsorted(self._sorted, keys.touch[row] + np.array([0, 1]))
         same = self._order[low:high]
-        others = same[(keys.sensor[same] != keys.sensor[anchor]) & self._usable[same]]
+        theirs = self.pool[same]
+        others = same[(keys.sensor[theirs] != keys.sensor[row]) & self._usable[same]]
         if not others.size:
-            others = same[(keys.unit[same] != keys.unit[anchor]) & (keys.unit[same] >= 0)]
+            others = same[(keys.unit[theirs] != keys.unit[row]) & (keys.unit[theirs] >= 0)]
         positive = int(others[rng.integers(others.size)])
-        sensor = int(keys.sensor[positive]) if self.same_sensor else None
-        rows = self._of_sensor(sensor)
-        tries = rows[rng.integers(len(rows), size=_TRIES)]
+        sensor = int(keys.sensor[self.pool[positive]]) if self.same_sensor else None
+        if sensor is None:
+            tries = rng.integers(len(self.pool), size=_TRIES)
+        else:
+            tries = self._of_sensor(sensor)
+            tries = tries[rng.integers(len(tries), size=_TRIES)]
         fit = np.flatnonzero(self._elsewhere(anchor, tries))
         if fit.size:
             return positive, int(tries[fit[0]])
@@ -77,31 +68,42 @@ class Matches:
         return positive, int(negatives[rng.integers(negatives.size)])
 
     def _negatives(self, anchor: int, sensor: int | None = None) -> np.ndarray:
-        rows = self._of_sensor(sensor)
-        found = rows[self._elsewhere(anchor, rows)]
+        ids = np.arange(len(self.pool)) if sensor is None else self._of_sensor(sensor)
+        found = ids[self._elsewhere(anchor, ids)]
         if not found.size:  # no other object: another known place of the same one
-            touch = self._keys.touch[rows]
-            found = rows[(touch >= 0) & (touch != self._keys.touch[anchor])]
+            touch = self._keys.touch[self.pool[ids]]
+            found = ids[(touch >= 0) & (touch != self._keys.touch[self.pool[anchor]])]
         return found
 
-    def _of_sensor(self, sensor: int | None) -> np.ndarray:
-        """Ids i64 of the pool that a sensor felt (None: all of them)."""
+    def _of_sensor(self, sensor: int) -> np.ndarray:
+        """Ids i64 of the pool that a sensor felt."""
         if sensor not in self._rows:
-            every = np.arange(len(self.pool))
-            self._rows[sensor] = every if sensor is None else np.flatnonzero(self._keys.sensor == sensor)
+            self._rows[sensor] = np.flatnonzero(self._keys.sensor[self.pool] == sensor)
         return self._rows[sensor]
 
-    def _elsewhere(self, anchor: int, rows: np.ndarray) -> np.ndarray:
-        """Which rows are surely another place, and not of the anchor's object: bool of the shape of `rows`."""
-        keys = self._keys
+    def _elsewhere(self, anchor: int, ids: np.ndarray) -> np.ndarray:
+        """Which `ids` are surely another place, and not of the anchor's object: bool of the shape of `ids`."""
+        keys, rows, row = self._keys, self.pool[ids], self.pool[anchor]
 
         def differs(key: np.ndarray) -> np.ndarray:
-            return (key[rows] != key[anchor]) & (key[rows] >= 0) & (key[anchor] >= 0)
+            return (key[rows] != key[row]) & (key[rows] >= 0) & (key[row] >= 0)
 
-        same_object = (keys.object[rows] == keys.object[anchor]) & (keys.object[anchor] >= 0)
+        same_object = (keys.object[rows] == keys.object[row]) & (keys.object[row] >= 0)
         unknown = keys.touch[rows] < 0
         place = differs(keys.touch) | (unknown & (differs(keys.object) | differs(keys.dataset)))
         return place & ~same_object
+
+
+def _has_partner(keys: Keys, usable: np.ndarray) -> np.ndarray:
+    """Which rows have a usable one of another sensor at their place, or else of another unit: bool (rows,)."""
+    sensors, units = _distinct(keys.touch, keys.sensor), _distinct(keys.touch, keys.unit)
+    others = _distinct(keys.touch, np.where(usable, keys.sensor, -1)) - usable
+    return np.where(sensors > 1, others > 0, (units > 1) & (keys.unit >= 0) & usable)
+
+
+def _many_places(keys: Keys) -> np.ndarray:
+    """Which rows are of a sensor that felt two known places or more: bool (rows,)."""
+    return _distinct(keys.sensor, keys.touch) > 1
 
 
 def felt_twice(touch: np.ndarray, sensor: np.ndarray, unit: np.ndarray) -> np.ndarray:

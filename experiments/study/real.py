@@ -52,7 +52,9 @@ def _slip(leaf: Leaf, encoder: Encoder, options: Probe) -> list[Row]:
     features = _features(leaf, encoder, task)
     return _compared(
         "slip, objects left out", features,
-        lambda x, scaling: probe.leave_groups_out(x, task.labels, task.groups, scaling=scaling),
+        lambda x, scaling: probe.leave_groups_out(
+            x, task.labels, task.groups, scaling=scaling, subsets=task.subsets
+        ),
     )  # fmt: skip
 
 

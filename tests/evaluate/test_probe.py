@@ -185,6 +185,15 @@ def test_groups_left_out_still_find_what_generalises() -> None:
         assert result.baseline < 0.4
 
 
+def test_groups_left_out_are_told_apart_by_what_was_described() -> None:
+    features, labels, groups, _ = table(groups=24, apart=0.8)
+    named = np.isin(groups, np.unique(groups)[:8])
+    result = leave_groups_out(features, labels, groups, subsets={"named": named, "others": ~named})
+    assert [part.n_test for part in result.parts] == [named.sum(), (~named).sum()]
+    whole = sum(part.accuracy * part.n_test for part in result.parts) / len(labels)
+    assert whole == pytest.approx(result.accuracy) and 0.4 < result.accuracy < 1
+
+
 @pytest.mark.parametrize("count", [2, 5, 7, 100])
 def test_folds_keep_groups_whole_and_spread_classes(count: int) -> None:
     features, labels, groups, _ = table(groups=30)

@@ -110,13 +110,14 @@ def leave_groups_out(
     folds: int | None = 10,
     penalties: Sequence[float] = (10.0, *PENALTIES),
     scaling: Scaling = "column",
+    subsets: Mapping[str, Array] | None = None,
     name: str = "linear, groups left out",
 ) -> ProbeResult:
     """Linear probe where each row is predicted by a fit that saw no row of its group, for instance of its object.
 
     The groups are dealt into `folds` folds (None: each group alone); the penalty of a fold is chosen by folds over
     the groups that remain. `baseline` names the commonest class of the same remaining rows. `low`, `high` are over
-    the groups. Every row with a label is both train and test; there is no split.
+    the groups. Every row with a label is both train and test; there is no split. `subsets` as in `linear_probe`.
     """
     rows = prepare(features, labels, groups, np.full(len(labels), "train"), tested=False)
     used, predicted, common = rows.train, np.full(len(rows.y), -1), np.full(len(rows.y), -1)
@@ -133,7 +134,9 @@ def leave_groups_out(
     notes = ("penalties of the folds: " + ", ".join(f"{v:g} ({n} x)" for v, n in zip(values, times, strict=True)),)
     inside = Rows(rows.x, rows.y, rows.names, rows.groups, used, used[:0], used, rows.notes)
     how, baseline = "cross-validation, median of the folds", float(np.mean(common[used] == rows.y[used]))
-    return _result(name, "honest", inside, correct, [], float(np.median(chosen)), how, notes, baseline=baseline)
+    return _result(
+        name, "honest", inside, correct, [], float(np.median(chosen)), how, notes, subsets, baseline=baseline
+    )
 
 
 def regression_probe(

@@ -65,7 +65,12 @@ def probe_features(
     if options.leave_out is not None:
         return [
             probe.leave_groups_out(
-                values, task.labels, task.groups, name=f"{name}: linear, {options.leave_out} left out", scaling=scaling
+                values,
+                task.labels,
+                task.groups,
+                name=f"{name}: linear, {options.leave_out} left out",
+                scaling=scaling,
+                subsets=task.subsets,
             )
         ]
     shared: dict[str, Any] = {"protocol": options.protocol, "seeds": options.seeds, "subsets": task.subsets}
@@ -102,7 +107,10 @@ def read_task(options: Probe, say: Say) -> Task:
         raise UserError(f"no row has a label in {options.label!r} after the filters")
     say(f"{len(rows)} of {len(manifest)} rows take part")
     groups = _groups(manifest, options, rows)
-    subsets = _subsets(manifest, label, split, rows)
+    if options.leave_out is None:
+        subsets = _subsets(manifest, label, split, rows, "classes")
+    else:  # a class of everything says little: it is the things left out that alignment may have named
+        subsets = _subsets(manifest, _column(table, options.leave_out), split, rows, f"{options.leave_out}s")
     return Task(manifest, rows, np.array([label[r] for r in rows]), groups, split[rows], subsets)
 
 
@@ -124,14 +132,14 @@ def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
     return np.array([str(column[r]) if column[r] not in (None, "") else f"sequence {sequence[r]}" for r in rows])
 
 
-def _subsets(manifest: Any, label: list[Any], split: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
+def _subsets(manifest: Any, names: list[Any], split: np.ndarray, rows: np.ndarray, what: str) -> dict[str, np.ndarray]:
     """Rows of classes that have a photograph or a caption in train, and the others: alignment may have named them."""
     described = manifest.present("image_path") | manifest.present("text")
-    named = {label[r] for r in np.flatnonzero(described & (split == "train"))}
-    mask = np.array([label[r] in named for r in rows])
+    named = {names[r] for r in np.flatnonzero(described & (split == "train"))} - {None, ""}
+    mask = np.array([names[r] in named for r in rows])
     if mask.all() or not mask.any():
         return {}
-    return {"classes with a photograph or caption": mask, "classes without": ~mask}
+    return {f"{what} with a photograph or caption": mask, f"{what} without": ~mask}
 
 
 def _features(options: Probe, task: Task, say: Say) -> Any:

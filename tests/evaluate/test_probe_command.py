@@ -1,0 +1,67 @@
+"""Which rows a probe of a manifest takes, how they are grouped, and which of its test was described in pre-training."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate import probe_command
+from anytouch_jax.options import Probe
+
+COUNT = 24
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    """Six objects, of two recordings of two frames: the first two have a caption in train, the third one in test."""
+    number = np.arange(COUNT)
+    split = np.where(number % 4 < 2, "train", "test")
+    objects = np.array([f"object {n // 4}" for n in number])
+    described = np.isin(objects, ["object 0", "object 1"]) & (split == "train")
+    described |= (objects == "object 2") & (split == "test")
+    columns = {
+        "path": [f"{n}.png" for n in number],
+        "sensor": ["digit"] * COUNT,
+        "sequence": [f"s{n // 2}" for n in number],
+        "frame_index": (number % 2).tolist(),
+        "split": split.tolist(),
+        "object": objects.tolist(),
+        "text": ["rough" if one else None for one in described],
+        "label.slip": ["yes" if n % 4 == 1 else "no" for n in number],
+        "label.score": number.tolist(),
+    }
+    path = tmp_path / "manifest.csv"
+    manifests.write(manifests.from_columns(columns, path), path)
+    return path
+
+
+def read(manifest, **options):
+    return probe_command.read_task(Probe(data=(manifest,), **options), lambda _: None)
+
+
+def test_classes_that_were_described_in_train_stand_apart(manifest):
+    task = read(manifest, label="object")
+    named = task.subsets["classes with a photograph or caption"]
+    assert set(task.labels[named]) == {"object 0", "object 1"}
+    np.testing.assert_array_equal(task.subsets["classes without"], ~named)
+    assert len(np.unique(task.groups)) == COUNT // 2  # recordings
+
+
+def test_of_things_left_out_it_is_the_thing_that_was_described(manifest):
+    task = read(manifest, label="slip", leave_out="object", where=("score", 3))
+    assert len(task.rows) == COUNT - 4 and len(np.unique(task.groups)) == 5
+    named = task.subsets["objects with a photograph or caption"]
+    assert set(task.groups[named]) == {"object 1"}
+    np.testing.assert_array_equal(task.subsets["objects without"], ~named)
+
+
+def test_where_nothing_or_all_was_described_nothing_stands_apart(manifest):
+    assert read(manifest, label="object", where=("score", 7)).subsets == {}
+    assert read(manifest, label="slip").subsets == {}  # both classes were
+
+
+def test_no_row_is_left(manifest):
+    with pytest.raises(UserError, match="no row has a label in 'slip' after the filters"):
+        read(manifest, label="slip", sensor="gelslim")

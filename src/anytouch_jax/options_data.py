@@ -146,6 +146,10 @@ class Annotate:
     """Price of a million tokens out."""
     limit: int | None = None
     """Only the first so many captions: look at a sample first."""
+    captions: Path | None = None
+    """Ask nobody: take the captions of this table (.csv, .parquet), a key column and `text`."""
+    key: str | None = None
+    """Column of table and manifest by which --captions are found: caption_id, sequence, object, path ..."""
     sheet: Path | None = None
     """HTML page of captions beside their pictures, to check by hand."""
     sheet_count: int = 40

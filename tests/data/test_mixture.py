@@ -101,13 +101,14 @@ def test_weight_zero_leaves_a_dataset_out_of_stills_clips_and_matching(make, set
 
 def test_the_release_has_weights_of_its_own_where_its_datasets_are(make, settings):
     there = make(_sets({"touch_and_go": 4, "octopi": 4, "x": 4}))
-    release, paper = Loader(there, settings(1, "release")), Loader(there, settings(1))
+    release, paper = Loader(there, settings(2, "release")), Loader(there, settings(2))
+    assert Loader(there, settings(1, "release")).steps_per_epoch == 3  # its stage 1 draws every row once
     assert release.steps_per_epoch == (8 + 12 + 4) // 4 and paper.steps_per_epoch == 3
     assert any("touch_and_go 2 times, octopi 3 times" in note for note in release.notes)
-    assert Loader(there, settings(1, "release", weights=())).steps_per_epoch == 3
-    some = Loader(make(_sets({"octopi": 4, "x": 4}), "some"), settings(1, "release"))
+    assert Loader(there, settings(2, "release", weights=())).steps_per_epoch == 3
+    some = Loader(make(_sets({"octopi": 4, "x": 4}), "some"), settings(2, "release"))
     assert some.steps_per_epoch == 4 and not any("touch_and_go" in note for note in some.notes)
-    none = Loader(make(_sets({"x": 4}), "none"), settings(1, "release"))
+    none = Loader(make(_sets({"x": 4}), "none"), settings(2, "release"))
     assert not any("an epoch draws" in note for note in none.notes)
 
 

@@ -134,7 +134,7 @@ def test_two_fingers_of_a_grasp_stand_side_by_side():
     found = select(world, TASKS["grasp"])
     names = [[world.value(int(one), "sequence") for one in pair] for pair in found.rows]
     assert sorted(names) == [["mug/0/during/A", "mug/0/during/B"], ["pan/0/during/A", "pan/0/during/B"]]
-    assert found.notes == ("1 touches without two fingers left out",)
+    assert found.notes == ("1 grasps without two fingers left out",)
     assert sorted(found.groups) == ["object mug", "object pan"]
     one = table([grasps()[0]])
     with pytest.raises(UserError, match="two fingers of one touch"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.commands.output import beside, write_new
@@ -13,6 +14,7 @@ from anytouch_jax.options_data import Annotate
 if TYPE_CHECKING:
     from anytouch_jax.data.annotate import Annotated, Estimate
     from anytouch_jax.data.endpoint import Endpoint
+    from anytouch_jax.data.manifest import Manifest
 
 
 class _OnlyAnEstimate(Exception):
@@ -29,6 +31,8 @@ def run(options: Annotate) -> int:
     target = options.out or beside(options.manifest, "captions")
     if target.expanduser().resolve() in manifest.files:
         raise UserError(f"{target} is the manifest that was read; name another file with --out")
+    if options.captions is not None:
+        return _attach(options, manifest, target)
     try:
         found = annotate(
             manifest, _endpoint(options), options.answers or beside(options.manifest, "answers", ""),
@@ -44,6 +48,18 @@ def run(options: Annotate) -> int:
         say(f"{sample_sheet(manifest, found.captions, options.sheet, count=options.sheet_count)}: captions to check")
     print(f"{write_new(found.manifest, target)}: {len(found.captions):,} captions")
     return 1 if found.failures else 0
+
+
+def _attach(options: Annotate, manifest: Manifest, target: Path) -> int:
+    """Captions that are there already, in a table."""
+    from anytouch_jax.data.edit import attach_text
+
+    assert options.captions is not None
+    named, notes = attach_text(manifest, options.captions, key=options.key, overwrite=options.overwrite)
+    for note in notes:
+        say(note)
+    print(f"{write_new(named, target)}: {int(named.present('text').sum()):,} of {len(named):,} rows have a caption")
+    return 0
 
 
 def _endpoint(options: Annotate) -> Endpoint:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anytouch_jax.commands.output import beside, write_new
+from anytouch_jax.commands.output import beside, check_new, write_new
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_data import Contact
 
@@ -14,6 +14,9 @@ def run(options: Contact) -> int:
     from anytouch_jax.evaluate.contact_report import contact_picture, contact_quality
 
     manifest = manifests.read(options.manifest)
+    target = options.out or (None if options.check else beside(options.manifest, "contact"))
+    if target is not None:
+        check_new(manifest, target)
     limits = dict(options.threshold)
     scores = contact.contact_scores(manifest, workers=options.threads)
     marked, report = contact.mark_contact(manifest, scores, thresholds=limits, drop=options.drop)
@@ -25,7 +28,6 @@ def run(options: Contact) -> int:
         print("\n".join(quality.lines()))
     if options.picture is not None:
         say(f"{contact_picture(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
-    if options.out is not None or not options.check:
-        target = write_new(marked, options.out or beside(options.manifest, "contact"))
-        print(f"{target}: {len(marked):,} rows, with label.contact_score and label.contact")
+    if target is not None:
+        print(f"{write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
     return 0

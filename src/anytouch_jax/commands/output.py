@@ -16,13 +16,22 @@ def beside(manifest: Path, word: str, suffix: str | None = None) -> Path:
     return manifest.with_name(f"{manifest.stem}_{word}{manifest.suffix if suffix is None else suffix}")
 
 
-def write_new(manifest: Manifest, path: Path) -> Path:
-    """Write `manifest` to `path`, whole or not at all. Raises UserError for one of the files that it was read from."""
+def check_new(manifest: Manifest, path: Path) -> Path:
+    """The absolute path of a manifest that `write_new` can write: to be asked before long work. Raises UserError."""
     from anytouch_jax.data import manifest as manifests
 
     target = path.expanduser().resolve()
     if target in manifest.files:
         raise UserError(f"{target} is the manifest that was read; name another file")
+    manifests.check_target(manifest, target)
+    return target
+
+
+def write_new(manifest: Manifest, path: Path) -> Path:
+    """Write `manifest` to `path`, whole or not at all. Raises UserError for one of the files that it was read from."""
+    from anytouch_jax.data import manifest as manifests
+
+    target = check_new(manifest, path)
     try:
         manifests.write(manifest, target)
     except OSError as error:

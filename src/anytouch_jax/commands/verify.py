@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anytouch_jax.commands.output import write_new, write_text
+from anytouch_jax.commands.output import check_new, write_new, write_text
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Verify
@@ -22,6 +22,9 @@ def run(options: Verify) -> int:
     if options.swap and options.repair is None:
         raise UserError("--swap exchanges files in the repaired copy: say where it goes with --repair OUT")
     manifest = manifests.read(options.manifests)
+    for target in (options.repair, options.commercial_only):
+        if target is not None:
+            check_new(manifest, target)
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)
     print(report.to_markdown(), end="")
     if options.out is not None:

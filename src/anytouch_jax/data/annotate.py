@@ -10,7 +10,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,11 +58,12 @@ class Caption(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """A caption that could not be had: where its first row is, how many rows lack it, and why."""
+    """A caption that could not be had: where its first row is, how many rows lack it, why, and the question's key."""
 
     where: str
     rows: int
     reason: str
+    key: str = ""
 
 
 class Annotated(NamedTuple):
@@ -119,13 +120,16 @@ def annotate(
     estimate = _estimate([job for job, _ in lacking], len(jobs) - len(lacking), side, price_in, price_out)
     if lacking and not confirm(estimate):
         raise AnnotateError("not confirmed: nothing was asked")
-    if lacking:
-        run.ask(Client(endpoint), lacking, threads, say)
+    lacking.sort(key=lambda one: one[1] in store.failed)  # what failed the last time bars no other question
+    try:
+        if lacking:
+            run.ask(Client(endpoint), lacking, threads, say)
+    finally:
+        store.write_failures(run.failures)
     captions = tuple(
         Caption(job, store.answers[key]["caption"], store.answers[key]["object"])
         for job, key in zip(jobs, keys, strict=True) if key in store.answers
     )  # fmt: skip
-    store.write_failures(run.failures)
     return Annotated(
         _attach(manifest, captions), captions, tuple(run.failures), found.left_out,
         run.asked, run.tokens[0], run.tokens[1],
@@ -156,7 +160,7 @@ class _Run:
         with closing(bounded_map(self._key, jobs, threads)) as found:
             for job, key in zip(jobs, found, strict=True):
                 if isinstance(key, UserError):
-                    self._fail(job, str(key))
+                    self._fail(job, "", str(key))
                 keys.append(key if isinstance(key, str) else "")
         return keys
 
@@ -165,7 +169,9 @@ class _Run:
         digest = hashlib.sha256(json.dumps([end.model, job.question.hash(), self.side, end.max_tokens]).encode())
         for row, column in job.pictures:
             try:
-                digest.update(hashlib.sha256(picture_bytes(self.manifest, row, column)).digest())
+                data = picture_bytes(self.manifest, row, column)
+                digest.update(hashlib.sha256(data).digest())
+                small_jpeg(data, f"{column} of row {row}", self.side)  # what cannot be decoded is not to be paid for
             except (UserError, OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or error
                 return UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}")
@@ -178,10 +184,10 @@ class _Run:
         streak = 0
         with closing(bounded_map(partial(self._ask_one, client), lacking, threads)) as reasons:
             try:
-                for count, ((job, _), reason) in enumerate(zip(lacking, reasons, strict=True), 1):
+                for count, ((job, key), reason) in enumerate(zip(lacking, reasons, strict=True), 1):
                     streak = streak + 1 if reason else 0
                     if reason:
-                        self._fail(job, client.redact(reason))
+                        self._fail(job, key, client.redact(reason))
                     if streak >= _STREAK:
                         raise AnnotateError(f"{streak} questions in a row failed, the last one: {reason}")
                     if say and (count % 100 == 0 or count == len(lacking)):
@@ -225,8 +231,8 @@ class _Run:
             return ""
         return f"{reason} ({_NONSENSE_TRIES} times)"
 
-    def _fail(self, job: Job, reason: str) -> None:
-        self.failures.append(Failure(self.manifest.where(int(job.rows[0])), len(job.rows), reason))
+    def _fail(self, job: Job, key: str, reason: str) -> None:
+        self.failures.append(Failure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key))
 
 
 class _Store:
@@ -236,7 +242,9 @@ class _Store:
         self.folder, self.lock = folder, threading.Lock()
         self.answers: dict[str, dict[str, Any]] = {}
         self._path, self._begin = folder / "answers.jsonl", ""
+        self.failed: set[str] = set()
         folder.mkdir(parents=True, exist_ok=True)
+        self._read_failures()
         if self._path.is_file():
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in file:
@@ -250,6 +258,13 @@ class _Store:
                 self.answers[str(entry["key"])] = entry
         except (ValueError, KeyError, TypeError, RecursionError):
             return
+
+    def _read_failures(self) -> None:
+        """The questions that the last run could not get an answer to."""
+        path = self.folder / "failures.jsonl"
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
+                self.failed.add(str(json.loads(line)["key"]))
 
     def keep(self, key: str, entry: dict[str, Any]) -> None:
         """Add an answer, from any thread: what was paid for is on the disk when this returns."""

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data.images import ImageError, decode
+from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import Manifest
 
 Scored = tuple[int, float, str]  # row, score, reason
@@ -197,6 +197,8 @@ def _score(frame: np.ndarray, background: np.ndarray) -> float:
     if frame.shape != background.shape:
         background = cv2.resize(background, frame.shape[1::-1])
     inner = difference(frame, background)[EDGE:-EDGE, EDGE:-EDGE]
+    if not inner.size:
+        raise ValueError("it is too thin a strip")
     return float(np.percentile(inner, PERCENTILE))
 
 
@@ -245,6 +247,7 @@ def _estimate(manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor) -
         group = free
     chosen = group[np.unique(np.linspace(0, len(group) - 1, MOST).astype(int))]
     pictures = [one for one in pool.map(partial(_readable, manifest), chosen) if one is not None]
+    pictures = [one for one in pictures if min(one.shape[:2]) > 2 * EDGE]
     shapes = Counter(one.shape for one in pictures)
     if not shapes:
         return None
@@ -255,7 +258,7 @@ def _estimate(manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor) -
 def _readable(manifest: Manifest, row: int) -> np.ndarray | None:
     try:
         return _prepared_file(manifest.file(row))
-    except ImageError:
+    except UserError:
         return None
 
 

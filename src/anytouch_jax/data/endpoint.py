@@ -155,7 +155,7 @@ class Client:
     def _judge(self, error: urllib.error.HTTPError, deadline: float) -> Exception:
         code = error.code
         try:
-            said = _message(_read(error, deadline))
+            said = _message(self.redact(_read(error, deadline).decode("utf-8", "replace")))
         except (_Again, OSError, http.client.HTTPException):
             said = ""
         said = self.redact(f"the endpoint answers {code}{f': {said}' if said else ''}")
@@ -210,13 +210,13 @@ def _parse(data: bytes) -> Answer:
         raise _Again("the endpoint does not answer in the form of a chat completion") from None
 
 
-def _message(data: bytes) -> str:
+def _message(data: str) -> str:
     """The words of an error, in one line of at most 200 characters."""
     try:
         error = json.loads(data)["error"]
         text = error["message"] if isinstance(error, dict) else error
     except (ValueError, KeyError, TypeError, RecursionError):
-        text = data[:400].decode("utf-8", "replace")
+        text = data[:400]
     return " ".join(str(text).split())[:200]
 
 

@@ -16,6 +16,9 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data.packed import HEADER_LOCK, read_file
 
 MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
+MOST_TIMES = (
+    100  # a longer side than so many times the shorter one is a strip, which would fill the memory when resized
+)
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
 
 # Since OpenCV 4.11; orientation tags are ignored as for other files.
@@ -76,6 +79,8 @@ def _unpack(data: bytes) -> np.ndarray:
     if pixels is None:
         raise ValueError("the picture is corrupt or cut short")
     if not jpeg and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
+        if pixels.dtype not in (np.uint8, np.uint16, np.float32):  # of a TIFF; OpenCV exchanges no channels of these
+            return pixels[..., 2::-1]
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
     return pixels
 
@@ -105,6 +110,8 @@ def _to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
         raise ImageError(
             f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels, more than the limit of {MAX_PIXELS}"
         )
+    if max(pixels.shape[:2]) > MOST_TIMES * min(pixels.shape[:2]):
+        raise ImageError(f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: that is a strip, not a picture")
     pixels = pixels[..., :3]
     if pixels.dtype == np.uint16:
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)

@@ -25,6 +25,7 @@ from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model
 from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, load_table, typed
 from anytouch_jax.data.windows import windows
 
+KEYS = ("sequence", "touch", "grasp_group")  # what two manifests may call alike and is not the same
 __all__ = [
     "PATHS", "REQUIRED", "SCHEMA", "SPLITS", "Manifest", "ManifestError",
     "from_columns", "read", "resolve", "sensor_rows", "write",
@@ -115,7 +116,10 @@ class Manifest:
         digest = hashlib.sha256()
         for name in sorted(self.table.column_names):
             column = self.table[name].combine_chunks()
-            text = pc.fill_null(column.cast(pa.large_string()), "")
+            try:
+                text = pc.fill_null(column.cast(pa.large_string()), "")
+            except pa.ArrowException:  # nested or binary: as Python writes it
+                text = pa.array([repr(value) for value in column.to_pylist()], pa.large_string())
             ends = np.frombuffer(text.buffers()[1], np.int64)[text.offset : text.offset + len(text) + 1]
             digest.update(name.encode() + b"\0")
             digest.update(np.packbits(np.asarray(pc.is_valid(column))).tobytes())
@@ -222,12 +226,11 @@ def _kinds(tables: list[pa.Table]) -> dict[str, set[bool]]:
 def write(manifest: Manifest, path: str | Path) -> None:
     """Write a manifest as .csv or .parquet, whole or not at all; its paths are made relative to the new folder.
 
-    Raises ManifestError for another ending and for a file that would lie outside the new folder.
+    Keys that two joined manifests share become different ones. Raises ManifestError for another ending, for a file that
+    would lie outside the new folder and for a column that the format cannot hold.
     """
-    target = Path(path).expanduser().resolve()
-    if target.suffix.lower() not in (".csv", ".parquet"):
-        raise ManifestError(f"{target}: a manifest ends in .csv or .parquet")
-    table = _rebase(manifest, target.parent)
+    target, table = _placed(manifest, path)
+    table = _own_keys(manifest, table)
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
@@ -240,9 +243,35 @@ def write(manifest: Manifest, path: str | Path) -> None:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)  # mkstemp gives a file that only its owner may read
         os.replace(temporary, target)
+    except pa.ArrowException as error:
+        Path(temporary).unlink(missing_ok=True)
+        raise ManifestError(f"{target} cannot be written: {str(error).splitlines()[0]}") from None
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def check_target(manifest: Manifest, path: str | Path) -> None:
+    """Raise the ManifestError of `write` before hours of work: a wrong ending, or files outside the new folder."""
+    _placed(manifest, path)
+
+
+def _placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
+    """The absolute path of a manifest to be written, and its table with paths relative to the folder."""
+    target = Path(path).expanduser().resolve()
+    if target.suffix.lower() not in (".csv", ".parquet"):
+        raise ManifestError(f"{target}: a manifest ends in .csv or .parquet")
+    return target, _rebase(manifest, target.parent)
+
+
+def _own_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
+    """`table` with keys of different files made different: in one file equal keys would be one."""
+    from anytouch_jax.data.edit import own_keys
+
+    for name in KEYS if len(manifest.files) > 1 else ():
+        if name in table.column_names:
+            table = table.set_column(table.column_names.index(name), name, own_keys(manifest, name))
+    return table
 
 
 def _rebase(manifest: Manifest, folder: Path) -> pa.Table:

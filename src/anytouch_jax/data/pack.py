@@ -28,7 +28,7 @@ from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.edit import own_keys
 from anytouch_jax.data.files import Files, distinct_files, write_whole
 from anytouch_jax.data.licences import licences
-from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.manifest import KEYS, Manifest
 from anytouch_jax.data.packed import INDEX, forget, read_file
 from anytouch_jax.data.table import PATHS
 
@@ -69,10 +69,14 @@ def pack(
     if shard_bytes < 1:
         raise PackError(f"a shard has at least 1 byte, not {shard_bytes}")
     target = folder / "manifest.parquet"
-    _claim(folder, {"version": _VERSION, "manifest": manifest.content_hash, "shard_bytes": shard_bytes})
-    if target.is_file() and (folder / "README.md").is_file():
-        return target
     files = distinct_files(manifest)
+    finished = target.is_file() and (folder / "README.md").is_file()
+    plan = {"version": _VERSION, "manifest": manifest.content_hash, "shard_bytes": shard_bytes}
+    _claim(folder, plan, _stamp(manifest, files), finished)
+    if finished:
+        if say:
+            say(f"{folder} was finished before: left as it is")
+        return target
     orders = _orders(manifest, files)
     sums: dict[str, str] = _read_sums(folder)
     shard_of, row_of = np.empty(len(files), np.int64), np.empty(len(files), np.int64)
@@ -94,17 +98,35 @@ def pack(
     return target
 
 
-def _claim(folder: Path, plan: dict[str, object]) -> None:
+def _stamp(manifest: Manifest, files: Files) -> str | None:
+    """A digest of where the files are, their sizes and times: equal manifests may show other pictures. None when one
+    of them is not there."""
+    digest = hashlib.sha256()
+    for row, column in zip(files.row, files.column, strict=True):
+        try:
+            path = manifest.file(row, column)
+            about = os.stat(path)
+        except (OSError, UserError):  # named when it is to be packed
+            return None
+        digest.update(f"{path}\0{about.st_size}\0{about.st_mtime_ns}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: bool) -> None:
     """Take the folder for this plan, or find that it is its own from an earlier run."""
     mark = folder / "pack.json"
     if mark.is_file():
-        if mark.read_text(encoding="utf-8") != json.dumps(plan):
+        old = json.loads(mark.read_text(encoding="utf-8"))
+        files = old.pop("files", None)
+        if old != plan:
             raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")
+        if files != stamp and files is not None and not (finished and stamp is None):
+            raise PackError(f"the files of the manifest are others than when {folder} was begun; choose another folder")
         return
     if folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
         raise PackError(f"{folder} is not an empty folder; choose another one")
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(mark, json.dumps(plan).encode())
+    write_whole(mark, json.dumps(plan | {"files": stamp}).encode())
 
 
 def _orders(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
@@ -288,7 +310,7 @@ def _repoint(
     for name, code in files.code.items():
         place = table.column_names.index(name)
         table = table.set_column(place, name, cell.take(pa.array(code, mask=code < 0)))
-    for name in {"sequence", "touch"} & set(table.column_names) if len(manifest.files) > 1 else ():
+    for name in set(KEYS) & set(table.column_names) if len(manifest.files) > 1 else ():
         table = table.set_column(table.column_names.index(name), name, own_keys(manifest, name))
     return Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
 

@@ -8,15 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.checks import identity, repeated_rows
+from anytouch_jax.data.checks import frame_order, identity, licence_conflicts, repeated_rows, split_leaks
 from anytouch_jax.data.edit import replace_column, select
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.scan import OK, STATES
-from anytouch_jax.data.swapped import verdicts
+from anytouch_jax.data.swapped import beside, verdicts
 from anytouch_jax.data.verify import Report
+
+_OF_ROWS = {f"leak_{name}" for name in ("sequence", "touch", "grasp_group", "object")}
+_OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict"}  # faults that a dropped row can take away
 
 
 class Repaired(NamedTuple):
@@ -66,8 +70,8 @@ def repair(manifest: Manifest, report: Report, *, swap: Collection[str] = ()) ->
     if repeats.size:
         keep[repeats] = False
         done.append(f"dropped {repeats.size} rows that repeat another, touch image and all")
-    left = _left(report, {v.dataset for v in verdicts(manifest, found) if exchanged[v.rows].any()})
-    return Repaired(select(result, np.flatnonzero(keep)), tuple(done), left)
+    result = select(result, np.flatnonzero(keep))
+    return Repaired(result, tuple(done), _left(report, result, exchanged))
 
 
 def _exchange(
@@ -83,6 +87,7 @@ def _exchange(
     for verdict in verdicts(manifest, report.scan):
         if verdict.whole and verdict.witnessed and verdict.dataset not in swap:
             exchanged[verdict.rows] = True
+            exchanged |= _backgrounds(manifest, verdict.rows)
             done.append(
                 f"exchanged touch image and photograph in {verdict.rows.size} rows of dataset {verdict.dataset!r}: "
                 "its photographs resemble the background frames, its touch images do not"
@@ -97,12 +102,34 @@ def _exchange(
         return manifest, exchanged
     touch, picture = (manifest.table[name].combine_chunks().to_numpy(False) for name in ("path", "image_path"))
     result = replace_column(manifest, "path", pa.array(np.where(exchanged, picture, touch), pa.string()))
-    return replace_column(result, "image_path", pa.array(np.where(exchanged, touch, picture), pa.string())), exchanged
+    result = replace_column(result, "image_path", pa.array(np.where(exchanged, touch, picture), pa.string()))
+    false = exchanged & beside(manifest, "background_path")  # it was in the folder of what is now a photograph
+    if false.any():
+        cells = np.where(false, None, manifest.column("background_path").combine_chunks().to_numpy(False))
+        result = replace_column(result, "background_path", pa.array(cells, pa.string()))
+        done.append(f"emptied background_path in {int(false.sum())} of them: it lay among the photographs")
+    return result, exchanged
 
 
-def _left(report: Report, exchanged: Collection[str | None]) -> tuple[str, ...]:
-    fixed = {*STATES, "repeated_row"} | ({"swapped"} if exchanged else set())
-    return tuple(f.sentence for f in report.findings if f.kind not in fixed and f.level != "info")
+def _backgrounds(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
+    """The background rows with a photograph, of the dataset and sensor of `rows`: what is true of those is of them."""
+    found = np.asarray(pc.equal(manifest.table["split"], "background")) & manifest.present("image_path")
+    for name in ("dataset", "sensor"):
+        code = manifest.codes(name)
+        found &= code == code[rows[0]]
+    return found
+
+
+def _left(report: Report, result: Manifest, exchanged: np.ndarray) -> tuple[str, ...]:
+    """What a repair did not take away: faults of files that it knows nothing of, and faults of the rows that remain."""
+    rows = {f.kind for f in (*split_leaks(result), *frame_order(result), *licence_conflicts(result))}
+    found = []
+    for f in report.findings:
+        of_rows = f.kind in _OF_ROWS
+        mended = f.kind in {*STATES, "repeated_row"} or (of_rows and f.kind not in rows)
+        if f.level != "info" and not mended and not (f.kind == "swapped" and exchanged[f.rows].any()):
+            found.append(f.sentence)
+    return tuple(found)
 
 
 def write_repaired(repaired: Repaired, path: str | Path, *, in_place: bool = False) -> Path:

@@ -136,7 +136,8 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
     there = pc.unique(column.take(rows)).drop_null().to_pylist()
     wanted = config.data.weights
     if wanted is None:
-        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in there) if config.recipe == "release" else ()
+        own = config.recipe == "release" and config.stage == 2  # its stage 1 draws every row once
+        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in there) if own else ()
     for name, weight in wanted:
         if name not in there:
             known = ", ".join(sorted(there)) or "none: its column 'dataset' is empty"

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow.compute as pc
 
 from anytouch_jax.data.checks import EXAMPLES, Finding, Level
 from anytouch_jax.data.manifest import Manifest
@@ -47,21 +48,34 @@ def verdicts(manifest: Manifest, found: Scan) -> list[Verdict]:
         pairs = np.unique(np.stack([code["path"][rows], code["image_path"][rows]], 1), axis=0)
         if len(pairs) < _FEWEST:
             continue
-        ground = _backgrounds(found, here, split, rows, decoded)
+        ground = _backgrounds(manifest, found, here, split, rows, decoded)
         swapped, whole = _judge(found, code, rows, pairs, ground)
         if swapped.size:
             result.append(Verdict(manifest.value(rows[0], "dataset"), rows, swapped, whole, bool(len(ground))))
     return result
 
 
-def _backgrounds(found: Scan, here: np.ndarray, split: np.ndarray, rows: np.ndarray, decoded: np.ndarray) -> np.ndarray:
-    """Colours f32 (k, 48) of the sensor's background frames, k = 0 where there is none."""
-    files = [found.files.code["path"][here & (split == "background")]]
-    if "background_path" in found.files.code:
-        files.append(found.files.code["background_path"][rows])
+def beside(manifest: Manifest, column: str) -> np.ndarray:
+    """Which rows name a file in `column` that lies in the folder of their touch image: bool (rows,)."""
+    folders = [pc.replace_substring_regex(manifest.column(name), r"[^/]*$", "") for name in (column, "path")]
+    return np.asarray(pc.fill_null(pc.equal(*folders), False))
+
+
+def _backgrounds(
+    manifest: Manifest, found: Scan, here: np.ndarray, split: np.ndarray, rows: np.ndarray, decoded: np.ndarray
+) -> np.ndarray:
+    """Colours f32 (k, 48) of the sensor's background frames, k = 0 where there is none.
+
+    What may have changed places itself is no witness: a background row with a photograph of its own, and a
+    `background_path` in the folder of the touch images.
+    """
+    code = found.files.code
+    files = [code["path"][here & (split == "background") & (code["image_path"] < 0)]]
+    if "background_path" in code:
+        files.append(code["background_path"][rows[~beside(manifest, "background_path")[rows]]])
     ids = np.unique(np.concatenate(files))
     # A background that is also a photograph would be a false witness.
-    ids = np.setdiff1d(ids, [-1, *np.unique(found.files.code["image_path"])])
+    ids = np.setdiff1d(ids, [-1, *np.unique(code["image_path"])])
     return found.colours[ids[decoded[ids]][:64]].astype(np.float32)
 
 

@@ -230,22 +230,28 @@ def _groups(table: Manifest, columns: Sequence[str]) -> Array:
     return found
 
 
+def _grasp(table: Manifest) -> str:
+    """The column that two fingers of one grasp share."""
+    return "grasp_group" if "grasp_group" in table.table.column_names else "touch"
+
+
 def _paired(table: Manifest) -> bool:
-    return bool(table.present("touch").any() and table.present("unit").any())
+    return bool(table.present(_grasp(table)).any() and table.present("unit").any())
 
 
 def _fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tuple[str, ...]]:
-    """Rows (n, 2) to read, of the two units of each touch in the order of the units' names; the row of each that has
+    """Rows (n, 2) to read, of the two units of each grasp in the order of the units' names; the row of each that has
     the label; and what was left out."""
-    rows = rows[table.present("touch")[rows] & table.present("unit")[rows]]
-    touch, unit = table.codes("touch", own=True)[rows], text_column(table, "unit")[rows]
-    order = np.lexsort((unit, touch))
-    rows, touch, unit = rows[order], touch[order], unit[order]
-    starts, counts = np.unique(touch, return_index=True, return_counts=True)[1:]
+    name = _grasp(table)
+    rows = rows[table.present(name)[rows] & table.present("unit")[rows]]
+    grasp, unit = table.codes(name, own=True)[rows], text_column(table, "unit")[rows]
+    order = np.lexsort((unit, grasp))
+    rows, grasp, unit = rows[order], grasp[order], unit[order]
+    starts, counts = np.unique(grasp, return_index=True, return_counts=True)[1:]
     whole = starts[counts == 2]
     whole = whole[unit[whole] != unit[whole + 1]]
     read = rows[whole[:, None] + np.arange(2)]
-    notes = [f"{len(starts) - len(whole)} touches without two fingers left out"] if len(starts) > len(whole) else []
+    notes = [f"{len(starts) - len(whole)} grasps without two fingers left out"] if len(starts) > len(whole) else []
     told = read[:, 0]
     if task.phase == "after":
         read = _after(table, read)

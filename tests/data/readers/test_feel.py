@@ -35,14 +35,15 @@ def test_only_during_frames_are_train_and_test(tmp_path, read):
     table = read("feel")
     assert table.report.splits == {"train": 4, "test": 4, "background": 8, "unused": 8}
     row = table.rows["blue bär/touch_during/1_B.png"]
-    assert (row["split"], row["label.success"], row["touch"], row["unit"]) == ("test", 1, "blue bär/1", "B")
+    assert (row["split"], row["label.success"], row["grasp_group"], row["unit"]) == ("test", 1, "blue bär/1", "B")
     assert row["image_path"] == "blue bär/vision_during/1.png"
     assert row["background_path"] == "blue bär/touch_before/1_B.png"
     assert table.rows["mug/touch_before/0_A.png"]["label.contact"] == 0
-    assert table.rows["mug/touch_after/0_A.png"]["touch"] is None
+    assert table.rows["mug/touch_after/0_A.png"]["grasp_group"] is None
+    assert "touch" not in row  # the fingers press opposite sides: no place that two sensors felt
     pairs = {}
     for one in table.rows.values():
-        pairs.setdefault(one["touch"], []).append(one["unit"])
+        pairs.setdefault(one["grasp_group"], []).append(one["unit"])
     pairs.pop(None)
     assert len(pairs) == 4 and all(sorted(units) == ["A", "B"] for units in pairs.values())
     assert not table.clips(2)  # before, during, after are no clip

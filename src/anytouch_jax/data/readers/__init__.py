@@ -117,6 +117,7 @@ def index(name: str, root: str | Path, out: str | Path | None = None, *, options
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
     manifest = manifests.from_columns(_below(columns, base, target.parent), target)
     manifest.clips(2)  # raises for a frame that is there twice
+    _refuse_links(manifest, base)
     try:
         manifests.write(manifest, target)
     except OSError as error:
@@ -125,6 +126,17 @@ def index(name: str, root: str | Path, out: str | Path | None = None, *, options
             "that contains the data"
         ) from None
     return _report(one, target, manifest, notes)
+
+
+def _refuse_links(manifest: manifests.Manifest, base: Path) -> None:
+    """Raise UserError for a folder that is a link out of ROOT: no row of it could ever be read."""
+    folders = dict.fromkeys(path.rpartition("/")[0] for path in manifest.column("path").to_pylist())
+    for folder in folders:
+        place = manifest.files[0].parent / folder
+        if not place.resolve().is_relative_to(manifest.files[0].parent.resolve()):
+            raise UserError(
+                f"{place} leads out of {base}, to {place.resolve()}; give the folder that really holds it as ROOT"
+            )
 
 
 def _refuse_unused(one: Reader, options: Options) -> None:

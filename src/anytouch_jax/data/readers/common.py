@@ -205,12 +205,16 @@ def read_table(path: Path) -> list[dict[str, str]]:
     return [dict(zip(rows[0], row, strict=False)) for row in rows[1:]]
 
 
-def read_json(path: Path) -> Any:
-    """What a JSON file holds. Raises DatasetError."""
+def read_json(path: Path, values: type = object) -> dict[str, Any]:
+    """The object (names with `values` of a kind) that a JSON file holds. Raises DatasetError."""
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
+        found = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path} cannot be read as JSON: {error}") from None
+    if not isinstance(found, dict) or not all(isinstance(value, values) for value in found.values()):
+        kind = "" if values is object else f" with a {values.__name__} for every name"
+        raise DatasetError(f"{path}: expected a JSON object{kind}")
+    return found
 
 
 def hash_split(dataset: str, group: str, options: Options) -> str:

@@ -6,7 +6,8 @@ folders are made from the original `calandra_corl2017_*.h5`. No licence of the d
 
 * The split of a `during` frame is its object's; `before` (open fingers) is background and the background of the
   others; `after` shows the outcome and is `unused`. Every frame is a sequence of its own: no clip spans the phases.
-* `touch` is the grasp: both fingers (`unit` A and B) have it. They press opposite sides, not one place.
+* `grasp_group` is the grasp: both fingers (`unit` A and B) have it. They press opposite sides, not one place, so it is
+  no `touch`: nothing is matched by it.
 * A pickled split file is never unpickled as code: `split_<k>.npy` is read by a reader that knows lists and strings
   only; `split_<k>.json` with the same content is read too. Without either: by hash of the object.
 * Only original files: say `export` and they are written as PNG first (needs `pip install h5py`).
@@ -48,7 +49,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         notes.say(f"{export(root, original)} grasps written from {len(original)} .h5 files")
     splits = _splits(base, options, notes)
     prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
-    rows = Rows("object", "unit", "touch", "image_path", "background_path", "label.success", "label.contact")
+    rows = Rows("object", "unit", "grasp_group", "image_path", "background_path", "label.success", "label.contact")
     there: dict[str, set[str]] = {}
     table = base / "feel.csv"
     for line, row in enumerate(read_csv(table), 1):
@@ -88,7 +89,7 @@ def _grasp(rows: Rows, notes: Notes, prefix: str, name: str, number: int, succes
                 frame_index=0,
                 split=part,
                 object=name,
-                touch=grasp if phase == "during" else None,
+                grasp_group=grasp if phase == "during" else None,
                 image_path=f"{prefix}{name}/{photo}" if photo in there else None,
                 background_path=f"{prefix}{name}/{before}" if before in there else None,
                 **{"label.success": success if phase == "during" else None,

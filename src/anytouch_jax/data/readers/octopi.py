@@ -72,7 +72,7 @@ def _own_splits(base: Path, options: Options, notes: Notes) -> dict[str, str]:
     own: dict[str, str] = {}
     for split, path in files.items():
         assert path is not None
-        for folder in (folder for folders in read_json(path).values() for folder in folders):
+        for folder in (folder for folders in read_json(path, list).values() for folder in map(str, folders)):
             name = Path(folder.replace("\\", "/")).name
             if own.setdefault(name, split) != split:
                 raise DatasetError(f"{path}: the sample {name} is also in {own[name]}_samples.json")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import UserError
-from anytouch_jax.sim import mechanics
+from anytouch_jax.sim import elastic, mechanics
+from anytouch_jax.sim.convolve import Plan
 from anytouch_jax.sim.mechanics import Gel, press
 
 N = 64
@@ -227,6 +228,25 @@ def test_a_thinner_layer_is_stiffer():
     assert np.all(np.diff(forces) < 0)
     assert forces[-1] == pytest.approx(float(exact(surface, 0.3, 0.1).force), rel=5e-3)
     assert np.asarray(on(2.0).displacement)[0, 0] < 0.1 * np.asarray(exact(surface, 0.3, 0.1).displacement)[0, 0]
+
+
+def test_on_a_bonded_layer_an_elastic_object_moves_as_a_half_space_and_the_gel_as_a_layer():
+    pitch, soft, gel = 0.25, PLANE / 3, Gel(thickness=2.0)
+    surface = jnp.asarray(ball(pitch), jnp.float32)
+    found = press(surface, 0.6, gel, pitch, modulus_object=soft, tolerance=1e-5)
+    plan = Plan(N, N)
+
+    def moves(thickness, modulus):
+        spectrum = elastic.normal_spectrum(plan, pitch, gel.poisson, thickness, 1.0, jnp.float32)
+        return np.asarray(plan.inverse(plan.even(plan.forward(found.pressure * (pitch / modulus)), spectrum)))
+
+    layer, object_ = moves(2.0, PLANE), moves(INF, soft)
+    np.testing.assert_allclose(found.displacement, layer, atol=2e-4)
+    touching = np.asarray(found.pressure) > 0
+    np.testing.assert_allclose((layer + object_)[touching], (np.asarray(surface) + 0.6)[touching], atol=1e-3)
+    assert abs(found.displacement[N // 2, 2]) < 0.02 * np.max(found.displacement)  # no dent like 1 / r far away
+    quick = press(surface, 0.6, gel, pitch, fidelity="fast", modulus_object=soft).displacement
+    assert np.sqrt(np.mean((quick - layer) ** 2)) < 0.02 * layer.max()
 
 
 def test_force_scales_with_the_modulus_and_the_units():

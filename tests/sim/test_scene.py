@@ -32,6 +32,7 @@ def recordings(scenes, number=0):
         ({"vision": 1.5}, "vision is a share"),
         ({"grade": "rough"}, "grade is fine or coarse"),
         ({"units": "two"}, "units is each or one, not two"),
+        ({"seed": -1}, "seed must be at least 0, not -1"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused(change, sentence):
@@ -132,6 +133,18 @@ def test_a_still_is_the_deepest_press():
     assert not moved.any() and depth.tolist() == [0.8]
 
 
+def test_a_still_has_no_motion_to_tell():
+    still = replace(SCENES, frames=1)
+    found = [scene.directions(recordings(still, number)["digit"]) for number in range(12)]
+    assert all(one == {"label.motion": "hold", "label.twist": "none", "label.slide": "none"} for one in found)
+
+
+def test_a_sensor_of_fields_has_no_camera_that_mirrors_or_crops():
+    for number in range(8):
+        unit = recordings(replace(SCENES, sensors=("tac3d",)), number)["tac3d"].unit
+        assert (unit.mirror == 1).all() and not unit.window.any() and unit.zoom == 1
+
+
 def test_directions_are_those_of_the_picture():
     recording = recordings(SCENES, 0)["digit"]
 
@@ -140,8 +153,8 @@ def test_directions_are_those_of_the_picture():
         gesture = Gesture(0.5, motion, np.asarray(slide), twist, 1.0)
         return scene.directions(recording._replace(unit=unit, gesture=gesture))
 
-    assert seen("hold") == {"label.twist": "none", "label.slide": "none"}
-    assert seen("slide", (2, 0.3)) == {"label.twist": "none", "label.slide": "right"}
+    assert seen("hold") == {"label.motion": "hold", "label.twist": "none", "label.slide": "none"}
+    assert seen("slide", (2, 0.3)) == {"label.motion": "slide", "label.twist": "none", "label.slide": "right"}
     assert seen("slide", (2, 0.3), mirror=(-1, 1))["label.slide"] == "left"
     assert seen("slide", (0.1, 1))["label.slide"] == "down"
     assert seen("slide", (1, 0), rotation=math.pi / 2)["label.slide"] == "down"

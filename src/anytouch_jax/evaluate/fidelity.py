@@ -16,6 +16,7 @@ from jax import Array
 
 from ..config import UserError
 from ..sim.mechanics import Contact, Fidelity, Gel, press
+from ..sim.sensors import SENSORS
 from ..sim.shear import Shear, shear_step
 
 Fields = npt.NDArray[Any]
@@ -94,7 +95,7 @@ class Setting:
     depth: float = 0.4
     motion: tuple[float, float, float] = (0.15, 0.05, 0.02)
     friction: float = 0.6
-    gel: Gel = field(default_factory=Gel)
+    gel: Gel = SENSORS["gelsight_mini"].gel  # a bonded layer, as that of every sensor
 
 
 def speed_against_error(

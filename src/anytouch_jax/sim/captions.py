@@ -1,8 +1,8 @@
 """Sentences about how an object feels, in the manner of the annotations of AnyTouch (its appendix on GPT-4o).
 
-They tell hardness, roughness, texture, the coarse form, warmth and grip: what a hand knows. They never tell the
-object's name, its material, the kind of its primitive, or anything about the touch itself (force, motion, direction),
-so that labels of these are not given away.
+They tell hardness, roughness, texture, warmth and grip: what a hand knows. They never name the object or its material
+(though most words for warmth and grip go with one material), and they tell nothing of its form, the indenter, or of
+the touch itself (force, motion, direction), so that labels of these are not given away.
 """
 
 from __future__ import annotations
@@ -46,22 +46,6 @@ SPACING: dict[str, tuple[str, ...]] = {
     "fine": ("fine", "closely spaced", "tight", "dense", "small-scale"),
     "wide": ("broad", "widely spaced", "large-scale", "spread-out", "big"),
 }
-# Three forms for nine primitives: a caption helps to see the form and does not name the primitive.
-FORM: dict[str, tuple[str, ...]] = {
-    "rounded": ("a rounded form", "a curved, convex form", "a rounded contour", "a gently curved shape"),
-    "angular": (
-        "an angular form",
-        "a form that falls away abruptly",
-        "a pronounced contour",
-        "a sharply defined outline",
-    ),
-    "level": ("a level form", "a broad, level shape", "a mostly level surface", "an even plane"),
-}
-FORM_OF = {
-    "sphere": "rounded", "cylinder": "rounded", "ring": "rounded", "screw": "rounded",
-    "edge": "angular", "corner": "angular", "cone": "angular",
-    "flat": "level", "letters": "level",
-}  # fmt: skip
 WIDE = 1.85  # mm of pitch from which a pattern is called wide
 
 FIRST = (
@@ -78,10 +62,9 @@ FIRST = (
 )
 SECOND = (
     "It is {feel}.",
-    "The touch is {feel}, and there is {form}.",
-    "There is {form}.",
-    "Overall it has {form} and feels {feel}.",
-    "It has {form}; the sensation is {feel}.",
+    "The touch is {feel}.",
+    "Overall it feels {feel}.",
+    "The sensation is {feel}.",
     "The material seems {feel}.",
 )
 
@@ -98,7 +81,6 @@ def caption(thing: Object, rng: np.random.Generator) -> str:
         "hard": one(HARDNESS[hardness_of(thing)]),
         "rough": one(ROUGHNESS[roughness_of(thing)]),
         "pattern": one(PATTERN[shape.texture]).format(s=one(SPACING[spacing])),
-        "form": one(FORM[FORM_OF[shape.primitive]]),
         "feel": one(thing.material.feel),
     }
     words |= {"Hard": words["hard"].capitalize(), "Rough": words["rough"].capitalize()}

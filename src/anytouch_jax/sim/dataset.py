@@ -30,7 +30,7 @@ from .sensors import SENSORS
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches a part
-VERSION = 1  # of what a seed gives; a change of the simulator raises it
+VERSION = 2  # of what a seed gives; a change of the simulator raises it
 Row = dict[str, Any]
 Say = Callable[[str], None]
 
@@ -57,12 +57,12 @@ def simulate(
 
 
 def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, int], None]) -> Path:
+    things, splits = scene.cast(scenes)  # before the folder is taken: what cannot be simulated leaves nothing
     _claim(scenes, out)
     target = out / MANIFEST
     if target.exists():
         return target
     (out / PARTS).mkdir(parents=True, exist_ok=True)
-    things, splits = scene.cast(scenes)
     groups = [range(start, min(start + GROUP, scenes.touches)) for start in range(0, scenes.touches, GROUP)]
     files = [out / PARTS / f"{i:05d}.parquet" for i in range(len(groups))]
     done = sum(len(group) for group, file in zip(groups, files, strict=True) if file.exists())
@@ -162,7 +162,7 @@ def _write_recording(scenes: Scenes, thing: objects.Object, recording: Recording
 
 def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> Row:
     """What all frames of a recording share."""
-    touch, gesture = recording.touch, recording.gesture
+    touch = recording.touch
     return {
         "sensor": recording.sensor,
         "split": touch.split,
@@ -180,7 +180,6 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> 
         "label.roughness": objects.roughness_of(thing),
         "label.indenter": thing.shape.primitive,
         "label.texture": thing.shape.texture,
-        "label.motion": gesture.motion,
     } | scene.directions(recording)
 
 

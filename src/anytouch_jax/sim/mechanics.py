@@ -95,11 +95,12 @@ def press(
     plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
     compliances = [_compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)]
     solve, most = (_fast, 2) if fidelity == "fast" else (_exact, 300)
-    found, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
+    found, load, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
+    moved = moved - _of_object(plans[0], load, share, modulus_object)  # both moved: the gel's part is the rest
     pressure = found.x * (scale * plane * share / pitch)
     force = jnp.sum(pressure) * pitch**2 * KPA_MM2
     converged = found.residual <= tolerance
-    return Contact(pressure, moved * (scale * share), force, converged, found.iterations, found.residual)
+    return Contact(pressure, moved * scale, force, converged, found.iterations, found.residual)
 
 
 def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
@@ -129,16 +130,33 @@ def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) ->
     return lambda pressure: plan.inverse(plan.even(plan.forward(pressure), spectrum))
 
 
-def _exact(compliances: list[Compliance], cut: Array, tolerance: float, iterations: int) -> tuple[Solution, Array]:
+def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
+    """The object's part of the displacement by a pressure, in the units of `cut`: a half-space whatever the gel is."""
+    if _is_rigid(modulus_object):
+        return 0.0
+    deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
+    return (1 - share) * plan.inverse(plan.even(plan.forward(pressure), deep))
+
+
+def _is_rigid(modulus_object: Any) -> bool:
+    return isinstance(modulus_object, float | int) and bool(np.isinf(modulus_object))
+
+
+def _exact(
+    compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
+) -> tuple[Solution, Array, Array]:
+    """The solution, the pressure that moves the surface, and that displacement."""
     (apply,) = compliances
     start = jnp.maximum(cut, 0)
     start = start * scaled(start, apply(start), cut)
     found = conjugate_gradients(apply, cut, start, tolerance, iterations)
-    return found, found.excess + cut
+    return found, found.x, found.excess + cut
 
 
-def _fast(compliances: list[Compliance], cut: Array, tolerance: float, iterations: int) -> tuple[Solution, Array]:
-    """From coarse to fine, `iterations` on the finest grid and twice as many on each coarser one."""
+def _fast(
+    compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
+) -> tuple[Solution, Array, Array]:
+    """As `_exact`, from coarse to fine, `iterations` on the finest grid and twice as many on each coarser one."""
     cuts = [cut]
     for _ in compliances[1:]:
         cuts.append(halved(cuts[-1]))
@@ -149,7 +167,7 @@ def _fast(compliances: list[Compliance], cut: Array, tolerance: float, iteration
         found = _descended(apply, here, pressure, iterations * 2**level)
         pressure = doubled(found.x) if level else found.x
     moved = jnp.maximum(found.excess, 0) + cut
-    return found._replace(x=_sharpened(found)), moved
+    return found._replace(x=_sharpened(found)), found.x, moved
 
 
 def _sharpened(found: Solution) -> Array:

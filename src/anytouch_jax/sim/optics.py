@@ -137,6 +137,18 @@ def background(
     return render(jnp.zeros((8, 8)), None, 1.0, sensor, unit, key, resolution=resolution)
 
 
+def onto_picture(
+    maps: Array, *, pitch: Any, sensor: Sensor, unit: Unit, resolution: tuple[int, int], vectors: bool = False
+) -> Array:
+    """Maps (..., h, w, C) of the solve grid at the pixels of a unit's picture (height, width), mirrored as it is.
+
+    `vectors`: the two channels are x and y of a vector, which is mirrored too.
+    """
+    ay, _, ax, _ = _resample(maps.shape[-3:-1], pitch, view(sensor, unit, resolution))
+    seen = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
+    return seen * unit.mirror.reshape((1,) * (seen.ndim - 1) + (2,)) if vectors else seen
+
+
 def _resample(shape: tuple[int, ...], pitch: Any, place: View) -> Matrices:
     """Value and derivative matrices from the solve grid to the picture's rows and columns."""
     rows = splines.spline(place.y / pitch + (shape[0] - 1) / 2, shape[0])

@@ -6,7 +6,7 @@ labels need it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -126,7 +126,9 @@ def record(
         contact.displacement, sheared.displacement, keys[1:]
     )
     background = optics.background(sensor, clip.unit, keys[0], resolution=shape)
-    return Take(image, background, _fields(fields, contact, sheared), labels)
+    seen = _fields(fields, contact, sheared, partial(optics.onto_picture, pitch=pitch, sensor=sensor, unit=clip.unit,
+                                                     resolution=shape))  # fmt: skip
+    return Take(image, background, seen, labels)
 
 
 def _sheared(clip: Clip, contact: Contact, gel: Gel, pitch: float, fidelity: Fidelity) -> shear.Shear:
@@ -134,7 +136,15 @@ def _sheared(clip: Clip, contact: Contact, gel: Gel, pitch: float, fidelity: Fid
 
     def step(state: shear.Shear, frame: tuple[Contact, Array]) -> tuple[shear.Shear, shear.Shear]:
         state = shear.shear_step(
-            state, frame[0], frame[1], gel, pitch, clip.friction, fidelity=fidelity, modulus_object=clip.modulus
+            state,
+            frame[0],
+            frame[1],
+            gel,
+            pitch,
+            clip.friction,
+            fidelity=fidelity,
+            modulus_object=clip.modulus,
+            centre=clip.unit.offset,
         )
         return state, state
 
@@ -162,14 +172,16 @@ def _labels(clip: Clip, contact: Contact, sheared: shear.Shear, pitch: float) ->
     }
 
 
-def _fields(names: tuple[str, ...], contact: Contact, sheared: shear.Shear) -> Array | None:
-    """The fields asked for, as channels: displacement mm, pressure kPa, shear (2) mm."""
+def _fields(
+    names: tuple[str, ...], contact: Contact, sheared: shear.Shear, onto_picture: Callable[..., Array]
+) -> Array | None:
+    """The fields asked for at the pixels of the picture, as channels: displacement mm, pressure kPa, shear (2) mm."""
     known = {
-        "displacement": contact.displacement[..., None],
-        "pressure": contact.pressure[..., None],
-        "shear": sheared.displacement,
+        "displacement": lambda: onto_picture(contact.displacement[..., None]),
+        "pressure": lambda: jnp.maximum(onto_picture(contact.pressure[..., None]), 0),  # a spline swings at an edge
+        "shear": lambda: onto_picture(sheared.displacement, vectors=True),
     }
-    return jnp.concatenate([known[name] for name in names], -1) if names else None
+    return jnp.concatenate([known[name]() for name in names], -1) if names else None
 
 
 def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:

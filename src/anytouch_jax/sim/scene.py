@@ -76,6 +76,8 @@ class Scenes:
                 raise UserError(f"{name} is a share between 0 and 1, not {getattr(self, name):g}")
         if self.grade not in ("fine", "coarse") or self.fidelity not in ("exact", "fast"):
             raise UserError(f"grade is fine or coarse and fidelity exact or fast, not {self.grade} and {self.fidelity}")
+        if self.seed < 0:
+            raise UserError(f"seed must be at least 0, not {self.seed}")
         if self.units not in ("each", "one"):
             raise UserError(f"units is each or one, not {self.units}")
 
@@ -164,6 +166,9 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     unit = draw_unit(SENSORS[sensor], rng)
     if scenes.units == "one":
         unit = device(scenes, sensor)
+    if SENSORS[sensor].kind == "field":  # no camera looks at it
+        plain = {"mirror": np.ones(2, np.float32), "window": np.zeros(2, np.float32), "zoom": np.float32(1)}
+        unit = unit._replace(**plain)
     gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
     if scenes.grade == "coarse":
         gesture = _draw_gesture(scenes, rng, gesture)
@@ -200,17 +205,18 @@ def trajectory(frames: int, gesture: Gesture) -> tuple[Array, Array]:
 
 
 def directions(recording: Recording) -> dict[str, str]:
-    """Labels of the motion as the picture shows it: `label.twist` (clockwise, counterclockwise, none) and
-    `label.slide` (right, down, left, up, none), the nearest of four."""
+    """Labels of the motion as the picture shows it: `label.motion` (hold, slide, twist), `label.twist` (clockwise,
+    counterclockwise, none) and `label.slide` (right, down, left, up, none), the nearest of four."""
     unit, gesture = recording.unit, recording.gesture
     turn = gesture.twist * float(unit.mirror[0] * unit.mirror[1])
-    twist = "none" if gesture.motion != "twist" else "clockwise" if turn > 0 else "counterclockwise"
+    moves = len(recording.depth) > 1  # a still shows none
+    twist = "none" if gesture.motion != "twist" or not moves else "clockwise" if turn > 0 else "counterclockwise"
     slide = "none"
-    if gesture.motion == "slide":
+    if gesture.motion == "slide" and moves:
         c, s = math.cos(float(unit.rotation)), math.sin(float(unit.rotation))
         x, y = np.array([[c, -s], [s, c]]) @ gesture.slide * np.asarray(unit.mirror)
         slide = ("right", "down", "left", "up")[round(math.atan2(y, x) / (math.pi / 2)) % 4]
-    return {"label.twist": twist, "label.slide": slide}
+    return {"label.motion": gesture.motion if moves else "hold", "label.twist": twist, "label.slide": slide}
 
 
 def photo_rng(scenes: Scenes, recording: Recording) -> np.random.Generator:

@@ -95,7 +95,10 @@ def shear_step(
     # In steps, not in totals: a small step is not lost in the rounding of a large traction.
     found = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
     total = jnp.where((limit > 0)[..., None], before + found.x, 0)  # without pressure exactly nothing
-    displacement = apply(total) * share
+    displacement = apply(total)
+    if not (isinstance(modulus_object, float | int) and np.isinf(modulus_object)):  # less the object's own part
+        deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
+        displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
     if times > 1:
         displacement = jax.image.resize(displacement, state.displacement.shape, "cubic")
     per_pressure = total * unit / times / jnp.where(coarse > 0, coarse, 1)[..., None]

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "src"))
 
 import jax
 
+from anytouch_jax.config import UserError
 from anytouch_jax.evaluate import machine, speed, speed_report
 from anytouch_jax.evaluate.variants import variants_of
 from anytouch_jax.evaluate.workloads import Workload, workloads
@@ -74,13 +75,18 @@ def main() -> None:
 
     works = [work for what in options.what for work in workloads(what, options.preset, options.batch)]
     for work in works:
-        found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, say=say)
+        try:
+            found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, say=say)
+        except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
+            found = [speed.Row(work.name, "none", work.samples, note=str(error).splitlines()[0])]
         rows += found
         print(speed_report.to_markdown(found), flush=True)
         save()
     for work in works:
         if work.trains and options.batches:
             mine = [row for row in rows if row.workload == work.name]
+            if all(row.note for row in mine):
+                continue
             swept += sweep(work, mine, tuple(options.batches), max(2, options.rounds // 3))
             save()
     print(save())

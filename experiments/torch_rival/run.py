@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from anytouch_jax import pages
 from anytouch_jax.evaluate import machine, plots, speed, speed_report, variants
 from anytouch_jax.evaluate.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
 from anytouch_jax.io import release
@@ -298,4 +299,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    pages.restart()  # as the command of the package does; PyTorch's process inherits them
     main()

@@ -22,6 +22,7 @@ from anytouch_jax.data import text as texts
 from anytouch_jax.data.loader import Loader
 from anytouch_jax.evaluate import figures
 from anytouch_jax.io import checkpoint, release
+from anytouch_jax.io.record import steps
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
@@ -53,6 +54,8 @@ def pretrain(
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     say = say if jax.process_index() == 0 else silent
+    if config.model.attention == "cudnn" and jax.default_backend() != "gpu":
+        raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
     net = build(config.model)
@@ -133,7 +136,7 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
     """The tokenizer of stage 2: the run's own, the one asked for, CLIP's, or one trained on the captions."""
     if config.model.text is None:
         return config, None
-    own, begun = run / "tokenizer.json", (run / "config.json").exists()
+    own, begun = run / "tokenizer.json", bool(steps(run / "checkpoints"))
     if own.exists() and begun:  # else it is left from a start that failed
         tokenizer = texts.load(own)
     elif config.data.tokenizer is not None:

@@ -62,6 +62,16 @@ def test_what_is_written_is_read(shown, manifest):
     assert pq.read_table(manifest)["label.mass"].to_pylist()[0] == pytest.approx(float(shown.mass[0, 0]))
 
 
+def test_what_is_unused_teaches_nobody_and_an_empty_choice_is_the_action(shown, manifest):
+    first = int(shown.steps[0])
+    path = changed(manifest, "part", **{
+        "split": lambda x: ["unused"] * first + x[first:], "label.choice": lambda x: [None] * len(x),
+    })  # fmt: skip
+    found = pouring_recordings.read(path, SIDE)
+    assert len(found.trials.steps) == COUNT - 1
+    np.testing.assert_array_equal(found.trials.choices, found.trials.actions)
+
+
 def test_recordings_teach_what_the_demonstrations_teach(shown, manifest, encoder):
     found = pouring_recordings.read(manifest, SIDE)
     direct = pouring_policy.learn_frozen(
@@ -128,7 +138,12 @@ def test_policies_are_compared_on_the_test_runs(manifest, encoder):
         ({"frame_index": lambda x: [i + (i > 4) for i in x]}, "frame 4 is followed by 6, a gap or a repeat"),
         ({"split": lambda x: ["train"] * len(x)}, "runs of split test are needed"),
         ({"sensor": lambda x: ["digit", *x[1:]]}, "one sensor a policy, not digit, gelsight_mini"),
-        ({"sequence": lambda x: [f"{i // 3}" for i in range(len(x))]}, "has 3 frames; 3 standing ones"),
+        (
+            {"sequence": lambda x: [f"{i // 3}" for i in range(len(x))], "split": lambda x: ["train"] * len(x)},
+            "has 3 frames; 3 standing ones",
+        ),
+        ({"split": lambda x: ["test", *x[1:]]}, "is in the splits test and train; a run is of one"),
+        ({"split": lambda x: ["unused"] * len(x)}, "no row is of split train, val, test"),
     ],
 )
 def test_mistakes_are_named(manifest, columns, sentence):
@@ -145,6 +160,8 @@ def test_files_that_do_not_belong_together(shown, encoder, tmp_path):
     (tmp_path / "one" / "encoder.safetensors").write_bytes((tmp_path / "two" / "encoder.safetensors").read_bytes())
     with pytest.raises(UserError, match="another encoder"):
         pouring_recordings.load_policy(tmp_path / "one")
-    (tmp_path / "two" / "policy.npz").write_bytes(b"no")
-    with pytest.raises(UserError, match="is no policy"):
-        pouring_recordings.load_policy(tmp_path / "two")
+    whole = (tmp_path / "two" / "policy.npz").read_bytes()
+    for damaged in (b"no", b"", whole[: len(whole) // 2]):
+        (tmp_path / "two" / "policy.npz").write_bytes(damaged)
+        with pytest.raises(UserError, match="is no policy"):
+            pouring_recordings.load_policy(tmp_path / "two")

@@ -100,3 +100,22 @@ def test_auto_maps_on_one_cpu_and_nowhere_else(monkeypatch):
         monkeypatch.setattr(jax, "device_count", lambda n=devices: n)
         attention(q, k, v, how="auto")
         assert len(calls) == wanted
+
+
+@pytest.mark.parametrize(
+    ("dtype", "length", "masked", "asked"),
+    [
+        (jnp.bfloat16, 262, False, "cudnn"),
+        (jnp.bfloat16, 257, False, "xla"),  # it takes no odd length
+        (jnp.bfloat16, 262, True, "xla"),  # nor a mask of keys
+        (jnp.float32, 262, False, "xla"),  # nor 32 bits
+    ],
+)
+def test_cudnn_does_what_it_can_and_xla_the_rest(monkeypatch, dtype, length, masked, asked):
+    told = []
+    monkeypatch.setattr(
+        jax.nn, "dot_product_attention", lambda q, *_, implementation, **__: told.append(implementation) or q
+    )
+    q = jnp.zeros((1, length, 2, 4), dtype)
+    attention(q, q, q, how="cudnn", mask=jnp.ones((1, length), bool) if masked else None)
+    assert told == [asked]

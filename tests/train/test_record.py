@@ -90,10 +90,22 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
+def begun(run):
+    """The run has a complete checkpoint."""
+    (run / "checkpoints" / "00000001").mkdir(parents=True)
+
+
+def test_a_start_that_failed_does_not_hold_the_folder(tmp_path):
+    open_run(tmp_path, toy_config(steps=30))
+    open_run(tmp_path, toy_config(steps=31))
+    assert from_json((tmp_path / "config.json").read_text()).run.steps == 31
+
+
 def test_the_config_is_written_once_and_read_back(tmp_path):
     config = toy_config(steps=30)
     open_run(tmp_path / "run", config)
     assert from_json((tmp_path / "run" / "config.json").read_text()) == config
+    begun(tmp_path / "run")
     open_run(tmp_path / "run", config)
     harmless = dataclasses.replace(
         config,
@@ -109,6 +121,7 @@ def test_the_config_is_written_once_and_read_back(tmp_path):
 def test_other_settings_are_all_named_with_both_values(tmp_path):
     config = toy_config(steps=30)
     open_run(tmp_path, config)
+    begun(tmp_path)
     other = dataclasses.replace(
         toy_config(steps=31, optim={"learning_rate": 0.1}), model=dataclasses.replace(config.model, image_size=56)
     )
@@ -127,6 +140,7 @@ def test_other_settings_are_all_named_with_both_values(tmp_path):
 
 def test_a_broken_config_is_named(tmp_path):
     (tmp_path / "config.json").write_text("{")
+    begun(tmp_path)
     with pytest.raises(UserError, match=r"config\.json cannot be read"):
         open_run(tmp_path, toy_config())
 

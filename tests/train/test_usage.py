@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from anytouch_jax.train import usage
 from anytouch_jax.train.usage import used_parameters
 
 X = np.ones(3, np.float32)
@@ -142,3 +145,22 @@ def test_a_nested_tree_keeps_its_form():
         lambda p, key: p["x"]["y"] * jax.random.normal(key), {"x": {"y": 1.0, "z": 2.0}}, jax.random.key(0)
     )
     assert found == {"x": {"y": True, "z": False}}
+
+
+def test_a_scan_is_read_in_the_words_of_either_jax():
+    """jax 0.11 has the lengths of a scan's operands in a tree; what is unused must be the same."""
+    jaxpr = jax.make_jaxpr(lambda x, used, unused: jax.lax.scan(lambda c, _: (c * used, unused), x, None, length=3)[0])(
+        1.0, 2.0, 3.0
+    )
+    (scan,) = (eqn for eqn in jaxpr.jaxpr.eqns if eqn.primitive.name == "scan")
+    outputs = [True] + [False] * (len(scan.outvars) - 1)
+    expected = usage._live_operands(scan, outputs)
+    assert True in expected and False in expected
+    if "num_consts" in scan.params:
+        consts, carry = scan.params["num_consts"], scan.params["num_carry"]
+        parts = [[0] * consts, [0] * carry, []]
+        rest = {name: value for name, value in scan.params.items() if name not in ("num_consts", "num_carry")}
+        later = SimpleNamespace(
+            primitive=scan.primitive, invars=scan.invars, params=rest | {"ft_in": SimpleNamespace(unpack=lambda: parts)}
+        )
+        assert usage._live_operands(later, outputs) == expected

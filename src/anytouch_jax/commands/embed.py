@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Embed
@@ -54,6 +55,9 @@ def _stream(encoder: Encoder, options: Embed) -> int:
     """Embed a camera or a video frame by frame: features to an .npz, or as JSON lines; then the latency budget."""
     from anytouch_jax.evaluate import features, stream
 
+    lines = str(options.out) == "-"
+    if not lines:
+        check_folder(options.out)  # before the camera: what is embedded must have a place
     source, live = stream.open_source(options.input)
     embedded = stream.stream(
         encoder,
@@ -66,7 +70,6 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         pooling=options.pooling,
         join=options.join,
     )
-    lines = str(options.out) == "-"
     result = stream.collect(embedded, _print_line if lines else None)
     if not len(result.numbers) and not result.interrupted:
         raise UserError(f"{options.input} has too few frames for a clip of {options.frames} at stride {options.stride}")

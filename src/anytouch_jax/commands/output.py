@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,17 @@ def write_new(manifest: Manifest, path: Path) -> Path:
     except OSError as error:
         raise UserError(f"{target} cannot be written: {error.strerror or error}") from None
     return target
+
+
+def check_folder(path: Path) -> None:
+    """Make the folder of a file that will be written after long work. Raises UserError where that cannot be."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writable = os.access(path.parent, os.W_OK)
+    except OSError as error:
+        raise UserError(f"{path.parent} cannot be made: {error.strerror or error}") from None
+    if not writable:
+        raise UserError(f"{path.parent} cannot be written to")
 
 
 def write_text(text: str, path: Path) -> Path:

@@ -127,6 +127,8 @@ def choose(
     if classes is not None:
         here &= classes >= 0
     rows = np.flatnonzero(here)
+    if count < 0:
+        raise UserError(f"{count} frames cannot be chosen; 0 or more")
     if len(rows) < count:
         known = ", ".join(sorted(set(text_column(manifest, "sensor"))))
         raise UserError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from .pouring import SENSOR, START, Controller, Trials
 from .pouring_policy import Head, Learning, Touch, blind_inputs, forward, imitate
 
 Array = npt.NDArray[Any]
+LEARNING = ("train", "val", "test")  # splits that are read; the others take no part
 POLICY, WEIGHTS = "policy.npz", "encoder.safetensors"
 
 
@@ -81,17 +83,25 @@ def read(path: Path, side: int) -> Recordings:
     sensors = np.unique(text_column(table, "sensor"))
     if len(sensors) > 1:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
-    sequences = text_column(table, "sequence")
-    runs = [_ordered(table, np.flatnonzero(sequences == name), name) for name in np.unique(sequences)]
+    split = text_column(table, "split")
+    sequences = np.where(np.isin(split, LEARNING), text_column(table, "sequence"), "")
+    for name in np.unique(sequences[sequences != ""]):
+        sides = np.unique(split[sequences == name])
+        if len(sides) > 1:
+            raise UserError(f"{path}: run {name} is in the splits {' and '.join(sides)}; a run is of one")
+    if not (sequences != "").any():
+        raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
+    runs = [_ordered(table, np.flatnonzero(sequences == name), name) for name in np.unique(sequences[sequences != ""])]
     steps = np.array([len(rows) for rows in runs])
     padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
     order = np.stack(padded, 1)  # (S, B) row numbers
     actions = _numbers(table, "label.action")
-    choices = _numbers(table, "label.choice") if "label.choice" in table.table.column_names else actions
+    choices = actions
+    if "label.choice" in table.table.column_names:
+        choices = np.where(table.present("label.choice"), _numbers(table, "label.choice"), actions)
     frames = np.stack([np.stack([_frame(table, row, side) for row in rows]) for rows in order])
     unknown = np.full(order.shape, np.nan)
     trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
-    split = text_column(table, "split")
     test = np.array([split[rows[0]] == "test" for rows in runs])
     if not test.any() or test.all():
         raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
@@ -112,7 +122,7 @@ def _ordered(table: Manifest, rows: Array, name: str) -> Array:
 
 
 def _numbers(table: Manifest, column: str) -> Array:
-    names = text_column(table, column)
+    names = np.where(table.present(column), text_column(table, column), ACTIONS[0])
     unknown = sorted(set(names) - set(ACTIONS))
     if unknown:
         raise UserError(f"{column} {str(unknown[0])!r} is no action; use {', '.join(ACTIONS)}")
@@ -185,12 +195,14 @@ def load_policy(folder: Path | str) -> Touch:
     folder = Path(folder)
     encoder = load_encoder(folder / WEIGHTS)
     try:
-        with np.load(folder / POLICY, allow_pickle=False) as file:
+        with np.load(io.BytesIO((folder / POLICY).read_bytes()), allow_pickle=False) as file:
             arrays, told = dict(file), json.loads(str(file["about"]))
-    except (OSError, ValueError, KeyError) as error:
+        stills, sensor, mark = bool(told["stills"]), str(told["sensor"]), told["encoder"]
+        count = sum(name.startswith("w/") for name in arrays)
+        layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
+        head = Head(arrays["mean"], arrays["scale"], layers)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
-    if told["encoder"] != encoder.mark:
+    if mark != encoder.mark:
         raise UserError(f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}; pour again")
-    count = sum(name.startswith("w/") for name in arrays)
-    layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
-    return Touch(encoder, Head(arrays["mean"], arrays["scale"], layers), stills=told["stills"], sensor=told["sensor"])
+    return Touch(encoder, head, stills=stills, sensor=sensor)

@@ -90,7 +90,10 @@ def read_task(options: Probe, say: Say) -> Task:
     kept = np.array([value not in (None, "") for value in label])
     if options.where is not None:
         name, least = options.where
-        number = np.array([np.nan if v in (None, "") else float(v) for v in _column(table, name)])
+        try:
+            number = np.array([np.nan if v in (None, "") else float(v) for v in _column(table, name)])
+        except ValueError:
+            raise UserError(f"--where {name}: that column holds words, not numbers") from None
         kept &= number > least
     if options.sensor is not None:
         kept &= np.array(_column(table, "sensor")) == options.sensor

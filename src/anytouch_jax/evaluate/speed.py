@@ -161,13 +161,15 @@ def measure(
                 raise UserError(f"{work.name}, {variant.name} cannot be compiled here: {error}") from error
             failed.append((variant, f"{type(error).__name__}: {str(error).splitlines()[0]}"))
     say(f"{work.name}: {rounds} rounds")
-    dtypes = sorted({"float32"} | {p.work.config.model.dtype for p in programs})
-    peaks = {dtype: machine.matmul(dtype, peak_size) for dtype in dtypes}
-    calls = step_calls(programs, state) if work.trains else embed_calls(programs, jax.device_put(whole["touch"]))
-    del state
-    repeats = [_LATENCY_CALLS if work.samples == 1 else 1] * len(programs) + [1] * len(peaks)
-    times = interleaved([*calls, *(run for run, _ in peaks.values())], rounds, repeats)
-    del calls
+    peaks = {kind: machine.matmul(kind[0], peak_size, kind[1]) for kind in {_FULL, *map(_kind, programs)}}
+    try:
+        times = _timed(programs, work, whole, state, peaks, rounds)
+    except RuntimeError:  # most often out of memory, at a first call: which of them can do it?
+        del state
+        gc.collect()
+        programs, broken = _those_that_run(programs, work, whole)
+        failed += broken
+        times = _timed(programs, work, whole, first_state(work.config), peaks, rounds)
     gc.collect()
     best = {d: peaks[d][1] / float(np.median(t)) for d, t in zip(peaks, times[len(programs) :], strict=True)}
     wrong: list[dict[str, float]] = [{} for _ in programs]
@@ -176,6 +178,46 @@ def measure(
         wrong = errors([program.variant for program in programs], work, whole)
     rows = [_row(p, times[i], times[0], best, wrong[i]) for i, p in enumerate(programs)]
     return rows + [_empty(work, variant, note) for variant, note in failed]
+
+
+_FULL = ("float32", "highest")
+
+
+def _kind(program: Program) -> tuple[str, str | None]:
+    """Type and precision of a program's products: what peak it is to be compared with."""
+    dtype = program.work.config.model.dtype
+    return dtype, (program.variant.precision or "highest") if dtype == "float32" else None
+
+
+def _timed(
+    programs: Sequence[Program], work: Workload, whole: Tree, state: Tree, peaks: Mapping[Any, Any], rounds: int
+) -> list[Any]:
+    """Seconds of every program, then of every peak."""
+    calls = step_calls(programs, state) if work.trains else embed_calls(programs, jax.device_put(whole["touch"]))
+    del state
+    repeats = [_LATENCY_CALLS if work.samples == 1 else 1] * len(programs) + [1] * len(peaks)
+    return interleaved([*calls, *(run for run, _ in peaks.values())], rounds, repeats)
+
+
+def _those_that_run(
+    programs: Sequence[Program], work: Workload, whole: Tree
+) -> tuple[list[Program], list[tuple[Variant, str]]]:
+    """The programs whose first call succeeds, and the others with the reason. Raises UserError for the baseline."""
+    good, failed = [], []
+    for program in programs:
+        try:
+            if work.trains:
+                step_calls([program], first_state(work.config))[0]()
+            else:
+                embed_calls([program], jax.device_put(whole["touch"]))[0]()
+            good.append(program)
+        except RuntimeError as error:
+            reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            if program is programs[0]:
+                raise UserError(f"{work.name}, {program.variant.name} cannot be run here: {reason}") from error
+            failed.append((program.variant, reason))
+        gc.collect()
+    return good, failed
 
 
 def step_calls(programs: Sequence[Program], state: Tree) -> list[Callable[[], object]]:
@@ -194,7 +236,7 @@ def embed_calls(programs: Sequence[Program], touch: Tree) -> list[Callable[[], o
     return [partial(lambda p: np.asarray(p.call({"touch": touch}, *p.batch[:2])), program) for program in programs]
 
 
-def _row(program: Program, times: Any, base: Any, peaks: Mapping[str, float], wrong: Mapping[str, float]) -> Row:
+def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wrong: Mapping[str, float]) -> Row:
     mine, theirs = np.median(times, axis=1), np.median(base, axis=1)
     seconds, ratios = float(np.median(mine)), mine / theirs
     operations = program.work.operations
@@ -208,8 +250,8 @@ def _row(program: Program, times: Any, base: Any, peaks: Mapping[str, float], wr
         ratio=float(np.median(ratios)),
         ratio_iqr=_iqr(ratios),
         operations=operations,
-        peak_share=rate / peaks[program.work.config.model.dtype],
-        float32_share=rate / peaks["float32"],
+        peak_share=rate / peaks[_kind(program)],
+        float32_share=rate / peaks[_FULL],
         p50=float(np.percentile(times, 50)),
         p99=float(np.percentile(times, 99)),
         calls=times.size,

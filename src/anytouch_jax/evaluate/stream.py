@@ -194,7 +194,8 @@ def _read(source: Source, live: bool, see: Sight, frames: int, stride: int, mail
             resized = time.perf_counter()
             if len(ring) == ring.maxlen:
                 decode = decoded - (grabbed if live else begin)
-                clip = Clip(number, np.stack(list(ring)[::stride]), decoded, decode, resized - decoded)
+                came = grabbed if live else begin  # a latency counts from here: decoding is part of it
+                clip = Clip(number, np.stack(list(ring)[::stride]), came, decode, resized - decoded)
                 wanted = mailbox.put(clip)
             number += 1
         mailbox.close()

@@ -7,6 +7,7 @@ only ever a name, looked up in the table `_BUILDERS` below, never imported, and 
 from __future__ import annotations
 
 import pickletools
+import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import IO, Any, Literal
@@ -104,7 +105,7 @@ def read_pickle(file: IO[bytes]) -> Any:
 
 def _whole(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"{value!r} where a size was expected")
+        raise ValueError(f"{type(value).__name__} where a size was expected")
     return value
 
 
@@ -309,7 +310,7 @@ class _Machine:
     def _reduce(self, _: Any) -> None:
         function, args = self._take(2)
         if not isinstance(function, Name) or function.name not in _BUILDERS or not isinstance(args, tuple):
-            raise ValueError(f"the pickle calls {function!r}")
+            raise ValueError(f"the pickle calls {reprlib.repr(function)}")
         self.stack.append(_BUILDERS[function.name](*args))
 
     _newobj = _reduce
@@ -330,4 +331,4 @@ class _Machine:
                     raise ValueError(f"a storage of kind {name}")
                 self.stack.append(Storage(key, kind, _whole(length)))
             case other:
-                raise ValueError(f"the pickle refers to {str(other)[:80]}")
+                raise ValueError(f"the pickle refers to {reprlib.repr(other)}")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from anytouch_jax.config import Config, ConfigError, UserError, from_json, to_json
+from anytouch_jax.io.record import steps
 
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
 HARMLESS = {
@@ -57,12 +58,13 @@ def write_atomic(path: Path, text: str) -> None:
 def open_run(run_dir: Path, config: Config) -> None:
     """Make a run folder with its config.json, or check that the one there was started with the same settings.
 
-    Settings in `HARMLESS` may differ. Raises UserError that names each other setting with both values.
+    A folder without a complete checkpoint was left by a start that failed, and is begun anew. Settings in `HARMLESS`
+    may differ. Raises UserError that names each other setting with both values.
     """
     path = run_dir / "config.json"
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
-        if not path.exists():
+        if not path.exists() or not steps(run_dir / "checkpoints"):
             write_atomic(path, to_json(config) + "\n")
             return
         text = path.read_text(encoding="utf-8")

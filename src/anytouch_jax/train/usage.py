@@ -68,7 +68,10 @@ def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
     if name == "stop_gradient":
         return [False] * len(eqn.invars)
     if name == "scan":
-        consts, carry = params["num_consts"], params["num_carry"]
+        if "num_consts" in params:
+            consts, carry = params["num_consts"], params["num_carry"]
+        else:  # jax 0.11
+            consts, carry = (len(part) for part in params["ft_in"].unpack()[:2])
         return _live_loop(params["jaxpr"].jaxpr, outputs, consts, carry)
     if name == "while":
         # The predicate is a bool: nothing flows through the condition.

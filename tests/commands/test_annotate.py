@@ -138,3 +138,16 @@ def test_mistakes_are_one_sentence(mistake, touches, monkeypatch):
     assert "set the environment variable OPENAI_API_KEY" in mistake("annotate", touches, "--yes")
     assert "is not an http or https address" in mistake("annotate", touches, "--url", "example", "--yes")
     assert "at least 1" in mistake("annotate", touches, "--url", "http://localhost:1", "--threads", 0, "--yes")
+
+
+def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, tmp_path):
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((32, 32, 3), np.uint8))
+    columns = {"path": ["0.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"],
+               "caption_id": ["octopi_3"]}  # fmt: skip
+    path = tmp_path / "m.csv"
+    manifests.write(manifests.from_columns(columns, path), path)
+    (tmp_path / "captions.csv").write_text("caption_id,text\noctopi_3,rough and hard\n")
+    said = anytouch("annotate", path, "--captions", tmp_path / "captions.csv", "--key", "caption_id")
+    assert said.status == 0, said.err
+    assert manifests.read(tmp_path / "m_captions.csv").column("text").to_pylist() == ["rough and hard"]
+    assert "1 of 1 rows have a caption" in said.out

@@ -77,3 +77,12 @@ def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, told):
 
 def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):
     assert "there is no manifest" in mistake("contact", tmp_path / "no.parquet")
+
+
+@pytest.mark.parametrize(("out", "words"), [("touch.txt", "ends in .csv or .parquet"), ("deep/x.csv", "is not inside")])
+def test_a_place_that_cannot_be_written_is_named_before_the_work(anytouch, pressed, tmp_path, monkeypatch, out, words):
+    from anytouch_jax.data import contact
+
+    monkeypatch.setattr(contact, "contact_scores", lambda *a, **k: pytest.fail("hours of work began"))
+    said = anytouch("contact", pressed, "--out", tmp_path / out)
+    assert said.status == 1 and words in said.err and len(said.err.strip().splitlines()) == 1

@@ -561,3 +561,36 @@ def test_the_sheet_shows_pictures_by_relative_path_and_escapes_words(make, tmp_p
     assert other.read_text() == text.replace("sheet_images", "b_images")
     with pytest.raises(UserError, match="no captions"):
         sample_sheet(done.manifest, (), tmp_path / "none.html")
+
+
+def test_many_pictures_that_cannot_be_read_bar_no_question(make, tmp_path):
+    loose = make(_rows(40))
+    for job in range(30):
+        loose.file(3 * job + 1, "image_path").write_bytes(b"")
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers")
+    assert len(server.asked) == len(done.captions) == 10 and len(done.failures) == 30
+    assert len((tmp_path / "answers" / "failures.jsonl").read_text().splitlines()) == 30
+
+
+def test_what_failed_the_last_time_is_asked_last(make, tmp_path):
+    loose, folder = make(_rows(40)), tmp_path / "answers"
+    refuse = (400, {}, {"error": "no"})
+    with serve(lambda *_: refuse) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)
+    assert len((folder / "failures.jsonl").read_text().splitlines()) == 25
+    good = lambda number, _: (200, {}, chat(GOOD)) if number < 15 else refuse  # noqa: E731
+    with serve(good) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)
+    with serve() as server:
+        assert len(_run(loose, server, folder).captions) == 40
+    assert len(server.asked) == 25
+
+
+def test_a_key_that_an_error_cuts_in_two_is_not_shown():
+    with (
+        serve(lambda *_: (400, {}, {"error": "x" * 190 + f" {KEY}"})) as server,
+        pytest.raises(AnswerError) as error,
+    ):
+        _ask(server, tries=1)
+    assert KEY[:8] not in str(error.value)

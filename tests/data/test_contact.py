@@ -177,3 +177,18 @@ def test_thresholds_by_sensor_and_an_older_score(world):
         _marked(manifest, [0.0, 0.0], drop=True)
     with pytest.raises(UserError, match="workers"):
         c.contact_scores(manifest, workers=0)
+
+
+def test_one_odd_file_ends_nothing(tmp_path):
+    (tmp_path / "data").mkdir()
+    cv2.imwrite(str(tmp_path / "away.png"), gel())
+    for number in range(12):
+        cv2.imwrite(str(tmp_path / "data" / f"{number}.png"), gel(press=60.0 * (number > 8), noise=number + 1))
+    (tmp_path / "data" / "3.png").unlink()
+    (tmp_path / "data" / "3.png").symlink_to(tmp_path / "away.png")
+    cv2.imwrite(str(tmp_path / "data" / "5.png"), np.zeros((3, 180, 3), np.uint8))
+    columns = {"path": [f"{n}.png" for n in range(12)], "sensor": ["digit"] * 12, "sequence": ["s"] * 12,
+               "frame_index": list(range(12)), "split": ["train"] * 12}  # fmt: skip
+    manifest = manifests.from_columns(columns, tmp_path / "data" / "m.csv")
+    scores = c.contact_scores(manifest, workers=1)
+    assert np.flatnonzero(np.isnan(scores.score)).tolist() == [3, 5]

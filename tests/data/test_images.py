@@ -198,3 +198,23 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "real_touch"
 def test_a_real_video(path):
     frame = next(images.frames_from_video(path))
     assert frame.shape == (240, 320, 3) and frame.std() > 5
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.int32, np.int16, np.int8])
+def test_a_tiff_of_an_unusual_type_is_a_picture_or_a_sentence(tmp_path, kind):
+    path = tmp_path / "odd.tiff"
+    values = np.zeros((6, 8, 3), kind)
+    values[..., 0] = 1  # blue, as OpenCV writes it
+    path.write_bytes(cv2.imencode(".tiff", values)[1].tobytes())
+    if kind is np.float64:
+        assert images.decode(path)[0, 0].tolist() == [0, 0, 255]
+    else:
+        with pytest.raises(images.ImageError, match=r"odd\.tiff has pixels of type"):
+            images.decode(path)
+
+
+def test_a_strip_is_no_picture(tmp_path):
+    path = tmp_path / "strip.png"
+    path.write_bytes(cv2.imencode(".png", np.zeros((1, 2000, 3), np.uint8))[1].tobytes())
+    with pytest.raises(images.ImageError, match="that is a strip, not a picture"):
+        images.decode(path)

@@ -230,3 +230,26 @@ def test_clips_of_many_rows():
     found = windows(sequence, frame, np.ones(n, np.int64), 4)
     assert found.shape == (n // 100 * 97, 4)
     assert (np.diff(found, axis=1) == 1).all()
+
+
+def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        rows = "".join(f"{i}.png,digit,s,{i},train,t{i},g\n" for i in range(3))
+        _file(tmp_path / name, f"{HEAD},touch,grasp_group\n{rows}")
+    both = m.read([tmp_path / "a/manifest.csv", tmp_path / "b/manifest.csv"])
+    m.write(both, tmp_path / "both.parquet")
+    one = m.read(tmp_path / "both.parquet")
+    assert len(one.clips(2)) == len(both.clips(2)) == 4
+    assert len(np.unique(one.codes("touch"))) == 6 and len(np.unique(one.codes("grasp_group"))) == 2
+
+
+def test_columns_of_any_kind_are_carried_along(tmp_path):
+    columns = {"path": ["a.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
+    one, two = (m.from_columns(columns | {"box": [[1, k]], "bytes": [b"\xff"]}, tmp_path / "m.csv") for k in (2, 3))
+    assert one.content_hash != two.content_hash
+    m.write(one, tmp_path / "m.parquet")
+    assert m.read(tmp_path / "m.parquet").column("box").to_pylist() == [[1, 2]]
+    with pytest.raises(m.ManifestError, match="cannot be written"):
+        m.write(one, tmp_path / "m.csv")
+    assert not (tmp_path / "m.csv").exists()

@@ -401,3 +401,15 @@ def test_a_bounded_map_raises_the_first_error_and_ends_its_threads():
 
 def test_errors_are_the_users():
     assert issubclass(PackError, UserError)
+
+
+def test_other_pictures_under_the_same_table_are_another_pack(make, tmp_path):
+    loose = make(_rows())
+    target = pack(loose, tmp_path / "out")
+    picture = loose.file(0)
+    picture.write_bytes(picture.read_bytes() + b"more")
+    with pytest.raises(PackError, match="are others than when"):
+        pack(loose, tmp_path / "out")
+    for row in range(len(loose)):
+        loose.file(row).unlink(missing_ok=True)  # packed and done with
+    assert pack(loose, tmp_path / "out") == target

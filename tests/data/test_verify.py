@@ -573,3 +573,25 @@ def test_a_parquet_with_a_missing_or_mistyped_column_is_named(tmp_path, change, 
     with pytest.raises(manifests.ManifestError, match=words) as error:
         verify(manifests.read(tmp_path / "m.parquet"))
     assert "m.parquet" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_backgrounds_that_changed_places_too_are_no_witness(make, tmp_path):
+    """TVL: the frames without contact lie in the same two folders as the others."""
+    loose = _pairs(tmp_path, make, swap=lambda i: True, witness=False)
+    split = ["background" if i % 4 == 0 else "train" for i in range(24)]
+    loose = replace_column(loose, "split", split)
+    loose = replace_column(loose, "background_path", ["touch0.png"] * 24)
+    report = verify(loose)
+    (finding,) = (f for f in report.findings if f.kind == "swapped")
+    assert finding.level == "warning" and "suspected" in finding.sentence
+    fixed = repair(loose, report, swap=["tvl"])
+    assert fixed.manifest.column("path").to_pylist()[:2] == ["see0.png", "see1.png"]
+    assert fixed.manifest.column("background_path").null_count == 24
+
+
+def test_backgrounds_go_with_the_dataset_that_is_exchanged(make, tmp_path):
+    loose = _pairs(tmp_path, make, swap=lambda i: True, witness=True)
+    split = ["background" if i % 4 == 0 else "train" for i in range(24)] + ["background"]
+    loose = replace_column(loose, "split", split)
+    fixed = repair(loose, verify(loose))
+    assert fixed.manifest.column("path").to_pylist()[:24] == [f"see{i}.png" for i in range(24)]

@@ -201,3 +201,15 @@ def test_taxim_presses_become_pictures(tmp_path, read):
     (calib / "gelsight/dataPack.npz").write_bytes(b"broken")
     with pytest.raises(UserError, match=r"dataPack.npz is not a calibration pack"):
         read("taxim_presses", root, lists=calib)
+
+
+def test_a_folder_that_leads_elsewhere_is_refused(tmp_path):
+    away = tmp_path / "big" / "real" / "apple" / "dataset_0" / "frames"
+    away.mkdir(parents=True)
+    for number in range(4):
+        (away / f"frame_{number:07d}.jpg").write_bytes(b"x")
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / "real").symlink_to(tmp_path / "big" / "real")
+    with pytest.raises(UserError, match="leads out of"):
+        index("ycb_slide", tmp_path / "root")
+    assert not list((tmp_path / "root").glob("*.parquet"))

@@ -27,7 +27,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import machine
 from anytouch_jax.evaluate.features import Encoder
 from anytouch_jax.pretrain import pretrain
-from anytouch_jax.sim.dataset import simulate
+from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
 from anytouch_jax.train.record import write_atomic
 
@@ -140,7 +140,7 @@ class Work:
 
 
 def _of(one: Scenes, size: Size) -> str:
-    return repr((one, size.frames, size.objects, size.pixels))
+    return repr((one, size.frames, size.objects, size.pixels, VERSION))
 
 
 @cache

@@ -81,7 +81,8 @@ def test_objectfolder_real_in_both_layouts(tmp_path, read, layout):
     assert numbers == list(range(11))  # 10.png comes after 9.png, not after 1.png
     row = table.rows[layout.format(1, 1) + "/3.png"]
     assert (row["object"], row["label.material"], row["label.object"]) == ("1", "Ceramic", "Soup_Spoon")
-    assert table.reasons["file outside a folder 'gelsight'"] == 1  # the camera's picture
+    seen = [row["image_path"] for row in table.rows.values() if row.get("image_path")]
+    assert seen == [layout.format(1, 0).replace("gelsight", "camera") + "/0.png"]
     by_object = {row["object"]: row["split"] for row in table.rows.values()}
     assert all(row["split"] == by_object[row["object"]] for row in table.rows.values())
 
@@ -158,3 +159,14 @@ EMPTY = ("visgel", "cloth", "objectfolder_real", "ycb_slide", "octopi", "tacquad
 def test_an_empty_folder_is_told(tmp_path, read, name):
     with pytest.raises(UserError, match=r"expected .*is ROOT the folder"):
         read(name)
+
+
+def test_objectfolder_real_camera_views_lie_beside_the_touch(tmp_path, read):
+    frames = [f"tactile/3/0/gelsight/{n}.png" for n in range(4)]
+    fill(tmp_path, [*frames, *(f"tactile/3/0/cam_{view}/{n}.png" for view in "ab" for n in range(3))])
+    fill(tmp_path, ["tactile/3/notes/0.png"])
+    table = read("objectfolder_real", val=0, test=0)
+    first, last = table.rows[frames[0]], table.rows[frames[3]]
+    assert (first["image_path"], first["image2_path"]) == ("tactile/3/0/cam_a/0.png", "tactile/3/0/cam_b/0.png")
+    assert last["image_path"] is None and last["image2_path"] is None
+    assert any("not beside one" in reason for reason in table.report.skipped)

@@ -2,14 +2,16 @@
 
 Seen in others' code: `<object>/tactile_data/<trial>/0/gelsight/<n>.png` (T3, Sparsh), the same under `tactile/`
 (AnyTouch); `objectfolder_real_metadata.csv` with Index,Name,Material (T3); the authors' `contact_text_obj.csv`: touch
-frame, photograph, caption number, both paths below `tactile/`. Not seen: the folders of the two camera views, so
-photographs come from that list alone. ObjectFolder is CC BY 4.0 (its repository); the same is assumed here.
+frame, photograph, caption number, both paths below `tactile/`. Not seen: the names of the folders of the two camera
+views. Assumed: they lie beside `gelsight` and number their pictures alike; the first two by name are `image_path` and
+`image2_path`, unless the list names the photograph. ObjectFolder is CC BY 4.0 (its repository); assumed here too.
 
 Any folder called `gelsight` is one recording. The object (the first number in its path) is the group of the split.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 
 from anytouch_jax.data.readers.common import (
@@ -29,6 +31,7 @@ from anytouch_jax.data.readers.common import (
     walk,
 )
 
+FRAME = r"(\d+)\.(?:png|jpe?g)"
 LISTS = ("contact_text_obj.csv", "contact_obj.csv")
 
 
@@ -41,35 +44,53 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     listed = contact_list(root, options, LISTS, "tactile")
     on_disk: set[str] = set()
     recordings: list[tuple[str, list[str]]] = []
+    views: dict[str, list[tuple[str, list[str]]]] = defaultdict(list)
     for inside, _, files in walk(base, notes):
         on_disk.update(f"{inside}/{name}" for name in files if listed is not None)
         if Path(inside).name == "gelsight":
             recordings.append((inside, files))
         elif files and inside:
-            notes.skip("file outside a folder 'gelsight'", f"{inside}/{files[0]}", len(files))
+            views[str(Path(inside).parent)].append((inside, files))
     if not recordings:
         raise DatasetError(f"expected tactile/<object>/<trial>/gelsight/<n>.png under {root}; is ROOT the folder "
                            "that holds 'tactile'?")  # fmt: skip
-    rows = Rows("object", "image_path", "caption_id", "label.contact", "label.material", "label.object")
+    for parent, others in views.items():
+        if not any(str(Path(inside).parent) == parent for inside, _ in recordings):
+            for inside, files in others:
+                notes.skip("file outside a folder 'gelsight' and not beside one", f"{inside}/{files[0]}", len(files))
+    rows = Rows("object", "image_path", "image2_path", "caption_id", "label.contact", "label.material", "label.object")
     found = 0
     for inside, files in recordings:
-        frames = numbered(files, r"(\d+)\.(?:png|jpe?g)", notes, inside)
+        frames = numbered(files, FRAME, notes, inside)
         obj = next((part for part in inside.split("/") if part.isdecimal()), inside.split("/")[0])
         about = objects.get(obj, {})
         cells = [(listed or {}).get(f"{inside}/{name}", [""]) for _, name in frames]
         photos = [row[1].rpartition("tactile/")[2] if len(row) > 2 else "" for row in cells]
         notes.skip("listed photograph that is not on disk (kept without)", inside,
                    sum(bool(photo) and photo not in on_disk for photo in photos))  # fmt: skip
+        first, second = _views(views[str(Path(inside).parent)], [number for number, _ in frames], place)
+        listed_photos = [f"{place}{photo}" if photo in on_disk else None for photo in photos]
         found += add_recording(
             rows, frames, f"{place}{inside}",
             split=hash_split("objectfolder_real", obj, options), listed=listed, key=inside,
             sensor="gelslim", sequence=inside.removesuffix("/gelsight"), object=obj,
-            image_path=[f"{place}{photo}" if photo in on_disk else None for photo in photos],
+            image_path=[a or b for a, b in zip(listed_photos, first, strict=True)],
+            image2_path=second,
             caption_id=[f"obj_{row[2]}" if len(row) > 2 else None for row in cells],
             **{"label.material": about.get("Material"), "label.object": about.get("Name")},
         )  # fmt: skip
     miss_listed(notes, listed, found)
     return rows.columns()
+
+
+def _views(beside: list[tuple[str, list[str]]], numbers: list[int], place: str) -> list[list[str | None]]:
+    """The pictures of the first two camera views (by name) that have the numbers of the touch frames, None without."""
+    found: list[list[str | None]] = []
+    for folder, files in sorted(beside):
+        pictures = {number: f"{place}{folder}/{name}" for number, name in numbered(files, FRAME, Notes(), folder)}
+        found.append([pictures.get(number) for number in numbers])
+    with_any = [view for view in found if any(view)][:2]
+    return with_any + [[None] * len(numbers)] * (2 - len(with_any))
 
 
 READER = Reader(

@@ -23,7 +23,7 @@ GOLDEN     ?= ../shared/golden
 WORKERS    ?= 2
 
 DEMO       ?= runs/demo
-PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets pouring
+PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets pouring translation
 
 train-stage1: RUN ?= runs/stage1
 train-stage2 probe export-onnx: RUN ?= runs/stage2

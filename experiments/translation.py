@@ -313,6 +313,9 @@ lines = [
     + ".",
     "",
 ]
+lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]
+lines += [f"![{path.stem}]({NAME}/{path.name})" for path in sorted(RUN_FILES.glob("*.png"))]
+lines.append("")
 write_atomic(OUT / f"{NAME}.md", "\n".join(lines))
 print("\n".join(lines))
 for picture in sorted(RUN_FILES.glob("*.png")):

@@ -13,7 +13,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data.manifest import Manifest, ManifestError
+from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.table import SCHEMA
 
 
@@ -103,20 +103,3 @@ def _captions(table: pa.Table, key: str, text: str, path: Path) -> dict[str, str
         if found.setdefault(name, caption) != caption:
             raise UserError(f"{path}, row {row}: {key} {name!r} has another caption in an earlier row")
     return found
-
-
-def own_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
-    """The column `name` with values that two of the manifest's files share made different, for writing as one file.
-
-    The keys of a manifest are its own (see manifest.py); in one file equal keys would be one.
-    """
-    if name not in manifest.table.column_names:
-        raise ManifestError(f"there is no column {name!r}")
-    column = manifest.table[name]
-    codes = manifest.codes(name)
-    known = codes >= 0
-    pairs = np.unique(np.stack([codes[known], manifest.source[known].astype(np.int64)], 1), axis=0)
-    if len(pairs) == len(np.unique(pairs[:, 0])):
-        return column
-    prefix = pa.array([f"{number}/" for number in range(len(manifest.files))]).take(pa.array(manifest.source))
-    return pa.chunked_array([pc.binary_join_element_wise(prefix, column.combine_chunks(), "")])

@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model
+from anytouch_jax.data.paths import resolve
 from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, load_table, typed
 from anytouch_jax.data.windows import windows
 
@@ -264,10 +265,25 @@ def _placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
     return target, _rebase(manifest, target.parent)
 
 
+def own_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
+    """The column `name` with values that two of the manifest's files share made different, for writing as one file.
+
+    The keys of a manifest are its own (see manifest.py); in one file equal keys would be one.
+    """
+    if name not in manifest.table.column_names:
+        raise ManifestError(f"there is no column {name!r}")
+    column = manifest.table[name]
+    codes = manifest.codes(name)
+    known = codes >= 0
+    pairs = np.unique(np.stack([codes[known], manifest.source[known].astype(np.int64)], 1), axis=0)
+    if len(pairs) == len(np.unique(pairs[:, 0])):
+        return column
+    prefix = pa.array([f"{number}/" for number in range(len(manifest.files))]).take(pa.array(manifest.source))
+    return pa.chunked_array([pc.binary_join_element_wise(prefix, column.combine_chunks(), "")])
+
+
 def _own_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
     """`table` with keys of different files made different: in one file equal keys would be one."""
-    from anytouch_jax.data.edit import own_keys
-
     for name in KEYS if len(manifest.files) > 1 else ():
         if name in table.column_names:
             table = table.set_column(table.column_names.index(name), name, own_keys(manifest, name))
@@ -292,32 +308,6 @@ def _relative(manifest: Manifest, row: int, cell: str, folder: Path) -> str:
             f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to be written"
         )
     return Path(file).relative_to(folder).as_posix()
-
-
-def resolve(root: str | Path, relative: str | None) -> Path:
-    """The file `relative` inside the folder `root` (absolute, resolved).
-
-    Raises ManifestError when the path is empty, absolute, or leaves the folder by "..", or by a symbolic link.
-    """
-    if not relative:
-        raise ManifestError("the path is empty")
-    if "\0" in relative:
-        raise ManifestError(f"the path {relative!r} is not a file name")
-    root = str(root)
-    head, _, name = relative.rpartition("/")
-    # A folder is looked at once and each file for itself: that is most of the time that a path takes.
-    path = f"{_real_folder(root, head)}/{name}"
-    if name in ("", ".", "..") or os.path.islink(path):
-        path = os.path.realpath(path)
-    if relative[0] == "/" or not path.startswith(root if root[-1] == "/" else f"{root}/"):
-        raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}")
-    return Path(path)
-
-
-@lru_cache(4096)
-def _real_folder(root: str, head: str) -> str:
-    folder = os.path.realpath(os.path.join(root, head))
-    return "" if folder == "/" else folder
 
 
 def sensor_rows(

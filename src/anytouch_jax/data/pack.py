@@ -25,10 +25,9 @@ import pyarrow.parquet
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.bounded import bounded_map
-from anytouch_jax.data.edit import own_keys
 from anytouch_jax.data.files import Files, distinct_files, write_whole
 from anytouch_jax.data.licences import licences
-from anytouch_jax.data.manifest import KEYS, Manifest
+from anytouch_jax.data.manifest import KEYS, Manifest, own_keys
 from anytouch_jax.data.packed import INDEX, forget, read_file
 from anytouch_jax.data.table import PATHS
 

@@ -53,8 +53,8 @@ class Clip(NamedTuple):
 class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
-    `at`: seconds from the start of the stream to the frame; `seconds`: of PARTS; `age`: from having the frame to having
-    its features, all waiting included.
+    `at`: seconds from the start of the stream to the frame; `seconds`: of PARTS; `age`: from the grabbed frame to
+    having its features, decoding and all waiting included.
     """
 
     number: int

@@ -122,7 +122,7 @@ notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/
 	@mkdir -p runs/notebooks
 	@for page in $(PAGES); do echo $$page; \
 	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$page.py && \
-	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=experiments $(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
+	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=$(CURDIR)/experiments $(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
 	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
 
 clean: ## remove .venv, builds and caches; runs stay

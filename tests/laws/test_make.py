@@ -114,6 +114,11 @@ def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
     assert "--stage 1" in steps[1] and "--stage 2" in steps[2] and "--init d/stage1" in steps[2]
 
 
+def test_notebooks_run_in_their_own_folder_and_find_their_helpers() -> None:
+    done = make("-n", "notebooks", "PAGES=q2_space")
+    assert done.returncode == 0 and f"PYTHONPATH={ROOT}/experiments " in done.stdout
+
+
 def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:
     for name in ("Makefile", "requirements.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path / name)

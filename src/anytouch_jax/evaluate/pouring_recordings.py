@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,15 +84,7 @@ def read(path: Path, side: int) -> Recordings:
     sensors = np.unique(text_column(table, "sensor"))
     if len(sensors) > 1:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
-    split = text_column(table, "split")
-    sequences = np.where(np.isin(split, LEARNING), text_column(table, "sequence"), "")
-    for name in np.unique(sequences[sequences != ""]):
-        sides = np.unique(split[sequences == name])
-        if len(sides) > 1:
-            raise UserError(f"{path}: run {name} is in the splits {' and '.join(sides)}; a run is of one")
-    if not (sequences != "").any():
-        raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
-    runs = [_ordered(table, np.flatnonzero(sequences == name), name) for name in np.unique(sequences[sequences != ""])]
+    runs, split = _runs(table, path), text_column(table, "split")
     steps = np.array([len(rows) for rows in runs])
     padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
     order = np.stack(padded, 1)  # (S, B) row numbers
@@ -99,13 +92,28 @@ def read(path: Path, side: int) -> Recordings:
     choices = actions
     if "label.choice" in table.table.column_names:
         choices = np.where(table.present("label.choice"), _numbers(table, "label.choice"), actions)
-    frames = np.stack([np.stack([_frame(table, row, side) for row in rows]) for rows in order])
+    frame = lru_cache(len(runs))(partial(_frame, table, side))  # a run that has ended repeats its last one
+    frames = np.stack([np.stack([frame(int(row)) for row in rows]) for rows in order])
     unknown = np.full(order.shape, np.nan)
     trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
     test = np.array([split[rows[0]] == "test" for rows in runs])
     if not test.any() or test.all():
         raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
     return Recordings(trials, test, str(sensors[0]))
+
+
+def _runs(table: Manifest, path: Path) -> list[Array]:
+    """The rows of each run in time. Raises UserError for a run on both sides of a split, or where there is none."""
+    split = text_column(table, "split")
+    sequences = np.where(np.isin(split, LEARNING), text_column(table, "sequence"), "")
+    names = np.unique(sequences[sequences != ""])
+    if not names.size:
+        raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
+    for name in names:
+        sides = np.unique(split[sequences == name])
+        if len(sides) > 1:
+            raise UserError(f"{path}: run {name} is in the splits {' and '.join(sides)}; a run is of one")
+    return [_ordered(table, np.flatnonzero(sequences == name), name) for name in names]
 
 
 def _ordered(table: Manifest, rows: Array, name: str) -> Array:
@@ -129,8 +137,8 @@ def _numbers(table: Manifest, column: str) -> Array:
     return np.array([ACTIONS.index(name) for name in names], np.int32)
 
 
-def _frame(table: Manifest, row: int, side: int) -> Array:
-    return touch_evaluation([decode(table.file(int(row)))], side)[0]
+def _frame(table: Manifest, side: int, row: int) -> Array:
+    return touch_evaluation([decode(table.file(row))], side)[0]
 
 
 class Agreement(NamedTuple):

@@ -231,7 +231,7 @@ def write(manifest: Manifest, path: str | Path) -> None:
     would lie outside the new folder and for a column that the format cannot hold.
     """
     target, table = _placed(manifest, path)
-    table = _own_keys(manifest, table)
+    table = with_own_keys(manifest, table)
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
@@ -282,7 +282,7 @@ def own_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
     return pa.chunked_array([pc.binary_join_element_wise(prefix, column.combine_chunks(), "")])
 
 
-def _own_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
+def with_own_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
     """`table` with keys of different files made different: in one file equal keys would be one."""
     for name in KEYS if len(manifest.files) > 1 else ():
         if name in table.column_names:

@@ -27,7 +27,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.files import Files, distinct_files, write_whole
 from anytouch_jax.data.licences import licences
-from anytouch_jax.data.manifest import KEYS, Manifest, own_keys
+from anytouch_jax.data.manifest import Manifest, with_own_keys
 from anytouch_jax.data.packed import INDEX, forget, read_file
 from anytouch_jax.data.table import PATHS
 
@@ -309,8 +309,7 @@ def _repoint(
     for name, code in files.code.items():
         place = table.column_names.index(name)
         table = table.set_column(place, name, cell.take(pa.array(code, mask=code < 0)))
-    for name in set(KEYS) & set(table.column_names) if len(manifest.files) > 1 else ():
-        table = table.set_column(table.column_names.index(name), name, own_keys(manifest, name))
+    table = with_own_keys(manifest, table)
     return Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
 
 

@@ -82,8 +82,9 @@ def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
     return distance, bessel0 @ (weights * normal), bessel0 @ (weights * (along + across) / 2), twofold
 
 
-def _is_deep(thickness: Any) -> bool:
-    return isinstance(thickness, float | int) and bool(np.isinf(thickness))
+def is_infinite(value: Any) -> bool:
+    """Whether a thickness or a modulus is known, before anything is traced, to be infinite."""
+    return isinstance(value, float | int) and bool(np.isinf(value))
 
 
 def _looked_up(far: Array, distance: Host, table: Host, limit: float) -> Array:
@@ -94,7 +95,7 @@ def _looked_up(far: Array, distance: Host, table: Host, limit: float) -> Array:
 def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
     """Spectrum of the normal coefficients; `share` (E* over the gel's own modulus) of the motion is the layer's."""
     deep = jnp.asarray(_normal_host(plan), dtype)
-    if _is_deep(thickness):
+    if is_infinite(thickness):
         return deep
     scale = jnp.asarray(pitch / thickness, dtype)
     distance, table, _, _ = layer_tables(poisson)
@@ -105,7 +106,7 @@ def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, shar
 def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
     """(3, KH, KW) spectra of the tangential coefficients xx, xy, yy; `share` as in `normal_spectrum`."""
     deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
-    if _is_deep(thickness):
+    if is_infinite(thickness):
         return deep
     scale = jnp.asarray(pitch / thickness, dtype)
     distance, _, mean, twofold = layer_tables(poisson)

@@ -16,7 +16,7 @@ from jax import Array
 
 from ..config import UserError
 from .convolve import Plan
-from .elastic import normal_spectrum
+from .elastic import is_infinite, normal_spectrum
 from .solver import OWN, Compliance, Solution, complementarity, conjugate_gradients, descent, scaled
 
 Fidelity = Literal["exact", "fast"]
@@ -132,14 +132,10 @@ def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) ->
 
 def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
     """The object's part of the displacement by a pressure, in the units of `cut`: a half-space whatever the gel is."""
-    if _is_rigid(modulus_object):
+    if is_infinite(modulus_object):
         return 0.0
     deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
     return (1 - share) * plan.inverse(plan.even(plan.forward(pressure), deep))
-
-
-def _is_rigid(modulus_object: Any) -> bool:
-    return isinstance(modulus_object, float | int) and bool(np.isinf(modulus_object))
 
 
 def _exact(

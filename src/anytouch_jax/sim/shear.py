@@ -15,7 +15,7 @@ from jax import Array
 
 from ..config import UserError
 from .convolve import Plan
-from .elastic import tangential_spectra
+from .elastic import is_infinite, tangential_spectra
 from .mechanics import KPA_MM2, Contact, Fidelity, Gel, centroid, grids, positions
 from .solver import Compliance, descent
 
@@ -96,7 +96,7 @@ def shear_step(
     found = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
     total = jnp.where((limit > 0)[..., None], before + found.x, 0)  # without pressure exactly nothing
     displacement = apply(total)
-    if not (isinstance(modulus_object, float | int) and np.isinf(modulus_object)):  # less the object's own part
+    if not is_infinite(modulus_object):  # less the object's own part
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
         displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
     if times > 1:

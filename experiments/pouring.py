@@ -20,7 +20,8 @@
 # `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3" .venv/bin/python experiments/pouring.py`, or
 # `make pouring RUNS=...`. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without
 # a path an untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only),
-# `anytouch`. A row without a run is left out, aloud. What is finished is not done again. QUICK=1 is a trial of minutes;
+# `anytouch`. `name=a,b,c` gives each seed an encoder of its own. A row without a run is left out, aloud. What is
+# finished is not done again. QUICK=1 is a trial of minutes;
 # TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS, TUNE (steps of fine-tuning), MODES and OUT in the environment
 # change the size and the place.
 
@@ -30,6 +31,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,7 @@ import numpy as np
 from study import page
 
 from anytouch_jax.config import preset
-from anytouch_jax.evaluate import plots, pouring, pouring_policy, pouring_table
+from anytouch_jax.evaluate import plots, pouring, pouring_bounds, pouring_policy, pouring_table
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
 from anytouch_jax.sim.pouring import VERSION, Task
@@ -56,9 +58,9 @@ def setting(name: str, full: int, quick: int) -> int:
 
 words = os.environ.get("RUNS", "").split()
 for word in words:
-    if "=" not in word or not Path(word.split("=", 1)[1]).exists():
-        raise SystemExit(f"RUNS: {word!r} is not name=path of a run that is there")
-RUNS = dict(word.split("=", 1) for word in words)
+    if "=" not in word or not all(Path(path).exists() for path in word.split("=", 1)[1].split(",")):
+        raise SystemExit(f"RUNS: {word!r} is not name=path, or name=path,path,path, of runs that are there")
+RUNS = {name: paths.split(",") for name, paths in (word.split("=", 1) for word in words)}
 SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
 MODES = (os.environ.get("MODES") or ("frozen" if QUICK else "frozen,fine-tuned")).split(",")
 TRIALS, DEMOS, TUNE = setting("TRIALS", 10, 10), setting("DEMOS", 40, 12), setting("TUNE", 150, 20)
@@ -78,31 +80,43 @@ if unknown:
 
 
 # %%
+def path_of(name: str, seed: int) -> str | None:
+    """The run of a row: one for all seeds, or one each."""
+    paths = RUNS.get(name) or (RUNS.get("anytouch") if name == "static" else None)
+    return paths[SEEDS.index(seed) % len(paths)] if paths else None
+
+
 @cache
 def encoder_of(name: str, seed: int) -> Encoder | None:
-    if name in RUNS:
-        return image_tower_encoder(RUNS[name]) if name == "none" else load_encoder(RUNS[name])
-    if name == "static" and "anytouch" in RUNS:
-        return load_encoder(RUNS["anytouch"])
+    path = path_of(name, seed)
+    if path is not None:
+        return image_tower_encoder(path) if name == "none" else load_encoder(path)
     if name == "none":
-        known = next((load_encoder(path).config for path in RUNS.values()), preset("tiny"))
+        known = next((load_encoder(paths[0]).config for paths in RUNS.values()), preset("tiny"))
         return random_encoder(known, seed)
     return None
 
 
-def source_of(name: str, encoder: Encoder) -> str:
+def source_of(name: str, seed: int, encoder: Encoder) -> str:
     """What a row's encoder is, and a mark of its weights: a run that was trained anew is another encoder."""
-    if name not in RUNS and name == "none":
-        return "untrained"
-    shown = "" if name in RUNS else f", {pouring_table.SHOWN}"
-    return f"{Path(RUNS.get(name) or RUNS['anytouch']).name} (weights {encoder.mark}{shown})"
+    shown = "" if name in RUNS or name == "none" else f", {pouring_table.SHOWN}"
+    path = path_of(name, seed)
+    return f"{'untrained' if path is None else Path(path).name} (weights {encoder.mark}{shown})"
 
 
-SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS, "version": VERSION}
+LEARNING = asdict(pouring_policy.Learning(tune_steps=TUNE))
+del LEARNING["seed"]
+SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS, "version": VERSION, "policy": pouring_policy.VERSION}
+SETTINGS |= {name: value for name, value in LEARNING.items() if not name.startswith("tune")}
+
+
+def path_of_row(name: str, mode: str, seed: int) -> Path:
+    return FOLDER / f"{name}-{mode}-{seed}.json"
 
 
 def settings_of(mode: str) -> dict[str, Any]:
-    return SETTINGS | ({"tune_steps": TUNE} if mode == "fine-tuned" else {})
+    tuning = {name: value for name, value in LEARNING.items() if name.startswith("tune")}
+    return SETTINGS | (tuning if mode == "fine-tuned" else {})
 
 
 def finished(path: Path, settings: dict[str, Any], source: str) -> bool:
@@ -129,19 +143,20 @@ def do_seed(seed: int) -> None:
             shown[side] = pouring_policy.demonstrate(TASK, seed, DEMOS, side=side)
         return shown[side]
 
-    def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float) -> None:
-        path = FOLDER / f"{name}-{mode}-{seed}.json"
-        write_atomic(path, pouring_table.record(name, mode, seed, trials, TASK, source, settings_of(mode)))
+    def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float, **about: float) -> None:
+        path, about["seconds"] = path_of_row(name, mode, seed), round(time.time() - since, 1)
+        write_atomic(path, pouring_table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
         mean = pouring.error(trials.poured, TASK.target).mean
-        print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {time.time() - since:.0f} s", flush=True)
+        print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {about['seconds']:.0f} s", flush=True)
 
     bounds = {
-        "blind": lambda: pouring_policy.learn_blind(TASK, seed, DEMOS, learning),
+        "blind": lambda: pouring_bounds.learn_blind(TASK, seed, DEMOS, learning),
         "count": lambda: pouring.best_counter(TASK, *pouring.draw_runs(TASK, seed, DEMOS)),
+        "load": lambda: pouring_bounds.Scales(TASK, setups, pouring_bounds.learn_loads(TASK, seed, DEMOS, learning)),
         "expert": lambda: pouring.Expert(TASK),
     }
     for name, make in bounds.items():
-        if not finished(FOLDER / f"{name}-bound-{seed}.json", SETTINGS, name):
+        if not finished(path_of_row(name, "bound", seed), SETTINGS, name):
             since = time.time()
             write(name, "bound", pouring.run(TASK, setups, keys, make()), name, since)
     for name in pouring_table.PAPER:
@@ -150,26 +165,18 @@ def do_seed(seed: int) -> None:
             if seed == SEEDS[0]:
                 print(f"no run is given for row {name}: it is left out")
             continue
-        source = source_of(name, encoder)
-        todo = [m for m in MODES if not finished(FOLDER / f"{name}-{m}-{seed}.json", settings_of(m), source)]
+        source = source_of(name, seed, encoder)
+        left = [m for m in MODES if not finished(path_of_row(name, m, seed), settings_of(m), source)]
+        todo = sorted(left, key=("frozen", "fine-tuned").index)  # fine-tuning goes on from the frozen policy
         if not todo:
             continue
         since, side = time.time(), encoder.config.model.image_size
         policy = pouring_policy.learn_frozen(encoder, demonstrations(side), learning, stills=stills)
-        if "frozen" in todo:
-            write(
-                name, "frozen", pouring.run(TASK, setups, keys, policy, side=side, grasps=grasps(side)), source, since
-            )
-        if "fine-tuned" in todo:
-            since = time.time()
-            tuned = pouring_policy.fine_tune(policy, demonstrations(side), learning)
-            write(
-                name,
-                "fine-tuned",
-                pouring.run(TASK, setups, keys, tuned, side=side, grasps=grasps(side)),
-                source,
-                since,
-            )
+        for mode in todo:
+            if mode == "fine-tuned":
+                since, policy = time.time(), pouring_policy.fine_tune(policy, demonstrations(side), learning)
+            trials = pouring.run(TASK, setups, keys, policy, side=side, grasps=grasps(side))
+            write(name, mode, trials, source, since, loss=round(policy.loss, 4))
 
 
 if not os.environ.get("TABLE"):
@@ -205,16 +212,18 @@ if not os.environ.get("TABLE") or not (figures / "pouring.gif").exists():
 # %%
 rows = pouring_table.read_rows(FOLDER)
 seeds = len({run.split("/")[0] for run in rows[0].runs})
-pouring_table.draw(figures / "pouring.png", rows)
+picture = f"{FOLDER.name}.png"
+pouring_table.draw(figures / picture, rows)
 text = f"""# Pouring by touch alone (simulated)
 
 {len(rows[0].runs)} runs a row ({seeds} seeds of learning, {len(rows[0].runs) // seeds} trials each); mean
 |poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
-compared. Differences are paired, run by run; a sign agrees when the interval and every seed say so. Settings:
-{rows[0].settings}.
+compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
+claimed of fewer than three. Settings:
+{min((row.settings for row in rows), key=len)}.
 
 {pouring_table.table(rows)}
-![errors](figures/pouring.png)
+![errors](figures/{picture})
 ![frames](figures/pouring_frames.png)
 ![film](figures/pouring.gif)
 
@@ -222,5 +231,5 @@ Made by `make pouring`, from the JSON in `{FOLDER.name}/`.
 """
 write_atomic(PAGE, text)
 print(text)
-for name in ("pouring.png", "pouring_frames.png"):
+for name in (picture, "pouring_frames.png"):
     page.show(figures / name)

@@ -36,7 +36,7 @@ class Export:
 class Pour:
     """Pour 60 g of 100 g of beads by touch alone, in simulation: imitation learning over a run's features, then trials.
 
-    Example: anytouch pour --run runs/stage2 --trials 10 --out pour
+    Example: anytouch pour --run runs/stage2 --trials 10
 
     Prints the mass of each trial and the mean error beside a blind policy and the expert; OUT gets a film, JSON and the
     policy. With --recordings it learns from your own runs and is compared with the hand on those of split test.
@@ -53,7 +53,7 @@ class Pour:
     trials: int = 10
     """Runs of the learned policy, with cylinders, beads, grips and sensors that it has not met."""
     out: Path | None = None
-    """Folder for pour.gif (the first trial) and pour.json."""
+    """Folder for pour.gif (the first trial), pour.json and the policy (default: pour in the run's folder)."""
     demos: int = 40
     """Demonstrations of the expert, who sees the scales."""
     stills: bool = False

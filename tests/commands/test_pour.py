@@ -31,11 +31,18 @@ def test_a_run_pours(anytouch, tiny_run, tmp_path):
         (["--run", "x", "--trials", "0"], "--trials must be at least 1"),
         (["--run", "x", "--demos", "0"], "--demos must be at least 1"),
         (["--run", "x", "--steps", "0"], "--steps must be at least 1"),
+        (["--run", "x", "--record", "y"], "--record only writes demonstrations"),
     ],
 )
 def test_mistakes_are_one_sentence(anytouch, words, sentence):
     said = anytouch("pour", *words)
     assert said.status == 1 and sentence in said.err and len(said.err.strip().splitlines()) == 1
+
+
+def test_what_was_recorded_is_not_mixed_with_new_pictures(anytouch, tmp_path):
+    (tmp_path / "manifest.parquet").write_bytes(b"of an earlier recording")
+    said = anytouch("pour", "--record", tmp_path, "--demos", 2)
+    assert said.status == 1 and "is there already" in said.err and len(list(tmp_path.iterdir())) == 1
 
 
 def test_without_a_run_one_is_asked_for(anytouch):

@@ -13,7 +13,7 @@ from PIL import Image
 from tiny_models import tiny_config
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate import pouring, pouring_policy, pouring_table
+from anytouch_jax.evaluate import pouring, pouring_bounds, pouring_policy, pouring_table
 from anytouch_jax.evaluate.features import random_encoder
 from anytouch_jax.evaluate.pouring_policy import Learning
 from anytouch_jax.sim.pouring import POUR, RETRACT, WAIT, Task
@@ -80,7 +80,7 @@ def test_a_late_hand_changes_what_is_done_and_not_what_is_told(told, late):
 
 
 def test_a_blind_policy_pours_but_cannot_know():
-    blind = pouring_policy.learn_blind(TASK, 0, 20, FAST)
+    blind = pouring_bounds.learn_blind(TASK, 0, 20, FAST)
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
     found = pouring.run(TASK, setups, keys, blind)
     assert 4 < pouring.error(found.poured, TASK.target).mean < 30
@@ -124,16 +124,40 @@ def toy(mass, step):
 
 def test_imitation_learns_a_toy_signal_and_beats_blind(late):
     z = np.stack([toy(mass, step) for step, mass in enumerate(late.mass)])[2:]
-    taken = late.taken[5:]
     head, loss = pouring_policy.imitate(
-        pouring_policy.input_table(z)[taken], late.choices[5:][taken], replace(FAST, steps=1500)
+        *pouring_policy.moments(late, pouring_policy.input_table(z)), replace(FAST, steps=1500)
     )
     assert loss < 0.5 * np.log(3)
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
     seen = pouring.run(TASK, setups, keys, Seer(head))
-    blind = pouring.run(TASK, setups, keys, pouring_policy.learn_blind(TASK, 0, 20, FAST))
+    blind = pouring.run(TASK, setups, keys, pouring_bounds.learn_blind(TASK, 0, 20, FAST))
     assert pouring.error(seen.poured, TASK.target).mean < 4
     assert np.mean(np.abs(seen.poured - 60) < np.abs(blind.poured - 60)) > 0.6
+
+
+def test_the_loss_is_that_of_demonstrations_held_out_at_their_best():
+    rng = np.random.default_rng(0)
+    runs = np.repeat(np.arange(10), 12)
+    noise = rng.normal(size=(120, 40)).astype(np.float32)  # each run can be told by heart, and tells nothing of others
+    choices = rng.integers(0, 3, 120)
+    learning = replace(FAST, steps=600, components=40)
+    head, loss = pouring_policy.imitate(noise, choices, runs, learning)
+    logits = pouring_policy.forward(head, noise[runs >= 8])
+    assert loss == pytest.approx(float(pouring_policy.imitation_loss(logits, choices[runs >= 8])), rel=1e-4)
+    learned = pouring_policy.forward(head, noise[runs < 8]).argmax(-1)
+    assert (np.asarray(learned) == choices[runs < 8]).mean() < 0.95  # stopped before all was learned by heart
+    head, _ = pouring_policy.imitate(noise, choices, runs, replace(learning, components=3))
+    assert head.basis.shape == (40, 3)
+    spread = np.asarray((noise[runs < 8] - np.asarray(head.mean)) @ np.asarray(head.basis)).std(0)
+    np.testing.assert_allclose(spread, 1, atol=0.02)
+
+
+def test_the_load_alone_is_enough_to_pour_by():
+    head = pouring_bounds.learn_loads(TASK, 0, 20, Learning())
+    setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
+    told = pouring.run(TASK, setups, keys, pouring_bounds.Scales(TASK, setups, head))
+    blind = pouring.run(TASK, setups, keys, pouring_bounds.learn_blind(TASK, 0, 20, Learning()))
+    assert pouring.error(told.poured, TASK.target).mean < 0.75 * pouring.error(blind.poured, TASK.target).mean
 
 
 def test_inputs_are_changes_from_the_standing_and_the_lifted_cylinder():
@@ -147,7 +171,7 @@ def test_inputs_are_changes_from_the_standing_and_the_lifted_cylinder():
 
 def test_blind_inputs_hold_time_and_own_actions_only():
     actions = np.array([[WAIT], [POUR], [POUR], [RETRACT]])
-    found = pouring_policy.blind_inputs(actions)[:, 0] * 100
+    found = pouring_bounds.blind_inputs(actions)[:, 0] * 100
     np.testing.assert_allclose(found, [[0, 0, 0, 0], [1, 0, 1, 0], [2, 1, 1, 0], [3, 2, 1, 0]], atol=1e-4)
 
 
@@ -199,7 +223,7 @@ def test_mistakes_are_one_sentence(told, encoder):
     with pytest.raises(UserError, match="no frames"):
         pouring_policy.features(encoder, told, stills=True)
     with pytest.raises(UserError, match="not finite"):
-        pouring_policy.imitate(np.full((4, 2), np.nan), np.zeros(4, int), FAST)
+        pouring_policy.imitate(np.full((4, 2), np.nan), np.zeros(4, int), np.arange(4), FAST)
     with pytest.raises(UserError, match="tune_steps"):
         Learning(tune_steps=0)
 
@@ -217,8 +241,9 @@ def test_the_film_shows_every_page(shown, tmp_path):
 
 
 def write(folder, name, mode, poured, seed=0, **settings):
-    trials = pouring.Trials(np.asarray(poured), np.full(len(poured), 9), *[np.zeros((1, 1))] * 5, None)
-    text = pouring_table.record(name, mode, seed, trials, TASK, "runs/x", {"trials": len(poured)} | settings)
+    steps = np.where(np.asarray(poured) == 100, TASK.limit, 9)
+    trials = pouring.Trials(np.asarray(poured), steps, *[np.zeros((1, 1))] * 5, None)
+    text = pouring_table.record(name, mode, seed, trials, TASK, "runs/x", {"trials": len(poured)} | settings, {})
     (folder / f"{name}-{mode}-{seed}.json").write_text(text)
 
 
@@ -253,8 +278,23 @@ def test_differences_are_paired_run_by_run(tmp_path):
     write(tmp_path, "static", "frozen", [0, 0, 0], seed=1)
     rows = {row.name: row for row in pouring_table.read_rows(tmp_path)}
     found = pouring_table.difference(rows["anytouch"], rows["static"])
-    assert (found.mean, found.low, found.high) == (-1, -1, -1)
+    assert (found.mean, found.low, found.high) == (-1, None, None)  # one seed is shared: one learned policy each
+    assert pouring_table.verdict(found) == "1 seed, no claim"
     assert len(rows["static"].runs) == 6
+
+
+def test_a_sign_is_decided_over_seeds_not_over_runs(tmp_path):
+    for seed, worse in enumerate((0.1, 8.0, 16.0)):  # ten runs each would be sure of it; three policies are not
+        write(tmp_path, "anytouch", "frozen", np.full(10, 61.0), seed)
+        write(tmp_path, "static", "frozen", np.full(10, 61.0 + worse), seed)
+    rows = {row.name: row for row in pouring_table.read_rows(tmp_path)}
+    found = pouring_table.difference(rows["anytouch"], rows["static"])
+    assert found.low < 0 < found.high and pouring_table.verdict(found) == "not decided"
+
+
+def test_runs_that_were_never_turned_back_are_told(tmp_path):
+    write(tmp_path, "static", "frozen", [100, 60, 100])
+    assert "2 never turned back" in pouring_table.table(pouring_table.read_rows(tmp_path))
 
 
 def test_a_broken_or_mixed_result_is_named(tmp_path):
@@ -264,6 +304,13 @@ def test_a_broken_or_mixed_result_is_named(tmp_path):
     write(tmp_path, "static", "frozen", [60.0, 61.0], seed=1)
     with pytest.raises(UserError, match="different settings"):
         pouring_table.read_rows(tmp_path)
+    write(tmp_path, "static", "frozen", [60.0], seed=1)
+    write(tmp_path, "static", "fine-tuned", [60.0], tune_steps=9)
+    pouring_table.read_rows(tmp_path)
+    write(tmp_path, "anytouch", "frozen", [60.0], demonstrations=9)  # would be compared with static
+    with pytest.raises(UserError, match="different settings"):
+        pouring_table.read_rows(tmp_path)
+    (tmp_path / "anytouch-frozen-0.json").unlink()
     (tmp_path / "static-frozen-1.json").write_text(json.dumps({"row": "static"}))
     with pytest.raises(UserError, match="static-frozen-1"):
         pouring_table.read_rows(tmp_path)

@@ -106,13 +106,26 @@ def test_steeper_holds_less_and_the_rim_is_exact():
 
 
 def test_the_slot_law_by_hand():
-    setup = setup_of(0, radius=25.0, bead=2.0, bulk=1.5e-3)
-    depth = 2.0  # mm over the slope of repose
-    excess = depth * 1.5e-3 * math.pi * 25**2
-    chord = 2 * math.sqrt(depth * (50 - depth))
+    setup = setup_of(0, radius=25.0, height=60.0, bead=2.0, bulk=1.5e-3)
+    slope, depth = math.radians(40), 2.0  # mm over the slope of repose; 50 tan 40 = 42 mm: the bottom is covered
+    excess = depth * 1.5e-3 * math.pi * 25**2 / math.cos(slope)
+    sagitta = depth / math.sin(slope)
+    chord = 2 * math.sqrt(sagitta * (50 - sagitta))
     expected = 1.03 * 1.5e-3 * math.sqrt(9810) * (chord - 2.8) * depth**1.5
-    assert float(pouring.slot_rate(jnp.asarray(excess), jnp.asarray(0.0), setup)) == pytest.approx(expected, rel=1e-5)
-    assert float(pouring.slot_rate(jnp.asarray(-3.0), jnp.asarray(0.0), setup)) == 0
+    assert float(pouring.slot_rate(jnp.asarray(excess), jnp.asarray(slope), setup)) == pytest.approx(expected, rel=1e-4)
+    assert float(pouring.slot_rate(jnp.asarray(-3.0), jnp.asarray(slope), setup)) == 0
+
+
+def test_the_layer_lies_on_what_is_left():
+    """Where half of the bottom is bare the same mass is a layer twice as deep."""
+    setup = setup_of(0, radius=25.0, height=25 * math.tan(math.radians(60)), bead=2.0, bulk=1.5e-3)
+    slope, depth = math.radians(60), 2.0  # the surface through the lip meets the bottom in its middle
+    excess = depth * 1.5e-3 * math.pi * 25**2 / 2 / math.cos(slope)
+    sagitta = depth / math.sin(slope)
+    chord = 2 * math.sqrt(sagitta * (50 - sagitta))
+    expected = 1.03 * 1.5e-3 * math.sqrt(9810) * (chord - 2.8) * depth**1.5
+    # slices are 1/49 of half a turn wide: the middle one is in or out
+    assert float(pouring.slot_rate(jnp.asarray(excess), jnp.asarray(slope), setup)) == pytest.approx(expected, rel=0.1)
 
 
 def test_chance_differs_and_a_seed_repeats_it():
@@ -140,6 +153,15 @@ def test_it_ends_when_it_is_back_and_stays_as_it_was():
     assert len(np.unique(np.asarray(states.tilt)[done])) == 1 and int(states.steps[-1]) == 42
     short = Task(limit=7)
     assert int(play(setup, actions_of((POUR, 10), length=10), 0, short).steps[-1]) == 7
+
+
+def test_it_does_not_end_while_beads_flow():
+    setup, task = setup_of(1), Task(back=0.25)
+    states = play(setup, actions_of((POUR, 150), (RETRACT, 30)), 0, task)
+    ends = int(np.asarray(states.done).argmax())
+    assert bool(states.flowing[150]) and ends > 150 and not bool(states.flowing[ends])
+    settled = play(setup, actions_of((POUR, 150), (RETRACT, ends - 149)), 0, Task(back=50.0))
+    assert float(states.mass[-1]) == float(settled.mass[-1])  # every bead is counted
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Pour
@@ -24,14 +25,25 @@ def run(options: Pour) -> int:
     enable_compilation_cache()
     if options.record is not None:
         return _record(options, options.record)
-    return _simulated(options) if options.recordings is None else _recorded(options, options.recordings)
+    out = _home(options)
+    return _simulated(options, out) if options.recordings is None else _recorded(options, options.recordings, out)
+
+
+def _home(options: Pour) -> Path:
+    """Where the results go: --out, else `pour` in the run's folder, or beside a weights file."""
+    assert options.run is not None
+    run = Path(options.run)
+    return options.out or (run if run.is_dir() else run.parent) / "pour"
 
 
 def _record(options: Pour, folder: Path) -> int:
     from anytouch_jax.evaluate import pouring_policy, pouring_recordings
     from anytouch_jax.sim.pouring import Task
 
-    task = Task(markers=options.markers)
+    task, path = Task(markers=options.markers), folder / "manifest.parquet"
+    if path.exists():
+        raise UserError(f"{path} is there already; record into another folder, or remove this one first")
+    check_folder(path)
     say(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=options.size)
     print(pouring_recordings.write(folder, shown, task))
@@ -48,7 +60,7 @@ def _policy(options: Pour, encoder: Encoder, shown: Trials, sensor: str) -> tupl
     return (pouring_policy.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning
 
 
-def _recorded(options: Pour, path: Path) -> int:
+def _recorded(options: Pour, path: Path, out: Path) -> int:
     """Learn from recorded runs, and compare with the hand on those of split test."""
     from anytouch_jax.evaluate import pouring_recordings
     from anytouch_jax.evaluate.features import load_encoder
@@ -57,6 +69,7 @@ def _recorded(options: Pour, path: Path) -> int:
     from anytouch_jax.sim.pouring import Task
 
     encoder = load_encoder(str(options.run))
+    check_folder(out / "pour.json")
     found = pouring_recordings.read(path, encoder.config.model.image_size)
     shown, unseen = found.part(False), found.part(True)
     say(f"{len(shown.steps)} runs of {found.sensor} to learn from, {len(unseen.steps)} of split test")
@@ -71,50 +84,49 @@ def _recorded(options: Pour, path: Path) -> int:
         (name, f"{100 * a.share:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s") for name, a in rows.items()
     ]
     print(markdown(head, lines))
-    if options.out is not None:
-        pouring_recordings.save_policy(options.out, policy)
-        about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
-        about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "sensor": policy.sensor}
-        found_text = json.dumps(about | {name: one._asdict() for name, one in rows.items()}, indent=2)
-        write_bytes(options.out / "pour.json", (found_text + "\n").encode())
-        say(f"policy and results in {options.out}")
+    pouring_recordings.save_policy(out, policy)
+    about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
+    about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "sensor": policy.sensor}
+    found_text = json.dumps(about | {name: one._asdict() for name, one in rows.items()}, indent=2)
+    write_bytes(out / "pour.json", (found_text + "\n").encode())
+    say(f"policy and results in {out}")
     return 0
 
 
-def _simulated(options: Pour) -> int:
-    from anytouch_jax.evaluate import pouring, pouring_policy, pouring_recordings
+def _simulated(options: Pour, out: Path) -> int:
+    from anytouch_jax.evaluate import pouring, pouring_bounds, pouring_policy, pouring_recordings
     from anytouch_jax.evaluate.features import load_encoder
     from anytouch_jax.evaluate.plots import write_bytes
     from anytouch_jax.evaluate.sections import markdown
     from anytouch_jax.sim.pouring import Task
 
     encoder = load_encoder(str(options.run))
+    check_folder(out / "pour.json")
     side = encoder.config.model.image_size
     task = Task(markers=options.markers)
     say(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=side)
     policy, learning = _policy(options, encoder, shown, pouring.SENSOR)
     rivals: dict[str, pouring.Controller] = {
-        "blind": pouring_policy.learn_blind(task, options.seed, options.demos, learning),
+        "blind": pouring_bounds.learn_blind(task, options.seed, options.demos, learning),
         "count": pouring.best_counter(task, *pouring.draw_runs(task, options.seed, options.demos)),
         "expert": pouring.Expert(task),
     }
     say(f"the policy pours {options.trials} times")
     setups, keys = pouring.draw_runs(task, options.seed + pouring_policy.UNSEEN, options.trials)
-    trials = pouring.run(task, setups, keys, policy, side=side, film=options.out is not None)
+    trials = pouring.run(task, setups, keys, policy, side=side, film=1)
     lines = [(str(i + 1), f"{g:.1f}", f"{abs(g - task.target):.1f}") for i, g in enumerate(trials.poured)]
     print(markdown(("trial", "poured, g", "error, g"), lines))
     results = {"touch": trials} | {k: pouring.run(task, setups, keys, rival) for k, rival in rivals.items()}
     for name, one in results.items():
         print(f"{name}: mean error {sentence(one, task.target)}")
-    if options.out is not None:
-        pouring.write_film(options.out / "pour.gif", trials, task)
-        pouring_recordings.save_policy(options.out, policy)
-        found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
-        about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
-        about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
-        write_bytes(options.out / "pour.json", (json.dumps(about | {"poured": found}, indent=2) + "\n").encode())
-        say(f"film, policy and results in {options.out}")
+    pouring.write_film(out / "pour.gif", trials, task)
+    pouring_recordings.save_policy(out, policy)
+    found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
+    about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
+    about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
+    write_bytes(out / "pour.json", (json.dumps(about | {"poured": found}, indent=2) + "\n").encode())
+    say(f"film, policy and results in {out}")
     return 0
 
 
@@ -135,10 +147,7 @@ def _check(options: Pour) -> None:
     for name in ("trials", "demos"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, not {getattr(options, name)}")
-    if options.out is not None:
-        try:
-            options.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"cannot make the folder {options.out}: {error.strerror}") from None
+    if options.record is not None and not (options.run is None and options.recordings is None and options.out is None):
+        raise UserError("--record only writes demonstrations; leave --run, --recordings and --out out")
     if options.steps is not None and options.steps < 1:
         raise UserError(f"--steps must be at least 1, not {options.steps}")

@@ -37,7 +37,7 @@ class Controller(Protocol):
 class Trials(NamedTuple):
     """What happened in B runs of up to S actions: `poured` (B,) g, `steps` (B,) taken, `choices` and `actions` (S, B),
     which differ only where a late hand went on, `mass` g, `tilt` degrees and `rate` g/s (S, B) before each action, and
-    the `frames` u8 (S, B, side, side, 3) or None."""
+    the `frames` u8 (S, F, side, side, 3) of those F runs, the first ones, that were filmed, or None."""
 
     poured: Array
     steps: Array
@@ -71,6 +71,24 @@ class Expert:
         left = self._task.target - (self._task.beads - mass)
         back = (left <= 0.3 + 0.35 * rate) | (highest > tilt + 1e-6)
         return np.where(back, RETRACT, np.where((rate > 0.8 + 0.2 * left) & self._patient, WAIT, POUR))
+
+
+class Replay:
+    """Does again what was done: `actions` (S, B)."""
+
+    looks = False
+
+    def __init__(self, actions: Array) -> None:
+        self._actions = actions
+
+    def begin(self, count: int) -> None:
+        """Time is 0 again."""
+        self._step = -1
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,) of this moment; the last ones for ever."""
+        self._step += 1
+        return self._actions[min(self._step, len(self._actions) - 1)]
 
 
 class Counter:
@@ -155,17 +173,19 @@ def run(
     controller: Controller,
     *,
     side: int = 112,
-    film: bool = False,
+    film: int = 0,
     late: Array | None = None,
     grasps: pouring_render.Grasp | None = None,
 ) -> Trials:
-    """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or for a `film`.
+    """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to `film` runs.
+
+    `film`: of so many runs, the first ones, the frames are kept.
 
     `grasps`: those of `hold` for these runs and `side`, where they are at hand.
     `late` (B,): a hand that goes on pouring for so many moments after it was told to retract, which then stays the
     choice. So demonstrations show what to do where the target is already passed.
     """
-    drawn = controller.looks or film
+    drawn = controller.looks or film > 0
     if drawn and grasps is None:
         grasps = hold(setups, side=side)
     state = _begin(setups, keys, task=task)
@@ -187,7 +207,7 @@ def run(
         told.append((choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate))))
         steps += ~np.asarray(state.done)
         if seen is not None and film:
-            frames.append(seen)
+            frames.append(seen[:film].copy())
         state = _advance(state, actions, setups, task=task)
     choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*told, strict=True))
     out = np.asarray(pouring.poured(state, task))
@@ -218,7 +238,7 @@ def write_film(path: Path, trials: Trials, task: Task, number: int = 0, *, every
     from .plots import write_bytes
 
     if trials.frames is None:
-        raise ValueError("these trials kept no frames; run them with film=True")
+        raise ValueError("these trials kept no frames; run them with film=1")
     last = int(trials.steps[number])
     pages = [
         Image.fromarray(_page(trials, task, number, step)).quantize(64)

@@ -6,7 +6,8 @@ knows only the time and its own actions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,12 +24,14 @@ from ..nn.functional import Net
 from ..objectives import normalise_touch
 from ..sim.pouring import ACTIONS, WAIT, Setup, State, Task
 from .features import Encoder
-from .pouring import FRAMES, SENSOR, START, Expert, Trials, draw_runs, run
+from .pouring import FRAMES, SENSOR, START, Expert, Replay, Trials, draw_runs, run
 
 Array = npt.NDArray[Any]
 Params = Any
 UNSEEN = 10_000  # added to a seed: runs that no demonstration met
+VERSION = 2  # of how a policy learns from the same demonstrations
 LATEST = 80  # moments, 20 degrees
+LOOKS = 30  # times that the held-out demonstrations are looked at while a policy learns
 LAG = 3  # moments from the segment before to the last one
 LIFTED = START - FRAMES + 1  # the number of the first segment of the lifted cylinder; number 0 is of the standing one
 
@@ -37,8 +40,9 @@ LIFTED = START - FRAMES + 1  # the number of the first segment of the lifted cyl
 class Learning:
     """How a policy learns: `steps` of AdamW at `rate` on batches of `batch` moments, `width` hidden units.
 
-    Fine-tuning goes on for `tune_steps` on `tune_batch` moments at `tune_rate` (the encoder's; the MLP's is a tenth of
-    `rate`).
+    Features are many and demonstrations few: the MLP is given the first `components` principal components of its
+    inputs, and the weights are kept that did best on a share `held_out` of the demonstrations. Fine-tuning goes on for
+    `tune_steps` on `tune_batch` moments at `tune_rate` (the encoder's; the MLP's is a tenth of `rate`).
     """
 
     steps: int = 1500
@@ -46,23 +50,31 @@ class Learning:
     batch: int = 256
     width: int = 128
     decay: float = 1e-2
+    components: int = 32
+    held_out: float = 0.2
     tune_steps: int = 150
     tune_batch: int = 16
     tune_rate: float = 1e-4
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "width", "tune_steps", "tune_batch"):
+        for name in ("steps", "batch", "width", "components", "tune_steps", "tune_batch"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} of the policy's learning must be at least 1, not {getattr(self, name)}")
 
 
 class Head(NamedTuple):
-    """The MLP over inputs (n, d): `mean`, `scale` (d,) of the inputs, weights and biases of its layers."""
+    """The MLP over inputs (n, d): their `mean` (d,), the `basis` (d, k) of their principal components of unit spread,
+    weights and biases of its layers."""
 
     mean: Any
-    scale: Any
+    basis: Any
     layers: tuple[tuple[Any, Any], ...]
+
+
+def late_hands(seed: int, count: int, late: int = LATEST) -> Array:
+    """How many moments (count,) the hand of each demonstration is late."""
+    return np.random.default_rng([seed % 2**63, count, late]).integers(0, late + 1, count)
 
 
 def demonstrate(
@@ -74,39 +86,21 @@ def demonstrate(
     only where one is retracting already (noise in demonstrations: Laskey et al. 2017).
     """
     setups, keys = draw_runs(task, seed, count)
-    hand = np.random.default_rng([seed % 2**63, count, late]).integers(0, late + 1, count)
+    hand = late_hands(seed, count, late)
     expert = Expert(task, patient=patient)
     plain = run(task, setups, keys, expert, late=hand)
     if side is None:
         return plain
-    # Runs of like length together: a batch is drawn until its longest has ended.
-    order, parts = np.argsort(plain.steps, kind="stable"), []
+    # Runs of like length together: a batch is drawn until its longest has ended. One array, since films are large.
+    frames = np.zeros((*plain.actions.shape, side, side, 3), np.uint8)
+    order = np.argsort(plain.steps, kind="stable")
     for start in range(0, count, chunk):
         part = order[start : start + chunk]
         some: Setup = jax.tree.map(lambda x, part=part: x[part], setups)
-        parts.append(run(task, some, keys[part], expert, side=side, film=True, late=hand[part]))
-    return _picked(joined(parts), np.argsort(order))
-
-
-def _picked(trials: Trials, order: Array) -> Trials:
-    """The runs of trials in another order."""
-    over_time = {name: getattr(trials, name) for name in Trials._fields[2:]}
-    moved: dict[str, Any] = {name: None if x is None else x[:, order] for name, x in over_time.items()}
-    return Trials(trials.poured[order], trials.steps[order], **moved)
-
-
-def joined(parts: Sequence[Trials]) -> Trials:
-    """Several batches of trials as one; the shorter ones are padded with their last moment."""
-    longest = max(len(part.actions) for part in parts)
-
-    def over_time(name: str) -> Any:
-        arrays = [getattr(part, name) for part in parts]
-        if arrays[0] is None:
-            return None
-        return np.concatenate([np.concatenate([x, np.repeat(x[-1:], longest - len(x), 0)]) for x in arrays], 1)
-
-    found = {name: over_time(name) for name in Trials._fields[2:]}
-    return Trials(*(np.concatenate([getattr(part, name) for part in parts]) for name in Trials._fields[:2]), **found)
+        shown = run(task, some, keys[part], Replay(plain.actions[:, part]), side=side, film=len(part))
+        assert shown.frames is not None
+        frames[: len(shown.frames), part] = shown.frames
+    return plain._replace(frames=frames)
 
 
 def features(encoder: Encoder, trials: Trials, *, stills: bool, sensor: str = SENSOR, batch: int = 64) -> Array:
@@ -153,17 +147,9 @@ def input_table(z: Array) -> Array:
     return np.asarray(inputs(now, before, *(np.broadcast_to(z[i], now.shape) for i in (LIFTED, 0))))
 
 
-def blind_inputs(actions: Array) -> Array:
-    """Time and counts of the own actions so far (S, B, 4), from actions (S, B); nothing of the run itself."""
-    chosen = np.eye(len(ACTIONS), dtype=np.float32)[actions]
-    before = np.cumsum(chosen, 0) - chosen
-    time = np.broadcast_to(np.arange(len(actions), dtype=np.float32)[:, None, None], (*actions.shape, 1))
-    return np.concatenate([time, before], -1) / 100
-
-
 def forward(head: Head, x: Any) -> jax.Array:
     """Logits (n, 3) of the actions."""
-    x = (x - head.mean[None]) / head.scale[None]
+    x = (x - head.mean[None]) @ head.basis
     for weight, bias in head.layers[:-1]:
         x = jax.nn.gelu(x @ weight + bias[None], approximate=False)
     weight, bias = head.layers[-1]
@@ -173,14 +159,22 @@ def forward(head: Head, x: Any) -> jax.Array:
 _forward = jax.jit(forward)
 
 
+def predict(head: Head, x: Array) -> Array:
+    """The likeliest actions (n,)."""
+    return np.asarray(_forward(head, x)).argmax(-1)
+
+
 def new_head(x: Array, learning: Learning) -> Head:
-    """An untrained MLP for inputs like `x` (n, d), which it standardises."""
-    mean, spread = x.mean(0), x.std(0)
-    sizes = (x.shape[1], learning.width, learning.width, len(ACTIONS))
+    """An untrained MLP for the principal components of inputs like `x` (n, d)."""
+    mean = x.mean(0)
+    spread, axes = np.linalg.eigh(np.cov(x - mean, rowvar=False).reshape(x.shape[1], -1))
+    spread, axes = spread[::-1][: learning.components], axes[:, ::-1][:, : learning.components]
+    basis = axes / np.sqrt(np.maximum(spread, 1e-6 * spread[0] + 1e-12))
+    sizes = (basis.shape[1], learning.width, learning.width, len(ACTIONS))
     keys = jax.random.split(jax.random.key(learning.seed), len(sizes) - 1)
     shapes = list(zip(sizes[:-1], sizes[1:], keys, strict=True))
     layers = tuple((jax.random.normal(key, (a, b)) * (1 / a) ** 0.5, jnp.zeros(b)) for a, b, key in shapes)
-    return Head(jnp.asarray(mean), jnp.asarray(np.where(spread > 1e-6, spread, 1.0)), layers)
+    return Head(jnp.asarray(mean, jnp.float32), jnp.asarray(basis, jnp.float32), layers)
 
 
 def imitation_loss(logits: jax.Array, choices: jax.Array) -> jax.Array:
@@ -188,42 +182,62 @@ def imitation_loss(logits: jax.Array, choices: jax.Array) -> jax.Array:
     return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, choices))
 
 
-def imitate(x: Array, actions: Array, learning: Learning) -> tuple[Head, float]:
-    """Train the MLP on inputs (n, d) and actions (n,); also the last mean loss. Raises UserError on inputs of NaN."""
+def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[Head, float]:
+    """Train the MLP on inputs (n, d), actions (n,) of the demonstrations `runs` (n,); also its loss on those held out.
+
+    A single demonstration is held out and learned from. Raises UserError on inputs of NaN.
+    """
     if not np.isfinite(x).all():
         raise UserError("the policy's inputs are not finite; look at the encoder's weights")
-    head = new_head(x, learning)
+    names = np.unique(runs)
+    late = np.isin(runs, names[len(names) - max(1, round(learning.held_out * len(names))) :])
+    known = late if late.all() else ~late
+    head = new_head(x[known], learning)
     optimiser = optax.adamw(optax.cosine_decay_schedule(learning.rate, learning.steps), weight_decay=learning.decay)
-    data = (jnp.asarray(x, jnp.float32), jnp.asarray(actions))
+    data = tuple((jnp.asarray(x[part], jnp.float32), jnp.asarray(actions[part])) for part in (known, late))
 
     @jax.jit
     def train(layers: Any, head: Head, data: Any) -> tuple[Any, jax.Array]:  # (constants would be compiled anew)
-        def step(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        (x, actions), unseen = data
+
+        def loss(layers: Any, x: jax.Array, actions: jax.Array) -> jax.Array:
+            return imitation_loss(forward(head._replace(layers=layers), x), actions)
+
+        def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
             layers, state = carry
-            ids = jax.random.randint(key, (learning.batch,), 0, len(data[0]))
+            ids = jax.random.randint(key, (learning.batch,), 0, len(x))
+            change, state = optimiser.update(jax.grad(loss)(layers, x[ids], actions[ids]), state, layers)
+            return (optax.apply_updates(layers, change), state), None
 
-            def loss(layers: Any) -> jax.Array:
-                return imitation_loss(forward(head._replace(layers=layers), data[0][ids]), data[1][ids])
+        def look(carry: Any, keys: jax.Array) -> tuple[Any, None]:
+            now, best, least = carry
+            now, _ = jax.lax.scan(step, now, keys)
+            value = loss(now[0], *unseen)
+            kept = jax.tree.map(lambda new, old: jnp.where(value < least, new, old), now[0], best)
+            return (now, kept, jnp.minimum(value, least)), None
 
-            value, slope = jax.value_and_grad(loss)(layers)
-            change, state = optimiser.update(slope, state, layers)
-            return (optax.apply_updates(layers, change), state), value
+        every = max(1, learning.steps // LOOKS)
+        keys = jax.random.split(jax.random.key(learning.seed + 1), (-(-learning.steps // every), every))
+        begin = ((layers, optimiser.init(layers)), layers, jnp.asarray(jnp.inf))
+        (_, layers, least), _ = jax.lax.scan(look, begin, keys)
+        return layers, least
 
-        keys = jax.random.split(jax.random.key(learning.seed + 1), learning.steps)
-        (layers, _), losses = jax.lax.scan(step, (layers, optimiser.init(layers)), keys)
-        return layers, jnp.mean(losses[-max(1, learning.steps // 10) :])
-
-    layers, last = train(head.layers, head, data)
-    return head._replace(layers=layers), float(last)
+    layers, least = train(head.layers, head, data)
+    return head._replace(layers=layers), float(least)
 
 
 class Touch:
-    """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features."""
+    """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features.
+
+    `loss`: of imitation, on the demonstrations held out.
+    """
 
     looks = True
 
-    def __init__(self, encoder: Encoder, head: Head, *, stills: bool, sensor: str = SENSOR) -> None:
-        self.encoder, self.head, self.stills, self.sensor = encoder, head, stills, sensor
+    def __init__(
+        self, encoder: Encoder, head: Head, *, stills: bool, sensor: str = SENSOR, loss: float = math.nan
+    ) -> None:
+        self.encoder, self.head, self.stills, self.sensor, self.loss = encoder, head, stills, sensor, loss
 
     def begin(self, count: int) -> None:
         """Forget the frames and features of the last runs."""
@@ -246,47 +260,20 @@ class Touch:
             return np.full(len(frames), WAIT)
         before = self._z[max(len(self._z) - 1 - LAG, LIFTED)]
         x = inputs(self._z[-1], before, self._z[LIFTED], self._z[0])
-        return np.asarray(_forward(self.head, x)).argmax(-1)
+        return predict(self.head, x)
 
 
-class Blind:
-    """The same MLP, told only the time and its own actions."""
-
-    looks = False
-
-    def __init__(self, head: Head) -> None:
-        self._head = head
-
-    def begin(self, count: int) -> None:
-        """Time is 0 again."""
-        self._x: Array = np.zeros((count, 1 + len(ACTIONS)), np.float32)
-
-    def act(self, frames: Array | None, state: State) -> Array:
-        """Actions (B,) from the time and the counts of its actions."""
-        chosen = np.asarray(_forward(self._head, self._x)).argmax(-1)
-        chosen = np.where(self._x[:, 0] * 100 < START - 0.5, WAIT, chosen)
-        self._x = self._x + np.concatenate([np.ones((len(chosen), 1)), np.eye(len(ACTIONS))[chosen]], 1) / 100
-        self._x = self._x.astype(np.float32)
-        return chosen
-
-
-def learn_blind(task: Task, seed: int, count: int, learning: Learning) -> Blind:
-    """A blind policy from `count` demonstrations of an expert that never waits.
-
-    To wait is to answer what is seen: a blind policy would learn that it has poured too early to stop, as it never
-    waited.
-    """
-    trials = demonstrate(task, seed, count, side=None, patient=False, chunk=count)
+def moments(trials: Trials, x: Array) -> tuple[Array, Array, Array]:
+    """The moments of choice of all demonstrations, from inputs x (S - START, B, d): inputs, choices and runs (n,)."""
     taken = trials.taken[START:]
-    return Blind(imitate(blind_inputs(trials.actions)[START:][taken], trials.choices[START:][taken], learning)[0])
+    return x[taken], trials.choices[START:][taken], np.nonzero(taken)[1]
 
 
 def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR) -> Touch:
     """A policy over frozen features, from demonstrations with frames of `sensor`."""
     z = features(encoder, trials, stills=stills, sensor=sensor)
-    taken = trials.taken[START:]
-    head, _ = imitate(input_table(z)[taken], trials.choices[START:][taken], learning)
-    return Touch(encoder, head, stills=stills, sensor=sensor)
+    head, loss = imitate(*moments(trials, input_table(z)), learning)
+    return Touch(encoder, head, stills=stills, sensor=sensor, loss=loss)
 
 
 def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
@@ -304,7 +291,7 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
         clips = [_clips(encoder, trials.frames, np.stack([number, at[:, 1]], 1), ahead) for number in numbers]
         params, state = step(params, state, head, np.concatenate(clips), trials.choices[at[:, 0] + START, at[:, 1]])
     tuned = replace(encoder, params=params["encoder"], source=f"{encoder.source}, fine-tuned")
-    return Touch(tuned, head._replace(layers=params["head"]), stills=stills, sensor=policy.sensor)
+    return Touch(tuned, head._replace(layers=params["head"]), stills=stills, sensor=policy.sensor, loss=policy.loss)
 
 
 def _tuner(

@@ -27,7 +27,8 @@ from ..sim.pouring import ACTIONS, STAND, Task
 from .features import load_encoder, text_column
 from .plots import write_bytes
 from .pouring import SENSOR, START, Controller, Trials
-from .pouring_policy import Head, Learning, Touch, blind_inputs, forward, imitate
+from .pouring_bounds import blind_inputs
+from .pouring_policy import Head, Learning, Touch, forward, imitate, moments
 
 Array = npt.NDArray[Any]
 LEARNING = ("train", "val", "test")  # splits that are read; the others take no part
@@ -160,8 +161,7 @@ def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
 
 def agreement_blind(shown: Trials, unseen: Trials, learning: Learning, rate: float) -> Agreement:
     """The agreement of the same MLP that is told the time and the hand's actions so far, not the touch."""
-    taken = shown.taken[START:]
-    head, _ = imitate(blind_inputs(shown.actions)[START:][taken], shown.choices[START:][taken], learning)
+    head, _ = imitate(*moments(shown, blind_inputs(shown.actions)[START:]), learning)
     said = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
     return compare(np.stack(said), unseen, rate)
 
@@ -192,7 +192,7 @@ def save_policy(folder: Path, policy: Touch) -> None:
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
     told = json.dumps({"stills": policy.stills, "sensor": policy.sensor, "encoder": encoder.mark})
     data = io.BytesIO()
-    arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "scale": np.asarray(head.scale), **layers}
+    arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
     np.savez(data, about=np.asarray(told), **arrays)
     write_bytes(folder / POLICY, data.getvalue())
 
@@ -208,7 +208,7 @@ def load_policy(folder: Path | str) -> Touch:
         stills, sensor, mark = bool(told["stills"]), str(told["sensor"]), told["encoder"]
         count = sum(name.startswith("w/") for name in arrays)
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
-        head = Head(arrays["mean"], arrays["scale"], layers)
+        head = Head(arrays["mean"], arrays["basis"], layers)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
     if mark != encoder.mark:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..config import UserError
 from ..sim.pouring import Task
 from .pouring import Error, Trials, error
-from .results import mean_interval
+from .results import seed_interval
 from .sections import markdown
 
 Array = npt.NDArray[Any]
@@ -25,6 +25,7 @@ TITLES = {
     "anytouch": "AnyTouch",
     "blind": "blind: time and own actions",
     "count": "blind: the best number of pours",
+    "load": "bound: told the load on the gel, no picture",
     "expert": "expert: sees the scales",
 }
 PAPER = {"none": (5.22, 49.1), "t3": (2.33, 9.74), "static": (2.45, 9.60), "anytouch": (1.56, 8.22)}
@@ -34,8 +35,12 @@ DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the othe
 CLAIMS = (("anytouch", "static"), ("anytouch", "t3"), ("static", "none"), ("t3", "none"), ("anytouch", "none"))
 
 
+CLAIM = 3  # seeds below which no sign is claimed
+
+
 class Row(NamedTuple):
-    """One row and mode over all its seeds: `poured` g of each run, `runs` names them ("seed/number")."""
+    """One row and mode over all its seeds: `poured` g of each run, `runs` names them ("seed/number"), and `lost` runs
+    were never turned back."""
 
     name: str
     mode: str
@@ -44,6 +49,7 @@ class Row(NamedTuple):
     target: float
     sources: tuple[str, ...]
     settings: str
+    lost: int
 
     @property
     def wrong(self) -> Array:
@@ -52,20 +58,27 @@ class Row(NamedTuple):
 
 
 def record(
-    name: str, mode: str, seed: int, trials: Trials, task: Task, source: str, settings: Mapping[str, Any]
+    name: str,
+    mode: str,
+    seed: int,
+    trials: Trials,
+    task: Task,
+    source: str,
+    settings: Mapping[str, Any],
+    about: Mapping[str, Any],
 ) -> str:
-    """The JSON of a row's trials with one seed."""
+    """The JSON of a row's trials with one seed; `about`: what else is known of it (seconds, the loss of learning)."""
     found = error(trials.poured, task.target)
     values = {
         "row": name, "mode": mode, "seed": seed, "target": task.target, "source": source, "settings": dict(settings),
         "poured": [round(float(x), 3) for x in trials.poured], "steps": [int(x) for x in trials.steps],
-        "mean_error": round(found.mean, 3),
+        "mean_error": round(found.mean, 3), "limit": task.limit,
     }  # fmt: skip
-    return json.dumps(values, indent=2) + "\n"
+    return json.dumps(values | dict(about), indent=2) + "\n"
 
 
 def read_rows(folder: Path) -> list[Row]:
-    """The rows of a folder of JSON files. Raises UserError for one that cannot be read, or none at all."""
+    """The rows of a folder of JSON files. Raises UserError for one that cannot be read, other settings, or none."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for path in sorted(folder.glob("*.json")):
         try:
@@ -75,7 +88,17 @@ def read_rows(folder: Path) -> list[Row]:
             raise UserError(f"{path} is not the result of a pouring row ({bad}); remove it and run again") from None
     if not found:
         raise UserError(f"no result of a pouring row in {folder}; run experiments/pouring.py")
+    common = {json.dumps(_common(one), sort_keys=True) for parts in found.values() for one in parts}
+    if len(common) > 1:
+        raise UserError(
+            f"rows of {folder} were run with different settings ({'; '.join(sorted(common))}); remove the old"
+        )
     return [_row(name, mode, parts) for (name, mode), parts in found.items()]
+
+
+def _common(one: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that rows must share to be compared: all but those of fine-tuning."""
+    return {name: value for name, value in one["settings"].items() if not name.startswith("tune")}
 
 
 def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
@@ -86,12 +109,13 @@ def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
     runs = tuple(f"{part['seed']}/{number}" for part in parts for number in range(len(part["poured"])))
     poured = np.concatenate([np.asarray(part["poured"], np.float64) for part in parts])
     sources = tuple(dict.fromkeys(part["source"] for part in parts))
-    return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop())
+    lost = sum(int(steps) >= part["limit"] for part in parts for steps in part["steps"])
+    return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop(), lost)
 
 
 class Difference(NamedTuple):
-    """Mean of a paired difference of errors in g with its 95 % interval over runs, and the mean of every seed `each`:
-    the runs of a seed share one learned policy, so the interval alone says too much."""
+    """Mean of a paired difference of errors in g, the mean of every seed `each`, and the 95 % interval over seeds
+    (Student's t): the runs of a seed share one learned policy."""
 
     mean: float
     low: float | None
@@ -107,14 +131,14 @@ def difference(a: Row, b: Row) -> Difference:
     change = np.array([a.wrong[a.runs.index(run)] - b.wrong[b.runs.index(run)] for run in shared])
     seed = np.array([run.split("/")[0] for run in shared])
     each = tuple(float(change[seed == one].mean()) for one in np.unique(seed))
-    return Difference(float(change.mean()), *mean_interval(change, np.arange(len(change))), each)
+    return Difference(float(change.mean()), *seed_interval(each), each)
 
 
 def verdict(change: Difference) -> str:
-    """What a difference says of a claim that it is below zero: its interval, and every seed."""
-    if change.high is not None and change.high < 0 and max(change.each) < 0:
-        return "agrees"
-    return "reversed" if change.low is not None and change.low > 0 and min(change.each) > 0 else "not decided"
+    """What a difference says of a claim that it is below zero; nothing with fewer than CLAIM seeds."""
+    if change.low is None or change.high is None or len(change.each) < CLAIM:
+        return f"{len(change.each)} seed{'s' if len(change.each) > 1 else ''}, no claim"
+    return "agrees" if change.high < 0 else "reversed" if change.low > 0 else "not decided"
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -127,7 +151,7 @@ def table(rows: Sequence[Row]) -> str:
         cells = []
         for number, mode in enumerate(MODES):
             row = by.get((name, mode)) or by.get((name, "bound"))
-            cells += [_words(error(row.poured, row.target)) if row else "-", _paper(name, number)]
+            cells += [_cell(row) if row else "-", _paper(name, number)]
         lines.append((title, "yes" if name in DYNAMIC else "no" if name in PAPER else "-", *cells))
     head = ("policy", "sees segments", "fine-tuned, g", "paper", "frozen, g", "paper")
     parts = [markdown(head, lines)]
@@ -139,7 +163,9 @@ def table(rows: Sequence[Row]) -> str:
     claims += [_claim(by, mode, name, bound) for mode in MODES for name in PAPER for bound in BLIND]
     found = [claim for claim in claims if claim]
     if found:
-        parts.append(markdown(("smaller error, as claimed", "than", "mode", "difference, g (95 %)", "sign"), found))
+        parts.append(
+            markdown(("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), found)
+        )
     return "\n\n".join(parts) + "\n"
 
 
@@ -154,6 +180,10 @@ def _claim(by: Mapping[tuple[str, str], Row], mode: str, better: str, worse: str
 
 def _paper(name: str, mode: int) -> str:
     return f"{PAPER[name][mode]:g}" if name in PAPER else "-"
+
+
+def _cell(row: Row) -> str:
+    return _words(error(row.poured, row.target)) + (f", {row.lost} never turned back" if row.lost else "")
 
 
 def _words(found: Error, form: str = ".1f") -> str:

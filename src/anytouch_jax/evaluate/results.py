@@ -123,6 +123,16 @@ def mean_interval(
     return float(low), float(high)
 
 
+def seed_interval(several: Sequence[float]) -> tuple[float | None, float | None]:
+    """95 % interval of the mean over seeds, by Student's t; (None, None) below two."""
+    if len(several) < 2:
+        return None, None
+    from scipy.stats import t
+
+    half = float(t.ppf(0.975, len(several) - 1) * np.std(several, ddof=1) / np.sqrt(len(several)))
+    return float(np.mean(several)) - half, float(np.mean(several)) + half
+
+
 def r2_interval(error: Array, truth: Array, groups: Array) -> tuple[float | None, float | None]:
     """95 % percentile interval of R2 under a bootstrap over `groups`; `error`, `truth` (n,) as `mean_interval`."""
     times, ids = group_draws(groups, 1000, 0)

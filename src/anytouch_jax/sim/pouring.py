@@ -30,7 +30,7 @@ STAND = 3  # moments in which the gripped cylinder still stands on the table; th
 EXPOSURE = 1 / 60  # s of one frame: blows shorter than this are averaged
 STEEPEST = math.radians(86)
 SHOCKS, PIXELS = 101, 102  # numbers of a state's chances beside those of `advance`, whose split gives 0, 1 and 2
-VERSION = 2  # of what a run gives for its seed
+VERSION = 3  # of what a run gives for its seed
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Task:
     """The paper's task: `beads` g in the cylinder, pour out `target` g, then retract.
 
     An action changes the tilt by `step` degrees, or not, `rate` times a second. A run ends when the tilt is `back`
-    degrees below the highest reached, or after `limit` actions; the tilt stays below `most` degrees. `markers`: of the
-    gel. Raises UserError for a task that cannot be done.
+    degrees below the highest reached and no bead flows any more, or after `limit` actions; the tilt stays below `most`
+    degrees. `markers`: of the gel. Raises UserError for a task that cannot be done.
     """
 
     beads: float = 100.0
@@ -190,7 +190,8 @@ def advance(state: State, action: Array, setup: Setup, task: Task) -> State:
     start = jnp.where(state.flowing & ~flowing, _start(start_key), state.start)
     slope = jnp.clip(state.slope, tilt - setup.repose, tilt + setup.repose)  # the surface stays until it is too steep
     steps = state.steps + 1
-    done = (highest - tilt >= jnp.deg2rad(task.back) - 1e-6) | (steps >= task.limit)
+    back = (highest - tilt >= jnp.deg2rad(task.back) - 1e-6) & ~flowing
+    done = back | (steps >= task.limit)
     rate = out * task.rate
     after = State(state.mass - out, tilt, highest, slope, start, flowing, rate, steps, tilt != state.tilt, done, key)
     return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), after, state)
@@ -213,20 +214,30 @@ def _steepness(slope: Array) -> Array:
 
 def capacity(slope: Array, setup: Setup) -> Array:
     """g of beads that stay behind a surface of `slope` rad (against the cross-section) that just reaches the lip."""
-    place, area = _slices(setup)
-    column = jnp.clip(setup.height - (setup.radius - place) * _steepness(slope), 0, setup.height)
+    area, column = _behind(slope, setup)
     return setup.bulk * jnp.sum(area * column)
+
+
+def _behind(slope: Array, setup: Setup) -> tuple[Array, Array]:
+    """The slices' areas mm^2, and the height mm of the beads in each behind a surface of `slope` that meets the lip."""
+    place, area = _slices(setup)
+    return area, jnp.clip(setup.height - (setup.radius - place) * _steepness(slope), 0, setup.height)
 
 
 def slot_rate(excess: Array, slope: Array, setup: Setup) -> Array:
     """g/s over the lip when `excess` g lie above the angle of repose.
 
-    A slot as wide as the lip's chord and as deep as the layer. The empty margin of 1.4 beads is left on the sides; the
-    layer is open above, and its lower rim is beads.
+    A slot as deep as the layer, which lies on the beads at rest (where they leave the bottom bare, on less than the
+    whole ellipse), and as wide as the chord of the lip that the layer's surface cuts, a plane `depth` above the one
+    that just meets the lip. The empty margin of 1.4 beads is left on the sides; the layer is open above, and its lower
+    rim is beads.
     """
-    inclined = jnp.cos(jnp.clip(slope, 0, math.radians(75)))
-    depth = jnp.maximum(excess, 0) / setup.bulk / (math.pi * setup.radius**2 / inclined)
-    chord = 2 * jnp.sqrt(jnp.maximum(depth * (2 * setup.radius - depth), 0))
+    inclined = jnp.clip(slope, 0, math.radians(75))
+    area, column = _behind(slope, setup)
+    covered = jnp.sum(jnp.where(column > 0, area, 0))
+    depth = jnp.maximum(excess, 0) / setup.bulk / (covered / jnp.cos(inclined))
+    sagitta = jnp.minimum(depth / jnp.maximum(jnp.sin(inclined), 1e-3), setup.radius)
+    chord = 2 * jnp.sqrt(sagitta * (2 * setup.radius - sagitta))
     width = jnp.maximum(chord - MARGIN * setup.bead, setup.bead)  # a single file of beads passes
     return FLOW * setup.bulk * math.sqrt(GRAVITY) * width * depth**1.5
 

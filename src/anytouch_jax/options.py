@@ -113,6 +113,7 @@ class Probe:
 
     The penalty is chosen on split val, or by cross-validation in groups inside train; the report is on split test.
     --tasks and --benchmark run the battery instead: objects and recordings apart, dealt anew by every seed.
+    An option that would do nothing there (--label, --group, --leave-out, --where, --sensor) is refused.
     Example: anytouch probe --run runs/stage2 --data data/scenes/manifest.parquet --tasks material,slip,force,twist
     """
 
@@ -123,7 +124,8 @@ class Probe:
     label: str = "object"
     """Label column, with or without "label."."""
     group: str = "grasp_group"
-    """Column whose values never stand on both sides of a split (falls back to sequence)."""
+    """Column, with or without "label.", whose values never stand on both sides of a split (default: grasp_group where
+    the manifest has it, else sequence)."""
     leave_out: str | None = None
     """Leave whole values of this column out in turn (for slip: object), instead of the splits."""
     where: tuple[str, float] | None = None

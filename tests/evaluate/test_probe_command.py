@@ -65,3 +65,15 @@ def test_where_nothing_or_all_was_described_nothing_stands_apart(manifest):
 def test_no_row_is_left(manifest):
     with pytest.raises(UserError, match="no row has a label in 'slip' after the filters"):
         read(manifest, label="slip", sensor="gelslim")
+
+
+def test_groups_are_found_with_or_without_label(manifest):
+    by_slip = [read(manifest, label="object", group=name).groups for name in ("slip", "label.slip")]
+    assert set(by_slip[0]) == {"yes", "no"}
+    np.testing.assert_array_equal(*by_slip)
+    assert set(read(manifest, label="slip", group="object").groups) == {f"object {n}" for n in range(6)}
+
+
+def test_a_group_that_is_not_there_is_no_recording(manifest):
+    with pytest.raises(UserError, match=r"no column 'taste' or 'label\.taste'; it has path"):
+        read(manifest, label="object", group="taste")

@@ -5,12 +5,21 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markdown import Markdown
 
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Probe
+
+_OF_LABEL = ("label", "group", "leave_out", "where", "sensor")
+_OF_SPLITS = ("group", "seeds", "protocol")  # of a label; --leave-out has folds instead
+_OF_BATTERY = (
+    "join", "heads", "order", "train_sensors", "test_sensors", "train_units", "test_units", "max_rows", "cache",
+)  # fmt: skip
+_OF_TASKS = ("frames", "pooling", "join", "heads", "protocol")  # a benchmark has the authors'
 
 
 def run(options: Probe) -> int:
     """Probe frozen features on a label column or on tasks, print a table, write JSON when asked."""
+    check_options(options)
     if options.tasks or options.benchmark:
         from anytouch_jax.evaluate import battery_command
 
@@ -29,3 +38,15 @@ def run(options: Probe) -> int:
         options.out.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(options.out, record)
     return 0
+
+
+def check_options(options: Probe) -> None:
+    """Refuse what differs from its default and would do nothing. Raises UserError that names it and says why."""
+    if options.tasks or options.benchmark:
+        refuse(options, _OF_LABEL, "beside --tasks or --benchmark, which have labels and groups of their own")
+        if options.benchmark and not options.tasks:
+            refuse(options, _OF_TASKS, "beside --benchmark, which has the authors' settings")
+        return
+    refuse(options, _OF_BATTERY, "without --tasks or --benchmark", "; or name tasks: --tasks all")
+    if options.leave_out is not None:
+        refuse(options, _OF_SPLITS, "beside --leave-out, which groups by its own column and needs no split")

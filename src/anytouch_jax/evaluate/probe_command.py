@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 RAW = "raw pixels"
+GROUP = "grasp_group"  # the default of --group, which a manifest need not have
 _RAW_SIZE = (240, 320)
 
 
@@ -126,10 +127,11 @@ def _column(table: Any, name: str) -> list[Any]:
 
 
 def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
-    """The column asked for, the sequence where it is empty; with leave_out that column alone."""
+    """The column left out or asked for, the sequence where it is empty, or where there is no default column."""
     sequence = _column(manifest.table, "sequence")
     name = options.leave_out or options.group
-    if options.leave_out is None and name not in manifest.table.column_names:
+    names = manifest.table.column_names
+    if name == GROUP and not {name, f"label.{name}"} & set(names):
         return np.array([sequence[r] for r in rows])
     column = _column(manifest.table, name)
     return np.array([str(column[r]) if column[r] not in (None, "") else f"sequence {sequence[r]}" for r in rows])

@@ -88,7 +88,7 @@ class Embed:
     split: str | None = None
     """Only this split of a manifest."""
     sensor: str = "universal"
-    """Sensor of a folder or a video; one that the model does not know gets the universal tokens."""
+    """Sensor of a folder, a video or a camera; one that the model does not know gets the universal tokens."""
     background: Path | None = None
     """Picture of the untouched gel of a folder, a video or a camera, for an encoder trained on differences from it."""
     frames: int = 1
@@ -98,7 +98,7 @@ class Embed:
     join: Literal["mean", "sum", "concat"] = "mean"
     """How the segments of a long clip are joined."""
     batch: int = 64
-    """Frames at a time."""
+    """Frames at a time (not with --stream)."""
     stream: bool = False
     """One frame at a time, the newest of a camera; prints where the time went."""
     stride: int = 1

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Embed
@@ -21,6 +22,7 @@ _MANIFESTS = (".csv", ".parquet")
 
 def run(options: Embed) -> int:
     """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
+    _refuse_unused(options)
     from anytouch_jax.evaluate import features
 
     encoder = features.load_encoder(options.run)
@@ -155,3 +157,13 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     stacked = np.concatenate(values)
     index = np.arange(options.frames - 1, count)
     return features.Features(stacked, index, {"frame_index": index})
+
+
+def _refuse_unused(options: Embed) -> None:
+    if options.stream:
+        refuse(options, ("split", "batch"), "with --stream, which embeds every frame by itself")
+    elif options.input.suffix.lower() in _MANIFESTS:
+        refuse(options, ("sensor", "stride"), "with a manifest, whose rows name their sensor and stride")
+    else:
+        refuse(options, ("split",), "with a folder or a video: only a manifest has splits")
+        refuse(options, ("stride",), "without --stream: clips of a folder or a video are of frames in a row")

@@ -166,7 +166,7 @@ def test_names_of_a_pareto_plot_lie_on_nothing(tmp_path: Path, drawn: list[Any])
 
 def test_a_folder_that_is_a_file_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"cannot write .*a\.png"):
+    with pytest.raises(UserError, match=r"cannot write .*a\.png: File exists; choose another folder"):
         plots.write_bytes(tmp_path / "file" / "a.png", b"new")
     with pytest.raises(UserError, match=r"cannot write .*a\.png"):
         plots.write_bytes(tmp_path / "file" / "deep" / "a.png", b"new")

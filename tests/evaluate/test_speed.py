@@ -284,7 +284,7 @@ def test_the_peak_is_that_of_a_square_product():
 
 def test_a_report_is_whole_or_not_there(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="choose another --out"):
+    with pytest.raises(UserError, match="choose another folder"):
         speed_report.write(tmp_path / "file", "speed", "text", {})
     path = speed_report.write(tmp_path / "new", "speed", "text", {"a": None})
     assert path.read_text() == "text" and [p.name for p in sorted(path.parent.iterdir())] == ["speed.json", "speed.md"]

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anytouch_jax.commands.output import beside, write_new
+from anytouch_jax.commands.output import beside, check_folder, write_new
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Annotate
@@ -31,6 +31,8 @@ def run(options: Annotate) -> int:
     target = options.out or beside(options.manifest, "captions")
     if target.expanduser().resolve() in manifest.files:
         raise UserError(f"{target} is the manifest that was read; name another file with --out")
+    if options.sheet is not None:
+        check_folder(options.sheet, "--sheet")
     if options.captions is not None:
         return _attach(options, manifest, target)
     try:

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Bench
 
@@ -21,6 +22,7 @@ def run(options: Bench) -> int:
     """Measure what was asked for, write speed.md, speed.json and a figure a workload, and print the tables."""
     from anytouch_jax.evaluate import machine, speed_report
 
+    check_folder(options.out / "speed.md")
     here = machine.describe()
     say(here.sentence())
     wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anytouch_jax.commands.output import beside, check_new, write_new
+from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_data import Contact
 
@@ -17,6 +17,8 @@ def run(options: Contact) -> int:
     target = options.out or (None if options.check else beside(options.manifest, "contact"))
     if target is not None:
         check_new(manifest, target)
+    if options.picture is not None:
+        check_folder(options.picture, "--picture")
     limits = dict(options.threshold)
     scores = contact.contact_scores(manifest, workers=options.threads)
     marked, report = contact.mark_contact(manifest, scores, thresholds=limits, drop=options.drop)

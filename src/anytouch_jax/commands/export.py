@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.options_use import Export
 
 
@@ -9,6 +10,7 @@ def run(options: Export) -> int:
     """Write the artefact and its description, after a comparison with the live model; say how far they differ."""
     from anytouch_jax.evaluate import export, features
 
+    check_folder(options.out)
     encoder = features.load_encoder(options.run)
     platforms = [name.strip() for name in options.platforms.split(",") if name.strip()]
     about = export.export(

@@ -40,15 +40,25 @@ def write_new(manifest: Manifest, path: Path) -> Path:
     return target
 
 
-def check_folder(path: Path) -> None:
-    """Make the folder of a file that will be written after long work. Raises UserError where that cannot be."""
+def check_folder(path: Path, option: str = "--out") -> None:
+    """Make the folder of a file that will be written after long work; `option` named it.
+
+    Raises UserError where that cannot be, and where `path` is a folder itself.
+    """
     try:
+        if path.is_dir():
+            raise UserError(f"{path} is a folder; name a file with {option}")
+        for folder in reversed(path.parents):
+            if folder.exists() and not folder.is_dir():
+                raise UserError(f"{folder} is a file, not a folder; choose another {option}")
         path.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(path.parent, os.W_OK)
     except OSError as error:
-        raise UserError(f"{path.parent} cannot be made: {error.strerror or error}") from None
+        raise UserError(
+            f"the folder {path.parent} cannot be made: {error.strerror or error}; choose another {option}"
+        ) from None
     if not writable:
-        raise UserError(f"{path.parent} cannot be written to")
+        raise UserError(f"the folder {path.parent} cannot be written to; choose another {option}")
 
 
 def write_text(text: str, path: Path) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markdown import Markdown
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Probe
@@ -20,6 +21,8 @@ _OF_TASKS = ("frames", "pooling", "join", "heads", "protocol")  # a benchmark ha
 def run(options: Probe) -> int:
     """Probe frozen features on a label column or on tasks, print a table, write JSON when asked."""
     check_options(options)
+    if options.out is not None:
+        check_folder(options.out)
     if options.tasks or options.benchmark:
         from anytouch_jax.evaluate import battery_command
 
@@ -35,7 +38,6 @@ def run(options: Probe) -> int:
     if options.out is not None:
         from anytouch_jax.train.record import write_atomic
 
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(options.out, record)
     return 0
 

@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.markdown import Markdown
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Retrieve
@@ -25,6 +26,8 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
     from anytouch_jax.evaluate.sections import markdown
 
+    if options.out is not None:
+        check_folder(options.out)
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]
@@ -58,7 +61,6 @@ def run(options: Retrieve) -> int:
     if options.out is not None:
         from anytouch_jax.train.record import write_atomic
 
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
         write_atomic(options.out, json.dumps(about | {"results": retrieval.to_records(scored)}, indent=2) + "\n")
     return 0

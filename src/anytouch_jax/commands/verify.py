@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anytouch_jax.commands.output import check_new, write_new, write_text
+from anytouch_jax.commands.output import check_folder, check_new, write_new, write_text
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Verify
@@ -25,6 +25,8 @@ def run(options: Verify) -> int:
     for target in (options.repair, options.commercial_only):
         if target is not None:
             check_new(manifest, target)
+    if options.out is not None:
+        check_folder(options.out)
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)
     print(report.to_markdown(), end="")
     if options.out is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -64,7 +65,8 @@ def write_bytes(path: Path, data: bytes) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):  # there may be no such folder
             part.unlink()
-        raise UserError(f"cannot write {path}: {error.strerror}; free some space or choose another folder") from None
+        advice = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose another folder"
+        raise UserError(f"cannot write {path}: {error.strerror}; {advice}") from None
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

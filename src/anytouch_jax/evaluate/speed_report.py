@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.config import UserError
+from anytouch_jax.evaluate.plots import write_bytes
 from anytouch_jax.evaluate.speed import Row
 
 _HEADS = (
@@ -109,18 +107,8 @@ def as_dict(row: Any) -> dict[str, Any]:
 
 
 def write(folder: Path, name: str, text: str, numbers: Mapping[str, Any]) -> Path:
-    """Write `name`.md and `name`.json in a folder, each in one move. Raises UserError for a full disk."""
+    """Write `name`.md and `name`.json in a folder, each in one move. Raises UserError when that cannot be done."""
     for suffix, content in ((".json", json.dumps(numbers, indent=2, allow_nan=False) + "\n"), (".md", text)):
         path = folder / f"{name}{suffix}"
-        part = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            part.write_text(content, encoding="utf-8")
-            os.replace(part, path)
-        except OSError as problem:
-            with contextlib.suppress(OSError):
-                part.unlink()
-            raise UserError(
-                f"cannot write {path}: {problem.strerror}; free some space or choose another --out"
-            ) from None
+        write_bytes(path, content.encode())
     return path

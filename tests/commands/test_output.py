@@ -1,0 +1,53 @@
+"""Where a command writes is asked before its long work begins."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from anytouch_jax.commands.output import check_folder
+from anytouch_jax.config import UserError
+
+WORK = {
+    "contact": "anytouch_jax.data.contact.contact_scores",
+    "verify": "anytouch_jax.data.verify.verify",
+    "export": "anytouch_jax.evaluate.features.load_encoder",
+    "probe": "anytouch_jax.evaluate.probe_command.run_probes",
+    "retrieve": "anytouch_jax.data.manifest.read",
+    "bench": "anytouch_jax.evaluate.machine.describe",
+    "annotate": "anytouch_jax.data.annotate.annotate",
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["contact", "touch.parquet", "--picture", "afile/c.png"], "--picture"),
+        (["verify", "touch.parquet", "--out", "afile/report.json"], "--out"),
+        (["export", "--run", "nowhere", "--out", "afile/e.bin"], "--out"),
+        (["probe", "--data", "touch.parquet", "--out", "afile/deep/p.json"], "--out"),
+        (["retrieve", "--data", "touch.parquet", "--out", "afile/r.json"], "--out"),
+        (["bench", "embed", "--quick", "--out", "afile"], "--out"),
+        (["annotate", "touch.parquet", "--yes", "--sheet", "afile/look.html"], "--sheet"),
+    ],
+)
+def test_a_place_that_cannot_be_is_named_before_the_work(mistake, pressed, monkeypatch, words, option):
+    monkeypatch.chdir(pressed.parent)
+    (pressed.parent / "afile").write_text("")
+    before = sorted(pressed.parent.iterdir())
+    monkeypatch.setattr(WORK[words[0]], lambda *a, **k: pytest.fail("long work began"))
+    assert f"afile is a file, not a folder; choose another {option}" in mistake(*words)
+    assert sorted(pressed.parent.iterdir()) == before
+
+
+def test_the_folder_is_made_where_it_can_be(tmp_path, monkeypatch):
+    check_folder(tmp_path / "a" / "b" / "c.json")
+    assert (tmp_path / "a" / "b").is_dir()
+    with pytest.raises(UserError, match="b is a folder; name a file with --out"):
+        check_folder(tmp_path / "a" / "b")
+    with pytest.raises(UserError, match="cannot be made: File name too long; choose another --sheet"):
+        check_folder(tmp_path / ("x" * 300) / "c.json", "--sheet")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of somebody else
+    with pytest.raises(UserError, match="cannot be written to; choose another --out"):
+        check_folder(tmp_path / "c.json")

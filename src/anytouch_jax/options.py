@@ -301,7 +301,7 @@ class Report:
 class Bench:
     """Measure speed against error: steps, embeddings, compilation, memory on many devices, simulator, loader.
 
-    Example: anytouch bench stage1 embed --preset small --out experiments/results
+    Example: anytouch bench stage1 embed --preset small --out runs/bench
 
     Without WHAT everything is measured. Variants take turns in one process; quiet the machine first.
     """

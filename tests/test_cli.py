@@ -78,6 +78,8 @@ def test_help_lists_every_command(capsys):
         assert run(*args) == 0
         out = capsys.readouterr().out
         assert all(f"\n  {name} " in out for name in _COMMANDS)
+        texts = {out.index(text) - out.rindex("\n", 0, out.index(text)) for _, text in _COMMANDS.values()}
+        assert len(texts) == 1  # one column
     assert run() == 2
     capsys.readouterr()
     assert run("--version") == 0 and capsys.readouterr().out.strip()[0].isdigit()
@@ -131,6 +133,8 @@ def test_a_mistyped_option_is_answered_with_the_nearest(typo, meant, capsys):
     assert run("train", "--data", "m.csv", "--run", "r", typo, "5") == 2
     error = capsys.readouterr().err
     assert typo in error and "Perhaps you meant" in error and meant in error.split("Perhaps", 1)[1]
+    more = "--help-all" if "." in typo else "--help"  # where the option that was meant is explained
+    assert f"run anytouch train {more}" in error and "[the options" not in error
 
 
 def test_wrong_values_are_usage_errors(capsys):

@@ -88,7 +88,8 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def _usage() -> str:
-    lines = "\n".join(f"  {name:8} {text}" for name, (_, text) in _COMMANDS.items())
+    width = max(map(len, _COMMANDS))
+    lines = "\n".join(f"  {name:{width}}  {text}" for name, (_, text) in _COMMANDS.items())
     return f"""usage: anytouch COMMAND [options]
 
 One representation of touch for many camera-based tactile sensors.
@@ -107,7 +108,8 @@ def _run(name: str, args: list[str]) -> int:
     return run(_parse(_COMMANDS[name][0], name, args))
 
 
-def _parse(kind: Any, name: str, args: list[str], default: Any = None) -> Any:
+def _parse(kind: Any, name: str, args: list[str], default: Any = None, closing: str = "") -> Any:
+    """The options of a command; `closing`, which takes --help away, stands below a mistake instead of a hint to it."""
     import tyro
 
     extra = {} if default is None else {"default": default}
@@ -120,7 +122,12 @@ def _parse(kind: Any, name: str, args: list[str], default: Any = None) -> Any:
         kind = make_dataclass(
             kind.__name__, [("source", spelled, kind.source)], bases=(kind,), frozen=True, namespace=about
         )
-    return tyro.cli(kind, prog=f"anytouch {name}", args=args, config=config, **extra)
+    try:
+        return tyro.cli(kind, prog=f"anytouch {name}", args=args, config=config, add_help=not closing, **extra)
+    except SystemExit:
+        if closing:
+            print(closing, file=sys.stderr)
+        raise
 
 
 def _parse_train(args: list[str]) -> tuple[Train, Config]:
@@ -136,10 +143,11 @@ def _parse_train(args: list[str]) -> tuple[Train, Config]:
     first, rest = _split_sections([arg for arg in args if arg != "--help-all"])
     options = _parse(Train, "train", first, Train((), Path("runs/stage1")) if asked else None)
     config = _configure(options)
+    closing = "For every field of the configuration, run anytouch train --help-all"
     if asked:
-        rest = ["--help"]
+        rest, closing = ["--help"], ""
     default = Sections(config.model, config.objective, config.optim, config.data, config.run)
-    s = _parse(Sections, "train [the options of --help]", rest, default)
+    s = _parse(Sections, "train [the options of --help]", rest, default, closing)
     return options, replace(config, model=s.model, objective=s.objective, optim=s.optim, data=s.loader, run=s.loop)
 
 

@@ -189,5 +189,19 @@ def test_the_command_makes_a_data_set(tmp_path, capsys):
     out = tmp_path / "scenes"
     options = ["--touches", "2", "--sensors", "digit", "--objects", "6", "--frames", "2", "--size", "32"]
     assert main(["simulate", "--out", str(out), *options]) == 0
-    assert "2 touches by digit" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.startswith("compiling the contact solver for digit: about a minute the first time\n")
+    assert "2 touches by digit" in said
     assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
+
+
+def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(dataset, "GROUP", 1)
+    words = ["--sensors", "digit,tac3d", "--objects", "6", "--frames", "2", "--size", "32", "--vision", "0"]
+    args = ["simulate", "--out", str(tmp_path / "scenes"), "--touches", "25", *words]
+    assert main(args) == 0
+    first, *lines, last = capsys.readouterr().err.splitlines()
+    assert "digit, tac3d" in first and "25 touches by" in last
+    assert lines == [f"{done} of 25 touches" for done in (3, 5, 8, 10, 13, 15, 18, 20, 23, 25)]
+    assert main(args) == 0  # nothing is left to do, nothing is compiled
+    assert len(capsys.readouterr().err.splitlines()) == 1

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Simulate
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 def run(options: Simulate) -> int:
@@ -35,15 +41,29 @@ def run(options: Simulate) -> int:
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("touches", total=options.touches)
-        path = simulate(
-            scenes,
-            options.out,
-            threads=options.threads,
-            progress=lambda done, of: bar.update(task, completed=done, total=of),
-        )
+        told = _teller(bar, scenes.sensors)
+        path = simulate(scenes, options.out, threads=options.threads, progress=told)
     say(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}")
     return 0
+
+
+def _teller(bar: Progress, sensors: tuple[str, ...]) -> Callable[[int, int], None]:
+    """What is told of (touches done, touches): a bar on a terminal, a line every tenth of them elsewhere."""
+    task, last = bar.add_task("touches"), -1
+
+    def tell(done: int, of: int) -> None:
+        nonlocal last
+        line = ""
+        if last < 0 and done < of:
+            line = f"compiling the contact solver for {', '.join(sensors)}: about a minute the first time"
+        elif bar.disable and 10 * done // of > 10 * last // of:
+            line = f"{done} of {of} touches"
+        if line:
+            bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        last = done
+        bar.update(task, completed=done, total=of)
+
+    return tell
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ STOP_AFTER ?=
 SAVE       ?=
 BATCH      ?=
 LABEL      ?= material
-GOLDEN     ?= ../shared/golden
+GOLDEN     ?= tests/parity/golden
 WORKERS    ?= 2
 
 DEMO       ?= runs/demo

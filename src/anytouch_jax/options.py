@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from anytouch_jax.config import Data, Model, Objective, Optim, Run
+from anytouch_jax.config import Data, Model, Objective, Optim, PresetName, Run
 
 Paths = tuple[Path, ...]
 
@@ -26,7 +26,7 @@ class Train:
     """Run folder: config.json, metrics.jsonl, checkpoints/, figures/."""
     stage: Literal[1, 2] = 1
     """1: pixels. 2: touch-vision-text alignment and cross-sensor matching."""
-    preset: Literal["tiny", "small", "base", "large"] = "tiny"
+    preset: PresetName = "tiny"
     """Sizes of the network; large is the paper's."""
     recipe: Literal["paper", "release"] = "paper"
     """Follow the paper's text, or the authors' released code where they differ."""
@@ -174,7 +174,7 @@ class Probe:
 class Parity:
     """Compare this implementation with golden vectors of the authors' PyTorch code.
 
-    Example: anytouch parity ../shared/golden
+    Example: anytouch parity tests/parity/golden
 
     Exits 1 when a case is out of tolerance or not understood.
     """
@@ -308,7 +308,7 @@ class Bench:
 
     what: tuple[Literal["stage1", "stage2", "embed", "compile", "memory", "simulator", "loader"], ...]
     """What to measure (default: everything)."""
-    preset: Literal["tiny", "small", "base", "large"] = "tiny"
+    preset: PresetName = "tiny"
     """Sizes of the network."""
     batch: int | None = None
     """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; a device for memory)."""

@@ -46,8 +46,8 @@ def planned(*words: str) -> str:
     ("words", "command"),
     [
         (
-            ["train-stage1", "DATA=../shared/real_touch/manifest.csv"],
-            "anytouch_jax train --stage 1 --data ../shared/real_touch/manifest.csv --run runs/stage1 --preset tiny",
+            ["train-stage1", "DATA=mine/manifest.csv"],
+            "anytouch_jax train --stage 1 --data mine/manifest.csv --run runs/stage1 --preset tiny",
         ),
         (
             ["train-stage1", "DATA=a.parquet b.csv", "RUN=r", "PRESET=large", "STEPS=4", "STOP_AFTER=2", "SAVE=1"],
@@ -66,12 +66,18 @@ def planned(*words: str) -> str:
             ["probe", "DATA=a.csv", "RUN=r", "LABEL=slip"],
             "anytouch_jax probe --run r --data a.csv --label slip",
         ),
-        (["parity"], "anytouch_jax parity ../shared/golden"),
+        (["parity"], "anytouch_jax parity tests/parity/golden"),
         (["parity", "GOLDEN=g"], "anytouch_jax parity g"),
     ],
 )
 def test_targets_run_the_command_line(words: list[str], command: str) -> None:
     assert planned(*words) == command
+
+
+def test_what_targets_take_by_default_is_in_the_repository() -> None:
+    default = re.search(r"^GOLDEN +\?= (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1)
+    folder = (ROOT / default).resolve()
+    assert folder.is_relative_to(ROOT) and list(folder.glob("A_*.npz"))
 
 
 def test_quick_and_whole_test_run() -> None:

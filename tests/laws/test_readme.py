@@ -1,0 +1,93 @@
+"""What the README tells a user to type: commands that parse, targets that are there, Python that runs, true sizes."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from tiny_models import tiny_config
+
+from anytouch_jax import cli
+from anytouch_jax.config import preset
+from anytouch_jax.nn.functional import build
+
+ROOT = Path(__file__).resolve().parents[2]
+README, MAKEFILE = ((ROOT / name).read_text() for name in ("README.md", "Makefile"))
+PYTHON = re.findall(r"^```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+
+
+def typed(program: str) -> list[str]:
+    """What the README shows to be typed after `program`: lines of code and table cells, without comments."""
+    lines = re.findall(rf"^ {{4}}{program} (.*)$", README, re.MULTILINE)
+    cells = re.findall(rf"^\|.*?`{program} ([^`]*)`", README, re.MULTILINE)
+    return [re.split(r"\s+#|\s\|", line)[0].replace(" ...", "").strip() for line in (*lines, *cells)]
+
+
+@pytest.mark.parametrize("line", typed("anytouch"))
+def test_a_command_of_the_readme_is_understood(line: str) -> None:
+    name, *args = shlex.split(line)
+    if name == "train":
+        if "--data" not in args:  # the example leaves to the reader what every run needs
+            args += ["--data", "m.csv", "--run", "r"]
+        cli._parse_train(args)
+    else:
+        cli._parse(cli._COMMANDS[name][0], name, args)
+
+
+def test_one_spelling_of_the_command() -> None:
+    assert len(typed("anytouch")) > 20
+    assert README.count(".venv/bin/") == 1 and ". .venv/bin/activate" in README
+
+
+@pytest.mark.parametrize("line", typed("make"))
+def test_a_target_of_the_readme_is_there_and_heeds_its_variables(line: str) -> None:
+    target, *given = (word for word in shlex.split(line.replace("[", "").replace("]", "")))
+    assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE)
+    for variable in given:
+        assert f"$({variable.partition('=')[0]})" in MAKEFILE, variable
+
+
+def test_the_notebooks_named_are_those_that_are_made() -> None:
+    pages = re.search(r"^PAGES +\?= (.*)$", MAKEFILE, re.MULTILINE).group(1).split()
+    told = re.search(r"make notebooks +# the pages (.*)$", README, re.MULTILINE).group(1)
+    assert told.split(", ") == pages
+
+
+def test_the_pinned_jax_is_the_one_named_for_a_gpu() -> None:
+    pin = re.search(r"^jax==(\S+)$", (ROOT / "requirements.txt").read_text(), re.MULTILINE).group(1)
+    assert f'"jax[cuda12]=={pin}"' in README
+
+
+@pytest.mark.parametrize("name", ["tiny", "small", "base", "large"])
+def test_the_table_of_presets_has_their_sizes(name: str) -> None:
+    model = preset(name).model
+    count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(build(model).abstract()["touch"]))
+    row = f"| {model.image_size} | {model.touch.width} x {model.touch.depth} | {count / 1e6:.1f} M |"
+    assert re.search(rf"^\| `{name}`[^|]* {re.escape(row)}$", README, re.MULTILINE), row
+
+
+def test_the_snippet_of_an_encoder_runs(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "stage2").symlink_to(tiny_run)
+    monkeypatch.chdir(tmp_path)
+    frames = np.random.default_rng(0).integers(0, 256, (4, 28, 28, 3), np.uint8)
+    names: dict[str, Any] = {f"frame{i}": frame for i, frame in enumerate(frames[:3])} | {"gel": frames[3]}
+    with warnings.catch_warnings(record=True):  # of the sensor that is not in the table
+        warnings.simplefilter("always")
+        exec(PYTHON[0], names)
+    assert names["z"].shape == (1, 12) and np.isfinite(names["z"]).all()
+
+
+def test_the_snippet_of_training_runs(monkeypatch: pytest.MonkeyPatch, compiled_once: None) -> None:
+    asked = []
+    monkeypatch.setattr("anytouch_jax.config.preset", lambda *a, **k: asked.append((a, k)) or tiny_config(1))
+    names: dict[str, Any] = {"clips": np.zeros((2, 4, 28, 28, 3), np.uint8), "rows": np.zeros(2, np.int32)}
+    exec(PYTHON[1], names)
+    assert asked == [(("tiny",), {"stage": 1})] and "(B, 4, 112, 112, 3)" in PYTHON[1]
+    assert names["state"].step == 1 and np.isfinite(names["metrics"]["loss"])

@@ -264,6 +264,36 @@ def test_the_matching_loss_is_that_of_the_logits():
     np.testing.assert_allclose(metrics["match"], loss, rtol=1e-5)
 
 
+def test_cosine_matching_has_the_other_places_of_the_batch_as_negatives():
+    config = replace(CONFIG2, model=replace(CONFIG2.model, match_head="cosine"))
+    net = build(config.model)
+    params = net.init(jax.random.key(1))
+    match = MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR, floats(4, 1) * jnp.nan, SENSOR)  # never looked at
+    terms = partial(objectives.stage2_terms, net=net, config=config)
+    total, metrics = terms(params, Stage2Batch(None, match), None)
+    both = objectives.touch_embeddings(params, [match[:2], match[2:4]], net=net)
+    logits = np.asarray(both[0] @ both[1].T, np.float64) / config.model.temperature
+    away = lambda x: np.log(np.exp(x).sum(1)) - np.diag(x)  # noqa: E731
+    np.testing.assert_allclose(metrics["match"], (away(logits).mean() + away(logits.T).mean()) / 2, rtol=1e-4)
+    np.testing.assert_allclose(total, config.objective.match_weight * metrics["match"], rtol=1e-6)
+    assert float(metrics["match_accuracy"]) == (logits.argmax(1) == np.arange(4)).mean()
+
+
+def test_patches_that_matching_drops_have_no_influence():
+    config = changed(CONFIG2, match_keep=0.25)
+    noise = jnp.asarray(RNG.random((3, 4, 16)), jnp.float32)
+    match = MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR, floats(4, 1), SENSOR)
+
+    def loss(clip):
+        batch = Stage2Batch(None, match._replace(positive=clip))
+        return objectives.stage2_terms(PARAMS2, batch, None, net=NET2, config=config, match_noise=noise)[0]
+
+    slope = np.asarray(jax.grad(loss)(match.positive)).reshape(4, 4, 7, 4, 7, 3).transpose(0, 1, 3, 2, 4, 5)
+    felt = np.abs(slope.reshape(4, 16, -1)).max(-1) > 0
+    kept = np.asarray(noise[1]).argsort(1)[:, :4]
+    np.testing.assert_array_equal(np.sort(np.nonzero(felt)[1].reshape(4, 4), 1), np.sort(kept, 1))
+
+
 def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
     terms = lambda p, b: objectives.stage2_terms(p, b, None, net=NET2, config=CONFIG2)[0]  # noqa: E731
     both = flops(terms, PARAMS2, Stage2Batch(ALIGN, MATCH))

@@ -57,7 +57,8 @@ class TextTower:
 class Model:
     """Everything that decides the shapes and the arithmetic of the network.
 
-    `image` and `text` None leave the towers out (stage 1); `lora_rank` 0: no LoRA. `sensors` names the rows of sensor
+    `image` and `text` None leave the towers out (stage 1); `lora_rank` 0: no LoRA. `match_head` "cosine" (ours): see
+    `losses.contrast_loss`. `sensors` names the rows of sensor
     tokens (Sec. 3.5) and of patch encoders if each has its own (T3); row "universal" serves sensors never seen.
     """
 
@@ -77,7 +78,7 @@ class Model:
     decoder_sensor_tokens: bool = False
     patch_encoder: Literal["shared", "sensor"] = "shared"
     force_head: bool = False
-    match_head: Literal["mlp", "linear", "none"] = "none"
+    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"
     lora_rank: int = 0
     lora_alpha: float = 16.0
     temperature: float = 0.07
@@ -121,7 +122,8 @@ class Objective:
     `reconstruct`: keep the stage-1 loss on the align batches of stage 2 (the release).
     `groups`: the batch is cut in that many shares and negatives stay within a share (1: the whole batch).
     `centre`: embeddings less their mean over the batch before they are compared (towers from scratch, which else
-    collapse to one point). `differences`, `force`: stage-1 weights of frame differences, of model.force_head.
+    collapse to one point). `match_keep`: share of the patches that a touch keeps in matching (ours, after FLIP).
+    `differences`, `force`: stage-1 weights of frame differences, of model.force_head.
     """
 
     mask_ratio: float = 0.75
@@ -132,6 +134,7 @@ class Objective:
     alpha_vl: float = 0.2
     touch_text_sum: bool = False
     match_weight: float = 0.1
+    match_keep: float = 1.0
     reconstruct: bool = False
     groups: int = 1
     centre: bool = False
@@ -142,6 +145,8 @@ class Objective:
     force: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 < self.match_keep <= 1:
+            raise ConfigError(f"match_keep must be above 0 and at most 1, not {self.match_keep}")
         if self.groups < 1 or not 0 <= self.mask_ratio <= 1:
             raise ConfigError(f"groups must be 1 or more and mask_ratio 0 to 1, not {self.groups}, {self.mask_ratio}")
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, Model
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.ops import losses, masking, tokens, universal
 
@@ -130,17 +130,24 @@ class Embeddings(NamedTuple):
     has_text: Array | None
 
 
-def touch_embeddings(params: Params, touches: Sequence[tuple[Array, Array]], *, net: Net) -> list[Array]:
+def touch_embeddings(
+    params: Params, touches: Sequence[tuple[Array, Array]], *, net: Net, keep_ids: Array | None = None
+) -> list[Array]:
     """Unit-norm embeddings (B, E) of several batches of (clip (B, T, H, W, 3) float, sensor i32 (B,)).
 
     Batches of one shape share a pass of the encoder: one stack to compile and larger products. They are interleaved row
-    by row, not chained, so that each row stays on its device.
+    by row, not chained, so that each row stays on its device. `keep_ids` (M, B, K): patches to keep of M batches.
     """
     z: list[Array] = [jnp.zeros(0)] * len(touches)
     for shape in {clip.shape: None for clip, _ in touches}:
         members = [i for i, (clip, _) in enumerate(touches) if clip.shape == shape]
         clips, sensors = (jnp.stack(part, axis=1) for part in zip(*(touches[i] for i in members), strict=True))
-        flat = net.apply(params, "encode", clips.reshape(-1, *shape[1:]), sensors.reshape(-1))
+        flat = clips.reshape(-1, *shape[1:]), sensors.reshape(-1)
+        if keep_ids is None:
+            flat = net.apply(params, "encode", *flat)
+        else:
+            ids = jnp.stack([keep_ids[i] for i in members], axis=1)
+            flat = net.apply(params, "encode_some", *flat, ids.reshape(-1, ids.shape[-1]))
         each = losses.normalise(flat).reshape(shape[0], len(members), -1)
         for j, i in enumerate(members):
             z[i] = each[:, j]
@@ -180,16 +187,24 @@ def stage2_terms(
     net: Net,
     config: Config,
     decoder_sensor: Array | None = None,
+    match_noise: Array | None = None,
 ) -> tuple[Array, Metrics]:
     """L_align + lambda L_match (Eq. 9), plus the stage-1 loss on the align batch where the recipe keeps it.
 
     Pixels are normalised floats, sensor rows are already drawn; a part of `batch` that is None is not computed.
-    `noise` (B, N) is read only for the reconstruction. Returns the sum and every term, unweighted.
+    `noise` (B, N) is read only for the reconstruction. `match_noise` (M, B, N) decides which patches the M touches of
+    matching keep (None: all). Returns the sum and every term, unweighted.
     """
     objective = config.objective
     total = jnp.zeros(())
     metrics: Metrics = {}
-    z_touch = touch_embeddings(params, _touches(batch, net.model.frames), net=net)
+    aligned, matched = _touches(batch, net.model)
+    if match_noise is None:
+        z_touch = touch_embeddings(params, aligned + matched, net=net)
+    else:
+        kept = masking.kept(net.model.patches, objective.match_keep)
+        ids = jax.vmap(lambda noise: masking.random_mask(noise, kept)[0])(match_noise)
+        z_touch = touch_embeddings(params, aligned, net=net) + touch_embeddings(params, matched, net=net, keep_ids=ids)
     if batch.align is not None:
         z = align_embeddings(params, batch.align, z_touch.pop(0), net=net)
         scale = net.apply(params, "scale")
@@ -207,7 +222,12 @@ def stage2_terms(
                 decoder_sensor=decoder_sensor,
             )
             total, metrics = total + pixels, metrics | terms
-    if batch.match is not None:
+    if batch.match is not None and net.model.match_head == "cosine":
+        first, second = z_touch
+        match, right = losses.contrast_loss(first, second, net.apply(params, "scale"), groups=objective.groups)
+        total = total + objective.match_weight * match
+        metrics |= {"match": match, "match_accuracy": right}
+    elif batch.match is not None:
         z_anchor, z_positive, z_negative = z_touch
         positive, negative = (net.apply(params, "match", z_anchor, z) for z in (z_positive, z_negative))  # Eq. 5
         match = losses.matching_loss(positive, negative)
@@ -217,11 +237,16 @@ def stage2_terms(
     return total, metrics
 
 
-def _touches(batch: Stage2Batch, frames: int) -> list[tuple[Array, Array]]:
-    """The touches that a batch embeds: those to align (without a next frame), then anchor, positive and negative."""
+Touches = list[tuple[Array, Array]]
+
+
+def _touches(batch: Stage2Batch, model: Model) -> tuple[Touches, Touches]:
+    """The touches that a batch embeds: those to align (without a next frame), and those to match: anchor, positive and,
+    where a head tells pairs apart one by one, negative."""
     align, match = batch
-    touches = [] if align is None else [(align.clip[:, :frames], align.sensor)]
-    return touches + ([] if match is None else [(match[i], match[i + 1]) for i in (0, 2, 4)])
+    aligned = [] if align is None else [(align.clip[:, : model.frames], align.sensor)]
+    several = (0, 2) if model.match_head == "cosine" else (0, 2, 4)
+    return aligned, [] if match is None else [(match[i], match[i + 1]) for i in several]
 
 
 def stage2_loss(
@@ -230,6 +255,7 @@ def stage2_loss(
     """`stage2_terms` of a uint8 batch, masks and sensor tokens drawn from `key`; `progress` drives p_u."""
     key_noise, key_align, key_match = jax.random.split(key, 3)
     align, match, noise, own, metrics = batch.align, batch.match, None, None, {}
+    match_noise = None
     if align is not None:
         own = align.sensor
         noise = jax.random.uniform(key_noise, (len(own), net.model.patches))
@@ -237,7 +263,18 @@ def stage2_loss(
         align = align._replace(clip=normalise_touch(align.clip), sensor=sensor, image=normalise_image(align.image))
     if match is not None:
         metrics["p_u"], match = _draw_match(match, key_match, progress, net, config)
-    loss, terms = stage2_terms(params, Stage2Batch(align, match), noise, net=net, config=config, decoder_sensor=own)
+        if config.objective.match_keep < 1:
+            shape = (2 if net.model.match_head == "cosine" else 3, len(match.sensor), net.model.patches)
+            match_noise = jax.random.uniform(jax.random.fold_in(key_match, 1), shape)
+    loss, terms = stage2_terms(
+        params,
+        Stage2Batch(align, match),
+        noise,
+        net=net,
+        config=config,
+        decoder_sensor=own,
+        match_noise=match_noise,
+    )
     return loss, terms | metrics
 
 

@@ -9,6 +9,7 @@ for the same result is not thereby faster. Counted as useful although a class to
 from __future__ import annotations
 
 from anytouch_jax.config import Config, Model, Stack
+from anytouch_jax.ops import masking
 
 _TRAINED, _FIRST = 3, 2  # forward and backward, with or without a gradient of the input
 
@@ -84,8 +85,13 @@ def align(config: Config, batch: int, frames: int, images: int, texts: int, leng
 
 
 def match(config: Config, batch: int, frames: int) -> float:
-    """A stage-2 matching step over `batch` triples: three embeddings each, and the head on two products."""
+    """A stage-2 matching step over `batch` triples: three embeddings each, and the head on two products; or two
+    embeddings of the patches that are kept, and their cosines."""
     model = config.model
+    if model.match_head == "cosine":
+        kept = masking.kept(model.patches, config.objective.match_keep)
+        last = _dense(2 * batch, model.touch.width, model.embed) + 2 * _dense(batch, model.embed, batch)
+        return encoder(model, 2 * batch, frames, kept, train=True) + _TRAINED * last
     head = _dense(2 * batch, model.embed, 1)
     if model.match_head == "mlp":
         head += _dense(2 * batch, model.embed, model.embed)

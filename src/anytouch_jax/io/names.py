@@ -254,8 +254,8 @@ def is_left_out(key: str, layout: Layout, model: Model) -> bool:
     absent = {
         "image": model.image is None,
         "text": model.text is None,
-        "matcher": model.match_head == "none",
-        "logit_scale": model.image is None and model.text is None,
+        "matcher": model.match_head in ("none", "cosine"),
+        "logit_scale": "logit_scale" not in param_shapes(model),
     }
     return (
         key in unused(layout)

@@ -46,7 +46,7 @@ def param_shapes(model: Model) -> dict[str, Shape]:
             "final_norm": _norm_shapes(stack.width),
             "projection": {"kernel": (stack.width, model.embed)},
         }
-    if model.image or model.text:
+    if model.image or model.text or model.match_head == "cosine":
         tree["logit_scale"] = ()
     if model.match_head == "linear":
         tree["matcher"] = _dense_shapes(model.embed, 1)

@@ -25,7 +25,7 @@ class Lora(nnx.Module):
 
 
 def _matcher(model: Model) -> Mlp | Dense | None:
-    """The matching head of Eq. 5: an MLP (paper), one linear layer (release), or none."""
+    """The matching head of Eq. 5: an MLP (paper), one linear layer (release), or none (as for cosines)."""
     if model.match_head == "mlp":
         return Mlp(model.embed, model.embed, model, gelu, outputs=1)
     return Dense(model.embed, 1, model) if model.match_head == "linear" else None
@@ -45,7 +45,7 @@ class AnyTouch(nnx.Module):
                 self.lora = nnx.Dict({n: Lora(*size) for n in ("query", "key", "value", "out")})
         if model.text is not None:
             self.text = TextEncoder(model, model.text)
-        if model.image is not None or model.text is not None:
+        if model.image is not None or model.text is not None or model.match_head == "cosine":
             self.logit_scale = table()
         self.matcher = _matcher(model)
         if model.force_head:
@@ -58,6 +58,10 @@ class AnyTouch(nnx.Module):
         (join="mean"), summed ("sum") or concatenated ("concat": (B, S*E)) (App. "Discussion on frame number").
         """
         return self._over_segments(self.touch.features, clip, sensor, join)
+
+    def encode_some(self, clip: Array, sensor: Array, keep_ids: Array) -> Array:
+        """As `encode`, of stills and clips of three frames, from the patches `keep_ids` (B, K) alone."""
+        return self.touch.features(clip, sensor, keep_ids)
 
     def encode_patches(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
         """As `encode`, from the mean over the projected patch tokens (the release's "global" pooling)."""

@@ -67,9 +67,9 @@ class TouchEncoder(nnx.Module):
         x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
         return run_blocks(self.blocks, x, remat=self.remat)
 
-    def features(self, clip: Array, sensor: Array) -> Array:
-        """Touch embedding (B, E) from the class token of the unmasked pass, not normalised."""
-        return self.projection(self.post_norm(self.hidden(clip, sensor)[:, 0]))
+    def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        """Touch embedding (B, E) from the class token, of all patches or those to keep (B, K); not normalised."""
+        return self.projection(self.post_norm(self.hidden(clip, sensor, keep_ids)[:, 0]))
 
 
 class TouchDecoder(nnx.Module):

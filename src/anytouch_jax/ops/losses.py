@@ -140,6 +140,18 @@ def alignment_loss(
     return total, metrics
 
 
+def contrast_loss(first: Array, second: Array, scale: Array, *, groups: int = 1) -> tuple[Array, Array]:
+    """InfoNCE between the two touches (B, E), unit length, of each place: a matching beyond the paper, for encoders
+    from scratch. The other places of the batch are the negatives, 2 B - 2 for each pair instead of one.
+
+    The mean of both directions, and the share of `first` whose own `second` is the nearest.
+    """
+    everyone = jnp.ones(first.shape[0], bool)
+    both = [info_nce(a, b, scale, everyone, groups=groups) for a, b in ((first, second), (second, first))]
+    near = jnp.argmax(_wide(first) @ _wide(second).T, axis=1) == jnp.arange(first.shape[0])
+    return sum(both, jnp.zeros(())) / 2, jnp.mean(near.astype(jnp.float32))
+
+
 def matching_loss(positive_logit: Array, negative_logit: Array) -> Array:
     """Binary cross-entropy of cross-sensor matching from logits (B,), each kind averaged over the batch (Eq. 6)."""
     positive, negative = _wide(positive_logit), _wide(negative_logit)

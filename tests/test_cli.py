@@ -149,6 +149,25 @@ def test_wrong_values_are_usage_errors(capsys):
 # Mistakes -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (("--model.patch", 0), "--model.patch must be 1 or more, not 0"),
+        (("--model.decoder.heads", 0), "heads must be 1 or more, not 0"),
+        (("--model.decoder.width", 18, "--model.decoder.heads", 2), "--model.decoder.width must be a multiple of 4"),
+        (("--optim.clip-norm", -1), "--optim.clip-norm must be above 0, not -1.0"),
+        (("--steps", 0), "--loop.steps must be 1 or more, not 0"),
+        (("--loader.flip", 7), "--loader.flip must be 0 to 1, not 7.0"),
+        (("--stop-after", -1), "--stop-after must be 0 or more, not -1"),
+    ],
+)
+def test_numbers_out_of_range_are_one_sentence(args, said, capsys, tmp_path, world):
+    assert run("train", "--data", world, "--run", tmp_path / "r", *args) in (1, 2)
+    told = capsys.readouterr().err
+    assert said in " ".join(told.replace("│", " ").split()) and "Traceback" not in told
+    assert not (tmp_path / "r").exists()
+
+
 def test_missing_files(capsys, tmp_path, tiny_run, world):
     missing = tmp_path / "none.csv"
     assert str(missing) in mistake(capsys, "train", "--data", missing, "--run", tmp_path / "r")

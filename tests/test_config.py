@@ -13,9 +13,11 @@ from anytouch_jax.config import (
     SENSORS,
     Config,
     ConfigError,
+    Data,
     Model,
     Objective,
     Optim,
+    Run,
     Stack,
     TextTower,
     UserError,
@@ -162,12 +164,45 @@ def test_impossible_models_are_errors():
     assert issubclass(ConfigError, UserError) and issubclass(UserError, ValueError)
 
 
-def test_numbers_out_of_range_are_errors():
-    for options in ({"groups": 0}, {"mask_ratio": 1.5}, {"mask_ratio": -0.1}):
-        with pytest.raises(ConfigError, match=r"groups must be 1 or more and mask_ratio 0 to 1"):
-            Objective(**options)
-    with pytest.raises(ConfigError, match="accumulate must be 1 or more, not 0"):
-        Optim(accumulate=0)
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (Stack, {"heads": 0}, "heads must be 1 or more, not 0"),
+        (Stack, {"width": -4}, "width must be 1 or more, not -4"),
+        (TextTower, {"length": 0}, "--model.text.length must be 1 or more, not 0"),
+        (Model, {"patch": 0}, "--model.patch must be 1 or more, not 0"),
+        (Model, {"temperature": 0.0}, "--model.temperature must be above 0, not 0.0"),
+        (Model, {"lora_rank": -1}, "--model.lora-rank must be 0 or more, not -1"),
+        (Model, {"decoder": Stack(18, 1, 2, 72)}, "--model.decoder.width must be a multiple of 4 .*, not 18"),
+        (Objective, {"groups": 0}, "--objective.groups must be 1 or more, not 0"),
+        (Objective, {"mask_ratio": 1.5}, "--objective.mask-ratio must be 0 to 1, not 1.5"),
+        (Objective, {"mask_ratio": -0.1}, "--objective.mask-ratio must be 0 to 1, not -0.1"),
+        (Objective, {"alpha_vl": -0.2}, "--objective.alpha-vl must be 0 or more, not -0.2"),
+        (Optim, {"accumulate": 0}, "--optim.accumulate must be 1 or more, not 0"),
+        (Optim, {"clip_norm": -1.0}, "--optim.clip-norm must be above 0, not -1.0"),
+        (Optim, {"clip_norm": 0.0}, "--optim.clip-norm must be above 0, not 0.0"),
+        (Optim, {"learning_rate": float("nan")}, "--optim.learning-rate must be 0 or more, not nan"),
+        (Optim, {"beta2": 1.0}, "--optim.beta2 must be 0 or more and below 1, not 1.0"),
+        (Data, {"flip": 7.0}, "--loader.flip must be 0 to 1, not 7.0"),
+        (Data, {"clip_share": -1.0}, "--loader.clip-share must be 0 to 1, not -1.0"),
+        (Data, {"jitter": (0.4, -0.1, 0.5, 0.3)}, "--loader.jitter must be 0 or more, not -0.1"),
+        (Data, {"batch_size": 0}, "--loader.batch-size must be 1 or more, not 0"),
+        (Run, {"steps": -5}, "--loop.steps must be 1 or more, not -5"),
+        (Run, {"keep": 0}, "--loop.keep must be 1 or more, not 0"),
+    ],
+)
+def test_numbers_out_of_range_are_errors(kind, options, message):
+    sound = {Stack: preset("tiny").model.touch, Model: preset("tiny").model, TextTower: TextTower(Stack(8, 1, 2, 32))}
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        replace(sound.get(kind) or kind(), **options)
+
+
+def test_numbers_that_mean_nothing_of_it_are_not():
+    Objective(mask_ratio=0.0, universal_end=0.0, match_weight=0.0)
+    Optim(learning_rate=0.0, warmup=0, clip_norm=None, ema=None)
+    Data(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0), rotation=0.0, clip_share=0.0, threads=0, prefetch=0)
+    Run(save_every=0, figure_every=0, max_skipped=0)
+    replace(preset("tiny").model, sensor_tokens=0, lora_rank=0)
 
 
 def test_wrong_presets_are_errors():

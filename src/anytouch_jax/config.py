@@ -11,107 +11,21 @@ import json
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from anytouch_jax.model import FIELD_SENSORS as FIELD_SENSORS
+from anytouch_jax.model import SENSORS as SENSORS
+from anytouch_jax.model import UNIVERSAL as UNIVERSAL
+from anytouch_jax.model import Model, Stack, TextTower
+from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NOT_NEGATIVE, SHARE, build, in_range
 from anytouch_jax.strict_json import ConfigError as ConfigError
 from anytouch_jax.strict_json import UserError as UserError
-from anytouch_jax.strict_json import build
 
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
 PresetName = Literal["tiny", "small", "base", "large"]
-UNIVERSAL = "universal"
-SENSORS = (
-    "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
-)  # fmt: skip
-FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))  # how often the release draws these in an epoch
 # Mean and spread of RGB in 0..1, for touch images (ImageNet) and for photographs (CLIP), as the release.
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-
-
-@dataclass(frozen=True)
-class Stack:
-    """A stack of transformer blocks: `width` channels, `depth` blocks, `heads`, `mlp` hidden channels."""
-
-    width: int
-    depth: int
-    heads: int
-    mlp: int
-
-    def __post_init__(self) -> None:
-        if self.width % self.heads:
-            raise ConfigError(f"width {self.width} must be a multiple of heads {self.heads}")
-
-
-@dataclass(frozen=True)
-class TextTower:
-    """CLIP's text tower. `end_token` None pools at the largest id (CLIP), else at its first occurrence."""
-
-    stack: Stack
-    vocab: int = 49408
-    length: int = 77
-    end_token: int | None = None
-
-
-@dataclass(frozen=True)
-class Model:
-    """Everything that decides the shapes and the arithmetic of the network.
-
-    `image` and `text` None leave the towers out (stage 1); `lora_rank` 0: no LoRA. `match_head` "cosine" (ours): see
-    `losses.contrast_loss`. `sensors` names the rows of sensor
-    tokens (Sec. 3.5) and of patch encoders if each has its own (T3); row "universal" serves sensors never seen.
-    """
-
-    image_size: int
-    patch: int
-    embed: int
-    touch: Stack
-    decoder: Stack
-    image: Stack | None = None
-    text: TextTower | None = None
-    frames: int = 3
-    sensors: tuple[str, ...] = SENSORS
-    sensor_tokens: int = 5
-    activation: Literal["gelu", "quick_gelu"] = "gelu"
-    norm_eps: float = 1e-5
-    decoder_norm_eps: float = 1e-12
-    decoder_sensor_tokens: bool = False
-    patch_encoder: Literal["shared", "sensor"] = "shared"
-    force_head: bool = False
-    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"
-    lora_rank: int = 0
-    lora_alpha: float = 16.0
-    temperature: float = 0.07
-    dtype: Literal["float32", "bfloat16", "float64"] = "float32"
-    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"
-    remat: bool = False
-
-    def __post_init__(self) -> None:
-        if self.image_size % self.patch:
-            raise ConfigError(f"image_size {self.image_size} must be a multiple of patch {self.patch}")
-        if len(set(self.sensors)) != len(self.sensors):
-            raise ConfigError(f"a sensor is named twice in {self.sensors}")
-        if UNIVERSAL not in self.sensors:
-            raise ConfigError(f"the sensor table needs a row named {UNIVERSAL!r}")
-
-    @property
-    def patches(self) -> int:
-        """Number of patch positions N = (image_size / patch)^2."""
-        return (self.image_size // self.patch) ** 2
-
-    @property
-    def universal_row(self) -> int:
-        """Row of the universal sensor tokens."""
-        return self.sensors.index(UNIVERSAL)
-
-    def sensor_row(self, name: str) -> int:
-        """Row of the sensor called `name`. Raises ConfigError when the table does not have it."""
-        if name in FIELD_SENSORS:
-            raise ConfigError(f"sensor {name!r} measures a force field and has no images; leave it out of training")
-        if name not in self.sensors:
-            known = ", ".join(self.sensors)
-            raise ConfigError(f"unknown sensor {name!r}; known: {known}. Add it at the end of --model.sensors")
-        return self.sensors.index(name)
 
 
 @dataclass(frozen=True)
@@ -145,10 +59,11 @@ class Objective:
     force: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.match_keep <= 1:
-            raise ConfigError(f"match_keep must be above 0 and at most 1, not {self.match_keep}")
-        if self.groups < 1 or not 0 <= self.mask_ratio <= 1:
-            raise ConfigError(f"groups must be 1 or more and mask_ratio 0 to 1, not {self.groups}, {self.mask_ratio}")
+        shares = ("mask_ratio", "match_keep", "universal_start", "universal_end")
+        in_range("--objective.", self, groups=COUNT, **dict.fromkeys(shares, SHARE))
+        in_range("--objective.", self, match_keep=ABOVE_0)
+        weights = ("alpha_tv", "alpha_tl", "alpha_vl", "match_weight", "differences", "force")
+        in_range("--objective.", self, **dict.fromkeys(weights, NOT_NEGATIVE))
 
     @property
     def keep_ratio(self) -> float:
@@ -180,8 +95,9 @@ class Optim:
     accumulate: int = 1
 
     def __post_init__(self) -> None:
-        if self.accumulate < 1:
-            raise ConfigError(f"accumulate must be 1 or more, not {self.accumulate}")
+        in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=SHARE, accumulate=COUNT)
+        others = ("learning_rate", "min_rate", "warmup", "eps", "weight_decay")
+        in_range("--optim.", self, **dict.fromkeys(others, NOT_NEGATIVE))
 
 
 @dataclass(frozen=True)
@@ -217,6 +133,10 @@ class Data:
     prefetch: int = 4
     on_bad_sample: Literal["error", "skip"] = "error"
 
+    def __post_init__(self) -> None:
+        in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE, jitter=NOT_NEGATIVE)
+        in_range("--loader.", self, rotation=NOT_NEGATIVE, threads=NOT_NEGATIVE, prefetch=NOT_NEGATIVE)
+
 
 @dataclass(frozen=True)
 class Run:
@@ -230,6 +150,10 @@ class Run:
     max_skipped: int = 20
     tensorboard: bool = False
     fsdp: int = 1
+
+    def __post_init__(self) -> None:
+        in_range("--loop.", self, steps=COUNT, keep=COUNT, fsdp=COUNT)
+        in_range("--loop.", self, save_every=NOT_NEGATIVE, figure_every=NOT_NEGATIVE, max_skipped=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)

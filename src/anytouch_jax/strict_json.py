@@ -1,11 +1,13 @@
-"""Reading dataclasses from JSON strictly, and the errors that every room raises for a user's mistake."""
+"""Reading dataclasses from JSON strictly, ranges of numbers, and the errors that every room raises for a user's
+mistake."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 import typing
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 
 class UserError(ValueError):
@@ -14,6 +16,34 @@ class UserError(ValueError):
 
 class ConfigError(UserError):
     """A configuration that cannot be read or makes no sense; the message says what to change."""
+
+
+class Range(NamedTuple):
+    """Numbers `low` to `high`, both included, and how a message calls them."""
+
+    low: float
+    high: float
+    words: str
+
+
+COUNT = Range(1, math.inf, "1 or more")
+NOT_NEGATIVE = Range(0, math.inf, "0 or more")
+ABOVE_0 = Range(math.ulp(0.0), math.inf, "above 0")
+SHARE = Range(0, 1, "0 to 1")
+BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
+
+
+def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
+    """Raise ConfigError for a field of `settings` outside its range; `prefix` is its section on the command line.
+
+    None is in every range, NaN in none; of a tuple every entry counts.
+    """
+    for name, (low, high, words) in ranges.items():
+        value = getattr(settings, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not low <= number <= high:
+                spelled = f"{prefix}{name.replace('_', '-')}" if prefix else name
+                raise ConfigError(f"{spelled} must be {words}, not {number}")
 
 
 def build(kind: Any, value: Any, where: str) -> Any:

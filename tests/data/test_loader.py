@@ -275,8 +275,10 @@ def test_a_bad_picture_names_its_column(make, settings):
 
 
 def test_nonsense_sizes_are_refused(make, settings):
-    with pytest.raises(UserError, match="batch_size 0"):
+    with pytest.raises(UserError, match=r"--loader\.batch-size must be 1 or more, not 0"):
         Loader(make([{}]), settings(batch_size=0))
+    with pytest.raises(UserError, match="devices must be 1 or more, not 0"):
+        Loader(make([{}]), settings(), devices=0)
 
 
 # Stage 2 ---------------------------------------------------------------------------------------------------------

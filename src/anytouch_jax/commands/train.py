@@ -15,6 +15,8 @@ def run(options: Train, config: Config) -> int:
     baseline = baselines.find(options.baseline)
     if options.stage == 2 and options.init and not baseline.starts_from_stage1:
         raise UserError(f"baseline {baseline.name} has no stage 1: leave out --init")
+    if options.stop_after is not None and options.stop_after < 0:
+        raise UserError(f"--stop-after must be 0 or more, not {options.stop_after}")
     from anytouch_jax.pretrain import pretrain
     from anytouch_jax.train.mesh import enable_compilation_cache
     from anytouch_jax.train.processes import joined

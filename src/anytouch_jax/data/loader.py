@@ -54,8 +54,8 @@ class Loader:
         devices: int = 1,
         shard: tuple[int, int] = (0, 1),
     ) -> None:
-        if config.data.batch_size < 1 or devices < 1:
-            raise UserError(f"batch_size {config.data.batch_size} and devices {devices} must be at least 1")
+        if devices < 1:
+            raise UserError(f"devices must be 1 or more, not {devices}")
         if config.stage == 2 and config.data.batch_size % config.objective.groups:
             raise UserError(
                 f"a batch of {config.data.batch_size} does not divide by objective.groups={config.objective.groups}"

@@ -175,6 +175,24 @@ def test_stage_one_starts_its_touch_encoder_from_clip(world, tmp_path):
         np.testing.assert_array_equal(frame, clip["image"]["patch"]["kernel"])
 
 
+@pytest.mark.parametrize(
+    ("file", "told"),
+    [
+        ("config.json", {"text_config": {"hidden_act": "quick_gelu"}, "vision_config": {"hidden_act": "quick_gelu"}}),
+        ("config.json", {"model_type": "clip", "vision_config": {}}),  # HF's default
+        ("open_clip_config.json", {"model_cfg": {"quick_gelu": True}}),
+    ],
+)
+@pytest.mark.parametrize("stage", [1, 2])
+def test_clip_weights_of_another_activation_are_refused(world, tmp_path, file, told, stage):
+    clip_folder(tmp_path / "clip", run_config(world, 2))
+    towers = "scratch" if stage == 1 else "pretrained"
+    (tmp_path / "clip" / file).write_text(json.dumps(told))
+    for path in (tmp_path / "clip", tmp_path / "clip" / "model.safetensors"):
+        message = refused(run_config(world, stage, towers=towers), tmp_path / "r", clip=path)
+        assert "model.safetensors was trained with quick_gelu" in message and "--model.activation quick_gelu" in message
+
+
 # Mistakes -----------------------------------------------------------------------------------------------------------
 
 
@@ -186,6 +204,8 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     assert str(tmp_path / "empty") in refused(stage2, tmp_path / "a", init=tmp_path / "empty")
     other = run_config(world, 2, model={"embed": 16})
     assert "touch/projection/kernel has (16, 12) instead of (16, 16)" in refused(other, tmp_path / "b", init=run)
+    other = run_config(world, 2, model={"activation": "quick_gelu"})
+    assert "trained with gelu, this run would use quick_gelu" in refused(other, tmp_path / "b", init=run)
     pretrained = run_config(world, 2, towers="pretrained")
     assert "--clip" in refused(pretrained, tmp_path / "c")
     assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")

@@ -182,7 +182,7 @@ def _first_params(config: Config, net: Net, init: Any, clip: Any, say: Say) -> P
         raise UserError(_NO_CLIP)
     params = net.init(jax.random.key(config.run.seed))
     first = None if init is None else _load(Path(init), config, say)
-    weights = None if clip is None else release.read_weights(_weights_file(Path(clip)))
+    weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
     if config.stage == 2:
         if init is None:
             say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
@@ -193,6 +193,19 @@ def _first_params(config: Config, net: Net, init: Any, clip: Any, say: Say) -> P
     return params if first is None else release.merge_stage2(params, stage1=first)
 
 
+def _read_clip(file: Path, config: Config) -> dict[str, np.ndarray]:
+    """The arrays of CLIP weights."""
+    _same_activation(file, release.told_activation(file), config)
+    return release.read_weights(file)
+
+
+def _same_activation(path: Path, told: str | None, config: Config) -> None:
+    """Raise UserError where weights were trained with another activation than the run's; None: nothing tells."""
+    ours = config.model.activation
+    if told not in (None, ours):
+        raise UserError(f"{path} was trained with {told}, this run would use {ours}: add --model.activation {told}")
+
+
 def _load(path: Path, config: Config, say: Say) -> Params:
     """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of the model's."""
     if not path.exists():
@@ -200,6 +213,7 @@ def _load(path: Path, config: Config, say: Say) -> Params:
     if path.is_dir() and not any(path.glob("*.pth")):
         params, text, _ = checkpoint.load_params(path)
         before = from_json(text)
+        _same_activation(path, before.model.activation, config)
         stored, shown = before.model.sensors, before.data.background
         if shown != config.data.background:
             say(
@@ -208,6 +222,7 @@ def _load(path: Path, config: Config, say: Say) -> Params:
             )
     else:
         file = _weights_file(path)
+        _same_activation(file, release.told_activation(file), config)
         weights = release.read_weights(file)
         detected = release.model_of(file, weights)
         params, stored = release.to_params(weights, detected), detected.sensors

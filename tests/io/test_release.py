@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, Model, Stack, TextTower, UserError, preset
 from anytouch_jax.io.release import (
+    WeightsError,
     clip_to_stage1,
     detect_layout,
     detect_model,
     match_sensors,
     merge_stage2,
+    model_of,
     read_weights,
     release_names,
     release_shapes,
@@ -371,6 +374,36 @@ def test_detects_heads_as_clip_and_the_authors_choose_them():
     shapes = release_shapes(preset("large").model)
     weights = {key: np.broadcast_to(np.float32(0), shape) for key, shape in shapes.items()}
     assert detect_model(weights) == preset("large").model
+
+
+@pytest.mark.parametrize(
+    ("beside", "activation"),
+    [
+        ({}, "gelu"),
+        ({"config.json": {"hidden_act": "quick_gelu"}}, "gelu"),  # not CLIP's
+        ({"config.json": {"vision_config": {"hidden_act": "gelu"}, "text_config": {"hidden_act": "gelu"}}}, "gelu"),
+        ({"config.json": {"vision_config": {"hidden_act": "quick_gelu"}}}, "quick_gelu"),
+        ({"open_clip_config.json": {"model_cfg": {"embed_dim": 768}}}, "gelu"),
+        ({"open_clip_config.json": {"model_cfg": {"quick_gelu": True}}}, "quick_gelu"),
+    ],
+)
+def test_the_activation_of_clip_is_what_stands_beside_it(tmp_path, beside, activation):
+    for name, content in beside.items():
+        (tmp_path / name).write_text(json.dumps(content))
+    assert model_of(tmp_path / "clip.bin", weights_of(STAGE2, "clip")).activation == activation
+    assert model_of(tmp_path / "x.bin", weights_of(STAGE1)).activation == "gelu"  # the authors' own
+
+
+def test_an_activation_that_the_network_lacks_is_refused(tmp_path):
+    file, clip = tmp_path / "config.json", weights_of(STAGE2, "clip")
+    for text, word in (
+        ('{"vision_config": {"hidden_act": "relu"}}', "relu"),
+        ('{"vision_config": {"hidden_act": "gelu"}, "text_config": {"hidden_act": "quick_gelu"}}', "gelu and quick"),
+        ("{", "not JSON"),
+    ):
+        file.write_text(text)
+        with pytest.raises(WeightsError, match=word):
+            model_of(tmp_path / "clip.bin", clip)
 
 
 def test_foreign_weights_are_named():

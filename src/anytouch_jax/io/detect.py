@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +59,50 @@ def detect_model(weights: Weights, *, heads: int | None = None, decoder_heads: i
 
 
 def model_of(path: str | Path, weights: Weights) -> Model:
-    """The model of a weights file: as the file tells it under `MODEL_KEY`, as ours do, else `detect_model`."""
+    """The model of a weights file: as the file tells it under `MODEL_KEY`, as ours do, else `detect_model`, with the
+    activation that CLIP's configuration beside it tells."""
     told = read_metadata(path).get(MODEL_KEY)
     if told is None:
-        return detect_model(weights)
+        activation: Any = told_activation(path) if detect_layout(weights) in ("clip", "openclip") else None
+        found = detect_model(weights)
+        return found if activation is None else replace(found, activation=activation)
     model: Model = from_json(told, Model)
     return model
+
+
+def told_activation(path: str | Path) -> str | None:
+    """The activation of CLIP weights, which leaves no trace in the arrays: as the file tells it under `MODEL_KEY`, else
+    HF's config.json or OpenCLIP's open_clip_config.json beside it. None where nothing tells.
+
+    Raises WeightsError for a file that is not JSON and for an activation that this network does not have.
+    """
+    path, told = Path(path), set()
+    if own := read_metadata(path).get(MODEL_KEY):
+        return str(from_json(own, Model).activation)
+    towers = _json(path.with_name("config.json"))
+    for tower in ("text_config", "vision_config"):
+        if isinstance(towers.get(tower), dict):
+            told.add(towers[tower].get("hidden_act", "quick_gelu"))  # HF's default
+    model = _json(path.with_name("open_clip_config.json")).get("model_cfg")
+    if not told and isinstance(model, dict):
+        told.add("quick_gelu" if model.get("quick_gelu") else "gelu")
+    if len(told) > 1 or not told <= {"gelu", "quick_gelu"}:
+        raise WeightsError(
+            f"the configuration beside {path} tells of the activation {' and '.join(sorted(map(str, told)))}; give "
+            "CLIP weights of which both towers use gelu, or both quick_gelu"
+        )
+    return next(iter(told), None)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file, {} where there is none. Raises WeightsError."""
+    if not path.is_file():
+        return {}
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        raise WeightsError(f"{path} is not JSON; mend it, or move the weights to a folder without it") from None
+    return value if isinstance(value, dict) else {}
 
 
 def _detected(layout: Layout, weights: Weights, heads: int | None, decoder_heads: int | None) -> Model:

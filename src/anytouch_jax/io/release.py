@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, Model
-from anytouch_jax.io.detect import BACKGROUND_KEY, MODEL_KEY, SEEN_KEY, detect_layout, detect_model, model_of
+from anytouch_jax.io.detect import (
+    BACKGROUND_KEY,
+    MODEL_KEY,
+    SEEN_KEY,
+    detect_layout,
+    detect_model,
+    model_of,
+    told_activation,
+)
 from anytouch_jax.io.names import Entry, Layout, entries, is_left_out, unused
 from anytouch_jax.io.resize import resize_position
 from anytouch_jax.io.shapes import Shape, param_shapes
@@ -50,6 +58,7 @@ __all__ = [
     "serve_unseen",
     "to_params",
     "to_release",
+    "told_activation",
     "write_safetensors",
 ]
 

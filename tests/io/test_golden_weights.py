@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from anytouch_jax.config import Stack, preset
-from anytouch_jax.io.release import (
-    clip_to_stage1,
-    detect_model,
-    merge_stage2,
-    read_weights,
-    release_names,
-    release_shapes,
-    to_params,
-    to_release,
-)
+from anytouch_jax.config import Stack
+from anytouch_jax.evaluate import parity_weights
+from anytouch_jax.evaluate.golden import Case
+from anytouch_jax.io.release import detect_model, read_weights, release_names, to_params, to_release
 from anytouch_jax.io.shapes import param_shapes
-from anytouch_jax.io.tree import flatten, nest
+from anytouch_jax.io.tree import flatten
 
 GOLDEN = Path(__file__).resolve().parents[3] / "shared" / "golden"
-STAGE1 = preset("large", recipe="release")
-STAGE2 = preset("large", stage=2, recipe="release", towers="pretrained")
 
 
 def same(first, second) -> None:
@@ -74,84 +63,64 @@ def test_clip_parameters_fill_both_towers():
     assert {name: leaf.shape for name, leaf in flatten(params).items()} == expected
 
 
+def checked(case, runner, change=lambda info: None):
+    """The rows of a case whose JSON was changed."""
+    info = json.loads((GOLDEN / f"{case}.json").read_text())
+    change(info)
+    made = Case(case, GOLDEN, info)
+    runner(made)
+    return made.rows
+
+
+def test_full_size_files_are_those_of_the_authors():
+    rows = checked("K_manifest", parity_weights.manifest)
+    assert [row for row in rows if not row.good] == []
+    assert {row.array for row in rows} == {
+        *(f"{kind}/keys" for kind in ("stage1", "stage2", "probe_material", "hf_clip_vit_l_14")),
+        *(f"{kind}/{what}" for kind in ("stage1", "stage2") for what in ("network", "groups")),
+    }
+
+
+def change_row(kind, key, place, value):
+    def change(info):
+        (row,) = [row for row in info[kind]["state_dict"] if row[0] == key]
+        row[place] = value
+
+    return change
+
+
 @pytest.mark.parametrize(
-    ("case", "layout", "model"),
+    ("change", "wrong"),
     [
-        ("stage1", "stage1", STAGE1.model),
-        ("stage2", "stage2", STAGE2.model),
-        ("hf_clip_vit_l_14", "clip", STAGE2.model),
-        ("probe_material", "probe", STAGE1.model),
+        (change_row("stage1", "mask_token", 3, "no_decay"), "stage1/groups/mask_token"),
+        (change_row("stage2", "logit_scale", 3, "frozen"), "stage2/groups/logit_scale"),
+        (change_row("probe_material", "sensor_token", 1, [9, 5, 1024]), "probe_material/keys/sensor_token"),
+        (change_row("hf_clip_vit_l_14", "logit_scale", 1, [1]), "hf_clip_vit_l_14/keys/logit_scale"),
     ],
 )
-def test_full_size_keys_and_shapes(case, layout, model):
-    manifest = json.loads((GOLDEN / "K_manifest.json").read_text())[case]["state_dict"]
-    rows = {key: tuple(shape) for key, shape, *_ in manifest if not key.startswith("head.")}
-    assert release_shapes(model, layout) == rows
+def test_another_group_or_shape_is_found(change, wrong):
+    assert [row.array for row in checked("K_manifest", parity_weights.manifest, change) if not row.good] == [wrong]
 
 
-def _first(rules, name):
-    return next(value for pattern, value in rules if re.search(pattern, name))
+def test_loading_follows_the_authors_map():
+    rows = checked("K_weight_loading_map", parity_weights.loading_map)
+    assert [row for row in rows if not row.good] == []
+    assert [row.array.split("/")[0] for row in rows] == [
+        "stage1_from_clip", "stage2_from_stage1_and_clip", "stage2_from_clip_only", "probe_from_stage1",
+        "probe_from_stage2",
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("case", "config"), [("stage1", STAGE1), ("stage2", STAGE2)])
-def test_decay_and_freezing_follow_the_authors_groups(case, config):
-    names = release_names(config.model)
-    manifest = json.loads((GOLDEN / "K_manifest.json").read_text())[case]["state_dict"]
-    checked = 0
-    for key, _, _, group in manifest:
-        if key not in names:  # an array that nothing reads
-            continue
-        name = names[key]
-        without_gradient = group == "frozen" or name.startswith("text/")  # under no_grad there, golden Q10
-        assert _first(config.frozen, name) == without_gradient, key
-        if group != "frozen":
-            assert _first(config.weight_decay, name) == {"decay": 0.1, "no_decay": 0.0}[group], key
-        checked += 1
-    assert checked == len(names) == len(manifest) - 2
+def test_a_value_from_elsewhere_is_found():
+    key = "touch_model.post_layernorm.weight"
 
+    def change(info):
+        info["stage1_from_clip"][key] = "clip:vision_model.pre_layrnorm.weight"
+        del info["stage2_from_clip_only"]["logit_scale"]
+        info["probe_from_stage1"][key] = "mae:touch_model.pre_layrnorm.weight"
 
-def _sources(case: str) -> dict[str, str]:
-    return json.loads((GOLDEN / "K_weight_loading_map.json").read_text())[case]
-
-
-def _values(shapes: dict[str, tuple], seed: int) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return {key: rng.normal(size=shape).astype("f4") for key, shape in shapes.items()}
-
-
-def _check_sources(case: str, merged: dict, fresh: dict, files: dict[str, dict]) -> None:
-    """Every used key of the merged weights has the value that the authors' loader would give it."""
-    for key, source in _sources(case).items():
-        if key not in merged:
-            continue
-        if source == "kept at its fresh initial value":
-            expected = fresh[key]
-        else:
-            file, _, theirs = source.partition(":")
-            expected = files[file][theirs]
-            if key.endswith("video_patch_embedding.weight") and file == "clip":
-                expected = np.repeat(expected[:, None], 3, axis=1)
-        np.testing.assert_array_equal(merged[key], expected, err_msg=key)
-
-
-@pytest.mark.parametrize("case", ["stage1_from_clip", "stage2_from_stage1_and_clip", "stage2_from_clip_only"])
-def test_loading_follows_the_authors_map(case):
-    # The map was written for a two-layer model; LoRA is inserted after loading.
-    stack = Stack(16, 2, 4, 24)
-    towers = {"image": stack, "text": dataclasses.replace(STAGE2.model.text, stack=Stack(10, 2, 2, 14), vocab=30)}
-    sizes = {"image_size": 28, "patch": 14, "embed": 12, "touch": stack, "decoder": Stack(8, 2, 2, 16)}
-    model1 = dataclasses.replace(STAGE1.model, **sizes)
-    model2 = dataclasses.replace(STAGE2.model, **sizes, **towers, lora_rank=0)
-    clip = _values(release_shapes(model2, "clip"), 1)
-    mae = _values(release_shapes(model1), 2)
-    model = model1 if case == "stage1_from_clip" else model2
-    fresh = nest(_values(param_shapes(model), 3))
-    if case == "stage1_from_clip":
-        merged = clip_to_stage1(clip, model, fresh)
-    else:
-        stage1 = to_params(mae, model1) if "stage1" in case else None
-        merged = merge_stage2(fresh, stage1=stage1, clip=to_params(clip, model))
-    used = set(release_names(model))
-    assert used <= set(_sources(case))
-    theirs, before = to_release(merged, model), to_release(fresh, model)
-    _check_sources(case, {key: theirs[key] for key in used}, before, {"clip": clip, "mae": mae})
+    found = {row.array for row in checked("K_weight_loading_map", parity_weights.loading_map, change) if not row.good}
+    assert found == {
+        f"stage1_from_clip/{key}", "stage2_from_clip_only/logit_scale", "stage2_from_clip_only/keys",
+        "probe_from_stage1/touch/post_norm/scale",
+    }  # fmt: skip

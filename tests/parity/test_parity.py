@@ -9,7 +9,7 @@ import pytest
 
 from anytouch_jax.cli import main
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate import parity
+from anytouch_jax.evaluate import parity, parity_weights
 from anytouch_jax.evaluate.golden import GRADIENT, OUTPUT, Case, Row, read_cases
 
 HERE = Path(__file__).parent / "golden"
@@ -20,8 +20,8 @@ COMPARISONS = {  # at least so many: a case that compares nothing would be withi
     "A_stage1_image_small_scale": 8,
     "F_stage2_match_image": 50,
     "I_pos_embed": 2,
-    "stage1_params": 0,
-    "stage2_params": 0,
+    "stage1_params": 1,
+    "stage2_params": 1,
 }
 
 
@@ -68,7 +68,7 @@ def test_the_authors_checkpoints_give_the_parameters_beside_them(path, tmp_path)
     for file in (path, ALL / f"{stage}_params.npz", ALL / f"{stage}_params.json"):
         shutil.copy(file, tmp_path)
     rows = parity.run(tmp_path)
-    assert len(rows) == 1 and rows[0].good and rows[0].case == path.name
+    assert [row.case for row in rows] == [f"{stage}_params", path.name] and all(row.good for row in rows)
 
 
 def test_a_wrong_number_is_reported(tmp_path):
@@ -112,6 +112,30 @@ def test_unknown_and_broken_cases_are_failures_not_tracebacks(tmp_path):
     rows = parity.run(tmp_path)
     assert [row.case for row in rows if not row.good] == ["A_broken", "Z_new"]
     assert all("understand" in row.note or "understood" in row.note for row in rows)
+
+
+def test_a_broken_checkpoint_is_a_failed_case(tmp_path):
+    folder = copied(tmp_path, "I_pos_embed")
+    (folder / "stage1_tiny.pth").write_bytes(b"x" * 100)
+    rows = parity.run(folder)
+    assert [row.case for row in rows if not row.good] == ["stage1_tiny.pth"] and len(rows) > 3
+
+
+def test_checkpoints_that_do_not_fit_their_parameters_are_failed_cases(tmp_path, monkeypatch):
+    folder = copied(tmp_path, "I_pos_embed")
+    with np.load(folder / "stage1_params.npz") as file:
+        stored = {name: file[name] for name in file.files}
+    (folder / "stage1_tiny.pth").write_bytes(b"")
+    for dropped, wrong in (("head", []), ("touch_decoder_blocks.1", None)):
+        fewer = {name: array for name, array in stored.items() if dropped not in name}
+        monkeypatch.setattr(parity_weights.release, "read_weights", lambda path, fewer=fewer: fewer)
+        found = [row for row in parity.run(folder) if not row.good]
+        assert {row.case for row in found} == ({"stage1_tiny.pth"} if wrong is None else set())
+    whole = (folder / "stage1_params.npz").read_bytes()
+    (folder / "stage1_params.npz").write_bytes(whole[: len(whole) // 2])  # truncated
+    found = [row for row in parity.run(folder) if not row.good]
+    assert {row.case for row in found} == {"stage1_params", "stage1_tiny.pth"}
+    assert all("cannot read the golden arrays" in row.note for row in found)
 
 
 def test_a_folder_without_cases_is_one_sentence(tmp_path):

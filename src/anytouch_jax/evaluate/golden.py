@@ -6,6 +6,8 @@ A case is `<name>.json` beside `<name>.npz`: arrays in/..., out/..., grad/..., f
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -104,9 +106,9 @@ class Case:
 def read_arrays(path: Path) -> Arrays:
     """The arrays of an `.npz` file, without pickle. Raises UserError."""
     try:
-        with np.load(path) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError) as error:
+        with open(path, "rb") as file, np.load(file) as arrays:  # np.load alone leaves a broken file open
+            return {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"cannot read the golden arrays {path}: {error}") from None
 
 

@@ -20,11 +20,11 @@ import numpy as np
 import optax
 
 from anytouch_jax import objectives
-from anytouch_jax.config import Config, preset
+from anytouch_jax.config import Config
+from anytouch_jax.evaluate import parity_weights
 from anytouch_jax.evaluate.golden import (
     GRADIENT,
     PARAMETER,
-    Arrays,
     Case,
     Row,
     channel_last,
@@ -35,10 +35,9 @@ from anytouch_jax.evaluate.golden import (
 )
 from anytouch_jax.evaluate.parity_losses import align, align_edge, dead_keys, encode, match, setup, stage1, table_rows
 from anytouch_jax.io import release
-from anytouch_jax.io.shapes import param_shapes
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, tokens
-from anytouch_jax.train.optim import flatten_names, learning_rate, moments, optimizer
+from anytouch_jax.train.optim import learning_rate, moments, optimizer
 from anytouch_jax.train.step import TrainState, init_state, make_step, merge
 
 Params = dict[str, Any]
@@ -47,7 +46,8 @@ Params = dict[str, Any]
 def run(folder: Path) -> list[Row]:
     """Compare every case of `folder`; a case or an array that is not understood is a failing row."""
     rows = [row for case in read_cases(folder) for row in run_case(case)]
-    return rows + [row for path in sorted(folder.glob("*.pth")) for row in _checkpoint(path)]
+    paths = sorted(folder.glob("*.pth"))
+    return rows + [row for path in paths for row in _tried(parity_weights.checkpoint, Case(path.name, folder, {}))]
 
 
 def run_case(case: Case) -> list[Row]:
@@ -56,6 +56,11 @@ def run_case(case: Case) -> list[Row]:
     if runner is None:
         case.fail("-", "not a case this version understands")
         return case.rows
+    return _tried(runner, case)
+
+
+def _tried(runner: Callable[[Case], None], case: Case) -> list[Row]:
+    """The rows of a case; what stops its runner is a failing row."""
     try:
         with jax.default_matmul_precision("highest"):
             runner(case)
@@ -251,47 +256,6 @@ def _clip(case: Case) -> None:
             case.compare(f"out/{sub}/logits_per_image", jnp.exp(params["logit_scale"]) * z_image @ z_text.T)
 
 
-def _manifest(case: Case) -> None:
-    """Keys and shapes of the full-size model against preset large, and its decay groups against our rules."""
-    for stage, kind in ((1, "stage1"), (2, "stage2")):
-        config = preset("large", stage=stage, recipe="release", towers="pretrained")  # type: ignore[arg-type]
-        shapes = {name: leaf.shape for name, leaf in flatten_names(build(config.model).abstract()).items()}
-        ours = release.release_shapes(config.model)
-        theirs = {key: tuple(shape) for key, shape, *_ in case.info[kind]["state_dict"]}
-        for key in sorted(set(ours) | set(theirs)):
-            if ours.get(key) != theirs.get(key):
-                case.fail(f"{kind}/{key}", f"{ours.get(key)} instead of {theirs.get(key)}")
-        implied = param_shapes(config.model)
-        if implied != shapes:
-            case.fail(f"{kind}/Net.abstract", "the network's shapes are not those of the weight files")
-        case.check(f"{kind}/keys", len(ours), len(theirs), 0.0)
-
-
-def _reference_only(case: Case) -> None:
-    """Files that hold parameters or a loading map: used by other cases, nothing to compare on their own."""
-    case.seen |= set(case.info.get("arrays", {}))
-
-
-def _checkpoint(path: Path) -> list[Row]:
-    """A `.pth` in the authors' format gives exactly the parameters stored beside it."""
-    case = Case(path.name, path.parent, {})
-    stage = 2 if path.name.startswith("stage2") else 1
-    weights = release.read_weights(path)
-    stored: Arrays = read_arrays(path.parent / f"stage{stage}_params.npz")
-    ours, theirs = (release.to_params(w, release.detect_model(w)) for w in (weights, _without_extra(stored, weights)))
-    for (name, a), b in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
-        if not np.array_equal(a, b):
-            case.fail(jax.tree_util.keystr(name), "differs from the parameters beside it")
-    case.check("parameters", len(jax.tree.leaves(ours)), len(jax.tree.leaves(theirs)), 0.0)
-    return case.rows
-
-
-def _without_extra(stored: Arrays, weights: Arrays) -> Arrays:
-    return {
-        key: value for key, value in stored.items() if key in weights or not key.endswith("sensor_token_proj.weight")
-    }
-
-
 _RUNNERS: dict[str, Callable[[Case], None]] = {
     r"[ABC]_": stage1,
     r"D_": align,
@@ -300,9 +264,9 @@ _RUNNERS: dict[str, Callable[[Case], None]] = {
     r"G_": _probe,
     r"H_": _optimizer,
     r"I_": _positions,
-    r"J_clip_params": _reference_only,
+    r"J_clip_params": parity_weights.parameters,
     r"J_": _clip,
-    r"K_weight_loading_map": _reference_only,
-    r"K_manifest": _manifest,
-    r"stage[12]_params": _reference_only,
+    r"K_weight_loading_map": parity_weights.loading_map,
+    r"K_manifest": parity_weights.manifest,
+    r"stage[12]_params": parity_weights.parameters,
 }

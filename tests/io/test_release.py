@@ -425,6 +425,11 @@ def test_own_names_are_read_too(model):
     same(to_params(flatten(params), model), params)
     stage1 = {part: params[part] for part in ("touch", "decoder")}
     same(to_params(flatten(stage1), model), stage1)
+    same(
+        to_params(flatten(params) | {"force/bias": np.zeros(2), "head/bias": np.zeros(3)}, model), params
+    )  # not its own
+    with pytest.raises(WeightsError, match=r"unknown keys \(2\): bogus/kernel, Touch/scale$"):
+        to_params(flatten(params) | {"bogus/kernel": np.zeros(2), "Touch/scale": np.zeros(2)}, model)
     flat = flatten(params)
     del flat["touch/class_token"]
     with pytest.raises(UserError, match=r"missing keys.*touch/class_token"):

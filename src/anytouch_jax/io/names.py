@@ -247,10 +247,15 @@ _TOWER_KEYS = {
 }
 
 
+# What some model of ours has: its parts, and the classifier that came with a probe file.
+_OWN_PARTS = frozenset(("touch", "decoder", "image", "lora", "text", "logit_scale", "matcher", "force", "head"))
+
+
 def is_left_out(key: str, layout: Layout, model: Model) -> bool:
     """Whether a key of a file is known and not needed: an unused array, a buffer, a tower that `model` lacks."""
     if layout == "own":
-        return key.split("/")[0] not in {name.split("/")[0] for name in param_shapes(model)}
+        part = key.split("/")[0]
+        return part in _OWN_PARTS and part not in {name.split("/")[0] for name in param_shapes(model)}
     absent = {
         "image": model.image is None,
         "text": model.text is None,

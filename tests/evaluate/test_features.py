@@ -95,6 +95,24 @@ def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
     )
 
 
+def test_a_sensor_of_the_table_that_training_never_saw_is_told_of(encoder, tmp_path):
+    assert encoder.seen == ("digit", "gelsight_mini") and encoder.universal_drawn
+    said = []
+    assert [encoder.sensor_row(name, said.append) for name in ("digit", "universal", "tacto")] == [1, 9, 7]
+    (line,) = said
+    assert "'tacto' was not drawn in training (that saw digit, gelsight_mini): using the universal tokens" in line
+    with pytest.warns(UserWarning, match="'tacto'"):
+        np.testing.assert_array_equal(encoder.embed(CLIPS[:, 0], "tacto"), encoder.embed(CLIPS[:, 0]))
+    # without universal tokens the mean of the others serves, also where the universal ones are asked for
+    own, said = replace(encoder, universal_drawn=False), []
+    assert [own.sensor_row(name, said.append) for name in ("digit", "tacto", "universal", "mine")] == [1, 7, 9, 9]
+    assert len(said) == 3 and all("using the mean of the tokens that training saw" in line for line in said)
+    about = {release.MODEL_KEY: to_json(encoder.config.model), release.SEEN_KEY: "digit"}
+    params = build(encoder.config.model).init(jax.random.key(0))
+    release.write_safetensors(tmp_path / "w.safetensors", release.to_release(params, encoder.config.model), about)
+    assert load_encoder(tmp_path / "w.safetensors").seen == ("digit",)
+
+
 # Where encoders come from -------------------------------------------------------------------------------------------
 
 
@@ -246,5 +264,7 @@ def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
     manifest = manifests.read(world)
     lenient = replace(encoder, config=replace(encoder.config, data=replace(encoder.config.data, on_bad_sample="skip")))
     blind = replace(lenient, config=replace(lenient.config, data=replace(lenient.config.data, background="subtract")))
-    with pytest.raises(UserError, match=r"none of the 2 rows can be read; `anytouch verify` says"):
+    with pytest.raises(UserError, match="background_path"):  # however it was trained
         embed_rows(blind, manifest, np.array([0, 1]))
+    with pytest.raises(UserError, match=r"none of the 2 rows can be read; `anytouch verify` says"):
+        embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip")

@@ -36,23 +36,38 @@ def _warn(sentence: str) -> None:
 
 @dataclass(frozen=True)
 class Encoder:
-    """A touch encoder with its parameters. `source` says where they came from."""
+    """A touch encoder with its parameters. `source` says where they came from.
+
+    `seen`: the sensors that it was trained on, None where nothing tells. `universal_drawn`: whether training drew the
+    universal tokens; else the mean over the sensors seen stands in their place (`release.serve_unseen`).
+    """
 
     config: Config
     params: dict[str, Any] = field(repr=False)
     source: str
+    seen: tuple[str, ...] | None = None
+    universal_drawn: bool = True
 
     @cached_property
     def net(self) -> Net:
         return build(self.config.model)
 
     def sensor_row(self, name: str, say: Say = _warn) -> int:
-        """Row of a sensor's tokens; the universal ones for a sensor that the table does not have, said aloud."""
-        model = self.config.model
-        if name in model.sensors:
+        """Row of a sensor's tokens. For one that training has not seen, or that the table does not have, these are the
+        universal ones, said aloud."""
+        model, drawn, known = (
+            self.config.model,
+            self.universal_drawn or not self.seen,
+            name in self.config.model.sensors,
+        )
+        if known and (drawn if name == UNIVERSAL else self.seen is None or name in self.seen):
             return model.sensors.index(name)
-        say(f"sensor {name!r} is not in this model's table ({', '.join(model.sensors)}): using the universal tokens")
-        return model.universal_row
+        why = f"is not in this model's table ({', '.join(model.sensors)})"
+        if known:
+            why = f"was not drawn in training (that saw {', '.join(self.seen or ())})"
+        instead = "the universal tokens" if drawn else "the mean of the tokens that training saw (no universal ones)"
+        say(f"sensor {name!r} {why}: using {instead}")
+        return model.sensors.index(name) if known else model.universal_row
 
     @property
     def subtracts(self) -> bool:
@@ -142,7 +157,8 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     """The encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
 
     Only the touch encoder is kept. A sensor that a run was not trained on is served by the universal tokens (Sec. 3.5),
-    whether or not the table has its name. Raises UserError when there is no touch encoder.
+    whether or not the table has its name. A bad sample stops what it embeds, whatever training did with such. Raises
+    UserError when there is no touch encoder.
     """
     path = Path(path)
     if not path.exists():
@@ -150,18 +166,22 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     if path.is_dir():
         params, config_json, about = checkpoint.load_params(path, step)
         config = from_json(config_json)
-        if "touch" in params and "seen" in about:
-            drawn = config.objective.universal_start + config.objective.universal_end > 0
-            served = release.serve_unseen(params["touch"], config.model, about["seen"], universal_drawn=drawn)
+        seen = about.get("seen")
+        drawn = config.objective.universal_start + config.objective.universal_end > 0
+        if "touch" in params and seen is not None:
+            served = release.serve_unseen(params["touch"], config.model, seen, universal_drawn=drawn)
             params = params | {"touch": served}
     else:
         weights = release.read_weights(path)
         model = release.model_of(path, weights)
-        shown: Any = release.read_metadata(path).get(release.BACKGROUND_KEY, "keep")
+        told = release.read_metadata(path)  # written by `anytouch convert`, which has served the sensors not seen
+        seen, drawn = told[release.SEEN_KEY].split(",") if release.SEEN_KEY in told else None, True
+        shown: Any = told.get(release.BACKGROUND_KEY, "keep")
         params, config = release.to_params(weights, model), Config(model, data=Data(background=shown))
     if "touch" not in params:
         raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
-    return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path))
+    known = None if seen is None else tuple(seen)
+    return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path), known, drawn)
 
 
 def random_encoder(config: Config, seed: int = 0) -> Encoder:
@@ -172,7 +192,7 @@ def random_encoder(config: Config, seed: int = 0) -> Encoder:
 
 def _touch_only(config: Config) -> Config:
     bare = replace(usable(config.model), image=None, text=None, match_head="none", lora_rank=0, force_head=False)
-    return replace(config, model=bare)
+    return replace(config, model=bare, data=replace(config.data, on_bad_sample="error"))
 
 
 @dataclass(frozen=True)
@@ -194,17 +214,20 @@ def embed_rows(
     join: Join = "mean",
     *,
     batch: int = 64,
+    on_bad_sample: Literal["error", "skip"] = "error",
     say: Say = _warn,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(row numbers, features) of manifest rows, each frame encoded once; `frames` is the length of a row's clip.
 
-    A sensor that the model does not know gets the universal tokens, said aloud. Raises UserError.
+    A sensor that the model does not know gets the universal tokens, said aloud. With `on_bad_sample` "skip" rows that
+    cannot be read are left out. Raises UserError.
     """
     if not len(rows):
         raise UserError("no rows are left to embed; check the split and the filters")
     for name in sorted(set(text_column(manifest, "sensor")[rows])):
         encoder.sensor_row(name, say)
-    config = replace(encoder.config, data=replace(encoder.config.data, batch_size=min(batch, len(rows))))
+    data = replace(encoder.config.data, batch_size=min(batch, len(rows)), on_bad_sample=on_bad_sample)
+    config = replace(encoder.config, data=data)
     kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
     ids, values = [], []
     for found, part in evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"):

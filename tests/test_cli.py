@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -285,6 +286,31 @@ def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
     assert "'new_sensor'" in (error := capsys.readouterr().err) and "universal tokens" in error
     with np.load(out) as file:
         assert np.abs(file["features"] - from_manifest).max() > 1e-4
+
+
+def test_embed_finds_first_that_it_cannot_write(tmp_path, world, capsys):
+    told = mistake(capsys, "embed", "--run", tmp_path / "gone", "--input", world, "--out", world / "features.npz")
+    assert f"{world} cannot be made" in told  # a file, not a folder
+
+
+def test_embed_and_probe_name_a_bad_picture_however_the_run_was_trained(tmp_path, world, tiny_run, capsys):
+    shutil.copytree(world.parent, tmp_path / "w")
+    (tmp_path / "w" / "c2.png").write_bytes(b"no picture")
+    shutil.copytree(tiny_run, tmp_path / "r")
+    record = next((tmp_path / "r" / "checkpoints").glob("*/checkpoint.json"))
+    content = json.loads(record.read_text())["record"]
+    content["config"] = content["config"].replace('"on_bad_sample": "error"', '"on_bad_sample": "skip"')
+    assert '"skip"' in content["config"]
+    body = json.dumps(content, sort_keys=True)
+    record.write_text(json.dumps({"checksum": zlib.crc32(body.encode()), "record": content}))
+    args = ("embed", "--run", tmp_path / "r", "--input", tmp_path / "w" / world.name, "--out", tmp_path / "f.npz")
+    told = mistake(capsys, *args, "--batch", 4)
+    assert "row 10 of" in told and "'path'" in told
+    assert run(*args, "--batch", 4, "--on-bad-sample", "skip") == 0
+    assert "11 features of 12 values, 1 skipped" in capsys.readouterr().out
+    assert run("probe", "--run", tmp_path / "r", "--data", tmp_path / "w" / world.name) == 1
+    told = capsys.readouterr().err
+    assert "row 10 of" in told and "'path'" in told
 
 
 def test_embed_clips_of_a_manifest_and_of_a_video(tmp_path, world, tiny_run, capsys):

@@ -103,6 +103,8 @@ class Embed:
     """One frame at a time, the newest of a camera; prints where the time went."""
     stride: int = 1
     """Frames from one frame of a streamed clip to its next: what the clips of the training data have."""
+    on_bad_sample: Literal["error", "skip"] = "error"
+    """A row of a manifest that cannot be read stops the command, or is left out and counted."""
 
 
 @dataclass(frozen=True)

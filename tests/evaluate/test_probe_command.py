@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -77,3 +78,19 @@ def test_groups_are_found_with_or_without_label(manifest):
 def test_a_group_that_is_not_there_is_no_recording(manifest):
     with pytest.raises(UserError, match=r"no column 'taste' or 'label\.taste'; it has path"):
         read(manifest, label="object", group="taste")
+
+
+def test_raw_pixels_name_the_row_and_the_column_of_a_bad_picture(tmp_path):
+    picture = np.zeros((24, 32, 3), np.uint8)
+    for name in ("a.png", "gel.png"):
+        cv2.imwrite(str(tmp_path / name), picture)
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    columns = {
+        "path": ["a.png", "a.png"], "sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1],
+        "split": ["train", "test"], "object": ["a", "b"], "background_path": ["gel.png", "bad.png"],
+    }  # fmt: skip
+    for change, said in (({}, "'background_path'"), ({"path": ["a.png", "bad.png"]}, "'path'")):
+        path = tmp_path / "manifest.csv"
+        manifests.write(manifests.from_columns(columns | change, path), path)
+        with pytest.raises(UserError, match=rf"row 1 of .*manifest\.csv, column {said}: .*bad\.png"):
+            probe_command.raw_features(read(path, label="object"))

@@ -25,6 +25,8 @@ def run(options: Embed) -> int:
     _refuse_unused(options)
     from anytouch_jax.evaluate import features
 
+    if not (options.stream and str(options.out) == "-"):
+        check_folder(options.out)  # before what takes long: what is embedded must have a place
     encoder = features.load_encoder(options.run)
     features.check_frames(encoder.config.model, options.frames)
     if options.batch < 1:
@@ -58,8 +60,6 @@ def _stream(encoder: Encoder, options: Embed) -> int:
     from anytouch_jax.evaluate import features, stream
 
     lines = str(options.out) == "-"
-    if not lines:
-        check_folder(options.out)  # before the camera: what is embedded must have a place
     source, live = stream.open_source(options.input)
     embedded = stream.stream(
         encoder,
@@ -118,8 +118,9 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     if len(usable) < len(rows):
         say(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
     rows, values = features.embed_rows(
-        encoder, manifest, usable, options.frames, options.pooling, options.join, batch=options.batch, say=say
-    )
+        encoder, manifest, usable, options.frames, options.pooling, options.join, batch=options.batch,
+        on_bad_sample=options.on_bad_sample, say=say,
+    )  # fmt: skip
     keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     return features.Features(values, rows, keys, len(usable) - len(rows))

@@ -46,7 +46,7 @@ class Reader:
         of the whole clip. Raises SampleError.
         """
         size = self.config.model.image_size
-        frames = [self._decode(row, "path") for row in rows]
+        frames = [read_picture(self.manifest, row) for row in rows]
         if self.config.data.background == "subtract":
             frames = subtract_background(frames, self._background(int(rows[-1])))
         if epoch is None or not (self.config.data.flip or any(self.config.data.jitter)):
@@ -57,7 +57,7 @@ class Reader:
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """The picture of a row's object as u8 (size, size, 3); `epoch` None means no augmentation."""
         size = self.config.model.image_size
-        picture = self._decode(row, "image_path")
+        picture = read_picture(self.manifest, row, "image_path")
         if epoch is None:
             return vision_evaluation(picture, size)
         rng = augmentation_rng(self.config.run.seed, epoch, int(row), VISION)
@@ -73,13 +73,18 @@ class Reader:
                 f"{self.manifest.where(row)} has no background_path, which --loader.background subtract takes off; "
                 "name one, or train with --loader.background keep"
             )
-        return self._decode(row, "background_path", _gel)
+        return read_picture(self.manifest, row, "background_path", _gel)
 
-    def _decode(self, row: int, column: str, how: Callable[[Path], np.ndarray] | None = None) -> np.ndarray:
-        try:
-            return (how or decode)(self.manifest.file(row, column))
-        except UserError as error:
-            raise SampleError(f"{self.manifest.where(row)}, column {column!r}: {error}") from None
+
+def read_picture(
+    manifest: Manifest, row: int, column: str = "path", how: Callable[[Path], np.ndarray] | None = None
+) -> np.ndarray:
+    """The picture u8 RGB (h, w, 3) that a column of a row names, decoded by `how`. Raises SampleError, which names the
+    row and the column."""
+    try:
+        return (how or decode)(manifest.file(row, column))
+    except UserError as error:
+        raise SampleError(f"{manifest.where(row)}, column {column!r}: {error}") from None
 
 
 def fill_slot(

@@ -10,7 +10,7 @@ import numpy as np
 
 from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.images import decode
+from anytouch_jax.data.samples import read_picture
 from anytouch_jax.evaluate import baseline, probe
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder
 
@@ -166,18 +166,17 @@ def raw_features(task: Task) -> np.ndarray:
     """Grey pixels and their difference from the background, reduced by a PCA fitted on train."""
     pieces = []
     for row in task.rows:
-        frame = _small(task.manifest.file(int(row)))
+        frame = _small(read_picture(task.manifest, int(row)))
         has = task.manifest.value(int(row), "background_path") is not None
-        ground = _small(task.manifest.file(int(row), "background_path")) if has else np.zeros_like(frame)
+        ground = _small(read_picture(task.manifest, int(row), "background_path")) if has else np.zeros_like(frame)
         pieces.append(baseline.raw_pixels(frame[None], ground[None], np.array([has]))[0])
     train = task.split == "train"
     return baseline.reduce(np.stack(pieces), train if train.any() else np.ones(len(pieces), bool))
 
 
-def _small(path: Any) -> np.ndarray:
+def _small(image: np.ndarray) -> np.ndarray:
     import cv2
 
-    image = decode(path)
     if image.shape[:2] == _RAW_SIZE:
         return image
     return np.asarray(cv2.resize(image, _RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))

@@ -1,6 +1,7 @@
 """Whole runs on a small world on disk: stage 1, then stage 2 from it, resumed, refused, started from other weights."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import jax
@@ -216,6 +217,18 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
 
 def saved_steps_if_any(run):
     return saved_steps(run) if (run / "checkpoints").exists() else []
+
+
+@pytest.mark.parametrize("content", [b'{"architectures": ["CLIPModel"]}', b"\xff\xfe\x00"], ids=["foreign", "binary"])
+def test_a_config_that_is_not_ours_is_replaced_or_named(straight, world, tmp_path, content):
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "config.json").write_bytes(content)
+    train(run_config(world), tmp_path / "new", stop_after=0)  # no run was there
+    assert from_json((tmp_path / "new" / "config.json").read_text()).run.steps == 4
+    shutil.copytree(straight[0], tmp_path / "begun")
+    (tmp_path / "begun" / "config.json").write_bytes(content)
+    told = refused(run_config(world), tmp_path / "begun")
+    assert f"{tmp_path / 'begun' / 'config.json'} cannot be read" in told
 
 
 def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):

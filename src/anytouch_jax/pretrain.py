@@ -26,6 +26,7 @@ from anytouch_jax.io.record import steps
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.train.record import begun_with
 from anytouch_jax.train.watch import silent
 
 Params = dict[str, Any]
@@ -83,8 +84,8 @@ def pretrain(
 
 def _warmed(config: Config, run: Path, loader: Loader) -> Config:
     """Warm-up of one epoch (appendix "Implementation details"), or a share of the run where that is less."""
-    stored = run / "config.json"
-    if config.optim.warmup is not None or (stored.exists() and from_json(stored.read_text()).optim.warmup is None):
+    begun = begun_with(run)
+    if config.optim.warmup is not None or (begun is not None and begun.optim.warmup is None):
         return config
     return replace(config, optim=replace(config.optim, warmup=min(loader.steps_per_epoch, config.warmup)))
 

@@ -55,6 +55,19 @@ def write_atomic(path: Path, text: str) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def begun_with(run_dir: Path) -> Config | None:
+    """The settings that the run in a folder was begun with, None without a complete checkpoint: what such a folder holds
+    was left by a start that failed, or is not ours. Raises UserError when they cannot be read."""
+    path = run_dir / "config.json"
+    if not steps(run_dir / "checkpoints") or not path.exists():
+        return None
+    try:
+        config: Config = from_json(path.read_text(encoding="utf-8"))
+    except (ConfigError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} cannot be read ({error}); choose another run folder, or mend it") from None
+    return config
+
+
 def open_run(run_dir: Path, config: Config) -> None:
     """Make a run folder with its config.json, or check that the one there was started with the same settings.
 
@@ -64,14 +77,11 @@ def open_run(run_dir: Path, config: Config) -> None:
     path = run_dir / "config.json"
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
-        if not path.exists() or not steps(run_dir / "checkpoints"):
+        begun = begun_with(run_dir)
+        if begun is None:
             write_atomic(path, to_json(config) + "\n")
             return
-        text = path.read_text(encoding="utf-8")
-    try:
-        before = _flat(dataclasses.asdict(from_json(text)))
-    except ConfigError as error:
-        raise UserError(f"{path} cannot be read ({error}); choose another run folder, or mend it") from None
+    before = _flat(dataclasses.asdict(begun))
     now = _flat(dataclasses.asdict(config))
     changed = [
         f"{name} was {before.get(name)!r} and is now {now.get(name)!r}"

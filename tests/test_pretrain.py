@@ -101,7 +101,8 @@ def parts(params, *names):
 def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp_path):
     run, stage1 = straight
     config, said = clips_only(run_config(world, 2)), []
-    first = train(config, tmp_path / "r", said, init=run, stop_after=1)
+    init = shutil.copytree(run, tmp_path / "stage1")
+    first = train(config, tmp_path / "r", said, init=init, stop_after=1)
     # the learning rate of step 0 is 0: what stage 1 learned is still whole
     for name, array in parts(stage1.params, "touch", "decoder").items():
         np.testing.assert_array_equal(parts(first.params, "touch", "decoder")[name], array, err_msg=name)
@@ -112,8 +113,11 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == vocabulary < 2048
     assert first.params["text"]["token"].shape == (vocabulary, 16)
 
-    last = train(config, tmp_path / "r", said, init=run)
-    assert (last.resumed, last.step, last.traces) == (1, 4, 1)
+    shutil.rmtree(init)  # what goes on needs it no more, whether or not it is named
+    assert train(config, tmp_path / "r", said, init=init, stop_after=2).step == 2
+    last = train(config, tmp_path / "r", said)
+    assert (last.resumed, last.step, last.traces) == (2, 4, 1)
+    assert not any("without a stage-1 run" in line for line in said)
     assert (tmp_path / "r" / "tokenizer.json").read_bytes() == tokenizer
     lines = read_metrics(tmp_path / "r")
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
@@ -126,7 +130,7 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
             if np.array_equal(a, moved[n])}  # fmt: skip
     assert same == set()
     source = checkpoint.read_metadata(tmp_path / "r")["source"]
-    assert source == {"init": str(run), "clip": None}
+    assert source == {"init": str(init), "clip": None}
 
 
 def test_stage_two_of_the_release(straight, world, tmp_path):
@@ -164,6 +168,7 @@ def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora
     lora = parts(result.params, "lora")
     assert all(np.any(np.asarray(array)) for array in lora.values())  # b starts at zero, so it has learned
     assert all(line["align"] > 0 for line in read_metrics(tmp_path / "r"))
+    assert train(config, tmp_path / "r").resumed == 3  # without CLIP's weights
     assert "model.bin" in refused(config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin")
 
 

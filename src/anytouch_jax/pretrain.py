@@ -49,7 +49,8 @@ def pretrain(
     """Train stage 1 or stage 2 in the folder `run`, or go on with it (Sec. 3.6).
 
     `init`: a stage-1 run (or AnyTouch weights) that stage 2 starts from, or weights for the touch encoder of stage 1.
-    `clip`: CLIP weights for the towers; stage 1 starts the touch encoder from their image tower, as the paper does.
+    `clip`: CLIP weights for the towers; stage 1 starts the touch encoder from their image tower, as the paper does. A
+    run that goes on reads neither.
     `mesh`: the devices to train on, all of them if None. Raises UserError for a mistake in the settings, the data or
     the folder.
     """
@@ -60,7 +61,9 @@ def pretrain(
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
     net = build(config.model)
-    params = _first_params(config, net, init, clip, say)
+    params = net.init(jax.random.key(config.run.seed))
+    if not steps(run / "checkpoints"):  # else only their shapes matter
+        params = _first_params(params, config, init, clip, say)
     _same_data(run, manifest)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
@@ -105,10 +108,14 @@ def _describe(
     config: Config, run: Path, init: Any, clip: Any, manifest: manifests.Manifest, loader: Loader
 ) -> dict[str, Any]:
     """What a checkpoint says of itself beside its config; `seen`: the sensors that it, or `init`, was trained on."""
-    seen = set(loader.sensors_seen)
-    for before in (run, init):  # a run that goes on may do so without --init
-        if before is not None:
-            seen |= _seen_by(Path(before))
+    seen: set[str] = set(loader.sensors_seen)
+    source = {"init": None if init is None else str(init), "clip": None if clip is None else str(clip)}
+    if steps(run / "checkpoints"):  # a run that goes on knows what it began from
+        with suppress(checkpoint.CheckpointError):
+            told = checkpoint.read_metadata(run)
+            seen, source = seen | set(told.get("seen", ())), told.get("source", source)
+    elif init is not None:
+        seen |= _seen_by(Path(init))
     return {
         "sensors": list(config.model.sensors),
         "seen": [name for name in config.model.sensors if name in seen],
@@ -116,7 +123,7 @@ def _describe(
             "touch": {"size": config.model.image_size, "mean": IMAGENET_MEAN, "std": IMAGENET_STD, "channels": "RGB"},
             "image": {"size": config.model.image_size, "mean": CLIP_MEAN, "std": CLIP_STD, "channels": "RGB"},
         },
-        "source": {"init": None if init is None else str(init), "clip": None if clip is None else str(clip)},
+        "source": source,
         "data": manifest.content_hash,
     }
 
@@ -177,11 +184,10 @@ def _weights_file(path: Path) -> Path:
     raise UserError(f"no weights (*.safetensors, *.bin, *.pth) in {path}")
 
 
-def _first_params(config: Config, net: Net, init: Any, clip: Any, say: Say) -> Params:
-    """Fresh parameters, with CLIP's and those of `init` in their places (golden K_weight_loading_map)."""
+def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say) -> Params:
+    """Fresh `params`, with CLIP's and those of `init` in their places (golden K_weight_loading_map)."""
     if config.towers == "pretrained" and clip is None:
         raise UserError(_NO_CLIP)
-    params = net.init(jax.random.key(config.run.seed))
     first = None if init is None else _load(Path(init), config, say)
     weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
     if config.stage == 2:

@@ -56,8 +56,8 @@ def write_atomic(path: Path, text: str) -> None:
 
 
 def begun_with(run_dir: Path) -> Config | None:
-    """The settings that the run in a folder was begun with, None without a complete checkpoint: what such a folder holds
-    was left by a start that failed, or is not ours. Raises UserError when they cannot be read."""
+    """The settings that the run in a folder was begun with, None without a complete checkpoint: what lies in such a
+    folder was left by a start that failed, or is not ours. Raises UserError when they cannot be read."""
     path = run_dir / "config.json"
     if not steps(run_dir / "checkpoints") or not path.exists():
         return None

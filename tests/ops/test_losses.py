@@ -89,6 +89,14 @@ def test_bfloat16_inputs_are_summed_in_float32():
     np.testing.assert_allclose(ours, loop_info_nce(wide_a, wide_b, 14.0, present), rtol=1e-5)
 
 
+def test_the_products_of_info_nce_are_whole_on_every_device():
+    """An accelerator's default is TF32 or bfloat16: a hundredth of a logit that is multiplied by 100."""
+    a, b, present = jnp.ones((4, 8)), jnp.ones((4, 8)), jnp.ones(4, bool)
+    loss = lambda a, b: info_nce(a, b, jnp.asarray(100.0), present)  # noqa: E731
+    text = str(jax.make_jaxpr(jax.grad(loss, argnums=(0, 1)))(a, b))
+    assert text.count("dot_general[") == 3 and text.count("HIGHEST") == 6, text  # of both operands
+
+
 def test_groups_keep_negatives_in_their_share():
     a, b, present = unit(8, seed=1), unit(8, seed=2), PRESENCE["mixed"]
     ours = info_nce(jnp.asarray(a), jnp.asarray(b), jnp.asarray(9.0), jnp.asarray(present), groups=2)

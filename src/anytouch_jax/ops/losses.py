@@ -77,7 +77,8 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     present = present.reshape(groups, -1)
     a = jnp.where(present[..., None], _wide(a).reshape(groups, -1, e), 0.0)
     b = jnp.where(present[..., None], _wide(b).reshape(groups, -1, e), 0.0)
-    logits = _wide(scale) * jnp.einsum("gie,gje->gij", a, b)
+    # Multiplied by up to 100: the shorter products that accelerators take by default would show in the loss.
+    logits = _wide(scale) * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
     logits = jnp.where(present[:, None, :], logits, jnp.finfo(logits.dtype).min)
     own = jnp.diagonal(logits, axis1=1, axis2=2)
     loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from tiny_models import full_model
 
 from anytouch_jax.nn.functional import build
@@ -30,6 +31,12 @@ def test_padding_behind_the_end_token_changes_nothing():
     a, b = NET.apply(PARAMS, "embed_text", IDS, mask), NET.apply(PARAMS, "embed_text", other, mask)
     np.testing.assert_allclose(a, b, atol=1e-6)
     np.testing.assert_allclose(a, NET.apply(PARAMS, "embed_text", IDS), atol=1e-6)
+
+
+@pytest.mark.parametrize("outside", [50, -1])
+def test_a_token_outside_the_vocabulary_is_nan(outside):
+    hidden = np.asarray(NET.apply(PARAMS, "text_hidden", IDS.at[1, 2].set(outside)))
+    assert np.isfinite(hidden[0]).all() and np.isnan(hidden[1, 2:]).all()
 
 
 def test_the_pooled_token_is_the_largest_id_or_the_end_token_named():

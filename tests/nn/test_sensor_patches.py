@@ -60,8 +60,9 @@ def test_sensors_differ_by_their_patch_encoders_without_tokens():
 
 def test_a_row_outside_the_table_is_nan_not_the_last_sensor():
     model = replace(OWN, sensor_tokens=0)
-    z = np.asarray(encode(model, parameters(model), CLIP, [0, 10, 3]))
-    assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
+    for outside in (10, -1):
+        z = np.asarray(encode(model, parameters(model), CLIP, [0, outside, 3]))
+        assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
 
 
 def test_each_kernel_starts_at_the_size_of_a_shared_one():

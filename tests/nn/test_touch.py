@@ -68,8 +68,18 @@ def test_sensor_tokens_matter_and_come_from_their_row():
 
 
 def test_a_sensor_outside_the_table_is_not_clamped_to_another():
-    z = np.asarray(encode(PARAMS, clips(1), jnp.asarray([9, 10])))
-    assert np.isfinite(z[0]).all() and np.isnan(z[1]).all()
+    for outside in (10, -1, -10):
+        z = np.asarray(encode(PARAMS, clips(1), jnp.asarray([9, outside])))
+        assert np.isfinite(z[0]).all() and np.isnan(z[1]).all()
+
+
+@pytest.mark.parametrize("outside", [10, -1])
+def test_nor_is_one_in_the_decoder(outside):
+    net = build(touch_model(decoder_sensor_tokens=True))
+    keep_ids, restore_ids, _ = masks()
+    own = jnp.asarray([9, outside])
+    pred = net.apply(net.init(jax.random.key(0)), "reconstruct", clips(1), SENSOR, keep_ids, restore_ids, 1, own)
+    assert np.isfinite(pred[0]).all() and np.isnan(pred[1]).all()
 
 
 @pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])

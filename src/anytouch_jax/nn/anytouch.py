@@ -10,7 +10,7 @@ from jax import Array
 
 from anytouch_jax.config import Model
 from anytouch_jax.nn.clip import ImageTower, TextEncoder
-from anytouch_jax.nn.layers import Dense, Mlp, gelu, table
+from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
 from anytouch_jax.ops import tokens
 
@@ -110,7 +110,7 @@ class AnyTouch(nnx.Module):
         return pixels, self.force(self.touch.projection(self.touch.post_norm(hidden[:, 0])))
 
     def _paint(self, latent: Array, restore_ids: Array, frames: int, sensor: Array) -> Array:
-        own = self.touch.sensor_tokens[...][sensor] if hasattr(self.decoder, "sensor_projection") else None
+        own = rows_of(self.touch.sensor_tokens[...], sensor) if hasattr(self.decoder, "sensor_projection") else None
         return self.decoder(latent, restore_ids, frames, own)
 
     def touch_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:

@@ -7,7 +7,7 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import Model, Stack, TextTower
-from anytouch_jax.nn.layers import Dense, LayerNorm, activation, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
 from anytouch_jax.ops import tokens
 
 
@@ -54,7 +54,7 @@ class TextEncoder(nnx.Module):
 
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
         """Normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""
-        x = self.token[...].at[ids].get(mode="fill", fill_value=jnp.nan) + self.position[...][None, : ids.shape[1]]
+        x = rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]
         return self.final_norm(run_blocks(self.blocks, x.astype(self.dtype), remat=self.remat, causal=True, mask=mask))
 
     def pooled(self, ids: Array, mask: Array | None = None) -> Array:

@@ -56,6 +56,12 @@ def table(*shape: int) -> nnx.Param:
     return nnx.Param(jnp.zeros(shape))
 
 
+def rows_of(values: Array, ids: Array) -> Array:
+    """Rows of a table (R, ...) by ids of any shape. An id outside it, also a negative one, gives NaN, which the step
+    reports; JAX would take the nearest row or count from the end."""
+    return values.at[ids].get(mode="fill", fill_value=jnp.nan, wrap_negative_indices=False)
+
+
 class Dense(nnx.Module):
     """A linear layer (..., inputs) -> (..., outputs): float32 parameters, arithmetic in the model's dtype."""
 

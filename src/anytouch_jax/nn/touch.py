@@ -7,7 +7,7 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import Model
-from anytouch_jax.nn.layers import Dense, LayerNorm, activation, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
 from anytouch_jax.ops import masking, tokens
 
 
@@ -29,7 +29,7 @@ class TouchPatch(nnx.Module):
             kernel = jnp.sum(kernel, axis=-3, keepdims=True)
         if not self.own:
             return jnp.einsum("bktc,tcd->bkd", patches.astype(self.dtype), kernel.astype(self.dtype))
-        each = kernel.astype(self.dtype).at[sensor].get(mode="fill", fill_value=jnp.nan)
+        each = rows_of(kernel.astype(self.dtype), sensor)
         return jnp.einsum("bktc,btcd->bkd", patches.astype(self.dtype), each)
 
 
@@ -58,8 +58,7 @@ class TouchEncoder(nnx.Module):
         start = jnp.broadcast_to(
             (self.class_token[...] + self.position[...][0])[None, None], (clip.shape[0], 1, x.shape[-1])
         )
-        # An id outside the table gives NaN, which the step reports; JAX would clamp it silently.
-        own = self.sensor_tokens[...].at[sensor].get(mode="fill", fill_value=jnp.nan)
+        own = rows_of(self.sensor_tokens[...], sensor)
         return jnp.concatenate([start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1)
 
     def hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:

@@ -229,7 +229,9 @@ def preset(
     """The configuration called `name` (tiny, small, base, large = the paper's) for a stage and a recipe.
 
     `towers` matters in stage 2 only: "scratch" trains small image and text towers whole, "pretrained" expects
-    CLIP weights, freezes the text tower and adapts the image tower by LoRA. Raises ConfigError.
+    CLIP weights, freezes the text tower and adapts the image tower by LoRA. One point of the release hangs on the
+    machine and is set by hand: there negatives stay within a device's 64 rows, `objective.groups` 4 for a batch of 256.
+    Raises ConfigError.
     """
     if name not in _PRESETS:
         raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(_PRESETS)}")

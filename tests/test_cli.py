@@ -2,7 +2,9 @@
 
 import json
 import os
+import pkgutil
 import shutil
+import signal
 import subprocess
 import sys
 import zlib
@@ -260,6 +262,27 @@ def test_train_goes_on_and_refuses_other_settings(tmp_path, world, tiny_run, cap
     assert run(*args, "--stop-after", 3) == 0
     error = capsys.readouterr().err
     assert "going on from the checkpoint of step 2" in error and "3 of 4 steps" in error
+
+
+@pytest.mark.parametrize("place", ["anytouch_jax.data.manifest.read", "anytouch_jax.io.checkpoint.Checkpoints.latest"])
+def test_a_termination_before_the_first_step_is_polite(tmp_path, world, capsys, monkeypatch, place):
+    module, _, name = place.rpartition(".")
+    owner = pkgutil.resolve_name(module)
+    before, real = signal.getsignal(signal.SIGTERM), getattr(owner, name)
+
+    def terminated(*args, **options):
+        signal.raise_signal(signal.SIGTERM)
+        return real(*args, **options)
+
+    args = ["train", "--data", world, "--run", tmp_path / "r", "--steps", 4, "--batch", 8, *SIZES]
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, terminated)
+        assert run(*args) == 0
+    told = capsys.readouterr().err.strip()
+    assert told.splitlines()[-1].startswith("stopped by SIGTERM before a step of") and "Traceback" not in told
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {"config.json"}
+    assert run(*args, "--stop-after", 0) == 0
 
 
 def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):

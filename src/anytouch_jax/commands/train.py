@@ -8,6 +8,7 @@ from anytouch_jax import baselines
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import Config, UserError
 from anytouch_jax.options import Train
+from anytouch_jax.train.watch import Terminated, terminating
 
 
 def run(options: Train, config: Config) -> int:
@@ -17,6 +18,15 @@ def run(options: Train, config: Config) -> int:
         raise UserError(f"baseline {baseline.name} has no stage 1: leave out --init")
     if options.stop_after is not None and options.stop_after < 0:
         raise UserError(f"--stop-after must be 0 or more, not {options.stop_after}")
+    try:
+        with terminating():
+            return _train(options, config)
+    except Terminated:
+        say(f"stopped by SIGTERM before a step of {options.run} was under way; the same command starts it, or goes on")
+        return 0
+
+
+def _train(options: Train, config: Config) -> int:
     from anytouch_jax.pretrain import pretrain
     from anytouch_jax.train.mesh import enable_compilation_cache
     from anytouch_jax.train.processes import joined

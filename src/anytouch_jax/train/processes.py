@@ -20,6 +20,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from anytouch_jax.config import ConfigError, UserError
+from anytouch_jax.train.watch import Terminated
 
 Tree = Any
 HEARTBEAT = 60  # seconds until a process that is silent counts as lost, where no collective has told before
@@ -135,6 +136,8 @@ def _farewell(error: BaseException, place: Place) -> tuple[str, int]:
     """What to say of the error that ends this process, and its exit status."""
     if isinstance(error, KeyboardInterrupt):
         return f"{place} was interrupted", 130
+    if isinstance(error, Terminated):
+        return f"{place} was stopped by SIGTERM before a step was under way", 0
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, jax.errors.JaxRuntimeError) and _PEERS.search(str(cause)):

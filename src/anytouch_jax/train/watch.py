@@ -90,3 +90,28 @@ def signals() -> Iterator[list[signal.Signals]]:
     finally:
         for name, handler in before.items():
             signal.signal(name, handler)
+
+
+class Terminated(BaseException):
+    """SIGTERM while no step is under way."""
+
+
+@contextlib.contextmanager
+def terminating() -> Iterator[None]:
+    """Let SIGTERM raise `Terminated` while the block runs, so that it is left as after any error: nothing half written.
+
+    Inside `signals` that one decides. The handler of before is restored in the end; outside the main thread, where
+    Python has no handlers, nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: Any) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -11,6 +11,7 @@ from tiny_models import tiny_config
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.mesh import batch_sharding, make_mesh, put_batch, replicated
 from anytouch_jax.train.optim import flatten_names, optimizer
@@ -404,6 +405,37 @@ def test_the_loss_falls_on_a_fixed_batch(stage):
     assert not any(row["skipped"] for row in found)
     if stage == 2:
         assert found[-1]["match"] < found[0]["match"] and found[-1]["align"] < found[0]["align"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", [1, 2])
+def test_the_loss_of_preset_tiny_falls_on_a_fixed_batch(stage):
+    config = preset("tiny", stage=stage)
+    config = replace(
+        config, optim=replace(config.optim, learning_rate=1e-3, warmup=1), run=replace(config.run, steps=100)
+    )
+    rng = np.random.default_rng(7)
+    sensor = np.asarray([0, 1, 3, 0, 1, 3, 0, 1], np.int32)
+
+    def draw(rows, *frames):
+        coarse = rng.integers(0, 256, (rows, *frames, 4, 4, 3), np.uint8)
+        return coarse.repeat(28, axis=-3).repeat(28, axis=-2)
+
+    batch = TouchBatch(draw(8, 4), sensor)
+    if stage == 2:
+        text = rng.integers(1, 40000, (4, 77)).astype(np.int32)
+        rows = np.asarray([1, 4, 6, 8], np.int32), np.asarray([1, 2, 4, 7], np.int32)
+        align = AlignBatch(draw(8, 1), sensor, draw(4), rows[0], text, text > 0, rows[1])
+        batch = Stage2Batch(align, MatchBatch(draw(8, 1), sensor, draw(8, 1), sensor[::-1].copy(), draw(8, 1), sensor))
+    net = build(config.model)
+    loss = partial(objectives.stage1_loss if stage == 1 else objectives.stage2_loss, net=net, config=config)
+    step = jax.jit(make_step(loss, optimizer(config), total_steps=config.run.steps))
+    state, losses = init_state(net.init(jax.random.key(2)), config), []
+    for _ in range(12):
+        state, metrics = step(state, batch, jax.random.key(0))
+        losses.append(float(metrics["loss"]))
+    assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3]), losses
+    assert int(state.step) == 12 and np.isfinite(losses).all()
 
 
 @pytest.mark.parametrize("devices", [2, 4])

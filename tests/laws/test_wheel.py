@@ -1,0 +1,50 @@
+"""The wheel: everything of `src` is in it, and it works where no checkout is."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def ran(*command, cwd: Path) -> str:
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_wheel_works_in_an_empty_folder(tmp_path):
+    """Without a network: the tools that build and what is imported are those of this environment."""
+    source, empty, home = (tmp_path / name for name in ("source", "empty", "venv"))
+    empty.mkdir()
+    shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
+    ran(*pip, "wheel", "--no-deps", "--no-index", "--no-build-isolation", "-w", tmp_path, source, cwd=tmp_path)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        packed = {name for name in file.namelist() if ".dist-info/" not in name}
+    assert packed == {p.relative_to(ROOT / "src").as_posix() for p in (ROOT / "src").rglob("*.py")} | {
+        "anytouch_jax/py.typed"
+    }
+    venv.create(home, with_pip=False)
+    python = home / "bin" / "python"
+    ran(*pip, "--python", python, "install", "--no-deps", "--no-index", wheel, cwd=tmp_path)
+    place = Path(ran(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=empty).strip())
+    (place / "others.pth").write_text(f"{sysconfig.get_path('purelib')}\n")  # after its own, so the wheel comes first
+    assert ran(python, "-c", "import anytouch_jax; print(anytouch_jax.__file__)", cwd=empty).startswith(str(place))
+    assert "usage: anytouch COMMAND" in ran(home / "bin" / "anytouch", "--help", cwd=empty)
+    assert "--on-bad-sample" in ran(home / "bin" / "anytouch", "train", "--help", cwd=empty)
+    assert not list(empty.iterdir())

@@ -14,6 +14,7 @@ from scipy import stats
 from anytouch_jax.config import UserError
 
 CLAIM = 3  # seeds from which a sign is claimed
+NO_SIGN = "no sign in the paper"
 Seeds = dict[int, float]
 
 
@@ -120,7 +121,7 @@ def change(first: Seeds, second: Seeds, expected: float | None, better: int = 1)
     if len(seeds) < CLAIM:
         word = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}, no claim"
     elif not expected:
-        word = "no sign in the paper"
+        word = NO_SIGN
     elif low is None or high is None or low <= 0 <= high:
         word = "undecided"
     else:

@@ -11,7 +11,7 @@ import numpy as np
 from anytouch_jax.evaluate.sections import markdown
 
 from . import paper
-from .results import CLAIM, Change, Column, Run, change, spread, together, values
+from .results import CLAIM, NO_SIGN, Change, Column, Run, change, spread, together, values
 
 TITLES = {
     "untrained": "untrained encoder", "pixels": "raw pixels, no encoder",
@@ -73,7 +73,10 @@ def judge(runs: Sequence[Run], question: str, columns: Sequence[Column], pairs: 
         }
         whole = [i for i in (range(len(columns)) if pair.whole is None else pair.whole) if pair.expected[i]]
         over = [columns[i].title for i in whole]
-        if len(whole) == 1:
+        if not whole:
+            run = any(one.word != "not run" for one in by_column.values())
+            row = Change(NO_SIGN if run else "not run")
+        elif len(whole) == 1:
             row = by_column[over[0]]
         else:
             row = together([sides[i] for i in whole], sum(np.sign(pair.expected[i] or 0) for i in whole) or None)
@@ -151,12 +154,12 @@ def cell(runs: Sequence[Run], question: str, name: str, column: Column) -> str:
 
 def sentence(one: Statement) -> str:
     """A statement as a line of a list."""
-    if all(part.word == "not run" for part in one.columns.values()):
+    if one.row.word == "not run":
         return f"- {one.label}: **not run**."
     columns = "; ".join(f"{name} {_shown(part)}" for name, part in one.columns.items())
     row = one.row
-    if row.word == "not run":  # nothing that the paper has a sign for
-        return f"- {one.label}: **no sign in the paper**. By column: {columns}."
+    if row.word == NO_SIGN:
+        return f"- {one.label}: **{NO_SIGN}**. By column: {columns}."
     word = {"agrees": "the sign agrees", "disagrees": "the sign does not agree"}.get(row.word, row.word)
     if len(one.columns) == 1:
         return f"- {one.label}: **{word}**, {_signed(row)}."
@@ -176,7 +179,7 @@ def _signed(one: Change) -> str:
 
 
 def tally(statements: Mapping[str, Sequence[Statement]]) -> str:
-    """How many rows of each table agree."""
+    """How many rows of each table agree, of those for which the paper has a sign."""
     words = ("agrees", "disagrees", "undecided", "no claim", "not run")
     lines = []
     for name, several in statements.items():

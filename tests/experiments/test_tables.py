@@ -101,6 +101,14 @@ def test_ablations_that_help_do_not_agree_and_others_are_undecided(rendered):
     assert "| Ablations (Table 6) | 0 | 1 | 7 | 0 | 0 |" in text
 
 
+def test_views_of_one_model_are_shown_and_not_counted(rendered):
+    text, runs = rendered(lambda question, name: 0.0)
+    clips = [one for one in report.parts(runs)["dynamics"].statements if "clips against" in one.label]
+    assert {one.row.word for one in clips} == {"no sign in the paper"} and len(clips) == 2
+    assert "- AnyTouch, clips against stills: **no sign in the paper**. By column: slip " in text
+    assert "| Dynamics | 0 | 0 | 1 | 0 | 0 |" in text  # dynamic training against stills only
+
+
 def test_what_was_not_run_is_said(rendered):
     leaves = [leaf for leaf in LEAVES if leaf.name != "no_universal" and leaf.question != "real"]
     text, _ = rendered(lambda question, name: 0.0, leaves)

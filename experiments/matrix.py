@@ -3,6 +3,7 @@
 Runs what is not done yet, one JSON file a run, and renders `experiments/results/README.md` from all of them. What is
 run stands in `study/plan.py`, what it costs in `study/budget.py`; `--plan` prints both. The same command again goes on,
 and the same command in another terminal helps: what one works on the other leaves to it. `--jobs 2` does just that.
+A folder of results is of one version of the simulator and of one size: runs of another go to a new one, `--out`.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from study import budget, plan
+from study.execute import check_folder, execute, is_done
 
 from anytouch_jax.config import UserError
 
@@ -26,14 +28,15 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plan", action="store_true", help="print every run with its minutes and stop")
     parser.add_argument("--render", action="store_true", help="only render the tables from the JSON files")
-    parser.add_argument("--quick", action="store_true", help="toy sizes: does it work? results go beside the data")
+    parser.add_argument("--quick", action="store_true", help="toy sizes: does it work?")
     parser.add_argument("--minutes", type=float, help="stop before a run that would not fit")
     parser.add_argument("--chunk", help="i/n: only part i of n, of about equal cost")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side (two: a third more an hour)")
     parser.add_argument("--only", nargs="+", help="only these questions")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=0,1")
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
-    parser.add_argument("--out", type=Path, help="folder of README.md and matrix/ (default: experiments/results)")
+    about = "folder of README.md and matrix/ (default: experiments/results; with --quick or --set beside the data)"
+    parser.add_argument("--out", type=Path, help=about)
     parser.add_argument("--real", type=Path, help="manifest of real touch (default: ../shared/real_touch/manifest.csv)")
     return parser.parse_args(argv)
 
@@ -60,9 +63,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if asked.jobs < 1:
             raise UserError(f"--jobs {asked.jobs}: 1 or more")
-        extra = 0 if asked.plan or asked.render else asked.jobs - 1
-        helpers = [subprocess.Popen([sys.executable, __file__, *words, "--jobs", "1"]) for _ in range(extra)]
-        return max(run(asked), *(helper.wait() for helper in helpers), 0)
+        chosen = choose(asked)
+        if asked.plan:
+            return _print(chosen)
+        if asked.render:
+            return _render(chosen)
+        check_folder(chosen.leaves, chosen.out / "matrix")
+        again = [sys.executable, __file__, *words, "--jobs", "1"]
+        helpers = [subprocess.Popen(again) for _ in range(asked.jobs - 1)]
+        return max(_execute(chosen, asked.minutes), *(helper.wait() for helper in helpers), 0)
     except UserError as error:
         print(f"matrix: {error}", file=sys.stderr)
         return 1
@@ -71,10 +80,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def run(asked: argparse.Namespace) -> int:
+class Chosen(NamedTuple):
+    """The runs asked for, the folders of data and of results, and the manifest of real touch (it need not exist)."""
+
+    leaves: Sequence[plan.Leaf]
+    folder: Path
+    out: Path
+    real: Path
+
+
+def choose(asked: argparse.Namespace) -> Chosen:
+    """What the command line asks for. Raises UserError for what is not there."""
     size = size_of(asked.quick, asked.set)
     folder = asked.work or ROOT / "runs" / ("matrix-quick" if asked.quick else "matrix")
-    out = asked.out or (folder / "results" if asked.quick else ROOT / "experiments" / "results")
+    out = asked.out or (folder / "results" if asked.quick or asked.set else ROOT / "experiments" / "results")
     real = (asked.real or ROOT.parent / "shared" / "real_touch" / "manifest.csv").resolve()
     leaves = plan.leaves(size, real=real.exists())
     if asked.only:
@@ -87,35 +106,39 @@ def run(asked: argparse.Namespace) -> int:
         if not (number.isdigit() and of.isdigit() and 1 <= int(number) <= int(of)):
             raise UserError(f"--chunk {asked.chunk}: write it as 2/4")
         leaves = budget.chunk(leaves, int(number), int(of))
-    if asked.plan:
-        from study.execute import is_done
-
-        print("\n".join(budget.lines(leaves, {one.file for one in leaves if is_done(one, out / "matrix")})))
-        return 0
-    return _execute(asked, leaves, folder, out, real)
+    return Chosen(leaves, folder, out, real)
 
 
-def _execute(asked: argparse.Namespace, leaves: Sequence[plan.Leaf], folder: Path, out: Path, real: Path) -> int:
+def _print(chosen: Chosen) -> int:
+    done = {one.file for one in chosen.leaves if is_done(one, chosen.out / "matrix")}
+    print("\n".join(budget.lines(chosen.leaves, done)))
+    return 0
+
+
+def _render(chosen: Chosen) -> int:
     from study import report
-    from study.execute import execute
+
+    print(report.write(chosen.out / "matrix", chosen.out))
+    return 0
+
+
+def _execute(chosen: Chosen, minutes: float | None) -> int:
     from study.work import Work
 
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    failed: dict[str, str] = {}
-    if not asked.render:
-        enable_compilation_cache()
-        if not real.exists():
-            print(f"there is no {real}: the question `real` is not run")
-        work = Work(folder, real=real if real.exists() else None)
-        result = execute(leaves, work, out / "matrix", minutes=asked.minutes)
-        failed = result.failed
-        made, found, left = (len(part) for part in result[:3])
-        print(f"{made} runs made, {found} were there, {left} left, {len(failed)} failed")
-    print(report.write(out / "matrix", out))
-    for name, error in failed.items():
+    enable_compilation_cache()
+    there = chosen.real.exists()
+    if not there:
+        print(f"there is no {chosen.real}: the question `real` is not run")
+    work = Work(chosen.folder, real=chosen.real if there else None)
+    result = execute(chosen.leaves, work, chosen.out / "matrix", minutes=minutes)
+    made, found, left = (len(part) for part in result[:3])
+    print(f"{made} runs made, {found} were there, {left} left, {len(result.failed)} failed")
+    _render(chosen)
+    for name, error in result.failed.items():
         print(f"failed: {name}: {error}", file=sys.stderr)
-    return 1 if failed else 0
+    return 1 if result.failed else 0
 
 
 if __name__ == "__main__":

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple, Protocol
 from anytouch_jax.config import UserError
 from anytouch_jax.train.record import write_atomic
 
-from . import budget
+from . import budget, plan
 from .plan import Leaf, Scenes, Size, Training
+from .results import differences, simulated
 
 Say = Callable[[str], None]
 PAUSE = 5.0  # s until what others work on is looked at again
@@ -57,6 +58,33 @@ def is_done(leaf: Leaf, out: Path) -> bool:
         return bool(json.loads((out / leaf.file).read_text(encoding="utf-8")).get("identity") == leaf.identity)
     except (OSError, ValueError):
         return False
+
+
+def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
+    """Raise UserError where `out` holds results of another simulator or of other settings than these runs.
+
+    In one folder they would stand in one table, and a part of what is there would be written over.
+    """
+    if not leaves:
+        return
+    size = leaves[0].size
+    ours = {"simulator": plan.simulator(), "settings": plan.settings(size), "size": size.name}
+    for path in sorted(out.glob("*.json")):
+        try:
+            theirs = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            continue  # broken: it is made again
+        if not isinstance(theirs, dict):
+            continue
+        if simulated(theirs) != ours["simulator"]:
+            what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
+        elif wrong := differences([theirs, ours]):
+            what = f"other settings than these runs ({wrong})"
+        else:
+            continue
+        raise UserError(
+            f"{out} holds results of {what}: give a new folder, for example make experiments OUT=runs/study"
+        )
 
 
 def execute(
@@ -139,7 +167,8 @@ def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
                 begin()
                 work.train(training)
     begin()
-    about = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity}
+    about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
+    about |= {"identity": leaf.identity, "simulator": plan.simulator()}
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
     return True

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from . import pictures, report
-from .results import Run, read
+from .results import Run, differences, read
 
 DEFAULT = Path(__file__).resolve().parents[1] / "results" / "matrix"
 
@@ -21,6 +21,9 @@ def runs(question: str) -> list[Run]:
     found = [run for run in read(folder) if run.question == question] if folder.is_dir() else []
     if not found:
         text(f"**{folder} holds no result of `{question}`: `make experiments ONLY={question}` makes them.**")
+    if wrong := differences([run.about for run in found]):
+        text(f"**The results of `{question}` in {folder} differ in what they must share ({wrong}): none is shown.**")
+        return []
     return found
 
 

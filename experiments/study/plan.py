@@ -26,6 +26,7 @@ SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in w
 UNSEEN = "duragel"
 RESTRICTED = ("gelsight", "digit")  # of the control of Table 2
 REAL = "real"
+LABELS = ("name", "seeds")  # fields of a size that no single run hangs on
 
 
 @dataclass(frozen=True)
@@ -125,9 +126,21 @@ class Leaf:
     @cached_property
     def identity(self) -> str:
         """What its result hangs on; a JSON with another identity is not this run's."""
-        about = (self.question, self.name, self.seed, self.tower, dataclasses.astuple(self.size))
+        about = (self.question, self.name, self.seed, self.tower, simulator(), settings(self.size))
         parts = [repr(about), *(one.key for one in self.trainings)]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def simulator() -> int:
+    """The version of the simulator: what a seed gives hangs on it. Imported late, since it brings jax."""
+    from anytouch_jax.sim.dataset import VERSION
+
+    return VERSION
+
+
+def settings(size: Size) -> dict[str, Any]:
+    """What runs of one table must share: a size without its name and its seeds."""
+    return {name: value for name, value in dataclasses.asdict(size).items() if name not in LABELS}
 
 
 def chosen(config: Any) -> Any:

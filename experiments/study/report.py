@@ -10,7 +10,7 @@ from anytouch_jax.train.record import write_atomic
 
 from . import pictures, questions, real_table
 from .questions import Part
-from .results import CLAIM, Run, read
+from .results import CLAIM, Run, comparable, differences, read, simulated
 from .tables import tally
 
 _INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
@@ -31,8 +31,15 @@ CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not ag
 
 
 def parts(runs: Sequence[Run]) -> dict[str, Part]:
-    """The sections, by question."""
-    return {name: make(runs) for name, make in (*questions.OF.items(), ("real", real_table.real))}
+    """The sections, by question. Where runs differ in what they must share there is no table, but what it is."""
+    found, kept = {}, comparable(runs)
+    for name, make in (*questions.OF.items(), ("real", real_table.real)):
+        wrong = differences([run.about for run in runs if run.question == name])
+        found[name] = make(kept)
+        if wrong:
+            text = f"**No table: these runs differ in what they must share ({wrong}).** Make them again in one folder."
+            found[name] = Part(found[name].title, text, ())
+    return found
 
 
 def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
@@ -69,6 +76,8 @@ def provenance(runs: Sequence[Run]) -> str:
     versions = sorted({f"{run.about['version']} ({run.about['source']})" for run in runs})
     notes = f"{len(runs)} runs, {len(every)} trainings, {total:.0f} minutes without the data. Version (hash of its "
     notes += f"source): {', '.join(versions) or '-'}. Machine: {' | '.join(machines) or '-'}."
+    simulators = sorted({simulated(run.about) for run in runs})
+    notes += f" Version of the simulator: {', '.join(map(str, simulators)) or '-'}."
     head = ("question", "runs", "trainings", "training, min", "scores, min", "files")
     return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"
 
@@ -76,7 +85,7 @@ def provenance(runs: Sequence[Run]) -> str:
 def write(folder: Path, out: Path) -> Path:
     """Render the JSON files in `folder` to `out`/README.md and `out`/figures; gives back the page."""
     runs = read(folder)
-    figures = pictures.draw_all(runs, out / "figures")
+    figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
     causes = out / CAUSES
     written = "\n" + causes.read_text(encoding="utf-8") if causes.exists() else ""

@@ -13,6 +13,8 @@ from scipy import stats
 
 from anytouch_jax.config import UserError
 
+from .plan import LABELS
+
 CLAIM = 3  # seeds from which a sign is claimed
 NO_SIGN = "no sign in the paper"
 Seeds = dict[int, float]
@@ -71,6 +73,37 @@ def read(folder: Path) -> list[Run]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path} is no result of a run ({error!r}); remove it, and make it again") from None
     return found
+
+
+def simulated(about: Mapping[str, Any]) -> int:
+    """The version of the simulator that a record is of; those that note none are of the first."""
+    return int(about.get("simulator", 1))
+
+
+def differences(records: Sequence[Mapping[str, Any]]) -> str:
+    """What records of one table must share and do not, in words; empty where they can be compared.
+
+    Simulator, settings, and the content of every data set by its name. Records that do not note their settings are
+    told apart by the name of their size.
+    """
+    found: dict[str, set[str]] = {}
+    untold = any(not about.get("settings") for about in records)
+    for about in records:
+        found.setdefault("simulator version", set()).add(str(simulated(about)))
+        for name, value in (about.get("settings") or {}).items():
+            if name not in LABELS:
+                found.setdefault(name, set()).add(str(value))
+        for name, value in about.get("data", {}).items():
+            found.setdefault(f"data set {name}", set()).add(value[:8])
+        if untold:
+            found.setdefault("size", set()).add(str(about.get("size")))
+    return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in found.items() if len(several) > 1)
+
+
+def comparable(runs: Sequence[Run]) -> list[Run]:
+    """The runs of those questions whose runs do not differ in what they must share."""
+    whole = {name: [run.about for run in runs if run.question == name] for name in {run.question for run in runs}}
+    return [run for run in runs if not differences(whole[run.question])]
 
 
 def values(runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest") -> Seeds:

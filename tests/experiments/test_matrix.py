@@ -10,7 +10,7 @@ from pathlib import Path
 import matrix
 import pytest
 import synthetic
-from study import plan
+from study import plan, results
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -65,6 +65,36 @@ def test_mistakes_are_one_sentence(words, sentence, capsys):
     assert matrix.main(["--plan", *words]) == 1
     error = capsys.readouterr().err
     assert error.startswith("matrix: ") and sentence in error and len(error.splitlines()) == 1
+
+
+def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(tmp_path, capsys):
+    words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    paths = synthetic.write(tmp_path / "matrix", plan.leaves(plan.QUICK, real=False)[:2])
+    for change, sentence in (
+        ({"simulator": 1}, "holds results of version 1 of the simulator, and these runs are of version"),
+        ({"settings": {"steps1": 999}}, "of other settings than these runs (steps1 6 and 999): give a new folder"),
+    ):
+        text = json.dumps(json.loads(paths[1].read_text()) | change)
+        paths[1].write_text(text)
+        assert matrix.main([*words, "--jobs", "3"]) == 1
+        out, error = capsys.readouterr()
+        assert sentence in error and "make experiments OUT=runs/study" in error and len(error.splitlines()) == 1
+        assert not out and paths[1].read_text() == text and not (tmp_path / "work").exists()
+        paths[1].write_text(paths[0].read_text())
+
+
+def test_the_committed_results_are_of_one_simulator_and_can_be_shown():
+    runs = results.read(ROOT / "experiments" / "results" / "matrix")
+    assert len({results.simulated(run.about) for run in runs}) == 1 and len(results.comparable(runs)) == len(runs)
+
+
+def test_changed_sizes_are_written_beside_the_data():
+    default = ROOT / "experiments" / "results"
+    assert matrix.choose(matrix.options([])).out == default
+    for words in (["--quick"], ["--set", "steps1=7"]):
+        found = matrix.choose(matrix.options([*words, "--work", "there"]))
+        assert found.out == Path("there") / "results" and found.folder == Path("there")
+    assert matrix.choose(matrix.options(["--set", "steps1=7", "--out", "here"])).out == Path("here")
 
 
 def test_make_calls_it():

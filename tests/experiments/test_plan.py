@@ -70,6 +70,15 @@ def test_files_and_identities_are_of_one_run_each():
     assert not set(longer.values()) & set(again.values())
 
 
+def test_a_result_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypatch):
+    again = {leaf.file: leaf.identity for leaf in LEAVES}
+    named = plan.leaves(dataclasses.replace(plan.FULL, name="changed", seeds=(0, 1, 2, 3)))
+    assert again.items() <= {leaf.file: leaf.identity for leaf in named}.items()
+    monkeypatch.setattr("anytouch_jax.sim.dataset.VERSION", plan.simulator() + 1)
+    later = {leaf.identity for leaf in plan.leaves(plan.FULL)}
+    assert not later & set(again.values())
+
+
 def test_without_real_data_there_is_no_real_run():
     assert {leaf.question for leaf in LEAVES} - {leaf.question for leaf in plan.leaves(plan.FULL, real=False)} == {
         "real"

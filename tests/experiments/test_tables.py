@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
 import synthetic
 from study import plan, report
 from study.paper import TABLE6
-from study.results import Column, change, interval, read, spread, together, values
+from study.results import Column, change, comparable, interval, read, spread, together, values
 
 from anytouch_jax.config import UserError
 
@@ -150,6 +151,34 @@ def test_every_question_has_its_signs(rendered):
     assert {one.row.word for one in found["q3"].statements} == {"agrees"}
     assert {one.row.word for one in found["restricted"].statements} == {"1 seed, no claim"}
     assert "### " not in text and text.count("\n## ") == 10
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"simulator": 1}, "simulator version 1 and 2"),
+        ({"settings": {"steps1": 400}}, "steps1 150 and 400"),
+        ({"settings": None, "size": "changed"}, "size changed and full"),
+        ({"data": {"own": "1" * 64, "aligned": "2" * 64}}, "data set own 00000000 and 11111111"),
+    ],
+)
+def test_runs_of_other_data_or_settings_stand_in_no_table(change, words, tmp_path, rendered):
+    text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"))
+    path = tmp_path / "ablations-no_text-1.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    after = report.text(read(tmp_path))
+    lines = section(after, "Ablations (Table 6)")
+    assert f"**No table: these runs differ in what they must share ({words}).**" in lines and "|" not in lines
+    assert "| Ablations (Table 6) |" not in after
+    assert section(after, "Dynamics") == section(text, "Dynamics")
+
+
+def test_old_records_are_of_the_first_simulator_and_go_together(tmp_path):
+    for path in synthetic.write(tmp_path, LEAVES[:9]):
+        about = json.loads(path.read_text())
+        del about["simulator"], about["settings"]
+        path.write_text(json.dumps(about))
+    assert len(comparable(read(tmp_path))) == 9 and "Version of the simulator: 1." in report.text(read(tmp_path))
 
 
 def test_shares_of_the_gap(tmp_path):

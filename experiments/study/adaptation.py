@@ -7,6 +7,7 @@ touches of the new sensor.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,9 @@ import numpy as np
 from anytouch_jax.cli import main
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.evaluate.battery_features import digest
 from anytouch_jax.evaluate.features import load_encoder, text_column
+from anytouch_jax.train.record import write_atomic
 
 from . import cuts, plan
 from .plan import Leaf
@@ -41,8 +44,8 @@ def rows(leaf: Leaf, work: Work, probes: Probes) -> list[dict[str, Any]]:
     found = probes(leaf, work, name, TASKS, "universal, 0 unlabelled", plain, **options)
     for frames in FRAMES:
         several = labelled(own, frames)
-        without = load_encoder(adapted(run, own / f"{plan.UNSEEN}.parquet", frames))
-        told = load_encoder(adapted(run, work.folder / several, frames, TOLD))
+        without = load_encoder(adapted(work, run, own / f"{plan.UNSEEN}.parquet", frames))
+        told = load_encoder(adapted(work, run, work.folder / several, frames, TOLD))
         for view, table, encoder in (
             (f"fitted, {frames} unlabelled", name, without),
             (f"universal, {frames} labelled", several, plain),
@@ -52,10 +55,15 @@ def rows(leaf: Leaf, work: Work, probes: Probes) -> list[dict[str, Any]]:
     return found
 
 
-def adapted(run: Path, data: Path, frames: int, labels: str | None = None) -> Path:
-    """The run with tokens fitted to so many frames of the new sensor, by reconstruction or by a label's classes."""
-    out = run.with_name(f"{run.name}-{'told' if labels else 'adapted'}{frames}")
-    if not (out / "done").exists():
+def adapted(work: Work, run: Path, data: Path, frames: int, labels: str | None = None) -> Path:
+    """The run with tokens fitted to so many frames of the new sensor, by reconstruction or by a label's classes.
+
+    It is kept beside the trainings, and made again when the run's weights or the data are others. Raises UserError
+    where `anytouch adapt` fails.
+    """
+    out = work.folder / "trained" / f"{run.name}-{'told' if labels else 'adapted'}{frames}"
+    note, of = out / "adapted.json", {"run": digest(load_encoder(run)), "data": cuts.content_hash(data)}
+    if not (note.exists() and json.loads(note.read_text(encoding="utf-8")) == of):
         shutil.rmtree(out, ignore_errors=True)  # begun and not finished
         table = manifests.read(data)
         mine = (text_column(table, "sensor") == plan.UNSEEN) & (text_column(table, "split") == "train")
@@ -65,7 +73,7 @@ def adapted(run: Path, data: Path, frames: int, labels: str | None = None) -> Pa
         words = ["adapt", "--run", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", frames, "--out", out]
         if main([str(word) for word in (*words, *(("--labels", labels) if labels else ()))]):
             raise UserError(f"anytouch adapt failed with {frames} frames of {plan.UNSEEN}; its message is above")
-        (out / "done").touch()
+        write_atomic(note, json.dumps(of) + "\n")
     return out
 
 

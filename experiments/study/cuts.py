@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,16 @@ def cut_all(folder: Path) -> None:
     rows = np.concatenate([deepest_rows(table, split=split) for split in there])
     cut(table, rows, folder / STATIC)
     cut(table, *held(table, folder / GRASP))
+
+
+def content_hash(path: Path) -> str:
+    """The content hash of a manifest; a file that was written anew is read again."""
+    return _content_hash(path, path.stat().st_mtime_ns)
+
+
+@cache
+def _content_hash(path: Path, changed: int) -> str:
+    return manifests.read(path).content_hash
 
 
 def alone(part: pa.Table) -> pa.Table:

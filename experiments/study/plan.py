@@ -98,6 +98,11 @@ class Training:
         """What it starts from, and itself."""
         return (*(self.init.chain if self.init else ()), self)
 
+    @property
+    def manifests(self) -> tuple[str, ...]:
+        """The names of what it and those before it learn from."""
+        return tuple(sorted({name for one in self.chain for name in one.config.data.manifests}))
+
 
 @dataclass(frozen=True)
 class Leaf:

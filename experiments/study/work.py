@@ -1,7 +1,7 @@
 """The work of a run on disk: data sets are simulated and cut, stages trained, encoders scored.
 
 Under one folder: the data sets by name, `trained/<key>` a run folder each, `cache` features by content. `done.json` in
-a folder says that it is finished; one without it is gone on with.
+a folder says that it is finished, and of what: one of other data is made again, one without it is gone on with.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import fcntl
 import gc
 import hashlib
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,7 +24,6 @@ import jax
 
 import anytouch_jax
 from anytouch_jax.config import Config, UserError, to_json
-from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import machine
 from anytouch_jax.evaluate.features import Encoder
 from anytouch_jax.pretrain import pretrain
@@ -32,10 +32,11 @@ from anytouch_jax.sim.scene import Scenes as Simulated
 from anytouch_jax.train.record import write_atomic
 
 from . import cuts, plan, scores
+from .cuts import content_hash
 from .plan import Leaf, Scenes, Size, Training
 
 Say = Callable[[str], None]
-DONE = "done.json"
+DONE, BEGUN = "done.json", "begun.json"
 
 
 class Work:
@@ -46,7 +47,7 @@ class Work:
 
     def ready(self, leaf: Leaf) -> set[str]:
         sets = {one.name for one in plan.scenes(leaf.size) if self._made(one, leaf.size)}
-        return sets | {one.key for one in leaf.trainings if (self.run_of(one) / DONE).exists()}
+        return sets | {one.key for one in leaf.trainings if self._trained(one, sets)}
 
     def run_of(self, one: Training) -> Path:
         """The run folder of a training."""
@@ -85,17 +86,38 @@ class Work:
         self._finish(folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)})
 
     def _made(self, one: Scenes, size: Size) -> bool:
-        """Whether a data set is there, and of this size (those made before sizes were noted count as fitting)."""
-        path = self.folder / one.name / DONE
-        return path.exists() and json.loads(path.read_text()).get("of", _of(one, size)) == _of(one, size)
+        """Whether a data set is there, and of this size and this simulator."""
+        return bool(_noted(self.folder / one.name / DONE).get("of") == _of(one, size))
+
+    def _trained(self, one: Training, sets: set[str]) -> bool:
+        """Whether a training is finished, on the data that are there now."""
+        of = _noted(self.run_of(one) / DONE).get("of")
+        needed = {name.partition("/")[0] for name in one.manifests} - {plan.REAL}
+        return of is not None and needed <= sets and of == self._contents(one)
+
+    def _contents(self, one: Training) -> dict[str, str]:
+        """{name: content hash} of the manifests that a training and those before it learn from."""
+        return {name: content_hash(self.manifest(name)) for name in one.manifests}
 
     def train(self, one: Training) -> None:
-        start, run = time.perf_counter(), self.run_of(one)
+        start, run, of = time.perf_counter(), self.run_of(one), self._contents(one)
+        before = _noted(run / BEGUN) or _noted(run / DONE)
+        if before.get("of", of) != of:
+            self.say(f"  {run.name} was trained on other data: it is begun anew")
+            shutil.rmtree(run)
+            before = {}
+        about = {"of": of, "parts": before.get("parts", 0) + 1, "seconds": before.get("seconds", 0.0)}
+        run.mkdir(parents=True, exist_ok=True)
+        write_atomic(run / BEGUN, json.dumps(about) + "\n")
         init = self.run_of(one.init) if one.init else None
-        result = pretrain(self.resolved(one.config), run, init=init, say=lambda _: None)
+        try:
+            result = pretrain(self.resolved(one.config), run, init=init, say=lambda _: None)
+        finally:  # the next part adds to this one's time; what a part that was killed took is lost
+            about["seconds"] = round(about["seconds"] + time.perf_counter() - start, 1)
+            write_atomic(run / BEGUN, json.dumps(about) + "\n")
         if result.interrupted is not None:
             raise KeyboardInterrupt
-        self._finish(run, {"seconds": round(time.perf_counter() - start, 1), "resumed_at_step": result.resumed})
+        self._finish(run, about | {"resumed_at_step": result.resumed})
         self._forget()
 
     def resolved(self, config: Config) -> Config:
@@ -107,18 +129,18 @@ class Work:
         start = time.perf_counter()
         found = scores.score(leaf, self)
         self._forget()
-        trained = [
-            {"key": one.key, "stage": one.config.stage, "config": json.loads(to_json(one.config))}
-            | json.loads((self.run_of(one) / DONE).read_text())
-            for one in leaf.trainings
-        ]
-        names = {name for one in leaf.trainings for name in one.config.data.manifests}
+        trained, data = [], {name: content_hash(self.manifest(name)) for name in found.pop("data")}
+        for one in leaf.trainings:
+            about = _noted(self.run_of(one) / DONE)
+            data |= about.pop("of")  # what it learned from, whatever is there now
+            of = {"key": one.key, "stage": one.config.stage, "config": json.loads(to_json(one.config))}
+            trained.append(of | about)
         return {
             "size": leaf.size.name,
             "settings": dataclasses.asdict(leaf.size),
             "steps": [leaf.size.steps1, leaf.size.steps2],
             "trained": trained,
-            "data": {name: content_hash(self.manifest(name)) for name in sorted(names | set(found.pop("data")))},
+            "data": dict(sorted(data.items())),
             "version": anytouch_jax.__version__,
             "source": source_hash(),
             "machine": machine.describe().sentence(),
@@ -143,10 +165,13 @@ def _of(one: Scenes, size: Size) -> str:
     return repr((one, size.frames, size.objects, size.pixels, VERSION))
 
 
-@cache
-def content_hash(path: Path) -> str:
-    """The content hash of a manifest."""
-    return manifests.read(path).content_hash
+def _noted(path: Path) -> dict[str, Any]:
+    """What a file of notes holds; nothing where there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 @cache

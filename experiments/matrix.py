@@ -69,6 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if asked.render:
             return _render(chosen)
         check_folder(chosen.leaves, chosen.out / "matrix")
+        _check_objects(chosen)
         again = [sys.executable, __file__, *words, "--jobs", "1"]
         helpers = [subprocess.Popen(again) for _ in range(asked.jobs - 1)]
         return max(_execute(chosen, asked.minutes), *(helper.wait() for helper in helpers), 0)
@@ -113,6 +114,13 @@ def _print(chosen: Chosen) -> int:
     done = {one.file for one in chosen.leaves if is_done(one, chosen.out / "matrix")}
     print("\n".join(budget.lines(chosen.leaves, done)))
     return 0
+
+
+def _check_objects(chosen: Chosen) -> None:
+    from study.work import check_objects
+
+    for leaf in chosen.leaves[:1]:  # all are of one size
+        check_objects(leaf.size)
 
 
 def _render(chosen: Chosen) -> int:

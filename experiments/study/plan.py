@@ -6,8 +6,8 @@ can be shared is shared without being said. Nothing here computes.
 Data, after the paper's: `own` is the data set of each sensor by itself (touches nobody else felt), `aligned` its
 coarse TacQuad (by hand, four sensors at one place), `other` a data set never trained on, of other individuals (more
 than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out are held out in both
-`own` and `aligned`. `own` also has DuraGel, which only the runs `seen` train on: it is the unseen sensor, as Taxim and
-TACTO are in the paper.
+`own` and `aligned` (`work.check_objects` refuses sizes at which they are not). `own` also has DuraGel, which only the
+runs `seen` train on: it is the unseen sensor, as Taxim and TACTO are in the paper.
 """
 
 from __future__ import annotations

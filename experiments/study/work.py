@@ -29,6 +29,7 @@ from anytouch_jax.evaluate.features import Encoder
 from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
+from anytouch_jax.sim.scene import cast
 from anytouch_jax.train.record import write_atomic
 
 from . import cuts, plan, scores
@@ -76,12 +77,9 @@ class Work:
                 yield True
 
     def make(self, one: Scenes, size: Size) -> None:
+        check_objects(size)
         start, folder = time.perf_counter(), self.folder / one.name
-        wanted = Simulated(
-            touches=one.touches, sensors=one.sensors, seed=one.seed, grade=one.grade, frames=size.frames,
-            objects=min(size.objects, one.touches), held_out=one.held_out, size=size.pixels,
-        )  # fmt: skip
-        simulate(wanted, folder)
+        simulate(_simulated(one, size), folder)
         cuts.cut_all(folder)
         self._finish(folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)})
 
@@ -159,6 +157,32 @@ class Work:
         """Programs of one training are of no use to the next and hold their memory."""
         jax.clear_caches()
         gc.collect()
+
+
+def check_objects(size: Size) -> None:
+    """Raise UserError where an object would stand in two splits of data sets that share their objects.
+
+    What is held out of `own` must not be met in training on `aligned`. Data sets of one seed draw from one catalogue,
+    in which a name is one object; which of them are held out hangs on how many there are.
+    """
+    seen: dict[tuple[int, str], tuple[str, str]] = {}
+    for one in plan.scenes(size):
+        things, splits = cast(_simulated(one, size))
+        for thing, split in zip(things, splits, strict=True):
+            name, before = seen.setdefault((one.seed, thing.name), (one.name, split))
+            if before != split:
+                least = min(other.touches for other in plan.scenes(size) if other.seed == one.seed)
+                raise UserError(
+                    f"the object {thing.name} would be in {before} of {name} and in {split} of {one.name}: give both "
+                    f"the same objects, for example --set objects={min(size.objects, least)}"
+                )
+
+
+def _simulated(one: Scenes, size: Size) -> Simulated:
+    return Simulated(
+        touches=one.touches, sensors=one.sensors, seed=one.seed, grade=one.grade, frames=size.frames,
+        objects=min(size.objects, one.touches), held_out=one.held_out, size=size.pixels,
+    )  # fmt: skip
 
 
 def _of(one: Scenes, size: Size) -> str:

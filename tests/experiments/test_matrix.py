@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import matrix
 import pytest
 import synthetic
-from study import plan, results
+from study import plan, results, work
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -67,6 +68,19 @@ def test_mistakes_are_one_sentence(words, sentence, capsys):
     assert error.startswith("matrix: ") and sentence in error and len(error.splitlines()) == 1
 
 
+def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, capsys):
+    for size in (plan.FULL, plan.QUICK):
+        work.check_objects(size)
+    for changes in (["own=150"], ["aligned=100", "objects=180"]):
+        words = ["--work", str(tmp_path / "work"), "--jobs", "2", "--minutes", "0.01", "--set", *changes]
+        assert matrix.main(words) == 1
+        error = capsys.readouterr().err
+        assert re.search(r"the object .* would be in \w+ of own and in \w+ of aligned: give both", error)
+        assert len(error.splitlines()) == 1 and not (tmp_path / "work").exists()
+        mended = int(re.search(r"--set objects=(\d+)", error).group(1))
+        work.check_objects(matrix.size_of(False, [*changes, f"objects={mended}"]))
+
+
 def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(tmp_path, capsys):
     words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path), "--real", str(tmp_path / "no.csv")]
     paths = synthetic.write(tmp_path / "matrix", plan.leaves(plan.QUICK, real=False)[:2])
@@ -108,7 +122,7 @@ def test_make_calls_it():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
-    words = ["--quick", "--set", "own=24", "aligned=8", "other=24", "objects=24", "frames=6", "steps1=2", "steps2=2"]
+    words = ["--quick", "--set", "own=24", "aligned=24", "other=24", "objects=24", "frames=6", "steps1=2", "steps2=2"]
     words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
     words += ["--real", str(tmp_path / "none.csv")]
     assert matrix.main(words) == 0, capsys.readouterr().err

@@ -11,12 +11,15 @@ from anytouch_jax.train.record import write_atomic
 from . import pictures, questions, real_table
 from .questions import Part
 from .results import CLAIM, Run, comparable, differences, read, simulated
-from .tables import tally
+from .tables import by_chance, tally
 
 _INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
 again from them without running anything. Every number is the mean over seeds of training, with its 95 % interval over
 seeds (Student's t; with one seed that of the run itself, over test objects). Accuracies are in %, by a linear probe of
 frozen features on objects never touched in training. Protocol `honest`: the penalty is chosen without the test set.
+
+An interval over seeds is one of trainings for these test objects, which are the same for every seed: it does not say
+how other objects would come out (the JSON files hold no numbers by object, so these cannot be drawn anew here).
 
 A sign is that of the difference of two rows, seed by seed. It *agrees* when the interval leaves zero out on the paper's
 side, is *undecided* when zero lies within, and is not claimed below {CLAIM} seeds. The data are simulated, the network
@@ -50,6 +53,7 @@ def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
         "# The paper's questions, answered",
         _INTRO,
         tally({p.title: p.statements for p in found.values() if p.statements}),
+        by_chance([one for part in found.values() for one in part.statements]),
     ]
     sizes = sorted({str(run.about.get("size")) for run in runs})
     if sizes not in ([], ["full"]):

@@ -153,10 +153,10 @@ def cell(runs: Sequence[Run], question: str, name: str, column: Column) -> str:
 
 
 def sentence(one: Statement) -> str:
-    """A statement as a line of a list."""
+    """A statement as a line of a list. A sign is told of the row alone: of many columns some differ by chance."""
     if one.row.word == "not run":
         return f"- {one.label}: **not run**."
-    columns = "; ".join(f"{name} {_shown(part)}" for name, part in one.columns.items())
+    columns = "; ".join(f"{name} {_signed(part)}" for name, part in one.columns.items())
     row = one.row
     if row.word == NO_SIGN:
         return f"- {one.label}: **{NO_SIGN}**. By column: {columns}."
@@ -167,15 +167,23 @@ def sentence(one: Statement) -> str:
     return f"- {one.label}: **{word}**, {over} {_signed(row)}. By column: {columns}."
 
 
-def _shown(one: Change) -> str:
-    return "not run" if one.mean is None else f"{_signed(one)}, {one.word}"
-
-
 def _signed(one: Change) -> str:
     if one.mean is None:
-        return "-"
+        return "not run"
     between = "" if one.low is None or one.high is None else f" ({one.low:+.2f} to {one.high:+.2f})"
     return f"{one.mean:+.2f}{between}"
+
+
+def by_chance(statements: Sequence[Statement]) -> str:
+    """How many intervals by column there are, and how many of them would leave zero out if nothing differed."""
+    told = ("agrees", "disagrees", "undecided")
+    columns = sum(part.word in told for one in statements for part in one.columns.values())
+    rows = sum(one.row.word in told for one in statements)
+    return (
+        f"Of {columns} columns the paper has a sign and these results an interval; about {columns / 20:.0f} of so many "
+        f"leave zero out\nby chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected "
+        "for that number."
+    )
 
 
 def tally(statements: Mapping[str, Sequence[Statement]]) -> str:

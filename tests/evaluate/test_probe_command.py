@@ -63,6 +63,15 @@ def test_where_nothing_or_all_was_described_nothing_stands_apart(manifest):
     assert read(manifest, label="slip").subsets == {}  # both classes were
 
 
+def test_recordings_of_joined_files_are_never_one_group(manifest, tmp_path):
+    other = tmp_path / "other" / "manifest.csv"
+    other.parent.mkdir()
+    other.write_bytes(manifest.read_bytes())
+    options = Probe(data=(manifest, other), label="object")
+    task = probe_command.read_task(options, lambda _: None)
+    assert len(np.unique(task.groups)) == COUNT and not set(task.groups[:COUNT]) & set(task.groups[COUNT:])
+
+
 def test_no_row_is_left(manifest):
     with pytest.raises(UserError, match="no row has a label in 'slip' after the filters"):
         read(manifest, label="slip", sensor="gelslim")

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # battery_world.py
 from battery_world import row, simulated, table
 
 from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import tasks
 from anytouch_jax.evaluate.tasks import TASKS, Task, available, mirrored, select
 from anytouch_jax.sim import scene
@@ -90,6 +91,23 @@ def test_groups_fall_back_to_the_recording():
     assert select(table(rows), TASKS["object"]).groups.tolist() == ["grasp_group g1", "touch t1", "sequence v/3"]
     video = Task("x", "label.object", groups=("recording",))
     assert select(table(rows), video).groups.tolist() == ["recording v"] * 3
+
+
+def test_recordings_of_joined_files_are_never_one_group(tmp_path):
+    files = [tmp_path / name for name in ("a.csv", "b.csv")]
+    for file in files:
+        some = [
+            row(sequence="s1", object="ball", label__object="a", grasp_group="g1"),
+            row(sequence="v/1", object="ball", label__object="a", touch="t1"),
+            row(sequence="v/2", object="ball", label__object="a"),
+        ]
+        columns = {name: [one.get(name) for one in some] for name in {**some[0], **some[1]}}
+        manifests.write(manifests.from_columns(columns, file), file)
+    both = manifests.read(files)
+    for groups, count in ((("grasp_group", "touch"), 6), (("recording",), 4), (("object",), 1), ((), 6)):
+        found = select(both, Task("x", "label.object", groups=groups)).groups
+        assert len(set(found)) == count, groups  # an object's name is the same thing everywhere
+        assert len(set(found[:3]) & set(found[3:])) == (groups == ("object",))
 
 
 def test_what_cannot_be_asked_is_one_sentence():

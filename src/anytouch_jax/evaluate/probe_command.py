@@ -128,12 +128,12 @@ def _column(table: Any, name: str) -> list[Any]:
 
 def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
     """The column left out or asked for, the sequence where it is empty, or where there is no default column."""
-    sequence = _column(manifest.table, "sequence")
+    table = manifests.with_own_keys(manifest, manifest.table)  # recordings of two files are never one
+    sequence = _column(table, "sequence")
     name = options.leave_out or options.group
-    names = manifest.table.column_names
-    if name == GROUP and not {name, f"label.{name}"} & set(names):
+    if name == GROUP and not {name, f"label.{name}"} & set(table.column_names):
         return np.array([sequence[r] for r in rows])
-    column = _column(manifest.table, name)
+    column = _column(table, name)
     return np.array([str(column[r]) if column[r] not in (None, "") else f"sequence {sequence[r]}" for r in rows])
 
 

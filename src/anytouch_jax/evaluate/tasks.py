@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from ..config import UserError
-from ..data.manifest import Manifest
+from ..data.manifest import KEYS, Manifest
 from .features import text_column
 
 Array = npt.NDArray[Any]
@@ -218,15 +218,21 @@ def _touching(table: Manifest) -> Array:
 
 
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
-    """The first column with a value names a row's group; the sequence where all are empty."""
+    """The first column with a value names a row's group; the sequence where all are empty.
+
+    Keys of joined manifests are their own: a recording of one file is not that of the same name in another.
+    """
     sequence = text_column(table, "sequence")
-    found = np.char.add("sequence ", sequence)
+    file = np.array([f" of file {one}" if len(table.files) > 1 else "" for one in table.source], dtype=str)
+    found = np.char.add(np.char.add("sequence ", sequence), file)
     for name in reversed(columns):
         if name == "recording":
-            found = np.array([f"recording {one.rpartition('/')[0] or one}" for one in sequence])
+            recordings = np.array([f"recording {one.rpartition('/')[0] or one}" for one in sequence])
+            found = np.char.add(recordings, file)
         elif name in table.table.column_names:
             values = text_column(table, name)
-            found = np.where(values != "", np.char.add(f"{name} ", values), found)
+            own = np.char.add(values, file) if name in KEYS else values
+            found = np.where(values != "", np.char.add(f"{name} ", own), found)
     return found
 
 

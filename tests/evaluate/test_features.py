@@ -236,6 +236,24 @@ def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
         save_npz(tmp_path / "no" / "folder.npz", features, {})
 
 
+def test_two_processes_may_write_the_same_file(tmp_path, monkeypatch):
+    values = np.zeros((1, 2), np.float32)
+    features = Features(values, np.array([0]), {})
+    write, process = np.savez, iter((1, 2))
+    monkeypatch.setattr("os.getpid", lambda: next(process))
+
+    def meanwhile(file, **arrays):  # another process writes the whole of it while this one has begun
+        monkeypatch.setattr(np, "savez", write)
+        save_npz(tmp_path / "f.npz", features, {"by": "other"})
+        write(file, **arrays)
+
+    monkeypatch.setattr(np, "savez", meanwhile)
+    save_npz(tmp_path / "f.npz", features, {"by": "this"})
+    with np.load(tmp_path / "f.npz") as file:
+        assert str(file["about/by"]) == "this"
+    assert [path.name for path in tmp_path.iterdir()] == ["f.npz"]
+
+
 def test_a_run_of_cudnn_can_be_used_where_there_is_none(encoder, monkeypatch, tiny_run):
     """The configuration of a run trained on a GPU asks for cuDNN's attention."""
     stored = replace(encoder.config, model=replace(encoder.config.model, attention="cudnn"))

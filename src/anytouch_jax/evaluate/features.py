@@ -246,7 +246,7 @@ def text_column(manifest: Manifest, name: str) -> np.ndarray:
 def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:
     """Write features, row numbers, keys and a description as one `.npz`, atomically. Raises UserError."""
     path = Path(path)
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}")  # another process may write the same
     try:
         with open(part, "wb") as file:
             described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
@@ -255,6 +255,7 @@ def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> Non
             np.savez(file, **arrays)
         os.replace(part, path)
     except OSError as error:
-        with contextlib.suppress(OSError):  # there may be no such folder
-            part.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(OSError):  # there may be no such folder
+            part.unlink(missing_ok=True)

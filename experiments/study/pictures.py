@@ -43,11 +43,19 @@ def draw_all(runs: Sequence[Run], folder: Path) -> list[Path]:
 
 
 def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | None:
-    """Touches by three sensors in four spaces (Figure 4): a mark a sensor, a colour and dashed lines a touch."""
-    of = {run.name: run.about["points"] for run in runs if run.question == "q2" and seed in (None, run.seed)}
-    stages = [(name, text) for name, text in STAGES if name in of]
-    if not stages:
+    """Touches by three sensors in four spaces (Figure 4): a mark a sensor, a colour and dashed lines a touch.
+
+    All panels are of one `seed`: the smallest that every stage there has, else (no common one) nothing is drawn.
+    """
+    every = {(run.name, run.seed): run.about["points"] for run in runs if run.question == "q2"}
+    stages = [(name, text) for name, text in STAGES if any(name == one for one, _ in every)]
+    common = [{number for one, number in every if one == name} for name, _ in stages]
+    seeds = set.intersection(*common) if common else set()
+    if seed is None and seeds:
+        seed = min(seeds)
+    if seed is None or seed not in seeds:
         return None
+    of = {name: every[name, seed] for name, _ in stages}
     figure, axes = _panels(1, len(stages), 3.6, 3.8)
     sensors = sorted({point["sensor"] for name, _ in stages for point in of[name]})
     touches = sorted({point["touch"] for name, _ in stages for point in of[name]})
@@ -57,6 +65,8 @@ def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | No
     for axis, (name, text) in zip(axes, stages, strict=True):
         for touch in touches:
             mine = [point for point in of[name] if point["touch"] == touch]
+            if not mine:  # this space has no point of it
+                continue
             colour = colours.get(touch, "#c8c8c8")
             ring = [*mine, mine[0]]
             if touch in colours:
@@ -68,7 +78,8 @@ def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | No
                 )
         axis.set(title=text, xticks=[], yticks=[])
     marks = [axes[-1].scatter([], [], s=30, color="#555555", marker=MARKS[i]) for i in range(len(sensors))]
-    figure.legend(marks, sensors, loc="outside lower center", ncols=len(sensors), frameon=False)
+    title = f"seed {seed}"
+    figure.legend(marks, sensors, loc="outside lower center", ncols=len(sensors), frameon=False, title=title)
     plots.write_figure(path, figure)
     return path
 

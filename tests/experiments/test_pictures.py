@@ -38,5 +38,22 @@ def test_the_four_spaces_have_a_mark_for_every_touch_and_sensor(tmp_path):
     assert len(hues) > 8  # a colour a touch
 
 
+def test_the_four_spaces_are_of_one_seed(tmp_path):
+    synthetic.write(tmp_path, [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed != 0])
+    runs = [run for run in read(tmp_path) if (run.name, run.seed) != ("masked", 1)]
+    chosen, told = pictures.q2(runs, tmp_path / "a.png"), pictures.q2(runs, tmp_path / "b.png", seed=2)
+    assert chosen.read_bytes() == told.read_bytes()  # masked has no seed 1, so all are of seed 2
+    apart = [run for run in runs if (run.name == "masked") == (run.seed == 2)]
+    assert pictures.q2(apart, tmp_path / "c.png") is None
+
+
+def test_a_touch_without_points_in_one_space_is_left_out_of_it(tmp_path):
+    synthetic.write(tmp_path, [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
+    runs = read(tmp_path)
+    matched = next(run for run in runs if run.name == "matched")
+    matched.about["points"] = [point for point in matched.about["points"] if point["touch"] != 3]
+    assert pictures.q2(runs, tmp_path / "four.png") is not None
+
+
 def test_nothing_to_draw(tmp_path):
     assert pictures.draw_all([], tmp_path) == []

@@ -99,6 +99,8 @@ def choose(asked: argparse.Namespace) -> Chosen:
     leaves = plan.leaves(size, real=real.exists())
     if asked.only:
         wrong = sorted(set(asked.only) - {leaf.question for leaf in leaves})
+        if wrong[:1] == [plan.REAL]:
+            raise UserError(f"the question real needs real touch, and there is no {real}; name its manifest, REAL=")
         if wrong:
             raise UserError(f"there is no question {wrong[0]!r}; choose among {', '.join(budget.SCORES)}")
         leaves = [leaf for leaf in leaves if leaf.question in asked.only]

@@ -147,6 +147,10 @@ def grasp(runs: Sequence[Run]) -> Part:
         "end of the slide or twist for the lift, and a touch slipped when more than half of its contact slid half-way\n"
         "through the motion.\n\n"
     )
+    if any("values" not in row for run in runs if run.question == "grasp" for row in run.about["rows"]):
+        text += (
+            "Each number is of one fit on the data set's own split; the other tables deal the objects five times.\n\n"
+        )
     return Part("Feel: frames after the grasp beside frames during it", text + block(runs, table, found), found)
 
 

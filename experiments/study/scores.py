@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anytouch_jax.config import Config
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.evaluate import battery, probe, retrieval, space
+from anytouch_jax.evaluate import battery, retrieval, space
 from anytouch_jax.evaluate.contacts import background_difference
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
+from anytouch_jax.evaluate.tasks import Task
 
 from . import adaptation, cuts, plan, real
 from .plan import Leaf
@@ -41,10 +43,14 @@ def score(leaf: Leaf, work: Work) -> dict[str, Any]:
 def encoder_of(leaf: Leaf, work: Work) -> Encoder:
     """The encoder of a run: trained, the image tower of a trained model, or untrained."""
     if leaf.model is None:
-        like = plan.training(leaf.size, "no_stage2", leaf.seed).config
-        return random_encoder(like, leaf.seed)
+        return random_encoder(untrained(leaf), leaf.seed)
     run = work.run_of(leaf.model)
     return image_tower_encoder(run) if leaf.tower else load_encoder(run)
+
+
+def untrained(leaf: Leaf) -> Config:
+    """The configuration of the encoder of a run that trains nothing."""
+    return plan.training(leaf.size, "no_stage2", leaf.seed).config
 
 
 def quiet(_: str) -> None:
@@ -52,7 +58,7 @@ def quiet(_: str) -> None:
 
 
 def _probes(
-    leaf: Leaf, work: Work, name: str, tasks: Sequence[str], view: str, encoder: Encoder | None, **options: Any
+    leaf: Leaf, work: Work, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
     """Rows of the battery on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
@@ -173,20 +179,12 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
 
 def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
     """Held or slipped, from the frame in which the press is done and from the last frame."""
-    table = manifests.read(work.folder / "own" / cuts.GRASP)
-    rows = np.flatnonzero(np.isin(text_column(table, "sensor"), plan.SENSORS))
-    values = embed_rows(encoder_of(leaf, work), table, rows, pooling="both", say=quiet)[1]
-    label, moment = text_column(table, "label.held")[rows], text_column(table, "label.moment")[rows]
-    split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
-    found = []
+    encoder, found = encoder_of(leaf, work), []
+    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None}
     for view in ("during", "after"):
-        one = moment == view
-        result = probe.linear_probe(values[one], label[one], groups[one], split[one], seeds=leaf.size.refits)
-        found.append(
-            {"view": view, "task": "grasp", "protocol": "honest", "metric": "accuracy", "mean": result.accuracy,
-             "low": result.low, "high": result.high, "test": result.n_test, "chance": result.baseline}
-        )  # fmt: skip
-    return {"rows": found, "data": ["own"]}
+        task = Task("grasp", "label.held", which="all", where=("label.moment", view))
+        found += _probes(leaf, work, f"own/{cuts.GRASP}", (task,), view, encoder, **options)
+    return {"rows": found, "data": ["own", "own/grasp"]}
 
 
 def _new_sensor(leaf: Leaf, work: Work) -> dict[str, Any]:

@@ -138,6 +138,7 @@ class Work:
             "settings": dataclasses.asdict(leaf.size),
             "steps": [leaf.size.steps1, leaf.size.steps2],
             "trained": trained,
+            "untrained": None if trained or leaf.name == scores.PIXELS else json.loads(to_json(scores.untrained(leaf))),
             "data": dict(sorted(data.items())),
             "version": anytouch_jax.__version__,
             "source": source_hash(),

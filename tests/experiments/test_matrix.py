@@ -14,6 +14,7 @@ import synthetic
 from study import plan, results, work
 
 ROOT = Path(__file__).resolve().parents[2]
+LEFT = ("untrained", "pixels")  # without a training
 
 
 def test_the_plan_is_printed_with_what_is_done(tmp_path, capsys):
@@ -58,6 +59,7 @@ def test_sizes_can_be_changed():
         (["--set", "depth=3"], "--set depth=3: choose among own, "),
         (["--set", "steps1=many"], "'many' is no number"),
         (["--only", "q9"], "there is no question 'q9'; choose among q1"),
+        (["--only", "real", "--real", "no.csv"], "needs real touch, and there is no "),
         (["--chunk", "3/2"], "--chunk 3/2: write it as 2/4"),
         (["--chunk", "half"], "write it as 2/4"),
     ],
@@ -132,6 +134,11 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
     stored = json.loads((tmp_path / "out" / "matrix" / "q2-matched-0.json").read_text())
     assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"]["run"]["steps"] == 2
     assert all(len(value) == 64 for value in stored["data"].values()) and stored["machine"] and stored["source"]
+    grasp = json.loads((tmp_path / "out" / "matrix" / "grasp-anytouch-0.json").read_text())
+    assert [row["view"] for row in grasp["rows"]] == ["during", "after"] and grasp["data"].keys() >= {"own/grasp"}
+    assert all(len(row["values"]) == plan.QUICK.refits and row["groups"] > 1 for row in grasp["rows"])
+    about = {name: json.loads((tmp_path / "out" / "matrix" / f"q2-{name}-0.json").read_text()) for name in LEFT}
+    assert about["untrained"]["untrained"]["model"]["embed"] == 32 and about["pixels"]["untrained"] is None
     assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(stored["points"]) > 4
     trained = sorted((tmp_path / "work" / "trained").iterdir())
     assert len(trained) == 3  # one stage 1, two stages 2

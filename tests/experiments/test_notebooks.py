@@ -1,4 +1,4 @@
-"""The pages of `experiments/`, each from top to bottom: over made-up results (quick), over a tiny matrix (slow)."""
+"""The pages of `experiments/`, each from top to bottom, over made-up results."""
 
 from __future__ import annotations
 
@@ -45,6 +45,15 @@ def test_a_page_shows_its_picture_and_its_finding(name, made_up, tmp_path, monke
 def test_a_page_without_results_says_what_to_do(tmp_path, monkeypatch, capsys):
     visit("ablations", monkeypatch, tmp_path, tmp_path)
     assert "`make experiments ONLY=ablations` makes them" in capsys.readouterr().out
+
+
+def test_accuracies_alone_are_averaged(tmp_path, monkeypatch, capsys):
+    leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "q3"]
+    synthetic.write(tmp_path, leaves, lambda question, name, seed, view, task: 0.9 * (task == "force") * (name == "t3"))
+    monkeypatch.setattr("study.pictures.draw_all", lambda runs, folder: [])
+    visit("q3_perception", monkeypatch, tmp_path, tmp_path)
+    found = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("T3-style ")]
+    assert found == [["T3-style", "static", "+0.0"], ["T3-style", "dynamic", "+0.0"]]
 
 
 def test_every_page_is_a_percent_script():

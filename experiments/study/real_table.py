@@ -30,10 +30,11 @@ def real(runs: Sequence[Run]) -> Part:
     text = (
         "Stages 1 and 2 on the simulated data and the training split of the pack; GelSight Mini with markers, frames\n"
         "in contact. Object: test recordings. Slip and fingers: recordings of all splits, so the encoder (not the\n"
-        "probe) has seen most of them, without labels, in pre-training. The paper has no such probe: tested is that\n"
-        "ours is above the controls by more than the interval, in every seed. Fingers: trained on the units of one\n"
-        "camera, tested on those of the other; the two fingers of a grasp are on both sides, so this is another gel\n"
-        "and camera, not another grasp.\n\n"
+        "probe) has seen most of them in pre-training: without labels, but with captions and photographs of some.\n"
+        "The paper has no such probe: tested is that ours is above the controls by more than the interval, in every\n"
+        "seed. Each number is of one fit (for slip one a fold), not the mean of five deals as in the tables above.\n"
+        "Fingers: trained on the units of one camera, tested on those of the other; the two fingers of a grasp are on\n"
+        "both sides, so this is another gel and camera, not another grasp.\n\n"
     )
     head = ("task", "features", "accuracy, mean over seeds", "95 % over test groups, by seed", "test frames")
     table = markdown(head, lines)

@@ -91,7 +91,11 @@ def write(folder: Path, out: Path) -> Path:
     runs = read(folder)
     figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
-    causes = out / CAUSES
-    written = "\n" + causes.read_text(encoding="utf-8") if causes.exists() else ""
-    write_atomic(out / "README.md", text(runs, figures) + written)
+    write_atomic(out / "README.md", whole(runs, figures, out))
     return out / "README.md"
+
+
+def whole(runs: Sequence[Run], figures: Sequence[Path], out: Path) -> str:
+    """The page with what is written by hand in `out`."""
+    causes = out / CAUSES
+    return text(runs, figures) + ("\n" + causes.read_text(encoding="utf-8") if causes.exists() else "")

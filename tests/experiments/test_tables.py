@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 import synthetic
@@ -213,6 +214,13 @@ def test_a_file_that_is_no_result_is_named(tmp_path):
     (tmp_path / "q1-x-0.json").write_text('{"question": "q1"}')
     with pytest.raises(UserError, match=r"q1-x-0\.json is no result of a run"):
         read(tmp_path)
+
+
+def test_the_committed_page_is_what_its_sources_give():
+    out = Path(__file__).resolve().parents[2] / "experiments" / "results"
+    figures = [out / "figures" / f"{name}.png" for name in (*report.parts([]),)]
+    again = report.whole(read(out / "matrix"), [path for path in figures if path.exists()], out)
+    assert (out / "README.md").read_text() == again, "render it again: make experiments RENDER=1"
 
 
 def test_toy_sizes_are_said_aloud(tmp_path):

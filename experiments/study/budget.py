@@ -1,10 +1,12 @@
 """What the matrix costs, and how it is cut.
 
-Rates of two slow CPU cores at preset tiny with 112 pixels: stage 1 0.65 s a step of 64; stage 2 2.4 s a step of 32, of
-which the touch to align 0.6 s, photographs 0.35 s, text 0.15 s and the three touches of a match 1.3 s; in proportion to
-the tokens for smaller pictures; 100 simulated frames a second and 20 s to compile a sensor; about 25 s to start and end
-a training; a run's scores 15 to 120 s. `matrix.py --plan` prints the sum for any size; five chunks, each of which makes
-its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do 1.3 to 1.4 times as much an hour.
+Rates are medians of the 83 trainings and 96 runs of `results/matrix/`, most made two at a time on two slow CPU cores
+with a load of 2 to 8; alone on a quiet machine a training takes about two thirds. At preset tiny with 112 pixels:
+stage 1 1.15 s a step of 64; stage 2 4.7 s a step of 32, of which the touch to align 1.2 s, photographs 0.3 s, text
+0.2 s and the three touches of a match 3.0 s; in proportion to the tokens for smaller pictures; 100 simulated frames a
+second and 20 s to compile a sensor; about 25 s to start and end a training; a run's scores 6 to 350 s. `matrix.py
+--plan` prints the sum for any size; six chunks, each of which makes its data again, stay below 75 minutes. Two
+processes side by side (`--jobs 2`) do 1.3 to 1.4 times as much an hour.
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ START = 25.0  # s to compile, read and save
 FRAMES = 100.0  # simulated a second
 SENSOR = 20.0  # s to compile a sensor
 SCORES: Mapping[str, float] = {
-    "q1": 20, "q2": 15, "q3": 45, "ablations": 20, "dynamics": 75, "grasp": 20, "restricted": 15, "new_sensor": 120,
-    "real": 150,
+    "q1": 30, "q2": 6, "q3": 60, "ablations": 30, "dynamics": 85, "grasp": 30, "restricted": 30, "new_sensor": 350,
+    "real": 95,
 }  # fmt: skip
 _TOY = 0.12  # a toy's share of these
 
@@ -30,10 +32,10 @@ def of_training(one: Training) -> float:
     batch, steps = config.data.batch_size, config.run.steps
     picture = (config.model.patches + 6) / 70  # tokens beside those of 112 pixels
     if config.stage == 1:
-        step = 0.65 * picture * batch / 64
+        step = 1.15 * picture * batch / 64
     else:
-        parts = (0.6, 0.35 * bool(config.model.image), 1.3 * matches(one))
-        step = (sum(parts) * picture + 0.15 * bool(config.model.text)) * batch / 32
+        parts = (1.2, 0.3 * bool(config.model.image), 3.0 * matches(one))
+        step = (sum(parts) * picture + 0.2 * bool(config.model.text)) * batch / 32
     toy = config.model.touch.width < 100
     return (START + steps * step) * (_TOY if toy else 1.0)
 

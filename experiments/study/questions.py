@@ -148,9 +148,7 @@ def grasp(runs: Sequence[Run]) -> Part:
         "through the motion.\n\n"
     )
     if any("values" not in row for run in runs if run.question == "grasp" for row in run.about["rows"]):
-        text += (
-            "Each number is of one fit on the data set's own split; the other tables deal the objects five times.\n\n"
-        )
+        text += "Each number is of one fit on the data set's own split; other tables deal the objects five times.\n\n"
     return Part("Feel: frames after the grasp beside frames during it", text + block(runs, table, found), found)
 
 

@@ -74,12 +74,14 @@ def provenance(runs: Sequence[Run]) -> str:
         seconds = (sum(trained.values()), sum(run.about["seconds"] for run in several))
         names = ", ".join(f"`{run.name}-{run.seed}`" for run in several)
         rows.append((question, str(len(several)), str(len(trained)), *(f"{one / 60:.1f}" for one in seconds), names))
-    every = {one["key"]: one["seconds"] for run in runs for one in run.about["trained"]}
-    total = (sum(every.values()) + sum(run.about["seconds"] for run in runs)) / 60
+    every = {one["key"]: one for run in runs for one in run.about["trained"]}
+    total = (sum(one["seconds"] for one in every.values()) + sum(run.about["seconds"] for run in runs)) / 60
     machines = sorted({run.about["machine"].split("; load")[0] for run in runs})
     versions = sorted({f"{run.about['version']} ({run.about['source']})" for run in runs})
     notes = f"{len(runs)} runs, {len(every)} trainings, {total:.0f} minutes without the data. Version (hash of its "
     notes += f"source): {', '.join(versions) or '-'}. Machine: {' | '.join(machines) or '-'}."
+    last = sum(bool(one.get("resumed_at_step")) and "parts" not in one for one in every.values())
+    notes += f" {last} trainings were gone on with and note their last part alone." if last else ""
     simulators = sorted({simulated(run.about) for run in runs})
     notes += f" Version of the simulator: {', '.join(map(str, simulators)) or '-'}."
     head = ("question", "runs", "trainings", "training, min", "scores, min", "files")

@@ -118,11 +118,11 @@ export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of it
 experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=2 MINUTES=75 CHUNK=2/5 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
 	$(PY) experiments/matrix.py$(if $(QUICK), --quick)$(if $(JOBS), --jobs $(JOBS))$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(RENDER), --render)$(if $(PLAN), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
-notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..."]
+notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..." RUN= DATA=]
 	@mkdir -p runs/notebooks
 	@for page in $(PAGES); do echo $$page; \
 	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$page.py && \
-	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=$(CURDIR)/experiments $(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
+	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=$(CURDIR)/experiments $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
 	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
 
 clean: ## remove .venv, builds and caches; runs stay

@@ -53,6 +53,15 @@ for ours, paper, name in sorted(order):
     print(f"{name:30} ours {ours:+.2f}   paper {paper:+.2f}")
 
 # %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("ablations", runs)
+
+# %% [markdown]
 # ## Finding
 
 # %%

@@ -51,6 +51,15 @@ for name in ("anytouch", "static_only", "no_flips", "frame_differences", "force_
             )
 
 # %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("dynamics", runs)
+
+# %% [markdown]
 # ## Finding
 
 # %%

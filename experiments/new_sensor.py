@@ -45,6 +45,15 @@ for name, view in (("left_out", "universal, 0 unlabelled"), ("seen", "seen")):
         print(f"{name:9} {task:10} {'not run' if found is None else f'{found[0]:.1f} %'}")
 
 # %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("new_sensor", runs)
+
+# %% [markdown]
 # ## Finding
 
 # %%

@@ -50,6 +50,15 @@ for view in ("class token", "patches"):
         print(f"{view:12} {name:10}", ", ".join(cells))
 
 # %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("q2", runs)
+
+# %% [markdown]
 # ## Finding
 
 # %%

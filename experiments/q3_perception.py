@@ -50,6 +50,15 @@ for name in ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t
             print(f"{title(name):40} {what:8} {sum(found) / len(found):+.1f}")
 
 # %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("q3", runs)
+
+# %% [markdown]
 # Raw pixels and the untrained encoder are no rivals of the paper. They say how much a number means: a task that
 # pixels solve says little of an encoder.
 #

@@ -50,6 +50,15 @@ for task in dict.fromkeys(row["task"] for run in runs for row in run.about["rows
                     print(f"{task:36} less {rival:9} seed {run.seed} {mean:+6.1f} ({low:+.1f} to {high:+.1f})")
 
 # %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the manifest of real touch: it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("real", runs)
+
+# %% [markdown]
 # ## Finding
 
 # %%

@@ -1,15 +1,18 @@
-"""The pages of `experiments/`, each from top to bottom, over made-up results."""
+"""The pages of `experiments/`, each from top to bottom: over made-up results, and (slow) with a tiny run."""
 
 from __future__ import annotations
 
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import synthetic
-from study import plan
+from study import page, plan
+
+from anytouch_jax.config import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {
@@ -54,6 +57,30 @@ def test_accuracies_alone_are_averaged(tmp_path, monkeypatch, capsys):
     visit("q3_perception", monkeypatch, tmp_path, tmp_path)
     found = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("T3-style ")]
     assert found == [["T3-style", "static", "+0.0"], ["T3-style", "dynamic", "+0.0"]]
+
+
+def test_a_run_of_ones_own_is_asked_for_in_one_line(monkeypatch, capsys, tmp_path):
+    monkeypatch.delenv("RUN", raising=False)
+    assert page.yours("q2", []) == [] and len(capsys.readouterr().out.splitlines()) == 1
+    monkeypatch.setenv("RUN", str(tmp_path / "none"))
+    with pytest.raises(UserError, match=r"there is no run .*none"):
+        page.yours("q2", [])
+
+
+@pytest.mark.slow
+def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, tiny_run, compiled_once):
+    size = replace(plan.QUICK, own=24, aligned=24, other=24, objects=24, frames=6)
+    monkeypatch.setattr(page, "SIZE", size)
+    monkeypatch.setenv("RUN", str(tiny_run))
+    monkeypatch.setenv("DATA", str(tmp_path / "data"))
+    synthetic.write(tmp_path / "made", plan.leaves(plan.FULL))
+    monkeypatch.setattr("study.pictures.draw_all", lambda runs, folder: [])
+    for name, least in (("q2_space", 6), ("q1_sensors", 8), ("dynamics", 19)):
+        mine = visit(name, monkeypatch, tmp_path / "made", tmp_path)["mine"]
+        out = capsys.readouterr().out
+        assert len(mine) >= least and all(f"| {row['view']} | {row['task']} |" in out for row in mine)
+        assert f"{mine[0]['mean']:.3f}" in out and "| 0.500 |" in out  # theirs beside
+    assert "is made, about" not in out  # the data sets of the first page serve the others
 
 
 def test_every_page_is_a_percent_script():

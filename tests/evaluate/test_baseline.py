@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate.baseline import raw_pixel_features, raw_pixels, reduce
+from anytouch_jax.evaluate.baseline import raw_pixels, reduce
 
 
 def pictures(count: int, height: int = 48, width: int = 64, seed: int = 0) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_components_are_those_of_train() -> None:
 
 def test_few_rows_give_few_components() -> None:
     frames = pictures(12)
-    assert raw_pixel_features(frames, pictures(12, seed=1), np.arange(12) < 9).shape == (12, 9)
+    assert reduce(raw_pixels(frames, pictures(12, seed=1)), np.arange(12) < 9).shape == (12, 9)
 
 
 def test_mistakes() -> None:

@@ -31,18 +31,11 @@ def raw_pixels(
     return np.concatenate([small, change], axis=1)
 
 
-def raw_pixel_features(
-    frames: Array, backgrounds: Array, train: Array, has_background: Array | None = None, *, components: int = 200
-) -> Array:
-    """`raw_pixels` reduced to f32 (n, components) by a PCA fitted on the rows where `train` (n,) is true.
-
-    With fewer train rows than `components`, as many as there are.
-    """
-    return reduce(raw_pixels(frames, backgrounds, has_background), train, components)
-
-
 def reduce(features: Array, train: Array, components: int = 200) -> Array:
-    """`features` (n, d) on the first principal components of its `train` (n,) rows, largest variance first."""
+    """`features` (n, d) on the first principal components of its `train` (n,) rows, largest variance first.
+
+    With fewer train rows than `components`, as many as there are. Raises UserError without any.
+    """
     train = np.asarray(train, bool)
     if not train.any():
         raise UserError("no row is marked as train; the principal components need some")

@@ -5,6 +5,9 @@ main_probe.py and downstream_dataset.py (batches are of two devices together). W
 computed once, so training pictures are not augmented (the release flips and jitters them, except for ObjectFolder 2.0).
 `published` is the release's protocol, its epoch the best on test; `honest` parts videos and objects, and chooses the
 epoch on groups left out of train.
+
+Their manifests: `anytouch index touch_and_go ROOT` (`--task rough` for roughness), `anytouch index feel ROOT --fold 3`,
+`anytouch index objectfolder ROOT`.
 """
 
 from __future__ import annotations
@@ -21,14 +24,13 @@ from .tasks import Task
 @dataclass(frozen=True)
 class Benchmark:
     """A preset. `universal`: the universal tokens for all (sensors never trained on); `paper`: accuracy of AnyTouch in
-    the paper; `index`: the command that makes its manifest."""
+    the paper."""
 
     task: Task
     pooling: Pooling
     recipe: Recipe
     universal: bool
     paper: float
-    index: str
 
     def settings(self) -> dict[str, Any]:
         """Keyword arguments of `battery.run`."""
@@ -41,17 +43,14 @@ class Benchmark:
 def _touch_and_go(label: str, listed: str, paper: float) -> Benchmark:
     task = Task(f"touch_and_go_{label}", f"label.{'rough' if listed == 'rough' else label}", groups=("recording",),
                 which="all", listed=listed, where=("dataset", "touch_and_go"))  # fmt: skip
-    return Benchmark(
-        task, "class", Recipe(batch=128, rate=2e-4, decay=0.05), False, paper,
-        f"anytouch index touch_and_go ROOT{' --task rough' if listed == 'rough' else ''}",
-    )  # fmt: skip
+    return Benchmark(task, "class", Recipe(batch=128, rate=2e-4, decay=0.05), False, paper)
 
 
 def _objectfolder(number: int, pooling: Pooling, batch: int, paper: float) -> Benchmark:
     task = Task(f"objectfolder{number}_material", "label.material", which="all",
                 where=("dataset", f"objectfolder{number}"))  # fmt: skip
     recipe = Recipe(batch=batch, rate=1e-3, decay=0.01)
-    return Benchmark(task, pooling, recipe, True, paper, "anytouch index objectfolder ROOT")
+    return Benchmark(task, pooling, recipe, True, paper)
 
 
 _FEEL = Task("feel_grasp", "label.success", which="all", fingers=True, where=("dataset", "feel"))
@@ -61,8 +60,7 @@ BENCHMARKS = {
         _touch_and_go("material", "material", 0.8082),
         _touch_and_go("roughness", "rough", 0.8674),
         _touch_and_go("hardness", "material", 0.9468),
-        Benchmark(_FEEL, "class", Recipe(batch=256, rate=1e-3, decay=0.05), False, 0.8053,
-                  "anytouch index feel ROOT --fold 3"),
+        Benchmark(_FEEL, "class", Recipe(batch=256, rate=1e-3, decay=0.05), False, 0.8053),
         _objectfolder(1, "mean", 128, 0.4962),
         _objectfolder(2, "class", 256, 0.7602),
     )

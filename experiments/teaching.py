@@ -68,10 +68,10 @@ def anytouch(*words: Any) -> None:
 # One data set a grade, and the same touches by the sensor that is left out. Both stages at preset tiny, for every seed.
 #
 # Matching departs from the paper here. Its head tells a pair from *one* other pair, on an encoder that already knows
-# pictures (CLIP); the same loss on an encoder from scratch stays at chance for as long as a CPU can wait. Cosines against
-# all other touches of the batch (`match_head=cosine`) tell 126 pairs apart at once, on half of the patches each. And the
-# learning rate matters: at 1e-3 all embeddings become equal within 100 steps (the loss is the logarithm of the batch
-# size, and stays there), at 3e-4 from stage 1 they do not.
+# pictures (CLIP); the same loss on an encoder from scratch stays at chance for as long as a CPU can wait. Cosines
+# against all other touches of the batch (`match_head=cosine`) tell 126 pairs apart at once, on half of the patches
+# each. And the learning rate matters: at 1e-3 all embeddings become equal within 100 steps (the loss is the logarithm
+# of the batch size, and stays there), at 3e-4 from stage 1 they do not.
 
 # %%
 TRAIN1 = ["--preset", "tiny", "--steps", STEPS1, "--batch", 64, "--optim.learning-rate", 1e-3]

@@ -219,7 +219,8 @@ text = f"""# Pouring by touch alone (simulated)
 {len(rows[0].runs)} runs a row ({seeds} seeds of learning, {len(rows[0].runs) // seeds} trials each); mean
 |poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
 compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
-claimed of fewer than three. Settings:
+claimed of fewer than three. Each row has one encoder unless several are named below. Settings (`version` is that of the
+flow and the load, {VERSION} now):
 {min((row.settings for row in rows), key=len)}.
 
 {pouring_table.table(rows)}

@@ -109,7 +109,7 @@ def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
     runs = tuple(f"{part['seed']}/{number}" for part in parts for number in range(len(part["poured"])))
     poured = np.concatenate([np.asarray(part["poured"], np.float64) for part in parts])
     sources = tuple(dict.fromkeys(part["source"] for part in parts))
-    lost = sum(int(steps) >= part["limit"] for part in parts for steps in part["steps"])
+    lost = sum(int(steps) >= part.get("limit", Task().limit) for part in parts for steps in part["steps"])
     return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop(), lost)
 
 

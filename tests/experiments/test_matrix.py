@@ -85,6 +85,7 @@ def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, ca
 
 def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(tmp_path, capsys):
     words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    words += ["--minutes", "0.01"]
     paths = synthetic.write(tmp_path / "matrix", plan.leaves(plan.QUICK, real=False)[:2])
     for change, sentence in (
         ({"simulator": 1}, "holds results of version 1 of the simulator, and these runs are of version"),

@@ -43,6 +43,8 @@ def test_the_four_spaces_are_of_one_seed(tmp_path):
     runs = [run for run in read(tmp_path) if (run.name, run.seed) != ("masked", 1)]
     chosen, told = pictures.q2(runs, tmp_path / "a.png"), pictures.q2(runs, tmp_path / "b.png", seed=2)
     assert chosen.read_bytes() == told.read_bytes()  # masked has no seed 1, so all are of seed 2
+    first = pictures.q2(read(tmp_path), tmp_path / "first.png")
+    assert first.read_bytes() == pictures.q2(read(tmp_path), tmp_path / "one.png", seed=1).read_bytes()
     apart = [run for run in runs if (run.name == "masked") == (run.seed == 2)]
     assert pictures.q2(apart, tmp_path / "c.png") is None
 

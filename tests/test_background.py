@@ -108,7 +108,9 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     words = ["embed", "--run", "unused", "--input", str(frames), "--sensor", str(table.value(row, "sensor"))]
     assert main([*words, "--out", str(tmp_path / "a.npz"), "--background", str(ground)]) == 0
     assert "first frame" not in capsys.readouterr().err
-    _, wanted = embed_rows(encoder, table, np.array([row]))
+    said: list[str] = []
+    _, wanted = embed_rows(encoder, table, np.array([row]), say=said.append)
+    assert all("sensor 'gelslim' was not drawn in training" in words for words in said)
     np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
     assert "the first frame is taken for that" in capsys.readouterr().err
@@ -141,7 +143,8 @@ def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
     clips = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
     for one in files:
         assert one.subtracts and run.subtracts
-        for sensor in ("digit", "duragel", "universal"):  # duragel was not trained on
+        rows = (config.model.sensors.index(name) for name in ("digit", "duragel", "universal"))
+        for sensor in (np.full(2, row) for row in rows):  # duragel was not trained on
             np.testing.assert_allclose(one.embed(clips, sensor), run.embed(clips, sensor), atol=1e-6)
 
 

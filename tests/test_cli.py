@@ -313,7 +313,7 @@ def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
 
 def test_embed_finds_first_that_it_cannot_write(tmp_path, world, capsys):
     told = mistake(capsys, "embed", "--run", tmp_path / "gone", "--input", world, "--out", world / "features.npz")
-    assert f"{world} cannot be made" in told  # a file, not a folder
+    assert f"{world} is a file, not a folder" in told
 
 
 def test_embed_and_probe_name_a_bad_picture_however_the_run_was_trained(tmp_path, world, tiny_run, capsys):

@@ -312,7 +312,7 @@ def drawn(monkeypatch, config, progress, rows=64):
     """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each (rows,)."""
     seen = {}
 
-    def spy(params, batch, noise, *, net, config, decoder_sensor):
+    def spy(params, batch, noise, *, net, config, decoder_sensor, match_noise):
         seen["rows"] = (batch.align.sensor, *batch.match[1::2])
         seen["own"] = decoder_sensor
         return jnp.zeros(()), {}

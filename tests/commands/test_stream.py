@@ -62,7 +62,7 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
         def grab(self):
             if self.count == 3:
                 signal.raise_signal(signal.SIGINT)
-                assert over.wait(60)
+                assert over.wait(240)
                 return False
             self.count += 1
             return True

@@ -55,11 +55,8 @@ class Encoder:
     def sensor_row(self, name: str, say: Say = _warn) -> int:
         """Row of a sensor's tokens. For one that training has not seen, or that the table does not have, these are the
         universal ones, said aloud."""
-        model, drawn, known = (
-            self.config.model,
-            self.universal_drawn or not self.seen,
-            name in self.config.model.sensors,
-        )
+        model, name = self.config.model, str(name)
+        drawn, known = self.universal_drawn or not self.seen, name in model.sensors
         if known and (drawn if name == UNIVERSAL else self.seen is None or name in self.seen):
             return model.sensors.index(name)
         why = f"is not in this model's table ({', '.join(model.sensors)})"

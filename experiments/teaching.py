@@ -77,7 +77,8 @@ def anytouch(*words: Any) -> None:
 TRAIN1 = ["--preset", "tiny", "--steps", STEPS1, "--batch", 64, "--optim.learning-rate", 1e-3]
 TRAIN2 = ["--preset", "tiny", "--steps", STEPS2, "--batch", 64, "--optim.learning-rate", 3e-4]
 TRAIN2 += ["--model.temperature", 0.2]  # untrained towers: a sharp softmax only punishes them
-TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 1.0, "--objective.match-keep", 0.5]  # see below
+TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 4.0, "--objective.match-keep", 0.5]  # see below
+TRAIN2 += ["--loader.jitter", 0, 0, 0, 0]  # colours tell slopes
 LESS = ["--loader.background", "subtract"]  # the contact alone: units differ more than touches do
 
 

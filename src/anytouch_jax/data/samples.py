@@ -43,16 +43,19 @@ class Reader:
         """The frames of a window of rows as u8 (T, size, size, 3); `epoch` None means no augmentation.
 
         They are written into `out`, once all could be read, or into a new array. The last row decides the augmentation
-        of the whole clip. Raises SampleError.
+        of the whole clip. Where the untouched gel is taken off, its picture is augmented too, as another light would
+        change both: a change of brightness alone would outshine the contact. Raises SampleError.
         """
-        size = self.config.model.image_size
+        size, data = self.config.model.image_size, self.config.data
         frames = [read_picture(self.manifest, row) for row in rows]
-        if self.config.data.background == "subtract":
-            frames = subtract_background(frames, self._background(int(rows[-1])))
-        if epoch is None or not (self.config.data.flip or any(self.config.data.jitter)):
-            return touch_evaluation(frames, size, out)
+        gel = self._background(int(rows[-1])) if data.background == "subtract" else None
+        if epoch is None or not (data.flip or any(data.jitter)):
+            return touch_evaluation(frames if gel is None else subtract_background(frames, gel), size, out)
         rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
-        return touch_transform(frames, size, rng, self.config.data, out)
+        if gel is None:
+            return touch_transform(frames, size, rng, data, out)
+        *seen, bare = touch_transform([*frames, gel], size, rng, data)
+        return np.stack(subtract_background(seen, bare), out=out)
 
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """The picture of a row's object as u8 (size, size, 3); `epoch` None means no augmentation."""

@@ -76,6 +76,8 @@ def matcher(run: str | Path) -> Any:
     """The matching head of a run: (features (n, E), features (n, E)) -> logits f32 (n,). Raises UserError."""
     params, text, _ = checkpoint.load_params(run)
     model = from_json(text).model
+    if model.match_head == "cosine":
+        raise UserError("the run matches by cosines, without a head: see its retrieval")
     if "matcher" not in params:
         raise UserError("the run has no matching head; give one of stage 2")
     net, kept = build(model), {"matcher": params["matcher"]}

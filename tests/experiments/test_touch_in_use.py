@@ -26,7 +26,7 @@ def test_pouring(tmp_path, tiny_run, monkeypatch, capsys):
     assert "no run is given for row t3: it is left out" in out
     names = {path.stem for path in (tmp_path / "pouring-quick").glob("*.json")}
     learned = {f"{name}-{mode}-0" for name in ("none", "static", "anytouch") for mode in ("frozen", "fine-tuned")}
-    assert names == learned | {"blind-bound-0", "count-bound-0", "expert-bound-0"}
+    assert names == learned | {"blind-bound-0", "count-bound-0", "load-bound-0", "expert-bound-0"}
     page = (tmp_path / "pouring-quick.md").read_text()
     assert (tmp_path / "figures" / "pouring.gif").exists() and "expert" in page
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "pouring-quick").iterdir()}

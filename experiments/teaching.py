@@ -153,7 +153,8 @@ def percent(values: list[float]) -> str:
 
 
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
-lines = ["# Simulated scenes as teachers", ""]
+SIZE = f"TOUCHES={TOUCHES} STEPS1={STEPS1} STEPS2={STEPS2} SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
+lines = ["# Simulated scenes as teachers", "", f"Made by `{SIZE} python experiments/teaching.py`, preset tiny.", ""]
 record: dict[str, Any] = {"touches": TOUCHES, "steps": [STEPS1, STEPS2], "seeds": SEEDS}
 for grade in GRADES:
     scored: dict[str, list[retrieval.Retrieval]] = {name: [] for name in NAMES}
@@ -170,7 +171,7 @@ for grade in GRADES:
         pairs = zip(scored["stage 2"], scored[name], strict=True)
         each = "-" if name == "stage 2" else "; ".join(points(retrieval.difference(a, b)) for a, b in pairs)
         rows.append((name, f"{100 * one.top1:.1f} %", f"{100 * one.top5:.1f} %", change, each))
-    lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seeds", ""]
+    lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
     lines += [
         markdown(
             ("features", "top-1 of 50", "top-5", "stage 2 ahead by (points, 95 % over objects)", "seed by seed"), rows

@@ -61,8 +61,8 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
 
         def grab(self):
             if self.count == 3:
-                signal.raise_signal(signal.SIGINT)
-                assert over.wait(240)
+                signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # as a terminal does
+                assert over.wait(60)
                 return False
             self.count += 1
             return True

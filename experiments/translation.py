@@ -140,7 +140,6 @@ def settings(
     seed: int,
     content: str,
 ) -> dict[str, Any]:
-    """What a run is; `content` tells its pairs apart from others."""
     return {
         "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,

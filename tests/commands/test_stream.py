@@ -75,8 +75,16 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
 
     monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
     monkeypatch.setattr(streams, "_PATIENCE", 0.01)
-    said = anytouch("embed", "--stream", "--run", tiny_run, "--input", "0", "--frames", 3, "--out", tmp_path / "f.npz")
-    over.set()
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # ignored, where a shell put pytest in the background
+    try:
+        said = anytouch(
+            "embed", "--stream", "--run", tiny_run, "--input", 0, "--frames", 3, "--out", tmp_path / "f.npz"
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+        over.set()
     assert said.status == 0, said
     with np.load(tmp_path / "f.npz") as file:
         assert (

@@ -38,7 +38,6 @@ from typing import Any
 
 import numpy as np
 from study import page
-from study.results import interval
 
 from anytouch_jax.config import preset
 from anytouch_jax.data import manifest as manifests
@@ -46,6 +45,7 @@ from anytouch_jax.evaluate import generation, pairs
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
+from anytouch_jax.evaluate.results import seed_interval as interval
 from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.nn.translation import Translation
 from anytouch_jax.sim.dataset import simulate

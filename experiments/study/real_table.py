@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from anytouch_jax.evaluate.results import seed_interval as interval
 from anytouch_jax.evaluate.sections import markdown
 
 from .questions import Part
 from .real import OURS, PIXELS, UNTRAINED
-from .results import CLAIM, Change, Run, interval
+from .results import CLAIM, Change, Run
 from .tables import Statement
 
 

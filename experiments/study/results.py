@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from anytouch_jax.config import UserError
+from anytouch_jax.evaluate.results import seed_interval as interval
 
 from .plan import LABELS
 
@@ -113,14 +113,6 @@ def values(runs: Sequence[Run], question: str, name: str, column: Column, protoc
         for run in runs
         if (run.question, run.name) == (question, name) and (row := run.row(column, protocol)) is not None
     }
-
-
-def interval(several: Sequence[float]) -> tuple[float | None, float | None]:
-    """95 % interval of the mean over seeds, by Student's t; (None, None) below two."""
-    if len(several) < 2:
-        return None, None
-    half = float(stats.t.ppf(0.975, len(several) - 1) * np.std(several, ddof=1) / np.sqrt(len(several)))
-    return float(np.mean(several)) - half, float(np.mean(several)) + half
 
 
 def spread(

@@ -142,12 +142,12 @@ def touch_embeddings(
     for shape in {clip.shape: None for clip, _ in touches}:
         members = [i for i, (clip, _) in enumerate(touches) if clip.shape == shape]
         clips, sensors = (jnp.stack(part, axis=1) for part in zip(*(touches[i] for i in members), strict=True))
-        flat = clips.reshape(-1, *shape[1:]), sensors.reshape(-1)
+        rows = clips.reshape(-1, *shape[1:]), sensors.reshape(-1)
         if keep_ids is None:
-            flat = net.apply(params, "encode", *flat)
+            flat = net.apply(params, "encode", *rows)
         else:
             ids = jnp.stack([keep_ids[i] for i in members], axis=1)
-            flat = net.apply(params, "encode_some", *flat, ids.reshape(-1, ids.shape[-1]))
+            flat = net.apply(params, "encode_some", *rows, ids.reshape(-1, ids.shape[-1]))
         each = losses.normalise(flat).reshape(shape[0], len(members), -1)
         for j, i in enumerate(members):
             z[i] = each[:, j]

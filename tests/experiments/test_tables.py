@@ -10,9 +10,10 @@ import pytest
 import synthetic
 from study import plan, report
 from study.paper import TABLE6
-from study.results import Column, change, comparable, interval, read, spread, together, values
+from study.results import Column, change, comparable, read, spread, together, values
 
 from anytouch_jax.config import UserError
+from anytouch_jax.evaluate.results import seed_interval as interval
 
 LEAVES = plan.leaves(plan.FULL)
 THREE = {0: 50.0, 1: 52.0, 2: 54.0}

@@ -45,10 +45,11 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
     """The sizes asked for. Raises UserError for a name or a number that is none."""
     size: Any = plan.QUICK if quick else plan.FULL
     fields = {field.name: getattr(size, field.name) for field in dataclasses.fields(size)}
+    settable = [name for name in fields if name not in ("name", "stack", "decoder")]
     for change in changes:
         name, _, text = change.partition("=")
-        if name not in fields or name in ("name", "toy"):
-            raise UserError(f"--set {change}: choose among {', '.join(n for n in fields if n not in ('name', 'toy'))}")
+        if name not in settable:
+            raise UserError(f"--set {change}: choose among {', '.join(settable)}")
         try:
             value = tuple(map(int, text.split(","))) if name == "seeds" else type(fields[name])(text)
         except ValueError:

@@ -11,12 +11,16 @@ from . import adaptation, paper, plan
 from .results import Column, Run, spread
 from .tables import Pair, Statement, Table, against, block, judge, sentence, title
 
-FOUR = (
-    Column("seen", "seen", "material"),
-    Column("seen sensor, other data", "seen, other data", "material"),
-    Column("unseen sensor", "unseen", "material"),
-    Column("unseen sensor, other data", "unseen, other data", "material"),
-)
+
+def four(task: str) -> tuple[Column, ...]:
+    """The columns of the paper's tables, of one task."""
+    return (
+        Column("seen", "seen", task), Column("seen sensor, other data", "seen, other data", task),
+        Column("unseen sensor", "unseen", task), Column("unseen sensor, other data", "unseen, other data", task),
+    )  # fmt: skip
+
+
+FOUR, FORM = four("material"), four("indenter")
 FOUR_PAPER = ("TAG", "Feel", "OF 1.0", "OF 2.0")
 SIX = (
     Column("material", "seen", "material"),
@@ -67,13 +71,24 @@ def q1(runs: Sequence[Run]) -> Part:
     first, last = table.names[1], table.names[-1]
     expected = [a - b for a, b in zip(paper.TABLE1[last], paper.TABLE1[first], strict=True)]  # type: ignore[operator]
     pairs.append(Pair("more sensors help the unseen one: four against one", last, first, expected, (2, 3)))
-    found = judge(runs, "q1", FOUR, pairs)
-    return Part("Q1: what each sensor's data adds (Table 1)", block(runs, table, found), found)
+    return Part("Q1: what each sensor's data adds (Table 1)", *_both(runs, table, pairs))
+
+
+def _both(runs: Sequence[Run], table: Table, pairs: Sequence[Pair]) -> tuple[str, list[Statement]]:
+    """A table of materials and, with the same signs expected, of forms: its text and statements."""
+    found = judge(runs, table.question, FOUR, pairs)
+    form = judge(runs, table.question, FORM, [pair._replace(label=f"form: {pair.label}") for pair in pairs])
+    text = (
+        f"The material, which captions name:\n\n{block(runs, table, found)}\n\n"
+        "The form of the indenter, which no caption names (the same signs are expected):\n\n"
+        f"{block(runs, table._replace(columns=FORM, paper={}, paper_titles=()), form)}"
+    )
+    return text, [*found, *form]
 
 
 def q2(runs: Sequence[Run]) -> Part:
     """Figure 4 in numbers: what each component does to the space."""
-    names = ("pixels", "untrained", "masked", "aligned", "matched")
+    names = ("pixels", "untrained", "masked", "aligned", "matched", "matched_mlp")
     # The paper in words: masked modelling draws the touches of a sensor together; alignment blends the sensors;
     # matching mixes them wholly. Signs are of what is better: to find the touch, not to be ordered by sensor.
     gathers = (None, None, -1, None, None, None)
@@ -104,6 +119,8 @@ def q3(runs: Sequence[Run]) -> Part:
     static = Table("q3", names, SIX, paper.TABLES23, SIX_PAPER)
     rivals = [pair for pair in against(static, "anytouch", None) if pair.second in paper.TABLES23]
     one = judge(runs, "q3", SIX, rivals)
+    shape = [pair._replace(label=f"form: {pair.label}", expected=_of_form(pair)) for pair in rivals]
+    form = judge(runs, "q3", FORM, shape)
     moving = Table("q3", names, dynamic("clips"), paper.TABLE4, ("pouring, fine-tuned (g)", "frozen (g)"))
     ahead = [
         Pair(f"AnyTouch against {title(name)}", "anytouch", name, (1, 1, 1, 1), (0, 2, 3))  # R2 is no accuracy
@@ -112,17 +129,23 @@ def q3(runs: Sequence[Run]) -> Part:
     two = judge(runs, "q3", moving.columns, ahead)
     text = (
         f"Static tasks (Tables 2 and 3):\n\n{block(runs, static, one)}\n\n"
+        "The form of the indenter, which no caption names (signs as of the materials):\n\n"
+        f"{block(runs, Table('q3', names, FORM), form)}\n\n"
         "Dynamic tasks, probes on clips; beside them the paper's pouring with a robot (Table 4,\n"
         f"less is better):\n\n{block(runs, moving, two)}"
     )
-    return Part("Q3: static and dynamic perception (Tables 2, 3, 4)", text, (*one, *two))
+    return Part("Q3: static and dynamic perception (Tables 2, 3, 4)", text, (*one, *form, *two))
+
+
+def _of_form(pair: Pair) -> tuple[float | None, ...]:
+    """What is expected of the columns of forms: the signs of material among the columns of `SIX`."""
+    return (pair.expected[0], *pair.expected[3:])
 
 
 def ablations(runs: Sequence[Run]) -> Part:
     """Table 6."""
     table = Table("ablations", (*paper.TABLE6,), FOUR, paper.TABLE6, FOUR_PAPER)
-    found = judge(runs, "ablations", FOUR, against(table, None, "anytouch"))
-    return Part("Ablations (Table 6)", block(runs, table, found), found)
+    return Part("Ablations (Table 6)", *_both(runs, table, against(table, None, "anytouch")))
 
 
 def restricted(runs: Sequence[Run]) -> Part:

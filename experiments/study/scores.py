@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 STATIC = ("material", "roughness", "hardness")
+FORM = "indenter"  # no caption names it
 DYNAMIC = ("slip", "force", "twist", "slide")
 BOTH = ("honest", "published")
 PIXELS = "pixels"
@@ -69,7 +70,10 @@ def _probes(
 
 
 def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
-    """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0)."""
+    """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0).
+
+    Of each the material and the form of the indenter; of the first also `tasks`.
+    """
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
     rows = []
     for view, name, sensors, labels in (
@@ -78,6 +82,7 @@ def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[s
         ("unseen", "own", (plan.UNSEEN,), ("material",)),
         ("unseen, other data", "other", (plan.UNSEEN,), ("material",)),
     ):
+        labels = (*labels, FORM)
         options = {"train_sensors": sensors, "test_sensors": sensors, "protocols": BOTH}
         rows += _probes(leaf, work, f"{name}/{cuts.WHOLE}", labels, view, encoder, **options)
     return rows

@@ -21,7 +21,8 @@ TITLES = {
     "no_text_aligned": "w/o text in the aligned set", "no_stage1": "w/o stage 1", "no_stage2": "w/o stage 2",
     "no_matching": "w/o cross-sensor matching", "no_dynamic": "w/o dynamic perception",
     "no_universal": "w/o universal tokens", "masked": "+ masked modelling", "aligned": "+ alignment",
-    "matched": "+ matching", "no_flips": "AnyTouch, touches never flipped",
+    "matched": "+ matching", "matched_mlp": "+ matching by the paper's head",
+    "no_flips": "AnyTouch, touches never flipped",
     "frame_differences": "AnyTouch, frame differences too", "force_heads": "AnyTouch, force heads too",
     "left_out": "left out of training", "seen": "trained on",
 }  # fmt: skip

@@ -96,7 +96,7 @@ def captions_drawn(loader, steps=24):
 
 
 def code(loader, name):
-    return tuple(loader.tokenizer.encode([name], 12)[0][0].tolist())
+    return tuple(loader.tokenizer.encode([name], 8)[0][0].tolist())
 
 
 def test_the_text_of_touches_felt_twice_never_reaches_a_batch(make, settings):

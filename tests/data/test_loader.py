@@ -297,7 +297,7 @@ def _check_align(batch, rows, read_back, tokenizer):
     assert used == with_text and (batch.text_row[len(used) :] == size).all()
     if len(batch.text):
         want, mask = tokenizer.encode(
-            [rows[drawn[slot]]["text"] for slot in used] + [""] * (len(batch.text) - len(used)), 12
+            [rows[drawn[slot]]["text"] for slot in used] + [""] * (len(batch.text) - len(used)), batch.text.shape[1]
         )
         np.testing.assert_array_equal(batch.text, want)
         np.testing.assert_array_equal(batch.text_mask, mask)
@@ -358,13 +358,26 @@ def test_no_vision_and_no_text_give_no_slots(make, settings):
     )
     batch = loader.batch(0).align
     assert batch.image.shape == (0, 28, 28, 3) and batch.image_row.shape == (0,)
-    assert batch.text.shape == batch.text_mask.shape == (0, 12) and batch.text_row.shape == (0,)
+    assert batch.text.shape == batch.text_mask.shape == (0, 0) and batch.text_row.shape == (0,)
     assert loader.tokenizer is None
     rows = [{"image_path": f"v{i}.png", "text": "words"} for i in range(8)]
     config = settings(2)
     towerless = replace(config, model=replace(config.model, image=None, text=None))
     batch = Loader(make(rows), towerless).batch(0).align  # what has no tower is not read
     assert batch.image.shape[0] == batch.text.shape[0] == 0
+
+
+def test_captions_are_padded_to_the_longest_in_eights_and_never_beyond_the_tower(make, settings):
+    """Positions behind the end token of every caption are work for nothing; a long caption keeps its end token."""
+    for words, length in ((["one"], 8), (["one two three four five six seven eight"], 12)):
+        manifest = make([{"text": text} for text in words * 8])
+        loader = Loader(manifest, settings(2))  # its tower has 12 positions
+        batch = loader.batch(0).align
+        assert batch.text.shape[1] == length
+        np.testing.assert_array_equal(batch.text[0], loader.tokenizer.encode(words[:1], length)[0][0])
+        assert loader.tokenizer.end_id in batch.text[0]
+    assert loader.tokenizer.longest([]) == 2
+    assert loader.tokenizer.longest(["", "one two three four five six seven eight"]) > 9
 
 
 def test_tokenizers(make, settings, tmp_path):

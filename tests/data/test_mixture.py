@@ -214,7 +214,7 @@ def test_text_of_downstream_test_frames_is_withheld_and_counted(make, settings):
         batch = loader.batch(step).align
         for text, row in zip(batch.text, batch.text_row, strict=True):
             used.add(tuple(text.tolist()) if row < 4 else None)
-    wanted = {tuple(loader.tokenizer.encode([f"word{i}"], 12)[0][0].tolist()) for i in range(3, 10)}
+    wanted = {tuple(loader.tokenizer.encode([f"word{i}"], 8)[0][0].tolist()) for i in range(3, 10)}
     assert used - {None} == wanted
     assert sources.captions(manifest, np.arange(10)) == [f"word{i}" for i in range(3, 10)]
     assert not any("withheld" in note for note in Loader(manifest, settings(1)).notes)

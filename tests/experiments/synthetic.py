@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from study import adaptation, plan, real
-from study.questions import FOUR, GRASP, SIX, SPACE, STATIC, VIEWS, dynamic
+from study.questions import FORM, FOUR, GRASP, SIX, SPACE, STATIC, VIEWS, dynamic
 from study.results import Column
 
 Mean = Callable[[str, str, int, str, str], float]  # (question, name, seed, view, task) -> 0..1
@@ -42,7 +42,8 @@ def write_one(folder: Path, leaf: plan.Leaf, mean: Mean = level) -> Path:
 
 def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
     columns: tuple[Column, ...] = {
-        "q1": FOUR, "ablations": FOUR, "q2": SPACE, "q3": (*SIX, *dynamic("clips")), "restricted": SIX, "grasp": GRASP,
+        "q1": (*FOUR, *FORM), "ablations": (*FOUR, *FORM), "q2": SPACE, "q3": (*SIX, *FORM, *dynamic("clips")),
+        "restricted": SIX, "grasp": GRASP,
         "dynamics": (*(one for view in VIEWS for one in dynamic(view)), *STATIC),
     }.get(leaf.question, ())  # fmt: skip
     found = [(one.view, one.task, one.metric) for one in columns]

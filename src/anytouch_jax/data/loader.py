@@ -66,6 +66,7 @@ class Loader:
         self._reader = Reader(manifest, config)
         found = find_sources(manifest, config, tokenizer, devices)
         self._pools, self._pairs, self._sensor, self.tokenizer, self.notes, self._force = found
+        self._length = self._caption_length()
         self._align_share = self._share_of_align()
         self._align, self._match = Turns(self._align_kinds), Turns(self._match_kinds)
 
@@ -199,16 +200,26 @@ class Loader:
             jobs.append(job if mine.touch is not None else partial(_uncounted, job))
         return Work((batch, force), jobs, {"images": images, "texts": texts})
 
+    def _caption_length(self) -> int:
+        """How many tokens a caption is padded to: the longest of the manifest, in eights, at most the text tower's.
+
+        The tower is causal and reads its embedding at the end token, so positions behind it change nothing.
+        """
+        tower = self.config.model.text
+        if tower is None or self.tokenizer is None:
+            return 0
+        captions = self.manifest.table.column("text").unique().drop_null().to_pylist()
+        return min(tower.length, -(-self.tokenizer.longest(captions) // 8) * 8)
+
     def _texts(self, pool: Pool) -> int:
         return pool.strata.texts if self.tokenizer is not None else 0
 
     def _slots(self, image_row: np.ndarray, text_row: np.ndarray) -> tuple[np.ndarray, ...]:
         """This shard's image and text slots, still empty. An unused text slot is an empty caption, so that no tower
         meets a text of nothing but padding (its gradient could be NaN even where its value is dropped)."""
-        size, tower = self.config.model.image_size, self.config.model.text
+        size, length = self.config.model.image_size, self._length
         image_row, text_row = self._shard.cut(image_row), self._shard.cut(text_row)
         image = np.zeros((len(image_row), size, size, 3), np.uint8)
-        length = tower.length if tower else 0
         if self.tokenizer is None or not len(text_row):
             text, mask = np.zeros((0, length), np.int32), np.zeros((0, length), bool)
         else:

@@ -42,7 +42,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation export-onnx experiments notebooks clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments notebooks clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -110,6 +110,10 @@ pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: RUNS="anyt
 
 translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: RUNS="anytouch=path t3=path" [QUICK=1 OUT=]
 	RUNS="$(RUNS)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
+
+long-clips: RUN ?= runs/stage2
+long-clips: $(STAMP) $(scenes) ## longer clips, what they see beside what they cost: [RUN= DATA= QUICK=1 OUT=]
+	RUN="$(RUN)" DATA="$(DATA)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/long_clips.py
 
 export-onnx: $(ONNX)/.made
 export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]

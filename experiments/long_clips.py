@@ -14,9 +14,11 @@
 # three, five and seven: slip, force, the sign of a twist and the direction of a slide by linear probes of frozen
 # features (honest protocol, objects never touched in training), beside the time that a clip takes.
 #
-#     RUN=runs/stage2 DATA=data/scenes/manifest.parquet .venv/bin/python experiments/long_clips.py
+#     make long-clips RUN=runs/stage2 DATA=data/scenes/manifest.parquet
 #
-# `OUT=` is where `long_clips.md`, `.json` and the picture go, `ROWS=` how many moments of a task at most.
+# `OUT=` is where the page, its picture and the folder `long_clips/` (a JSON file for each length) go, `ROWS=` how many
+# moments of a task at most. A length whose file is there, of this encoder and these data, is not done again. `QUICK=1`
+# is a trial of a minute or two.
 
 # %%
 from __future__ import annotations
@@ -24,6 +26,8 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +41,10 @@ from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.train.record import write_atomic
 
 RUN, DATA = Path(os.environ.get("RUN", "runs/stage2")), os.environ.get("DATA", "data/scenes/manifest.parquet")
-OUT = Path(os.environ.get("OUT", "experiments/results"))
-ROWS, ROUNDS, BATCH = int(os.environ.get("ROWS", "1500")), 9, 32
+QUICK = os.environ.get("QUICK", "") not in ("", "0")
+OUT, NAME = Path(os.environ.get("OUT") or "experiments/results"), "long_clips-quick" if QUICK else "long_clips"
+ROWS = int(os.environ.get("ROWS") or (100 if QUICK else 1500))
+ROUNDS, BATCH = (3, 8) if QUICK else (9, 32)
 LOOKS = [(1, "mean"), (3, "mean"), *((frames, join) for frames in (5, 7) for join in ("mean", "sum", "concat"))]
 LONGEST = max(frames for frames, _ in LOOKS)
 TASKS = ("slip", "force", "twist", "slide")
@@ -100,15 +106,48 @@ def milliseconds(encoder: Encoder) -> list[float]:
     return [float(np.median(one)) for one in spent]
 
 
-cost = milliseconds(encoder)
-record: list[dict[str, Any]] = []
-for (frames, join), ms in zip(LOOKS, cost, strict=True):
-    read, values = embed_rows(encoder, table, rows, frames, "both", join, say=lambda _: None)  # type: ignore[arg-type]
+# %% [markdown]
+# ## Look by look
+
+# %%
+FOLDER = OUT / NAME
+FOLDER.mkdir(parents=True, exist_ok=True)
+SETTINGS = {"encoder": encoder.mark, "manifest": table.content_hash, "rows": ROWS, "rounds": ROUNDS, "batch": BATCH}
+
+
+def finished(path: Path) -> dict[str, Any] | None:
+    """What was measured with these settings, if it was."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return found if found.get("settings") == SETTINGS else None
+
+
+def make(name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    path = FOLDER / f"{name}.json"
+    found = finished(path)
+    if found is None:
+        found = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": SETTINGS} | measure()
+        write_atomic(path, json.dumps(found, indent=1) + "\n")
+    return found
+
+
+def seen(frames: int, join: Any) -> dict[str, Any]:
+    read, values = embed_rows(encoder, table, rows, frames, "both", join, say=lambda _: None)
     if len(read) < len(rows):
         raise SystemExit(f"{len(rows) - len(read)} rows cannot be read; `anytouch verify` says what is wrong with them")
+    found = scores(values)
+    print({name: round(one["mean"], 3) for name, one in found.items()}, frames, join, flush=True)
+    return {"tasks": found}
+
+
+time_taken = make("time", lambda: {"ms": milliseconds(encoder)})
+cost = time_taken["ms"]
+record: list[dict[str, Any]] = []
+for (frames, join), ms in zip(LOOKS, cost, strict=True):
     about = {"frames": frames, "join": join if frames > 3 else "-", "ms": ms, "ratio": ms / cost[1]}
-    record.append(about | {"tasks": scores(values)})
-    print({name: round(one["mean"], 3) for name, one in record[-1]["tasks"].items()}, frames, join, flush=True)
+    record.append(about | make(f"{frames}-{join}", partial(seen, frames, join)))
 
 # %% [markdown]
 # ## Table and picture
@@ -130,21 +169,19 @@ body = [
 tested = ", ".join(f"{name} {one['test']}" for name, one in record[0]["tasks"].items())
 text = f"""# Longer clips: what they see beside what they cost
 
-Made by `experiments/long_clips.py` from the run `{RUN.name}`. {machine.describe().sentence()}
+Made by `make long-clips` from the run `{time_taken["run"]}`. {time_taken["machine"]}
 Linear probes of frozen features on objects never touched in training, 95 % over test objects; moments tested: {tested}.
 Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
 {markdown(head, body)}
 
-![Slip against time](figures/long_clips.png)
+![Slip against time](figures/{NAME}.png)
 """
-about = {"run": RUN.name, "manifest": table.content_hash, "machine": machine.describe().sentence(), "looks": record}
-OUT.mkdir(parents=True, exist_ok=True)
-write_atomic(OUT / "long_clips.json", json.dumps(about, indent=1) + "\n")
-write_atomic(OUT / "long_clips.md", text)
+write_atomic(OUT / f"{NAME}.md", text)
 points = {
     f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"]) for one in record
 }
-plots.pareto(OUT / "figures" / "long_clips.png", points, x="ms a clip", y="share of slips told wrongly")
+picture = OUT / "figures" / f"{NAME}.png"
+plots.pareto(picture, points, x="ms a clip", y="share of slips told wrongly")
 print(text)
-page.show(OUT / "figures" / "long_clips.png")
+page.show(picture)

@@ -17,6 +17,9 @@ WORK = {
     "retrieve": "anytouch_jax.data.manifest.read",
     "bench": "anytouch_jax.evaluate.machine.describe",
     "annotate": "anytouch_jax.data.annotate.annotate",
+    "report": "anytouch_jax.evaluate.report.demo_report",
+    "adapt": "anytouch_jax.data.manifest.read",
+    "translate": "anytouch_jax.evaluate.features.load_encoder",
 }
 
 
@@ -30,6 +33,13 @@ WORK = {
         (["retrieve", "--data", "touch.parquet", "--out", "afile/r.json"], "--out"),
         (["bench", "embed", "--quick", "--out", "afile"], "--out"),
         (["annotate", "touch.parquet", "--yes", "--sheet", "afile/look.html"], "--sheet"),
+        (["report", "--data", "touch.parquet", "--stage1", "a", "--stage2", "b", "--out", "afile/r"], "--out"),
+        (["adapt", "--run", "a", "--data", "touch.parquet", "--sensor", "digit", "--out", "afile/r"], "--out"),
+        (
+            ["translate", "--fit", "--run", ".", "--data", "touch.parquet", "--from", "a", "--to", "b"]
+            + ["--out", "afile/t"],
+            "--out",
+        ),
     ],
 )
 def test_a_place_that_cannot_be_is_named_before_the_work(mistake, pressed, monkeypatch, words, option):

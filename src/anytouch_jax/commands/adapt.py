@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_use import Adapt
 
@@ -9,9 +10,11 @@ from anytouch_jax.options_use import Adapt
 def run(options: Adapt) -> int:
     """Fit the tokens of a new sensor and write a run folder."""
     from anytouch_jax.data import manifest as manifests
-    from anytouch_jax.evaluate.adapt import adapt, save
+    from anytouch_jax.evaluate.adapt import adapt, check_empty, save
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    check_empty(options.out)
+    check_folder(options.out / "config.json")
     enable_compilation_cache()
     table = manifests.read([str(path) for path in options.data])
     found = adapt(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Report
 
@@ -11,6 +12,7 @@ def run(options: Report) -> int:
     from anytouch_jax.evaluate.report import demo_report
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    check_folder(options.out / "report.md")
     enable_compilation_cache()
     demo_report(
         options.data, options.stage1, options.stage2, options.out, say,

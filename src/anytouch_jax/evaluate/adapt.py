@@ -89,11 +89,16 @@ def adapt(
     return Adapted(config, new, history, measure(small), after, on, about)
 
 
+def check_empty(out: Path) -> None:
+    """Raise UserError when the folder of a new run holds something already."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out} is not empty; give another --out")
+
+
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     """Write a run folder that embed, probe and retrieve read. Raises UserError when `out` holds something already."""
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out} is not empty; give another --out")
+    check_empty(out)
     out.mkdir(parents=True, exist_ok=True)
     text = to_json(adapted.config)
     write_atomic(out / "config.json", text + "\n")

@@ -245,9 +245,6 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
     whole = own("anytouch")
     for name, recipe in (("masked", "no_stage2"), ("aligned", "no_matching"), ("matched", "anytouch")):
         yield "q2", name, own(recipe), False
-    if first:
-        paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0)  # as the paper has it
-        yield "q2", "matched_mlp", training(paired, "anytouch", seed), False
     for name in ("unitouch", "tlv_link", "t3", "static_only", "anytouch"):
         yield "q3", name, own(name), False
     yield "q3", "no_pretraining", whole, True
@@ -272,6 +269,8 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
         yield "dynamics", "no_flips", own("anytouch", data={"flip": 0.0}), False
         for name in ("frame_differences", "force_heads"):
             yield "dynamics", name, own(name), False
+        paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0)  # as the paper has it
+        yield "q2", "matched_mlp", training(paired, "anytouch", seed), False
 
 
 ABLATIONS = (

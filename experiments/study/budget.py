@@ -42,7 +42,7 @@ def of_training(one: Training) -> float:
 
 def matches(one: Training) -> bool:
     """Whether its data have touches felt twice, and it has a head for them."""
-    return one.config.model.match_head != "none" and bool({"aligned", plan.REAL} & set(one.config.data.manifests))
+    return one.config.model.match_head != "none" and bool({*plan.ALIGNED, plan.REAL} & set(one.config.data.manifests))
 
 
 def of_scenes(one: Scenes, size: Size) -> float:

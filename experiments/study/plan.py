@@ -3,11 +3,11 @@
 A `Training` is its configuration, its data and the training that it starts from; two that are equal are one, so what
 can be shared is shared without being said. Nothing here computes.
 
-Data, after the paper's: `own` is the data set of each sensor by itself (touches nobody else felt), `aligned` its
-coarse TacQuad (by hand, four sensors at one place), `other` a data set never trained on, of other individuals (more
-than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out are held out in both
-`own` and `aligned` (`work.check_objects` refuses sizes at which they are not). `own` also has DuraGel, which only the
-runs `seen` train on: it is the unseen sensor, as Taxim and TACTO are in the paper.
+Data, after the paper's: `own` is the data set of each sensor by itself (touches nobody else felt), `fine` and `coarse`
+its TacQuad (four sensors at one place, by one motion or by hand), `other` a data set never trained on, of other
+individuals (more than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out
+are held out in `own`, `fine` and `coarse` alike (`work.check_objects` refuses sizes at which they are not). `own` also
+has DuraGel, which only the runs `seen` train on: it is the unseen sensor, as Taxim and TACTO are in the paper.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from anytouch_jax.config import UNIVERSAL, Config, Stack, preset
 
 SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in which Table 1 adds them
 UNSEEN = "duragel"
+ALIGNED = ("fine", "coarse")
 RESTRICTED = ("gelsight", "digit")  # of the control of Table 2
 REAL = "real"
 STACK, DECODER = Stack(128, 4, 4, 512), Stack(128, 2, 4, 512)
@@ -48,7 +49,8 @@ class Size:
 
     name: str = "full"
     own: int = 400
-    aligned: int = 400
+    fine: int = 300
+    coarse: int = 400
     other: int = 300
     objects: int = 250
     frames: int = 10
@@ -75,8 +77,8 @@ class Size:
 
 FULL = Size()
 QUICK = Size(
-    "quick", own=60, aligned=24, other=48, objects=24, pixels=64, image=56, steps1=6, batch1=16, steps2=4, batch2=8,
-    seeds=(0,), refits=2, max_rows=300, embed=32, stack=Stack(32, 2, 2, 64), decoder=Stack(16, 1, 2, 32),
+    "quick", own=60, fine=24, coarse=24, other=48, objects=24, pixels=64, image=56, steps1=6, batch1=16, steps2=4,
+    batch2=8, seeds=(0,), refits=2, max_rows=300, embed=32, stack=Stack(32, 2, 2, 64), decoder=Stack(16, 1, 2, 32),
 )  # fmt: skip
 
 
@@ -90,6 +92,7 @@ class Scenes:
     grade: Literal["fine", "coarse"]
     seed: int
     held_out: float
+    first: int = 0
 
 
 @dataclass(frozen=True)
@@ -169,10 +172,11 @@ def chosen(config: Any) -> Any:
 
 
 def scenes(size: Size) -> tuple[Scenes, ...]:
-    """The simulated data sets. `own` and `aligned` share their objects and which of them are held out."""
+    """The simulated data sets. All but `other` share their objects and which of them are held out."""
     return (
         Scenes("own", (*SENSORS, UNSEEN), size.own, "fine", 0, 0.25),
-        Scenes("aligned", SENSORS, size.aligned, "coarse", 0, 0.25),
+        Scenes("fine", SENSORS, size.fine, "fine", 0, 0.25, first=size.own),
+        Scenes("coarse", SENSORS, size.coarse, "coarse", 0, 0.25),
         Scenes("other", (SENSORS[0], UNSEEN), size.other, "fine", 1, 0.5),
     )
 
@@ -181,11 +185,12 @@ def training(
     size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True,
     extra: Sequence[str] = (), data: dict[str, Any] | None = None,
 ) -> Training:  # fmt: skip
-    """The last stage of a recipe (see `anytouch_jax.baselines`) on the data of `sensors`, and of `aligned`.
+    """The last stage of a recipe (see `anytouch_jax.baselines`) on the data of `sensors` and, `aligned`, touches felt
+    by several.
 
     `extra` more manifests by name; `data` more settings of the data, for both stages.
     """
-    manifests = (*(f"own/{name}" for name in sensors), *(("aligned",) if aligned else ()), *extra)
+    manifests = (*(f"own/{name}" for name in sensors), *(ALIGNED if aligned else ()), *extra)
     last: Training | None = None
     for stage in baselines.find(recipe).stages:
         config = _config(size, stage, seed, sensors, manifests)

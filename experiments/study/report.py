@@ -25,12 +25,12 @@ A sign is that of the difference of two rows, seed by seed. It *agrees* when the
 side, is *undecided* when zero lies within, and is not claimed below {CLAIM} seeds. The data are simulated, the network
 is preset tiny made smaller still, trained from scratch for minutes, and cross-sensor matching is contrast with all
 other touches of the batch instead of the paper's pairs (`Size` in `study/plan.py` says why): compared is the direction
-of an effect, never the paper's absolute numbers, which stand beside ours as printed there. Columns: *seen* is a data set trained on (as TAG); *seen sensor, other data* one
-never trained on (as Feel), whose objects are held out from the probe (their kinds may have been met in pre-training);
-*unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0). Recipes of one stage are trained for that stage's
-steps alone, AnyTouch for both. *No tactile pre-training* is the image tower of our AnyTouch: it never saw a touch, but
-was trained here towards touch, photographs and text; the paper's CLIP never met touch. Statements on dynamic tasks and
-on the grasp test the paper's claim, not a number of its."""
+of an effect, never the paper's absolute numbers, which stand beside ours as printed there. Columns: *seen* is a data
+set trained on (as TAG); *seen sensor, other data* one never trained on (as Feel), whose objects are held out from the
+probe (their kinds may have been met in pre-training); *unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0).
+Recipes of one stage are trained for that stage's steps alone, AnyTouch for both. *No tactile pre-training* is the image
+tower of our AnyTouch: it never saw a touch, but was trained here towards touch, photographs and text; the paper's CLIP
+never met touch. Statements on dynamic tasks and on the grasp test the paper's claim, not a number of its."""
 CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not agree
 
 

@@ -182,7 +182,7 @@ def check_objects(size: Size) -> None:
 def _simulated(one: Scenes, size: Size) -> Simulated:
     return Simulated(
         touches=one.touches, sensors=one.sensors, seed=one.seed, grade=one.grade, frames=size.frames,
-        objects=min(size.objects, one.touches), held_out=one.held_out, size=size.pixels,
+        objects=min(size.objects, one.touches), held_out=one.held_out, size=size.pixels, first=one.first,
     )  # fmt: skip
 
 

@@ -235,6 +235,8 @@ class Simulate:
     """Share of the recordings with a caption."""
     held_out: float = 0.25
     """Share of the objects that only the test split touches, by whole pairs of primitive and texture."""
+    first: int = 0
+    """Number of the first touch: another one gives other touches of the same objects, with the same splits."""
     fields: str = ""
     """Fields to write beside the images (.npy), with commas between: displacement, pressure, shear."""
     size: int = 224

@@ -36,8 +36,7 @@ WORK = {
         (["report", "--data", "touch.parquet", "--stage1", "a", "--stage2", "b", "--out", "afile/r"], "--out"),
         (["adapt", "--run", "a", "--data", "touch.parquet", "--sensor", "digit", "--out", "afile/r"], "--out"),
         (
-            ["translate", "--fit", "--run", ".", "--data", "touch.parquet", "--from", "a", "--to", "b"]
-            + ["--out", "afile/t"],
+            ["translate", "--fit", "--run", ".", "--data", "t.parquet", "--from", "a", "--to", "b", "--out", "afile/t"],
             "--out",
         ),
     ],

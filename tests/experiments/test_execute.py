@@ -71,7 +71,7 @@ def test_each_training_is_made_once_and_every_run_leaves_a_file(tmp_path):
     result, _ = run(work, tmp_path)
     assert result.made == [leaf.file for leaf in LEAVES] == [name for name in work.calls if name.endswith(".json")]
     keys = {one.key for leaf in LEAVES for one in leaf.trainings}
-    assert sorted(set(work.calls) & keys) == sorted(keys) and work.calls[:3] == ["own", "aligned", "other"]
+    assert sorted(set(work.calls) & keys) == sorted(keys) and work.calls[:4] == ["own", "fine", "coarse", "other"]
     stored = json.loads((tmp_path / LEAVES[0].file).read_text())
     assert stored["identity"] == LEAVES[0].identity and stored["seed"] == 0 and stored["question"] == LEAVES[0].question
 
@@ -136,11 +136,11 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path):
 def test_what_another_process_works_on_is_left_to_it(tmp_path):
     work, training = Notes(), LEAVES[0].trainings[0]
     need = [leaf for leaf in LEAVES if training in leaf.trainings]
-    work.elsewhere = {"aligned", training.key, LEAVES[-1].file}
+    work.elsewhere = {"coarse", training.key, LEAVES[-1].file}
 
     def pause(seconds):  # meanwhile the other one finishes a thing
         assert seconds == PAUSE and work.elsewhere
-        name = "aligned" if "aligned" in work.elsewhere else min(work.elsewhere)
+        name = "coarse" if "coarse" in work.elsewhere else min(work.elsewhere)
         work.elsewhere.remove(name)
         if name == LEAVES[-1].file:
             (tmp_path / name).write_text(json.dumps({"identity": LEAVES[-1].identity}))
@@ -150,13 +150,13 @@ def test_what_another_process_works_on_is_left_to_it(tmp_path):
     result, _ = run(work, tmp_path, pause=pause)
     assert 1 < len(need) < len(LEAVES) - 1 and LEAVES[-1] not in need
     assert result.found == [LEAVES[-1].file] and sorted(result.made) == sorted(leaf.file for leaf in LEAVES[:-1])
-    assert not {"aligned", training.key, LEAVES[-1].file} & set(work.calls)
+    assert not {"coarse", training.key, LEAVES[-1].file} & set(work.calls)
     assert {leaf.file for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
 
 
 def test_a_claim_is_one_process_alone_and_ends_with_it(tmp_path):
     one, other = Work(tmp_path), Work(tmp_path)
-    with one.claim("own") as first, other.claim("own") as second, other.claim("aligned") as third:
+    with one.claim("own") as first, other.claim("own") as second, other.claim("coarse") as third:
         assert first and not second and third
     with other.claim("own") as again:
         assert again

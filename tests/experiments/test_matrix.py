@@ -73,11 +73,11 @@ def test_mistakes_are_one_sentence(words, sentence, capsys):
 def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, capsys):
     for size in (plan.FULL, plan.QUICK):
         work.check_objects(size)
-    for changes in (["own=150"], ["aligned=100", "objects=180"]):
+    for changes in (["own=150"], ["coarse=100", "objects=180"]):
         words = ["--work", str(tmp_path / "work"), "--jobs", "2", "--minutes", "0.01", "--set", *changes]
         assert matrix.main(words) == 1
         error = capsys.readouterr().err
-        assert re.search(r"the object .* would be in \w+ of own and in \w+ of aligned: give both", error)
+        assert re.search(r"the object .* would be in \w+ of own and in \w+ of (fine|coarse): give both", error)
         assert len(error.splitlines()) == 1 and not (tmp_path / "work").exists()
         mended = int(re.search(r"--set objects=(\d+)", error).group(1))
         work.check_objects(matrix.size_of(False, [*changes, f"objects={mended}"]))
@@ -125,7 +125,18 @@ def test_make_calls_it():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
-    words = ["--quick", "--set", "own=24", "aligned=24", "other=24", "objects=24", "frames=6", "steps1=2", "steps2=2"]
+    words = [
+        "--quick",
+        "--set",
+        "own=24",
+        "fine=24",
+        "coarse=24",
+        "other=24",
+        "objects=24",
+        "frames=6",
+        "steps1=2",
+        "steps2=2",
+    ]
     words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
     words += ["--real", str(tmp_path / "none.csv")]
     assert matrix.main(words) == 0, capsys.readouterr().err

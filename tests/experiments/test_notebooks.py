@@ -69,7 +69,7 @@ def test_a_run_of_ones_own_is_asked_for_in_one_line(monkeypatch, capsys, tmp_pat
 
 @pytest.mark.slow
 def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, tiny_run, compiled_once):
-    size = replace(plan.QUICK, own=24, aligned=24, other=24, objects=24, frames=6)
+    size = replace(plan.QUICK, own=24, fine=24, coarse=24, other=24, objects=24, frames=6)
     monkeypatch.setattr(page, "SIZE", size)
     monkeypatch.setenv("RUN", str(tiny_run))
     monkeypatch.setenv("DATA", str(tmp_path / "data"))

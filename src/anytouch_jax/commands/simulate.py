@@ -37,6 +37,7 @@ def run(options: Simulate) -> int:
         fields=_names(options.fields),
         size=options.size,
         units=options.units,
+        first=options.first,
     )
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)

@@ -63,7 +63,8 @@ def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, 
     if target.exists():
         return target
     (out / PARTS).mkdir(parents=True, exist_ok=True)
-    groups = [range(start, min(start + GROUP, scenes.touches)) for start in range(0, scenes.touches, GROUP)]
+    end = scenes.first + scenes.touches
+    groups = [range(start, min(start + GROUP, end)) for start in range(scenes.first, end, GROUP)]
     files = [out / PARTS / f"{i:05d}.parquet" for i in range(len(groups))]
     done = sum(len(group) for group, file in zip(groups, files, strict=True) if file.exists())
     progress(done, scenes.touches)
@@ -85,8 +86,9 @@ def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, 
 def _claim(scenes: Scenes, out: Path) -> None:
     """Note the settings in the folder, or check that they are those of the folder."""
     settings = {"version": VERSION} | dataclasses.asdict(scenes)
-    if scenes.units == "each":  # data sets older than this setting go on
-        del settings["units"]
+    for name, default in (("units", "each"), ("first", 0)):  # data sets older than these settings go on
+        if settings[name] == default:
+            del settings[name]
     text, file = json.dumps(settings, indent=2) + "\n", out / SETTINGS
     if file.exists():
         if file.read_text() == text:

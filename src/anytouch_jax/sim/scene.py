@@ -37,7 +37,9 @@ class Scenes:
     the deepest press; `vision` and `text`, the shares of recordings that have a photograph and a caption; `held_out`,
     the share of objects never touched in training, by whole (primitive, texture) pairs; `fields` of FIELDS are written
     beside the images. `units` each: every recording by a device of its own; one: one device of each sensor for all,
-    mounted straight, as on the paper's calibrated platform. Raises UserError for what cannot be simulated.
+    mounted straight, as on the paper's calibrated platform. `first`: the number of the first touch; data sets of one
+    seed and number of objects whose numbers do not overlap share objects and splits, and no touch. Raises UserError
+    for what cannot be simulated.
     """
 
     touches: int = 400
@@ -54,6 +56,7 @@ class Scenes:
     fields: tuple[str, ...] = ()
     size: int = 224
     units: Literal["each", "one"] = "each"
+    first: int = 0
 
     def __post_init__(self) -> None:
         for name in self.sensors:
@@ -76,8 +79,9 @@ class Scenes:
                 raise UserError(f"{name} is a share between 0 and 1, not {getattr(self, name):g}")
         if self.grade not in ("fine", "coarse") or self.fidelity not in ("exact", "fast"):
             raise UserError(f"grade is fine or coarse and fidelity exact or fast, not {self.grade} and {self.fidelity}")
-        if self.seed < 0:
-            raise UserError(f"seed must be at least 0, not {self.seed}")
+        for name in ("seed", "first"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name} must be at least 0, not {getattr(self, name)}")
         if self.units not in ("each", "one"):
             raise UserError(f"units is each or one, not {self.units}")
 

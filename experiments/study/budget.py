@@ -34,10 +34,12 @@ def of_training(one: Training) -> float:
     if config.stage == 1:
         step = 1.15 * picture * batch / 64
     else:
-        parts = (1.2, 0.3 * bool(config.model.image), 3.0 * matches(one))
+        touches = (0.7 if config.model.match_head == "cosine" else 1.0) * config.objective.match_keep
+        parts = (1.2, 0.3 * bool(config.model.image), 3.0 * touches * matches(one))
         step = (sum(parts) * picture + 0.2 * bool(config.model.text)) * batch / 32
-    toy = config.model.touch.width < 100
-    return (START + steps * step) * (_TOY if toy else 1.0)
+    stack = config.model.touch
+    share = max(_TOY, stack.width**2 * stack.depth / (192**2 * 6))  # of the work of preset tiny
+    return (START if share > _TOY else START * _TOY) + steps * step * share
 
 
 def matches(one: Training) -> bool:

@@ -58,7 +58,7 @@ class Size:
     image: int = 84
     steps1: int = 150
     batch1: int = 48
-    steps2: int = 300
+    steps2: int = 260
     batch2: int = 64
     rate1: float = 1e-3
     rate2: float = 1e-3

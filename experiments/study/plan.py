@@ -77,7 +77,7 @@ class Size:
 
 FULL = Size()
 QUICK = Size(
-    "quick", own=60, fine=24, coarse=24, other=48, objects=24, pixels=64, image=56, steps1=6, batch1=16, steps2=4,
+    "quick", own=48, fine=24, coarse=24, other=36, objects=24, pixels=64, image=56, steps1=6, batch1=16, steps2=4,
     batch2=8, seeds=(0,), refits=2, max_rows=300, embed=32, stack=Stack(32, 2, 2, 64), decoder=Stack(16, 1, 2, 32),
 )  # fmt: skip
 

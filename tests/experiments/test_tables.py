@@ -89,21 +89,22 @@ def section(text, title):
 def test_ablations_that_hurt_agree(rendered):
     text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"))
     lines = [line for line in section(text, "Ablations (Table 6)").splitlines() if line.startswith("- ")]
-    assert len(lines) == len(TABLE6) - 1 == 8
+    assert len(lines) == 2 * (len(TABLE6) - 1) == 16  # of materials, and of forms
     for line in lines:
         assert "**the sign agrees**" in line, line
     stage1 = next(line for line in lines if "w/o stage 1" in line)  # OF 2.0 rises by 0.06 in the paper
     assert re.search(r"unseen sensor, other data -5\.\d+ \([^)]*\)\.$", stage1)  # of a column no sign is told
-    # Q1 5 x 4, Q2 10, Q3 2 + 4 + 6 static and 3 x 4 dynamic, ablations 8 x 4, grasp 1, dynamics 4
-    assert "Of 91 columns the paper has a sign and these results an interval; about 5 of so many leave" in text
-    assert "| Ablations (Table 6) | 8 | 0 | 0 | 0 | 0 |" in text
+    # Q1 2 x 5 x 4, Q2 10, Q3 2 + 4 + 6 static, 2 + 2 + 4 of forms and 3 x 4 dynamic, ablations 2 x 8 x 4, grasp 1,
+    # dynamics 4
+    assert "Of 151 columns the paper has a sign and these results an interval; about 8 of so many leave" in text
+    assert "| Ablations (Table 6) | 16 | 0 | 0 | 0 | 0 |" in text
 
 
 def test_ablations_that_help_do_not_agree_and_others_are_undecided(rendered):
     text, _ = rendered(lambda question, name: 0.05 * (name == "no_text"))
     lines = section(text, "Ablations (Table 6)")
     assert "- w/o text against AnyTouch: **the sign does not agree**" in lines
-    assert "| Ablations (Table 6) | 0 | 1 | 7 | 0 | 0 |" in text
+    assert "| Ablations (Table 6) | 0 | 2 | 14 | 0 | 0 |" in text
 
 
 def test_views_of_one_model_are_shown_and_not_counted(rendered):

@@ -58,7 +58,7 @@ def work(tmp_path):
 
 
 def test_a_training_on_other_data_is_not_finished_and_is_begun_anew(work, trainer):
-    sets = {"own", "aligned", "other"}
+    sets = {"own", "fine", "coarse", "other"}
     assert work.ready(LEAF) == sets
     for one in LEAF.trainings:
         work.train(one)
@@ -77,7 +77,7 @@ def test_what_does_not_say_of_what_it_is_counts_for_nothing(work, trainer):
         about = json.loads(path.read_text())
         del about["of"]
         path.write_text(json.dumps(about))
-    assert work.ready(LEAF) == {"own", "aligned"}
+    assert work.ready(LEAF) == {"own", "fine", "coarse"}
 
 
 def test_the_time_of_an_interrupted_training_is_that_of_all_its_parts(work, trainer):

@@ -109,6 +109,22 @@ def test_only_what_is_asked_for_is_written(tmp_path):
     assert np.load(folder / rows[0]["field_path"]).shape == (12, 8, 1)
 
 
+def test_touches_from_another_number_on_are_others_of_the_same_objects(made, tmp_path):
+    later = replace(SCENES, touches=2, first=2)
+    dataset.simulate(later, tmp_path / "later")
+    number = lambda row: row["path"].split("/")[1]  # noqa: E731
+    rows = {number(row): row for row in manifests.read(tmp_path / "later" / "manifest.parquet").table.to_pylist()}
+    assert sorted(rows) == ["000002", "000003"]
+    for row in manifests.read(made / "manifest.parquet").table.to_pylist():  # touch 2 of either is one and the same
+        if number(row) in rows:
+            assert row["object"] == rows[number(row)]["object"]
+            assert (made / row["path"]).read_bytes() == (tmp_path / "later" / row["path"]).read_bytes()
+    assert '"first": 2' in (tmp_path / "later" / "dataset.json").read_text()
+    assert "first" not in (made / "dataset.json").read_text()  # data sets older than the setting go on
+    with pytest.raises(UserError, match="first 2, not None"):
+        dataset.simulate(replace(later, first=0), tmp_path / "later")
+
+
 def test_a_seed_gives_the_same_bytes_and_another_seed_does_not(made, tmp_path):
     dataset.simulate(SCENES, tmp_path / "again", threads=1)
     assert tree(tmp_path / "again") == tree(made)

@@ -33,6 +33,7 @@ def recordings(scenes, number=0):
         ({"grade": "rough"}, "grade is fine or coarse"),
         ({"units": "two"}, "units is each or one, not two"),
         ({"seed": -1}, "seed must be at least 0, not -1"),
+        ({"first": -1}, "first must be at least 0, not -1"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused(change, sentence):

@@ -35,11 +35,13 @@ CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not ag
 
 
 def parts(runs: Sequence[Run]) -> dict[str, Part]:
-    """The sections, by question. Where runs differ in what they must share there is no table, but what it is."""
+    """The sections, by question. Without runs, or where they differ in what they must share, there is no table."""
     found, kept = {}, comparable(runs)
     for name, make in (*questions.OF.items(), ("real", real_table.real)):
         wrong = differences([run.about for run in runs if run.question == name])
         found[name] = make(kept)
+        if not any(run.question == name for run in runs):
+            found[name] = found[name]._replace(text="**Not run.**")
         if wrong:
             text = f"**No table: these runs differ in what they must share ({wrong}).** Make them again in one folder."
             found[name] = Part(found[name].title, text, ())

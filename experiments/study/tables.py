@@ -180,9 +180,9 @@ def by_chance(statements: Sequence[Statement]) -> str:
     told = ("agrees", "disagrees", "undecided")
     columns = sum(part.word in told for one in statements for part in one.columns.values())
     rows = sum(one.row.word in told for one in statements)
+    few = f"about {columns / 20:.0f}" if columns >= 20 else "less than one"
     return (
-        f"Of {columns} columns the paper has a sign and these results an interval; about {columns / 20:.0f} of so many "
-        f"leave zero out\nby chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected "
+        f"Of {columns} columns the paper has a sign and these results an interval; {few} of so many leave zero out\nby chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected "
         "for that number."
     )
 

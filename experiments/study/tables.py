@@ -182,8 +182,8 @@ def by_chance(statements: Sequence[Statement]) -> str:
     rows = sum(one.row.word in told for one in statements)
     few = f"about {columns / 20:.0f}" if columns >= 20 else "less than one"
     return (
-        f"Of {columns} columns the paper has a sign and these results an interval; {few} of so many leave zero out\nby chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected "
-        "for that number."
+        f"Of {columns} columns the paper has a sign and these results an interval; {few} of so many leave zero out by\n"
+        f"chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected for that number."
     )
 
 

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.output import check_folder, check_home
 from anytouch_jax.config import UserError
 
 WORK = {
@@ -48,6 +48,15 @@ def test_a_place_that_cannot_be_is_named_before_the_work(mistake, pressed, monke
     monkeypatch.setattr(WORK[words[0]], lambda *a, **k: pytest.fail("long work began"))
     assert f"afile is a file, not a folder; choose another {option}" in mistake(*words)
     assert sorted(pressed.parent.iterdir()) == before
+
+
+def test_a_folder_of_results_is_not_made_before_there_are_any(tmp_path):
+    check_home(tmp_path / "a" / "b")
+    assert [path.name for path in tmp_path.rglob("*")] == ["a"]
+    check_home(tmp_path / "a")  # one that is there will do
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="file is a file, not a folder; choose another --out"):
+        check_home(tmp_path / "file")
 
 
 def test_the_folder_is_made_where_it_can_be(tmp_path, monkeypatch):

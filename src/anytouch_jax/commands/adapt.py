@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_use import Adapt
 
@@ -14,7 +14,7 @@ def run(options: Adapt) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_empty(options.out)
-    check_folder(options.out / "config.json")
+    check_home(options.out)
     enable_compilation_cache()
     table = manifests.read([str(path) for path in options.data])
     found = adapt(

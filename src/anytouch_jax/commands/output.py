@@ -61,6 +61,15 @@ def check_folder(path: Path, option: str = "--out") -> None:
         raise UserError(f"the folder {path.parent} cannot be written to; choose another {option}")
 
 
+def check_home(folder: Path, option: str = "--out") -> None:
+    """As `check_folder`, for a folder that will be filled after long work: its parents are made, it is not."""
+    if folder.is_dir():
+        return
+    if folder.exists():
+        raise UserError(f"{folder} is a file, not a folder; choose another {option}")
+    check_folder(folder, option)
+
+
 def write_text(text: str, path: Path) -> Path:
     """Write a report to `path`, whole or not at all; its folder is made."""
     from anytouch_jax.data.files import write_whole

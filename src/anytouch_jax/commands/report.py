@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Report
 
@@ -12,7 +12,7 @@ def run(options: Report) -> int:
     from anytouch_jax.evaluate.report import demo_report
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    check_folder(options.out / "report.md")
+    check_home(options.out)
     enable_compilation_cache()
     demo_report(
         options.data, options.stage1, options.stage2, options.out, say,

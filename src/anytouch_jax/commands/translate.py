@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Translate
@@ -48,7 +48,7 @@ def _fit(options: Translate) -> int:
     home = _home(options, options.out or options.generator, "out")
     if options.run is None or not options.data:
         raise UserError("--fit needs the encoder of --run and the pairs of --data")
-    check_folder(home / "report.json")
+    check_home(home)
     how = generator.Fit(
         steps=options.steps,
         batch=options.batch,

@@ -1,4 +1,4 @@
-"""What the README tells a user to type: commands that parse, targets that are there, Python that runs, true sizes."""
+"""What the README and the pages in docs tell a user: commands that parse, targets that are there, Python that runs."""
 
 from __future__ import annotations
 
@@ -19,13 +19,18 @@ from anytouch_jax.nn.functional import build
 
 ROOT = Path(__file__).resolve().parents[2]
 README, MAKEFILE = ((ROOT / name).read_text() for name in ("README.md", "Makefile"))
+PAGES = {
+    name: (ROOT / name).read_text()
+    for name in ("README.md", *(f"docs/{one.name}" for one in (ROOT / "docs").glob("*.md")))
+}
+TEXT = "\n".join(PAGES.values())
 PYTHON = re.findall(r"^```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 
 
 def typed(program: str) -> list[str]:
-    """What the README shows to be typed after `program`: lines of code and table cells, without comments."""
-    lines = re.findall(rf"^ {{4}}{program} (.*)$", README, re.MULTILINE)
-    cells = re.findall(rf"^\|.*?`{program} ([^`]*)`", README, re.MULTILINE)
+    """What these pages show to be typed after `program`: lines of code and table cells, without comments."""
+    lines = re.findall(rf"^ {{4}}{program} (.*)$", TEXT, re.MULTILINE)
+    cells = re.findall(rf"^\|.*?`{program} ([^`]*)`", TEXT, re.MULTILINE)
     return [re.split(r"\s+#|\s\|", line)[0].replace(" ...", "").strip() for line in (*lines, *cells)]
 
 
@@ -42,7 +47,7 @@ def test_a_command_of_the_readme_is_understood(line: str) -> None:
 
 def test_one_spelling_of_the_command() -> None:
     assert len(typed("anytouch")) > 20
-    assert README.count(".venv/bin/") == 1 and ". .venv/bin/activate" in README
+    assert TEXT.count(".venv/bin/") == 1 and ". .venv/bin/activate" in README
 
 
 @pytest.mark.parametrize("line", typed("make"))
@@ -55,7 +60,7 @@ def test_a_target_of_the_readme_is_there_and_heeds_its_variables(line: str) -> N
 
 def test_the_notebooks_named_are_those_that_are_made() -> None:
     pages = re.search(r"^PAGES +\?= (.*)$", MAKEFILE, re.MULTILINE).group(1).split()
-    told = re.search(r"make notebooks +# the pages (.*)$", README, re.MULTILINE).group(1)
+    told = re.search(r"make notebooks +# the pages (.*)$", TEXT, re.MULTILINE).group(1)
     assert told.split(", ") == pages
 
 
@@ -69,7 +74,7 @@ def test_the_table_of_presets_has_their_sizes(name: str) -> None:
     model = preset(name).model
     count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(build(model).abstract()["touch"]))
     row = f"| {model.image_size} | {model.touch.width} x {model.touch.depth} | {count / 1e6:.1f} M |"
-    assert re.search(rf"^\| `{name}`[^|]* {re.escape(row)}$", README, re.MULTILINE), row
+    assert re.search(rf"^\| `{name}`[^|]* {re.escape(row)}$", TEXT, re.MULTILINE), row
 
 
 def test_the_snippet_of_an_encoder_runs(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,3 +96,16 @@ def test_the_snippet_of_training_runs(monkeypatch: pytest.MonkeyPatch, compiled_
     exec(PYTHON[1], names)
     assert asked == [(("tiny",), {"stage": 1})] and "(B, 4, 112, 112, 3)" in PYTHON[1]
     assert names["state"].step == 1 and np.isfinite(names["metrics"]["loss"])
+
+
+@pytest.mark.parametrize("name", [*PAGES, "CONTRIBUTING.md"])
+def test_links_lead_somewhere(name: str) -> None:
+    text = PAGES.get(name) or (ROOT / name).read_text()
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        file, _, heading = target.partition("#")
+        if file.startswith("http"):
+            continue
+        found = (ROOT / name).parent / file if file else ROOT / name
+        assert found.is_file(), target
+        titles = re.findall(r"^#+ (.*)$", found.read_text(), re.MULTILINE) if heading else []
+        assert not heading or heading in [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]

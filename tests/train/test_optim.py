@@ -11,7 +11,6 @@ from train_toy import toy_config, toy_params
 
 from anytouch_jax.config import ConfigError, preset
 from anytouch_jax.train.optim import (
-    ema_params,
     flatten_names,
     learning_rate,
     match_rules,
@@ -194,16 +193,16 @@ def test_the_rate_is_given_or_follows_the_step_never_a_counter():
 def test_ema_follows_the_parameters_and_is_off_by_default():
     params = {"w": jnp.ones(2), "b": jnp.ones(2)}
     grads = random_grads(params, 6)
-    assert ema_params(run_updates(toy_config(), params, grads)[1]) is None
+    assert not run_updates(toy_config(), params, grads)[1].ema
     config = toy_config(optim={"ema": 0.9})
     tx = optimizer(config)
     state, mean = tx.init(params), jax.tree.map(np.asarray, params)
-    assert all(ema_params(state)[name] is not params[name] for name in params)  # both are donated to the step
+    assert all(state.ema[name] is not params[name] for name in params)  # both are donated to the step
     for step, grad in enumerate(grads):
         updates, state = tx.update(grad, state, params, used={"w": True, "b": step > 2}, step=step)
         params = jax.tree.map(jnp.add, params, updates)
         mean = jax.tree.map(lambda m, p: 0.9 * m + 0.1 * np.asarray(p), mean, params)
-    for name, value in ema_params(state).items():
+    for name, value in state.ema.items():
         np.testing.assert_allclose(value, mean[name], rtol=1e-6)
         assert not np.array_equal(value, params[name])
 

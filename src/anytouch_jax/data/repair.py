@@ -1,9 +1,8 @@
-"""Repairs that need no guess, made on a copy of the manifest; and where the copy may be written."""
+"""Repairs that need no guess, made on a copy of the manifest."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.checks import frame_order, identity, licence_conflicts, repeated_rows, split_leaks
 from anytouch_jax.data.edit import replace_column, select
 from anytouch_jax.data.manifest import Manifest
@@ -130,12 +128,3 @@ def _left(report: Report, result: Manifest, exchanged: np.ndarray) -> tuple[str,
         if f.level != "info" and not mended and not (f.kind == "swapped" and exchanged[f.rows].any()):
             found.append(f.sentence)
     return tuple(found)
-
-
-def write_repaired(repaired: Repaired, path: str | Path, *, in_place: bool = False) -> Path:
-    """Write the repaired manifest to a new file, whole or not at all; over one of its own only with `in_place`."""
-    target = Path(path).expanduser().resolve()
-    if target in repaired.manifest.files and not in_place:
-        raise UserError(f"{target} is the manifest itself; give another name for the repaired one")
-    manifests.write(repaired.manifest, target)
-    return target

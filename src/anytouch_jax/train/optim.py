@@ -102,7 +102,7 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
 
     `update(grads, state, params, *, used=None, step=None, learning_rate=None)`: `used` is a tree of Python bools, a
     parameter that is not used stays as it is and does not count in the clipping norm; the rate is that of `schedule`
-    at `step`, or `learning_rate` if given. So a skipped step does not shift the schedule. `ema_params` reads the EMA.
+    at `step`, or `learning_rate` if given. So a skipped step does not shift the schedule. `OptState.ema`: the average.
     """
     options, rate = config.optim, schedule(config)
 
@@ -167,8 +167,3 @@ def _adamw(
         directions.append(direction.astype(value.dtype))
         mus[k], nus[k] = mu.astype(mus[k].dtype), nu.astype(nus[k].dtype)
     return directions, count, tuple(mus), tuple(nus)
-
-
-def ema_params(opt_state: OptState) -> Tree | None:
-    """The exponential moving average of the trained parameters, or None when `optim.ema` is off."""
-    return opt_state.ema or None

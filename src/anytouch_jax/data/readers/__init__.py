@@ -62,6 +62,7 @@ class IndexReport:
     with_text: int
     with_touch: int
     license: str
+    citation: str
     commercial: bool
     skipped: dict[str, tuple[int, str]]
     notes: list[str]
@@ -79,6 +80,7 @@ class IndexReport:
             f"touch frames {self.frames:,}; {paper}",
             f"with photograph {self.with_image:,}, with text {self.with_text:,}, in a touch pair {self.with_touch:,}",
             f"licence: {self.license}; {use}",
+            f"to be cited: {self.citation}",
             *(f"left out or noted, {reason}: {count:,} (first: {one})" for reason, (count, one) in
               self.skipped.items()),
             *(f"note: {sentence}" for sentence in self.notes),
@@ -185,6 +187,7 @@ def _report(one: Reader, target: Path, manifest: manifests.Manifest, notes: Note
         with_text=int(manifest.present("text").sum()),
         with_touch=int(manifest.present("touch").sum()),
         license=one.license,
+        citation=one.citation,
         commercial=one.commercial,
         skipped=dict(sorted(notes.skipped.items())),
         notes=notes.said,

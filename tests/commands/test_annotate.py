@@ -102,6 +102,14 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
         monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
         monkeypatch.setattr("builtins.input", lambda _: "no")
         assert "not confirmed" in mistake(*words)
+        monkeypatch.setattr("builtins.input", lambda _: (_ for _ in ()).throw(EOFError))  # Ctrl-D
+        assert "not confirmed" in mistake(*words)
+        for wrong, told in (
+            (["--timeout", "-1"], "timeout -1.0 must be above 0"), (["--tries", "0"], "tries 0"),
+            (["--limit", "0"], "limit 0 must be at least 1"), (["--out", "captions.txt"], "ends in .csv or .parquet"),
+            (["--url", "http://127.0.0.1:9/\u00e9/v1"], "is not an http or https address"),
+        ):  # fmt: skip
+            assert told in mistake(*words, *wrong)
         assert server.heads == [] and not (tmp_path / "touch_captions.parquet").exists()
         monkeypatch.setattr("builtins.input", lambda _: "y")
         assert anytouch(*words).status == 0 and len(server.heads) == 3

@@ -75,6 +75,19 @@ def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, told):
     assert pressed.read_bytes() == before
 
 
+def test_known_contact_may_be_true_or_false_and_nothing_else(anytouch, mistake, pressed, tmp_path):
+    table = manifests.read(pressed).table
+    columns = {name: table[name].to_pylist() for name in table.column_names}
+    columns["label.contact"] = ["False", "True", None, *["0"] * 7]
+    manifests.write(manifests.from_columns(columns, tmp_path / "words.csv"), tmp_path / "words.csv")
+    assert anytouch("contact", tmp_path / "words.csv", "--out", tmp_path / "m.parquet").status == 0
+    assert contacts(tmp_path / "m.parquet") == [0, 1, 0, *[0] * 7]
+    columns["label.contact"][4] = "yes"
+    manifests.write(manifests.from_columns(columns, tmp_path / "words.csv"), tmp_path / "words.csv")
+    told = mistake("contact", tmp_path / "words.csv")
+    assert "row 4 of" in told and "must be a number, true or false, is 'yes'" in told
+
+
 def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):
     assert "there is no manifest" in mistake("contact", tmp_path / "no.parquet")
 

@@ -161,6 +161,19 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
     assert "photograph" in _words(server.asked[0])
 
 
+def test_one_photograph_of_an_object_is_asked_about_once(make, tmp_path):
+    rows = [
+        row | {"dataset": "tacquad", "touch": f"place{i // 3}", "image_path": "mug.png"}
+        for i, row in enumerate(_rows())
+    ]
+    loose = make(rows)
+    told = []
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers", confirm=lambda estimate: told.append(estimate) or True)
+    assert len(server.asked) == done.asked == told[0].questions == 1
+    assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
+
+
 def test_a_touch_by_two_sensors_has_one_caption_and_pictures_are_made_small(make, tmp_path):
     rows = _rows(2, "tacquad", touch="place")
     rows += [{"sequence": "alone", "dataset": "tacquad", "image_path": "big.png"}]

@@ -105,6 +105,18 @@ def test_cut_files_are_named(tmp_path, suffix, share):
         images.decode(path)
 
 
+def test_a_jpeg_with_a_trailer_or_a_thumbnail_is_whole(tmp_path):
+    whole = _encoded(".jpg")
+    for seed in range(5):  # phones append films; markers stand in them by chance
+        path = tmp_path / f"{seed}.jpg"
+        path.write_bytes(whole + np.random.default_rng(seed).bytes(200_000) + b"\xff\xda")
+        np.testing.assert_array_equal(images.decode(path), images.decode_bytes(whole, "whole"))
+    thumbnail = b"\xff\xe1" + (len(whole) + 2).to_bytes(2) + whole  # an EXIF segment with a picture in it
+    path.write_bytes(whole[:2] + thumbnail + whole[2 : len(whole) * 2 // 3])
+    with pytest.raises(images.ImageError, match="cut short"):
+        images.decode(path)
+
+
 def test_files_that_are_no_pictures_are_named(tmp_path):
     (tmp_path / "text.jpg").write_text("not a picture at all")
     corrupt = bytearray(_encoded(".png"))

@@ -387,6 +387,8 @@ def test_tokenizers(make, settings, tmp_path):
     assert any("trained on the captions" in note for note in loader.notes)
     given = text.train([row["text"] for row in rows], 300)
     given.save(tmp_path)
+    silent = Loader(make([{"image_path": f"v{i}.png"} for i in range(4)], "silent"), config, tokenizer=given)
+    assert not len(silent.batch(0).align.text)  # a manifest without captions, as CLIP's tokenizer meets it
     first = Loader(manifest, config, tokenizer=given)
     assert first.tokenizer is given and first.notes != loader.notes
     second = Loader(manifest, settings(2, tokenizer=str(tmp_path)))

@@ -76,6 +76,8 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
         (GOOD.replace(",split", ",slit"), ["lacks the column 'split'", "slit"]),
         (GOOD.replace("s,2,train", "s,two,train"), ["row 1", "'frame_index'", "whole number", "'two'"]),
         (GOOD.replace("s,2,train", "s,2.5,train"), ["row 1", "'frame_index'", "'2.5'"]),
+        (GOOD.replace("s,2,train", "s,1e30,train"), ["row 1", "'frame_index'", "'1e30'"]),
+        (GOOD.replace("s,2,train", "s,1_0,train"), ["row 1", "'frame_index'", "'1_0'"]),
         (GOOD.replace("s,2,train", "s,,train"), ["row 1", "'frame_index' is empty"]),
         (GOOD.replace("c.png", "  "), ["row 2", "'path' is empty"]),
         (GOOD.replace("test", "tset"), ["row 2", "'split'", "tset", "background"]),
@@ -119,8 +121,13 @@ def test_types_in_memory_are_enforced(tmp_path):
     for bad in ({"sequence": [3]}, {"frame_index": [0.5]}, {"frame_index": [[1]]}, {"commercial": [2]}, {"text": [1]}):
         with pytest.raises(m.ManifestError, match=f"column {next(iter(bad))!r}"):
             m.from_columns({**good, **bad}, tmp_path / "x.csv")
-    with pytest.raises(m.ManifestError, match="make no table"):
-        m.from_columns({**good, "split": ["train", "val"]}, tmp_path / "x.csv")
+    for odd in ({"split": ["train", "val"]}, {"frame_index": [10**20]}):
+        with pytest.raises(m.ManifestError, match="make no table"):
+            m.from_columns({**good, **odd}, tmp_path / "x.csv")
+    for name, cell in (("a", "soft"), ("b", ["soft"])):
+        m.write(m.from_columns({**good, "label.x": [cell]}, tmp_path / f"{name}.parquet"), tmp_path / f"{name}.parquet")
+    with pytest.raises(m.ManifestError, match="cannot be joined"):
+        m.read([tmp_path / "a.parquet", tmp_path / "b.parquet"])
 
 
 def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):

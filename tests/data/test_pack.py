@@ -3,6 +3,7 @@ import json
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -93,13 +94,16 @@ def test_every_file_is_stored_once_and_unchanged(make, tmp_path):
 
 
 def test_a_shard_is_what_the_hub_reads(make, tmp_path):
-    pack(make(_shuffled([row | {"license": "MIT"} for row in _rows()])), tmp_path / "out")
+    loose = make(_shuffled([row | {"license": "MIT"} for row in _rows()]))
+    score = pyarrow.array(np.arange(len(loose)), pyarrow.float32())  # as `anytouch contact` writes it
+    pack(replace(loose, table=loose.table.append_column("label.contact_score", score)), tmp_path / "out")
     shard = pyarrow.parquet.ParquetFile(tmp_path / "out" / "touch" / "00000.parquet")
     schema = shard.schema_arrow
     assert schema.field("image").type == pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
     features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
     assert features["image"] == {"_type": "Image"} and set(features) == set(schema.names)
     assert features["frame_index"] == {"dtype": "int64", "_type": "Value"}
+    assert features["label.contact_score"] == {"dtype": "float32", "_type": "Value"}
     table = shard.read()
     order = list(zip(table["sequence"].to_pylist(), table["frame_index"].to_pylist(), strict=True))
     assert [frame for _, frame in order] == list(range(6)) * 4  # contiguous by sequence, in time
@@ -232,6 +236,11 @@ def test_other_folders_are_not_touched(make, tmp_path):
         pack(select(loose, np.arange(5)), tmp_path / "out")
     with pytest.raises(PackError, match="another manifest or shard size"):
         pack(loose, tmp_path / "out", shard_bytes=7)
+    for spoiled in ('{"version"', "[1]"):
+        (tmp_path / "bad").mkdir(exist_ok=True)
+        (tmp_path / "bad" / "pack.json").write_text(spoiled)
+        with pytest.raises(PackError, match=r"pack\.json is not of a pack"):
+            pack(loose, tmp_path / "bad")
     with pytest.raises(PackError, match="at least 1 byte"):
         pack(loose, tmp_path / "new", shard_bytes=0)
 

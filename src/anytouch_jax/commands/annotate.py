@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anytouch_jax.commands.output import beside, check_folder, write_new
+from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Annotate
@@ -29,8 +29,8 @@ def run(options: Annotate) -> int:
 
     manifest = manifests.read(options.manifest)
     target = options.out or beside(options.manifest, "captions")
-    if target.expanduser().resolve() in manifest.files:
-        raise UserError(f"{target} is the manifest that was read; name another file with --out")
+    if not options.estimate:
+        check_new(manifest, target)
     if options.sheet is not None:
         check_folder(options.sheet, "--sheet")
     if options.captions is not None:
@@ -82,7 +82,10 @@ def _consent(options: Annotate, estimate: Estimate) -> bool:
         return True
     if not sys.stdin.isatty():
         raise UserError("nobody is there to confirm this; add --yes, or --estimate to see the estimate only")
-    return input("Ask now? [y/N] ").strip().lower() in ("y", "yes")
+    try:
+        return input("Ask now? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
 
 
 def _tell(found: Annotated) -> None:

@@ -19,6 +19,7 @@ def run(options: Contact) -> int:
         check_new(manifest, target)
     if options.picture is not None:
         check_folder(options.picture, "--picture")
+    contact.known_contact(manifest)  # a word that is no number is told before the work
     limits = dict(options.threshold)
     scores = contact.contact_scores(manifest, workers=options.threads)
     marked, report = contact.mark_contact(manifest, scores, thresholds=limits, drop=options.drop)

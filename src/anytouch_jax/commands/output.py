@@ -25,6 +25,7 @@ def check_new(manifest: Manifest, path: Path) -> Path:
     if target in manifest.files:
         raise UserError(f"{target} is the manifest that was read; name another file")
     manifests.check_target(manifest, target)
+    check_folder(target)
     return target
 
 

@@ -108,16 +108,23 @@ def annotate(
     """
     if threads < 1 or side < 16:
         raise AnnotateError(f"threads {threads} must be at least 1 and side {side} at least 16")
+    if limit is not None and limit < 1:
+        raise AnnotateError(f"limit {limit} must be at least 1; leave it away for all captions")
     exposed = endpoint.exposes_key  # a mistake in the address is told at once; a key is needed only to ask
     store = _Store(Path(folder).expanduser().resolve())
     found = find_jobs(manifest, split=split, families=families, overwrite=overwrite, second_image=second_image)
     run = _Run(manifest, endpoint, store, side)
     jobs = found.jobs[:limit]
     keys = run.keys(jobs, threads)
-    lacking = [(job, key) for job, key in zip(jobs, keys, strict=True) if key and key not in store.answers]
+    asking: dict[str, Job] = {}  # equal questions about equal pictures are one
+    for job, key in zip(jobs, keys, strict=True):
+        if key and key not in store.answers:
+            asking.setdefault(key, job)
+    lacking = [(job, key) for key, job in asking.items()]
     if say and exposed:
         say(f"the key travels unencrypted to {endpoint.url}; use https")
-    estimate = _estimate([job for job, _ in lacking], len(jobs) - len(lacking), side, price_in, price_out)
+    cached = sum(key in store.answers for key in keys)
+    estimate = _estimate([job for job, _ in lacking], cached, side, price_in, price_out)
     if lacking and not confirm(estimate):
         raise AnnotateError("not confirmed: nothing was asked")
     lacking.sort(key=lambda one: one[1] in store.failed)  # what failed the last time bars no other question

@@ -100,7 +100,10 @@ def repeated_rows(manifest: Manifest, same: np.ndarray) -> np.ndarray:
 
 
 def _codes(column: pa.ChunkedArray) -> pa.Array:
-    return column.cast(pa.string()).combine_chunks().dictionary_encode().indices
+    plain = (
+        column if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type) else column.cast(pa.string())
+    )
+    return plain.combine_chunks().dictionary_encode().indices
 
 
 def duplicates(manifest: Manifest, found: Scan) -> Iterator[Finding]:

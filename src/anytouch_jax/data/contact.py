@@ -135,9 +135,8 @@ def mark_contact(
     contact = np.where(np.isnan(score), np.nan, score > limits)
     background = np.asarray(manifest.table["split"].to_pylist(), object) == "background"
     contact[background] = 0  # what the split says
-    if "label.contact" in manifest.table.column_names:
-        given = np.array([np.nan if one is None else float(one) for one in manifest.table["label.contact"].to_pylist()])
-        contact = np.where(np.isnan(given), contact, given > 0)
+    given = known_contact(manifest)
+    contact = np.where(np.isnan(given), contact, given > 0)
     free = contact == 0
     table = _set(manifest.table, "label.contact_score", pa.array(score, pa.float32(), mask=np.isnan(score)), keep=True)
     column = pa.array(np.nan_to_num(contact).astype(np.int64), pa.int64(), mask=np.isnan(contact))
@@ -189,6 +188,24 @@ def _scale(picture: np.ndarray) -> np.ndarray:
 
 def _close(picture: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(picture, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT)))
+
+
+def known_contact(manifest: Manifest) -> np.ndarray:
+    """`label.contact` of every row as f64 (rows,), NaN where it is not known. Raises UserError for another word."""
+    words = {"true": 1.0, "false": 0.0}
+    found = np.full(len(manifest), np.nan)
+    if "label.contact" not in manifest.table.column_names:
+        return found
+    for row, value in enumerate(manifest.table["label.contact"].to_pylist()):
+        if value is None:
+            continue
+        word = str(value).strip().lower()
+        try:
+            found[row] = words[word] if word in words else float(word)
+        except ValueError:
+            what = f"column 'label.contact' must be a number, true or false, is {value!r}"
+            raise UserError(f"{manifest.where(row)}: {what}") from None
+    return found
 
 
 def _score(frame: np.ndarray, background: np.ndarray) -> float:

@@ -90,6 +90,9 @@ def _read(path: Path) -> pa.Table:
 
 
 def _captions(table: pa.Table, key: str, text: str, path: Path) -> dict[str, str]:
+    twice = [name for name in (key, text) if table.column_names.count(name) > 1]
+    if twice:
+        raise UserError(f"{path} has the column {twice[0]!r} twice")
     try:
         keys, texts = table[key].cast(pa.string()).to_pylist(), table[text].cast(pa.string()).to_pylist()
     except pa.ArrowException:

@@ -61,13 +61,19 @@ class Endpoint:
     json_mode: bool = True
     token_field: str = "max_tokens"
 
+    def __post_init__(self) -> None:
+        if not 0 < self.timeout <= 86_400:
+            raise EndpointError(f"timeout {self.timeout} must be above 0 seconds and at most 86,400")
+        if self.tries < 1 or self.max_tokens < 1:
+            raise EndpointError(f"tries {self.tries} and max-tokens {self.max_tokens} must be at least 1")
+
     @property
     def address(self) -> str:
         """The address that questions go to. Raises EndpointError for one that is no http(s) address."""
         url = self.url.rstrip("/")
         try:
             parts = urllib.parse.urlsplit(url)
-            good = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+            good = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and url.isascii()
         except ValueError:
             good = False
         if not good:

@@ -68,8 +68,8 @@ def _unpack(data: bytes) -> np.ndarray:
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
     if size[0] * size[1] > MAX_PIXELS:
         raise ValueError(f"it declares {size[0]} x {size[1]} pixels, more than the limit of {MAX_PIXELS}")
-    # OpenCV fills the lost part of some cut JPEG files with grey; in a whole one no scan begins after the end marker.
-    if data[:2] == b"\xff\xd8" and data.find(b"\xff\xda", max(0, data.rfind(b"\xff\xd9"))) >= 0:
+    # OpenCV fills the lost part of some cut JPEG files with grey.
+    if data[:2] == b"\xff\xd8" and data.find(b"\xff\xd9", _jpeg_scan(data)) < 0:
         raise ValueError("the file is cut short")
     jpeg = data[:2] == b"\xff\xd8" and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
     try:
@@ -175,6 +175,16 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             return width, height
         else:
             at += 2 + length
+
+
+def _jpeg_scan(data: bytes) -> int:
+    """Where the first scan begins. No end marker stands in a scan, but one may in what is before it (a thumbnail)."""
+    at = 2
+    while data[at : at + 2] != b"\xff\xda":
+        if at + 4 > len(data) or data[at] != 0xFF:
+            raise ValueError("the file is cut short")
+        at += 1 if data[at + 1] == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4])
+    return at
 
 
 def _tiff_size(data: bytes) -> tuple[int, int]:

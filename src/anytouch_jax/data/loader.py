@@ -208,7 +208,7 @@ class Loader:
         tower = self.config.model.text
         if tower is None or self.tokenizer is None:
             return 0
-        captions = self.manifest.table.column("text").unique().drop_null().to_pylist()
+        captions = self.manifest.column("text").unique().drop_null().to_pylist()
         return min(tower.length, -(-self.tokenizer.longest(captions) // 8) * 8)
 
     def _texts(self, pool: Pool) -> int:

@@ -189,19 +189,19 @@ def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
     file = Path(path).expanduser().resolve()
     try:
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
-    except (pa.ArrowException, ValueError) as error:
+    except (pa.ArrowException, ValueError, OverflowError) as error:
         raise ManifestError(f"{file}: the columns make no table: {error}") from None
     return _join([typed(table, str(file))], (file,))
 
 
 def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
     clash = {name for name, kinds in _kinds(tables).items() if len(kinds) > 1}
-    # A label that is a number in one manifest and text in another becomes text in all of them.
-    same = [
-        pa.table({n: t[n].cast(pa.string()) if n in clash else t[n] for n in t.column_names}) if clash else t
-        for t in tables
-    ]
     try:
+        # A label that is a number in one manifest and text in another becomes text in all of them.
+        same = [
+            pa.table({n: t[n].cast(pa.string()) if n in clash else t[n] for n in t.column_names}) if clash else t
+            for t in tables
+        ]
         table = pa.concat_tables(same, promote_options="permissive")
     except pa.ArrowException as error:
         raise ManifestError(f"{', '.join(map(str, files))} cannot be joined: {error}") from None

@@ -36,7 +36,9 @@ GROUPS = {"touch": ("path",), "shared": _PICTURES, "field": ("field_path",)}
 SHARD_BYTES = 256 << 20
 _GROUP_ROWS, _GROUP_BYTES = 64, 8 << 20  # of a row group: what a viewer reads at once
 _VERSION = 1
-_FEATURES = {pa.string(): "string", pa.int64(): "int64", pa.bool_(): "bool", pa.float64(): "float64"}
+_FEATURES = {pa.string(): "string", pa.bool_(): "bool"}
+_FEATURES |= {kind: str(kind) for kind in (pa.int8(), pa.int16(), pa.int32(), pa.int64())}
+_FEATURES |= {pa.float32(): "float32", pa.float64(): "float64"}
 
 
 class PackError(UserError):
@@ -115,7 +117,10 @@ def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: b
     """Take the folder for this plan, or find that it is its own from an earlier run."""
     mark = folder / "pack.json"
     if mark.is_file():
-        old = json.loads(mark.read_text(encoding="utf-8"))
+        try:
+            old = dict(json.loads(mark.read_text(encoding="utf-8")))
+        except (ValueError, TypeError):
+            raise PackError(f"{mark} is not of a pack; choose another folder") from None
         files = old.pop("files", None)
         if old != plan:
             raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")

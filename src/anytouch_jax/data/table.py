@@ -193,7 +193,7 @@ def _plain(kind: pa.DataType) -> str:
 
 
 def _parse_whole(value: Any) -> None:
-    if float(value) != int(float(value)):
+    if "_" in str(value) or float(value) != int(float(value)) or abs(float(value)) >= 2**63:
         raise ValueError
 
 

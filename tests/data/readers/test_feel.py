@@ -93,6 +93,10 @@ def test_json_splits_and_an_object_in_both(tmp_path, read):
     _tree(tmp_path)
     (tmp_path / "split_0.json").write_text(json.dumps({"train": ["mug"], "test": ["blue bär"]}))
     assert read("feel").report.splits["test"] == 4
+    for wrong in (None, "mug"):
+        (tmp_path / "split_0.json").write_text(json.dumps({"train": wrong, "test": []}))
+        with pytest.raises(UserError, match="expected the lists 'train' and 'test'"):
+            read("feel")
     (tmp_path / "split_0.json").write_text(json.dumps({"train": ["mug"], "test": ["mug"]}))
     with pytest.raises(UserError, match="the object mug is in train and in test"):
         read("feel")

@@ -213,3 +213,15 @@ def test_a_folder_that_leads_elsewhere_is_refused(tmp_path):
     with pytest.raises(UserError, match="leads out of"):
         index("ycb_slide", tmp_path / "root")
     assert not list((tmp_path / "root").glob("*.parquet"))
+
+
+def test_photographs_that_lie_elsewhere_are_refused(tmp_path):
+    for name in ("tac", "rgb"):
+        (tmp_path / f"images_{name}").mkdir()
+        (tmp_path / f"images_{name}" / f"image_0_{name}.jpg").write_bytes(b"x")
+    root = tmp_path / "root" / "ssvtp"
+    root.mkdir(parents=True)
+    (tmp_path / "images_tac").rename(root / "images_tac")
+    (root / "images_rgb").symlink_to(tmp_path / "images_rgb")
+    with pytest.raises(UserError, match="images_rgb leads out of"):
+        index("ssvtp", tmp_path / "root")

@@ -63,9 +63,10 @@ def test_cloth_has_its_properties(tmp_path, read):
     assert table.rows[f"{base}/13/t0/gsframes/frame000002.jpg"]["label.textile_type"] is None
     assert table.reasons["cloth without properties (kept without labels)"] == 1
     assert table.reasons["video that is not unpacked (expected gelsight_frame/0000.png)"] == 1
-    (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(json.dumps({"11": [1, 2]}))
-    with pytest.raises(UserError, match="cloth '11' must have 11 numbers"):
-        read("cloth")
+    for wrong in ([1, 2], [None] * 11, [1.5] * 11, "eleven"):
+        (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(json.dumps({"11": wrong}))
+        with pytest.raises(UserError, match="cloth '11' must have 11 whole numbers"):
+            read("cloth")
 
 
 @pytest.mark.parametrize("layout", ["tactile/{}/tactile_data/{}/0/gelsight", "{}/tactile_data/{}/0/gelsight"])

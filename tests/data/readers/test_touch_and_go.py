@@ -133,3 +133,12 @@ def test_another_folder_is_refused(tmp_path, read):
     _both(tmp_path)
     with pytest.raises(UserError, match=r"expected a folder 'dataset' in .*is ROOT the folder that holds it"):
         read("touch_and_go", tmp_path / "dataset")
+
+
+def test_frames_of_a_touch_that_is_tested_are_not_trained_on(tmp_path, read):
+    _both(tmp_path)  # 24 to 28 are a test
+    _list(tmp_path, "label.txt", [(i, 3) for i in range(14, 32)])
+    table = read("touch_and_go")
+    assert {i: _at(table, i)["split"] for i in (14, 23, 24, 28, 29, 31)} == {
+        14: "train", 23: "unused", 24: "test", 28: "test", 29: "unused", 31: "unused",
+    }  # fmt: skip

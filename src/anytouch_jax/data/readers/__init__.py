@@ -132,8 +132,8 @@ def index(name: str, root: str | Path, out: str | Path | None = None, *, options
 
 def _refuse_links(manifest: manifests.Manifest, base: Path) -> None:
     """Raise UserError for a folder that is a link out of ROOT: no row of it could ever be read."""
-    folders = dict.fromkeys(path.rpartition("/")[0] for path in manifest.column("path").to_pylist())
-    for folder in folders:
+    found = (path for name in manifests.PATHS for path in manifest.column(name).unique().drop_null().to_pylist())
+    for folder in dict.fromkeys(path.rpartition("/")[0] for path in found):
         place = manifest.files[0].parent / folder
         if not place.resolve().is_relative_to(manifest.files[0].parent.resolve()):
             raise UserError(

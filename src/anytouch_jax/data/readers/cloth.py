@@ -68,9 +68,13 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
 def _labels(values: object, table: Path | None, cloth: str) -> dict[str, int]:
     if values is None:
         return {}
-    if not isinstance(values, list) or len(values) != len(PROPERTIES):
-        raise DatasetError(f"{table}: cloth {cloth!r} must have {len(PROPERTIES)} numbers, has {values}")
-    return {f"label.{name}": int(value) for name, value in zip(PROPERTIES, values, strict=True)}
+    try:
+        numbers = [float(value) for value in values if value is not None] if isinstance(values, list) else []
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != len(PROPERTIES) or numbers != [int(number) for number in numbers]:
+        raise DatasetError(f"{table}: cloth {cloth!r} must have {len(PROPERTIES)} whole numbers, has {values}")
+    return {f"label.{name}": int(number) for name, number in zip(PROPERTIES, numbers, strict=True)}
 
 
 READER = Reader(

@@ -161,7 +161,7 @@ def numbered(files: Sequence[str], pattern: str, notes: Notes, where: str) -> Fr
     frames: dict[int, str] = {}
     for name in files:
         found = match(name)
-        if not found:
+        if not found or len(found[1]) > 18:  # a manifest holds numbers of 64 bits
             notes.skip("file that is not a frame by its name", f"{where}/{name}")
         elif int(found[1]) in frames:
             notes.skip("second file of one frame number", f"{where}/{name}")

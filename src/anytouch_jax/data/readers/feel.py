@@ -104,7 +104,8 @@ def _splits(base: Path, options: Options, notes: Notes) -> dict[str, str] | None
         notes.say(f"no split_{options.fold}.npy or .json: split by hash of the object")
         return None
     table = read_json(path) if path.suffix == ".json" else strings_in_pickle(path)
-    if not isinstance(table, dict) or not {"train", "test"} <= table.keys():
+    lists = table.values() if isinstance(table, dict) else ()
+    if not isinstance(table, dict) or not {"train", "test"} <= table.keys() or not all(map(_is_list, lists)):
         raise DatasetError(f"{path}: expected the lists 'train' and 'test' of object names")
     splits: dict[str, str] = {}
     for part in ("train", "val", "test"):
@@ -112,6 +113,10 @@ def _splits(base: Path, options: Options, notes: Notes) -> dict[str, str] | None
             if splits.setdefault(str(name), part) != part:
                 raise DatasetError(f"{path}: the object {name} is in {splits[str(name)]} and in {part}")
     return splits
+
+
+def _is_list(one: object) -> bool:
+    return hasattr(one, "__len__") and not isinstance(one, str | bytes | dict)
 
 
 READER = Reader(

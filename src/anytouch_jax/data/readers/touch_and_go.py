@@ -113,12 +113,14 @@ def _video(rows: Rows, notes: Notes, folder: Path, prefix: str, known: dict[int,
     for touch in _runs(there, lambda a, b: b == a + 1):
         before = frames.get(touch[0] - BEFORE)
         for run in _runs(touch, lambda a, b: known[a].split.get(task) == known[b].split.get(task)):
-            _touch(rows, prefix, frames, photos, [known[n] for n in run], run, before, task)
+            unlisted = "unused" if any(known[n].split.get(task) == "test" for n in touch) else "train"
+            split = known[run[0]].split.get(task, unlisted)  # no frame is trained on beside one of a test
+            _touch(rows, prefix, frames, photos, [known[n] for n in run], run, before, split)
     return len(there)
 
 
 def _touch(rows: Rows, prefix: str, frames: dict[int, str], photos: set[str], known: list[_Frame], run: list[int],
-           before: str | None, task: str) -> None:  # fmt: skip
+           before: str | None, split: str) -> None:  # fmt: skip
     names = [frames[number] for number in run]
     material = [frame.label.get("material") for frame in known]
     tests = ["+".join(sorted(t for t, split in frame.split.items() if split == "test")) for frame in known]
@@ -127,7 +129,7 @@ def _touch(rows: Rows, prefix: str, frames: dict[int, str], photos: set[str], kn
         sensor="gelsight",
         sequence=f"{Path(prefix).name}/{run[0]}",
         frame_index=run,
-        split=known[0].split.get(task, "train"),
+        split=split,
         image_path=[f"{prefix}/video_frame/{name}" if name in photos else None for name in names],
         background_path=before and f"{prefix}/gelsight_frame/{before}",
         **{

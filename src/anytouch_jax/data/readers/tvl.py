@@ -135,10 +135,15 @@ def _contact(folder: Path, notes: Notes) -> tuple[set[str] | None, dict[str, str
         notes.say(f"no {folder.name}/contact.json: which of its frames are contact is not known")
         return None, {}
     table = read_json(path)
-    if not isinstance(table, dict) or not isinstance(table.get("tactile"), list):
-        raise DatasetError(f"{path}: expected a list 'tactile' of contact frames")
+    lists = [table.get(name, []) for name in ("tactile", "background")] if isinstance(table, dict) else [None]
+    if "tactile" not in (table or ()) or not all(
+        isinstance(one, list) and set(map(type, one)) <= {str} for one in lists
+    ):
+        raise DatasetError(
+            f"{path}: expected a list 'tactile' of contact frames, and beside it a list 'background' or none"
+        )
     keys = [_key(one) for one in table["tactile"]]
-    return set(keys), dict(zip(keys, table.get("background", []), strict=False))
+    return set(keys), dict(zip(keys, lists[1], strict=False))
 
 
 def _tables(folder: Path, notes: Notes) -> tuple[set[str], dict[str, str]]:

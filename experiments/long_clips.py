@@ -77,10 +77,11 @@ def scores(values: np.ndarray) -> dict[str, dict[str, Any]]:
         given = (values[np.searchsorted(rows, one.rows[:, 0])], one.labels, one.groups, one.split)
         if name == "force":
             fit = probe.regression_probe(*given)
-            result[name] = {"mean": fit.r2, "low": fit.low, "high": fit.high, "test": fit.n_test}
+            result[name] = {"mean": fit.r2, "low": fit.low, "high": fit.high, "test": fit.n_test, "chance": 0.0}
         else:
             hit = probe.linear_probe(*given, seeds=0)
             result[name] = {"mean": hit.accuracy, "low": hit.low, "high": hit.high, "test": hit.n_test}
+            result[name] |= {"chance": hit.baseline, "balanced": hit.balanced_accuracy}
     return result
 
 
@@ -112,7 +113,14 @@ def milliseconds(encoder: Encoder) -> list[float]:
 # %%
 FOLDER = OUT / NAME
 FOLDER.mkdir(parents=True, exist_ok=True)
-SETTINGS = {"encoder": encoder.mark, "manifest": table.content_hash, "rows": ROWS, "rounds": ROUNDS, "batch": BATCH}
+SETTINGS = {
+    "version": 2,
+    "encoder": encoder.mark,
+    "manifest": table.content_hash,
+    "rows": ROWS,
+    "rounds": ROUNDS,
+    "batch": BATCH,
+}
 
 
 def finished(path: Path) -> dict[str, Any] | None:
@@ -166,11 +174,16 @@ body = [
      *(cell(name, one["tasks"][name]) for name in TASKS))
     for one in record
 ]  # fmt: skip
+chance = (
+    cell(name, record[0]["tasks"][name] | {"mean": record[0]["tasks"][name]["chance"], "low": None}) for name in TASKS
+)
+body.append(("*the commonest answer*", "-", "-", "-", *chance))
 tested = ", ".join(f"{name} {one['test']}" for name, one in record[0]["tasks"].items())
 text = f"""# Longer clips: what they see beside what they cost
 
 Made by `make long-clips` from the run `{time_taken["run"]}`. {time_taken["machine"]}
 Linear probes of frozen features on objects never touched in training, 95 % over test objects; moments tested: {tested}.
+An accuracy equal to that of the commonest answer is one: the probe found nothing and gives the same answer for all.
 Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
 {markdown(head, body)}

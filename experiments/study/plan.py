@@ -257,6 +257,8 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
         yield question, "untrained", None, False
         if first:
             yield question, "pixels", None, False  # no seed of theirs
+            if question == "q2":
+                yield question, "contact", None, False
     for name in ("anytouch", *ABLATIONS):
         yield "ablations", name, own(name), False
     yield "q1", "no_pretraining", whole, True

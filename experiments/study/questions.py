@@ -88,16 +88,26 @@ def _both(runs: Sequence[Run], table: Table, pairs: Sequence[Pair]) -> tuple[str
 
 def q2(runs: Sequence[Run]) -> Part:
     """Figure 4 in numbers: what each component does to the space."""
-    names = ("pixels", "untrained", "masked", "aligned", "matched", "matched_mlp")
-    # The paper in words: masked modelling draws the touches of a sensor together; alignment blends the sensors;
-    # matching mixes them wholly. Signs are of what is better: to find the touch, not to be ordered by sensor.
-    gathers = (None, None, -1, None, None, None)
-    pairs = (
-        Pair("masked modelling gathers each sensor's touches", "masked", "untrained", gathers),
-        Pair("alignment begins to blend the sensors", "aligned", "masked", (1, 1, 1, 1, None, None), (0, 1)),
-        Pair("matching mixes them: it raises retrieval", "matched", "aligned", (1, 1, 1, 1, 1, None), (0, 1)),
-    )
-    found = judge(runs, "q2", SPACE, pairs)
+    names = ("pixels", "contact", "untrained", "masked", "aligned", "matched", "matched_mlp")
+    # The paper in words: masked modelling draws the touches of a sensor together; alignment begins to blend the
+    # sensors; matching mixes them and gathers the touches of an object. Signs are of what is better: to find the
+    # touch, not to be ordered by sensor.
+    found = []
+    for label, first, second, column, sign in (
+        ("masked modelling gathers each sensor's touches", "masked", "untrained", 2, -1),
+        ("alignment begins to blend the sensors", "aligned", "masked", 2, 1),
+        ("matching mixes the sensors", "matched", "aligned", 2, 1),
+        ("matching gathers the touches of an object", "matched", "aligned", 3, 1),
+    ):
+        found += judge(runs, "q2", SPACE[column : column + 1], [Pair(label, first, second, (sign,))])
+    finds = (1, 1)
+    found += judge(runs, "q2", SPACE[:2], [
+        Pair("retrieval: alignment above masked modelling", "aligned", "masked", finds),
+        Pair("retrieval: matching above alignment", "matched", "aligned", finds),
+        Pair("retrieval: matching above no pre-training", "matched", "untrained", finds),
+        Pair("retrieval: matching above raw pixels", "matched", "pixels", finds),
+        Pair("retrieval: matching above area, place and force", "matched", "contact", finds),
+    ])  # fmt: skip
     table = Table("q2", names, SPACE)
     return Part("Q2: the space of touches (Figure 4)", f"{_chances(runs)}{block(runs, table, found)}", found)
 
@@ -110,7 +120,13 @@ def _chances(runs: Sequence[Run]) -> str:
     chance = {row["task"]: f"{100 * row['chance']:.0f} %" for row in rows}
     among = " or ".join(sorted({str(row["gallery"]) for row in rows}))
     words = ", ".join(f"{task} {value}" for task, value in chance.items())
-    return f"Retrieved among {among} touches that are nearest in place, depth and force; by chance {words}.\n\n"
+    known = [row for row in rows if row.get("nearness") is not None]
+    near = ""
+    if known:
+        near = f" of {known[0]['of']} (they lie {known[0]['nearness']:.2f} times as far as all do)"
+    return (
+        f"Retrieved among the {among} touches{near} that are nearest in place, depth and force; by chance {words}.\n\n"
+    )
 
 
 def q3(runs: Sequence[Run]) -> Part:

@@ -15,7 +15,7 @@ import numpy as np
 from anytouch_jax.config import Config
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery, retrieval, space
-from anytouch_jax.evaluate.contacts import background_difference
+from anytouch_jax.evaluate.contacts import background_difference, contact_vector
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
 from anytouch_jax.evaluate.tasks import Task
@@ -31,7 +31,7 @@ STATIC = ("material", "roughness", "hardness")
 FORM = "indenter"  # no caption names it
 DYNAMIC = ("slip", "force", "twist", "slide")
 BOTH = ("honest", "published")
-PIXELS = "pixels"
+PIXELS, CONTACT = "pixels", "contact"
 SHOWN = ("gelsight", "digit", "gelsight_mini")  # of the t-SNE, as the paper shows three
 TOUCHES = 30
 
@@ -138,21 +138,29 @@ def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
     rows = rows[np.isin(sensors[rows], plan.SENSORS)]
     if leaf.name == PIXELS:
         found = {"class token": background_difference(table, rows)}
+    elif leaf.name == CONTACT:
+        found = {"class token": contact_vector(table, rows)}
     else:
         encoder = encoder_of(leaf, work)
         both = embed_rows(encoder, table, rows, pooling="both", say=quiet)[1]
         width = encoder.config.model.embed
         found = {"class token": both[:, :width], "patches": both[:, width:]}
-    results = [row for view, values in found.items() for row in _space(table, rows, values, view)]
+    metric: retrieval.Metric = "euclidean" if leaf.name == CONTACT else "cosine"
+    results = [row for view, values in found.items() for row in _space(table, rows, values, view, metric)]
     return {"rows": results, "points": _points(table, rows, found["class token"], leaf.seed), "data": ["own"]}
 
 
-def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str) -> list[Row]:
+def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: retrieval.Metric) -> list[Row]:
     sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
     about = space.describe(values, sensors, text_column(table, "object")[rows], touch)
     fewest = min(len(np.unique(touch[sensors == one])) for one in np.unique(sensors))
     pooled = retrieval.cross_sensor_retrieval(
-        table, {view: values}, rows, gallery_size=min(retrieval.GALLERY, fewest), centre=(False,)
+        table,
+        {view: values},
+        rows,
+        gallery_size=min(retrieval.GALLERY, fewest),
+        centre=(False,),
+        metrics={view: metric},
     )[-1]
     plain = {
         "alignment": about.alignment, "uniformity": about.uniformity,
@@ -165,7 +173,7 @@ def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str) -> list[
         ("top-5", pooled.top5, pooled.top5_low, pooled.top5_high, pooled.chance5),
     ):
         about_it = {"task": name, "metric": "share", "mean": mean, "low": low, "high": high, "chance": chance}
-        found.append(shared | about_it | {"gallery": pooled.gallery})
+        found.append(shared | about_it | {"gallery": pooled.gallery, "of": fewest, "nearness": pooled.nearness})
     return found
 
 

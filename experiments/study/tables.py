@@ -11,10 +11,11 @@ import numpy as np
 from anytouch_jax.evaluate.sections import markdown
 
 from . import paper
-from .results import CLAIM, NO_SIGN, Change, Column, Run, change, spread, together, values
+from .results import CLAIM, NO_SIGN, Change, Column, Run, Seeds, change, spread, together, values
 
 TITLES = {
     "untrained": "untrained encoder", "pixels": "raw pixels, no encoder",
+    "contact": "area, place and force alone",
     "no_pretraining": "no tactile pre-training (image tower)",
     "anytouch": "AnyTouch", "unitouch": "UniTouch-style", "tlv_link": "TLV-Link-style", "t3": "T3-style",
     "static_only": "AnyTouch, stills only", "no_text": "w/o text", "no_vision": "w/o vision",
@@ -26,6 +27,9 @@ TITLES = {
     "frame_differences": "AnyTouch, frame differences too", "force_heads": "AnyTouch, force heads too",
     "left_out": "left out of training", "seen": "trained on",
 }  # fmt: skip
+
+
+UNSEEDED = ("pixels", "contact")  # models that nothing is drawn for
 
 
 class Table(NamedTuple):
@@ -65,9 +69,10 @@ def judge(runs: Sequence[Run], question: str, columns: Sequence[Column], pairs: 
     found = []
     for pair in pairs:
         sides = [
-            (values(runs, question, pair.first, one), values(runs, question, pair.second, one), one.better)
+            (mine := values(runs, question, pair.first, one), _opponent(runs, question, pair.second, one, mine),
+             one.better)
             for one in columns
-        ]
+        ]  # fmt: skip
         by_column = {
             column.title: change(first, second, expected, better)
             for column, (first, second, better), expected in zip(columns, sides, pair.expected, strict=True)
@@ -83,6 +88,12 @@ def judge(runs: Sequence[Run], question: str, columns: Sequence[Column], pairs: 
             row = together([sides[i] for i in whole], sum(np.sign(pair.expected[i] or 0) for i in whole) or None)
         found.append(Statement(pair.label, row, by_column, over))
     return found
+
+
+def _opponent(runs: Sequence[Run], question: str, name: str, column: Column, first: Seeds) -> Seeds:
+    """The values of the second of a pair; what is not trained is one number, the same for every seed of the first."""
+    found = values(runs, question, name, column)
+    return dict.fromkeys(first, next(iter(found.values()))) if found and name in UNSEEDED else found
 
 
 def against(table: Table, first: str | None, second: str | None, *, flip: float = 1.0) -> list[Pair]:
@@ -125,7 +136,18 @@ def _ours(runs: Sequence[Run], table: Table) -> str:
             cells = ["not run"] * len(table.columns)
         theirs = table.paper.get(name, (None,) * len(table.paper_titles))
         lines.append((title(name), str(len(seeds)), *cells, *("-" if one is None else f"{one:.2f}" for one in theirs)))
+    chances = [_chance(runs, table.question, column) for column in table.columns]
+    if any(one != "-" for one in chances):
+        lines.append(("*the commonest answer*", "-", *chances, *("-" for _ in table.paper_titles)))
     return markdown(head, lines)
+
+
+def _chance(runs: Sequence[Run], question: str, column: Column) -> str:
+    """What one answer for all gives on the test rows of a column of accuracies; R2 is 0 then."""
+    if column.metric == "r2":
+        return f"{0:.{column.digits}f}"
+    found = [row["chance"] for run in runs if run.question == question and (row := run.row(column)) and "chance" in row]
+    return f"{column.factor * np.mean(found):.{column.digits}f}" if found and column.metric == "accuracy" else "-"
 
 
 def _published(runs: Sequence[Run], table: Table) -> str:
@@ -164,6 +186,8 @@ def sentence(one: Statement) -> str:
     word = {"agrees": "the sign agrees", "disagrees": "the sign does not agree"}.get(row.word, row.word)
     if len(one.columns) == 1:
         return f"- {one.label}: **{word}**, {_signed(row)}."
+    wrong = [name for name, part in one.columns.items() if part.word == "disagrees" and row.word != "disagrees"]
+    columns += f". **Against the paper's sign: {', '.join(wrong)}**" if wrong else ""
     over = "all columns together" if len(one.over) == len(one.columns) else " and ".join(one.over)
     return f"- {one.label}: **{word}**, {over} {_signed(row)}. By column: {columns}."
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +251,39 @@ def test_the_cache_goes_by_content(monkeypatch, encoder, pictures, tmp_path):
     assert encoded(encoder, moved, **plain).file(1) == store.file(1)
     (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
     assert encoded(encoder, moved, **plain).file(1) != store.file(1)  # an equal table beside other pictures
+    before = encoded(encoder, moved, **plain).file(1)
+    cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))  # another photograph of the gel
+    assert encoded(encoder, moved, **plain).file(1) != before
+
+
+def test_features_that_are_no_numbers_are_refused(monkeypatch):
+    planted(monkeypatch, lambda rows: np.full((len(rows), 3), np.nan))
+    with pytest.raises(UserError, match="task material: features are NaN"):
+        battery.run(NOBODY, WORLD, ["material"])
+
+
+@pytest.mark.parametrize(("name", "value"), [("seeds", 0), ("max_rows", -3), ("frames", -1)])
+def test_counts_start_at_one(name, value):
+    with pytest.raises(UserError, match=f"{name} must be at least 1, not {value}"):
+        battery.run(NOBODY, WORLD, ["material"], **{name: value})
+
+
+def test_a_sensor_that_training_never_saw_is_told(monkeypatch):
+    planted(monkeypatch, noise)
+    some = replace(NOBODY, seen=("digit",))  # the table of the model has it
+    (found,) = battery.run(some, MANY, ["material"], seeds=1)
+    assert found["notes"] == ["universal tokens for duragel"]
+
+
+def test_classes_that_were_never_learned_are_told(monkeypatch):
+    planted(monkeypatch, noise)
+    rows = [
+        row(path=f"{i}.png", sequence=f"{i}", object=f"o{i // 2}", split="train" if i < 40 else "test",
+            label__material="ab"[i % 2] if i < 40 else "ac"[i % 2])
+        for i in range(60)
+    ]  # fmt: skip
+    (found,) = battery.run(NOBODY, table(rows), ["material"], seeds=1)
+    assert "10 test rows of classes that train lacks count as errors: c" in found["notes"]
 
 
 def test_a_broken_cache_is_made_again(monkeypatch, encoder, pictures, tmp_path):

@@ -296,6 +296,22 @@ def test_a_sensor_is_not_found_by_itself(touched: manifests.Manifest) -> None:
         cross_sensor_retrieval(with_columns(touched, sensor=["digit"] * len(touched)), features, rows, gallery_size=5)
 
 
+def test_sensors_that_share_no_touch_are_left_out_aloud(touched: manifests.Manifest) -> None:
+    """digit and gelsight felt the even touches together, gelsight and gelslim the odd ones."""
+    rows = touched.rows_of("test")
+    code, sensor = touched.codes("touch"), touched.column("sensor").to_pylist()
+    gone = {"digit": 1, "gelslim": 0}
+    rows = np.array([row for row in rows if gone.get(sensor[row]) != code[row] % 2])
+    found = cross_sensor_retrieval(touched, {"x": texture_features(touched, rows)}, rows, gallery_size=10)
+    assert {(one.query_sensor, one.gallery_sensor) for one in found[:4]} == {
+        ("digit", "gelsight"), ("gelsight", "digit"), ("gelsight", "gelslim"), ("gelslim", "gelsight"),
+    }  # fmt: skip
+    assert "digit to gelslim left out: no touch was felt by both" in found[-1].notes
+    alone = rows[np.array(sensor)[rows] != "gelsight"]
+    with pytest.raises(UserError, match="no touch was felt by two sensors"):
+        cross_sensor_retrieval(touched, {"x": texture_features(touched, alone)}, alone, gallery_size=10)
+
+
 def test_what_a_manifest_lacks_is_said(touched: manifests.Manifest) -> None:
     rows = deepest_rows(touched)
     features = {"x": texture_features(touched, rows)}

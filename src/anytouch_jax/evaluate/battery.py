@@ -77,7 +77,9 @@ def run(
         store = raw(table, order=order, folder=cache)
     else:
         store = encoded(encoder, table, pooling=pooling, join=join, order=order, universal=universal, folder=cache)
-        setting = setting._replace(scaling="column", known=frozenset(encoder.config.model.sensors))
+        setting = setting._replace(
+            scaling="column", known=frozenset(encoder.config.model.sensors if encoder.seen is None else encoder.seen)
+        )
     return _probe(store, table, tasks, setting, head_names, protocols)
 
 
@@ -121,8 +123,9 @@ def _probe(
     head_names: Sequence[HeadName],
     protocols: Sequence[Protocol],
 ) -> list[dict[str, Any]]:
-    if setting.seeds < 1:
-        raise UserError(f"seeds must be at least 1, not {setting.seeds}")
+    for what, count in (("seeds", setting.seeds), ("max_rows", setting.max_rows), ("frames", setting.frames)):
+        if count is not None and count < 1:
+            raise UserError(f"{what} must be at least 1, not {count}")
     chosen = [task_of(task) for task in tasks]
     selections = [_selected(table, task, setting) for task in chosen]
     lengths = [setting.frames or task.frames for task in chosen]
@@ -133,6 +136,8 @@ def _probe(
     for task, selection, length in zip(chosen, selections, lengths, strict=True):
         rows, names = _rows(task, selection, setting.sides)
         x = store.get(selection.rows, length)
+        if not np.isfinite(x).all():
+            raise UserError(f"task {task.name}: features are NaN or infinite; did the training diverge?")
         case = Case(x if setting.scaling == "column" else _components(x, rows), rows, names, task, setting)
         notes = [*selection.notes, *_remarks(rows, selection, setting)]
         for head in head_names:
@@ -197,6 +202,13 @@ def _remarks(rows: deals.Rows, selection: Selection, setting: Setting) -> list[s
     if setting.known is not None:
         unknown = sorted(set(selection.sensors) - setting.known)
         notes += [f"universal tokens for {', '.join(unknown)}" if unknown else ""]
+    learned, tested = rows.pool & rows.fits, rows.test & rows.tests
+    if not rows.measured and deals.scheme(rows)[0] == "split":
+        never = tested & ~np.isin(rows.y, rows.y[learned])
+        names = np.unique(selection.labels[never])
+        notes += [f"{never.sum()} test rows of classes that train lacks count as errors: {', '.join(names)}"] * bool(
+            len(names)
+        )
     return [note for note in notes if note]
 
 

@@ -42,7 +42,7 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
         found += [{"features": name} | one for one in battery.run(encoder, table, tasks, **shared, **settings)]
         say(f"probed {name}")
     if options.controls:
-        plain = {name: settings[name] for name in ("protocols", "frames") if name in settings}
+        plain = {name: settings[name] for name in ("protocols", "frames", "head_names", "recipe") if name in settings}
         found += [{"features": RAW} | one for one in battery.run(None, table, tasks, **shared, **plain)]
         say(f"probed {RAW}")
     runs = {name: dataclasses.asdict(encoder.config) for name, encoder in encoders.items()}
@@ -61,7 +61,9 @@ def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], f
     protocols = ("honest", "published") if options.protocol == "published" else ("honest",)
     settings = {"pooling": options.pooling, "join": options.join, "protocols": protocols,
                 "head_names": tuple(_names(options.heads) or ())}  # fmt: skip
-    return names or (), settings | ({"frames": options.frames} if options.frames else {}), None
+    if not names:
+        raise UserError("the manifest has no label of any task; `anytouch probe --label COLUMN` takes any column")
+    return names, settings | ({"frames": options.frames} if options.frames else {}), None
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -17,6 +18,7 @@ import numpy.typing as npt
 
 from ..config import UserError
 from ..data.evaluation import evaluation
+from ..data.files import distinct_files
 from ..data.images import decode
 from ..data.manifest import Manifest
 from ..data.packed import read_file
@@ -28,7 +30,7 @@ Array = npt.NDArray[Any]
 Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
 
-VERSION = 1  # of what is computed; a change raises it
+VERSION = 2  # of what is computed; a change raises it
 BATCH = 64
 RAW_SIZE = (240, 320)
 
@@ -175,8 +177,14 @@ def digest(encoder: Encoder) -> str:
 
 
 def pictures(table: Manifest, count: int = 32) -> str:
-    """SHA-256 over some pictures of a manifest, evenly spaced: equal tables may lie beside other pictures."""
+    """SHA-256 over what tells other pictures under an equal table: the size of every frame, the bytes of every
+    background and of some frames, evenly spaced. It is the same for a copy of the folder."""
     found = hashlib.sha256()
+    files = distinct_files(table, ("path", "background_path"))
+    for row, column in zip(files.row, files.column, strict=True):
+        with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
+            file = table.file(int(row), column)
+            found.update(read_file(file) if column == "background_path" else str(os.stat(file).st_size).encode())
     for row in np.unique(np.linspace(0, len(table) - 1, count).astype(int)):
         with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
             found.update(read_file(table.file(int(row))))

@@ -54,6 +54,8 @@ def draw_galleries(
     seeds: int = 5,
 ) -> Galleries:
     """The galleries of `retrieval.retrieve`; they depend on names, covariates and seeds, not on any order of rows."""
+    if seeds < 1:
+        raise UserError(f"seeds must be at least 1, not {seeds}")
     if gallery_size < 2:
         raise UserError(f"gallery_size {gallery_size} is too small: a gallery holds the touch and at least one other")
     query = _sorted(query_touch, query_unit, "query")

@@ -138,11 +138,16 @@ def cross_sensor_retrieval(
     drawn = {}
     for first, second in _pairs(sensors) if pairs is None else pairs:
         one, two = _rows_of(sensors, first, second)
+        if pairs is None and not np.isin(touch[one], touch[two]).any():
+            notes += (f"{first} to {second} left out: no touch was felt by both",)
+            continue
         near = None if match is None else numbers(manifest, covariates, kept[two])
         drawn[first, second] = draw_galleries(
             touch[one], touch[two], gallery_size=gallery_size, match=near, query_unit=unit[one],
             gallery_unit=unit[two], seeds=seeds,
         )  # fmt: skip
+    if not drawn:
+        raise UserError("no touch was felt by two sensors; `touch` must be equal where the same place was touched")
     results = []
     for name, centred in ((name, centred) for name in features for centred in centre):
         metric, values = (metrics or {}).get(name, "cosine"), np.asarray(features[name])[place]

@@ -1,6 +1,7 @@
 """A data set on disk: the same bytes for a seed, whole or not there, going on after an interruption."""
 
 import errno
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,6 +183,18 @@ def test_a_folder_of_something_else_is_left_alone(made, tmp_path):
     assert (tmp_path / "mine.txt").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
     with pytest.raises(UserError, match=r"holds a data set with seed 4, not 5; vision 0.5, not 0.25"):
         dataset.simulate(replace(SCENES, seed=5, vision=0.25), made)
+    (tmp_path / "dataset.json").write_text("[1]")
+    with pytest.raises(UserError, match="holds a data set with version None"):
+        dataset.simulate(SCENES, tmp_path)
+
+
+def test_settings_are_compared_by_value(made):
+    file = made / "dataset.json"
+    before = file.read_bytes()
+    file.write_text(json.dumps(json.loads(before)))  # formatted otherwise
+    same = replace(SCENES, depth=(int(SCENES.depth[0]), SCENES.depth[1])) if SCENES.depth[0] == 0 else SCENES
+    assert dataset.simulate(same, made) == made / "manifest.parquet"
+    file.write_bytes(before)
 
 
 def test_the_loader_trains_on_it(made):
@@ -199,6 +212,12 @@ def test_a_mistake_on_the_command_line_is_one_sentence(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("anytouch simulate: there is no sensor 'nose' to simulate; choose among")
     assert main(["simulate", "--out", str(tmp_path / "x"), "--depth", "-1", "1"]) == 1
     assert "depth is a range of mm" in capsys.readouterr().err and not (tmp_path / "x").exists()
+    assert main(["simulate", "--out", str(tmp_path / "x"), "--threads", "0"]) == 1
+    assert "threads must be at least 1, not 0" in capsys.readouterr().err and not (tmp_path / "x").exists()
+    (tmp_path / "file").write_text("")
+    for place in ("file", "file/below"):
+        assert main(["simulate", "--out", str(tmp_path / place), "--touches", "1"]) == 1
+        assert "is a file; give a folder" in capsys.readouterr().err
 
 
 def test_the_command_makes_a_data_set(tmp_path, capsys):

@@ -171,6 +171,8 @@ def test_it_does_not_end_while_beads_flow():
         ({"step": 0.0}, "step"),
         ({"beads": math.nan}, "beads"),
         ({"limit": 0}, "limit"),
+        ({"most": -5.0}, "most"),
+        ({"most": 200.0}, "at most 180"),
     ],
 )
 def test_a_task_that_cannot_be_done_is_refused(changes, words):

@@ -33,6 +33,9 @@ def recordings(scenes, number=0):
         ({"grade": "rough"}, "grade is fine or coarse"),
         ({"units": "two"}, "units is each or one, not two"),
         ({"seed": -1}, "seed must be at least 0, not -1"),
+        ({"depth": (0.5, 3.0)}, "depth 3 mm goes through the gel of"),
+        ({"fields": ("shear", "shear")}, "each field once"),
+        ({"held_out": -0.3}, "held_out is a share from 0 to below 1, not -0.3"),
         ({"first": -1}, "first must be at least 0, not -1"),
     ],
 )
@@ -48,6 +51,16 @@ def test_splits_share_no_pair_of_primitive_and_texture():
     assert 0.25 <= SPLITS.count("test") / len(SPLITS) < 0.4
     for part in range(2):  # every primitive and every texture of the test objects is seen in training, apart
         assert {kind[part] for kind in kinds["test"]} <= {kind[part] for kind in kinds["train"]}
+
+
+@pytest.mark.parametrize("objects", range(12, 19))
+def test_few_objects_have_a_test_set_or_say_why_not(objects):
+    try:
+        splits = scene.cast(replace(SCENES, objects=objects))[1]
+    except UserError as error:
+        assert f"--objects {objects} and --held-out 0.25: of {objects} objects only" in str(error)
+    else:
+        assert "test" in splits and splits.count("train") > splits.count("test")
 
 
 def test_objects_take_turns_and_a_seed_decides():

@@ -45,26 +45,29 @@ def test_an_open_grid_gives_what_full_arrays_give(name):
     assert full.min() >= 0 and full.max() <= 1
 
 
-@pytest.mark.parametrize(("pitch", "depth"), [(0.9, 0.12), (2.0, 0.4)])
-def test_sand_has_the_rms_and_the_correlation_length_that_it_states(pitch, depth):
-    rms, length = textures.sand_statistics(pitch, depth)
-    x, y = axes(200, length / 5)
-    found_rms, found_length = [], []
+@pytest.mark.parametrize(("texture", "pitch", "depth"), [("sand", 0.9, 0.12), ("sand", 2.0, 0.4), ("bark", 1.1, 0.3)])
+def test_roughness_has_the_rms_and_the_correlation_lengths_that_it_states(texture, pitch, depth):
+    rms, *lengths = textures.roughness(texture, pitch, depth)
+    step = min(lengths) / 5
+    x, y = axes(200, step)
+    found_rms, found_lengths = [], []
     for seed in range(6):
-        z = height(Shape("flat", "sand", 1e3, pitch, depth, seed=seed), x, y)
+        z = height(Shape("flat", texture, 1e3, pitch, depth, seed=seed), x, y)
         z = z - z.mean()
         found_rms.append(z.std())
-        spectrum = np.abs(np.fft.fft2(z)) ** 2
-        correlation = np.real(np.fft.ifft2(spectrum))
-        for line in (correlation[0, :20], correlation[:20, 0]):
-            line = line / line[0]
-            at = int(np.argmax(line < 1 / math.e))
-            share = (line[at - 1] - 1 / math.e) / (line[at - 1] - line[at])
-            found_length.append((at - 1 + share) * length / 5)
+        correlation = np.real(np.fft.ifft2(np.abs(np.fft.fft2(z)) ** 2))
+        found_lengths.append([falls(line[:100]) * step for line in (correlation[0], correlation[:, 0])])
     assert np.mean(found_rms) == pytest.approx(rms, rel=0.03)
-    assert np.mean(found_length) == pytest.approx(length, rel=0.04)
-    along_x, along_y = np.mean(found_length[::2]), np.mean(found_length[1::2])
-    assert along_x == pytest.approx(along_y, rel=0.12)  # no direction is preferred
+    np.testing.assert_allclose(np.mean(found_lengths, axis=0), lengths, rtol=0.1)
+    if texture == "sand":
+        assert np.mean(found_lengths) == pytest.approx(lengths[0], rel=0.04)
+
+
+def falls(line):
+    """Where a correlation falls to 1/e, in steps."""
+    line = line / line[0]
+    at = int(np.argmax(line < 1 / math.e))
+    return at - 1 + (line[at - 1] - 1 / math.e) / (line[at - 1] - line[at])
 
 
 def test_a_gaussian_field_is_of_unit_deviation_and_stretched_as_asked():
@@ -91,7 +94,9 @@ def test_irregularity_bends_a_pattern_by_what_it_says():
     assert textures.warped(x, y, 1.5, 0.0, 3)[0] is x
 
 
-def test_sand_without_depth_or_pitch_is_named():
+def test_roughness_without_depth_or_pitch_is_named():
     for pitch, depth in ((0.0, 0.1), (1.0, 0.0), (math.nan, 0.1)):
         with pytest.raises(UserError, match="above 0"):
-            textures.sand_statistics(pitch, depth)
+            textures.roughness("sand", pitch, depth)
+    with pytest.raises(UserError, match="weave is no random roughness; choose among sand, bark"):
+        textures.roughness("weave", 1.0, 0.1)

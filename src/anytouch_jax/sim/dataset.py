@@ -48,8 +48,12 @@ def simulate(
     and a machine. Raises UserError when `out` holds something else, or cannot be written.
     """
     out = Path(out)
+    if threads < 1:
+        raise UserError(f"threads must be at least 1, not {threads}")
     try:
         return _simulate(scenes, out, threads, progress)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UserError(f"{error.filename or out} is a file; give a folder") from None
     except OSError as error:
         raise UserError(
             f"{error.filename or out}: {error.strerror or error}; what is finished is kept, the same command goes on"
@@ -91,15 +95,15 @@ def _claim(scenes: Scenes, out: Path) -> None:
             del settings[name]
     text, file = json.dumps(settings, indent=2) + "\n", out / SETTINGS
     if file.exists():
-        if file.read_text() == text:
-            return
         try:
             held = json.loads(file.read_text())
-        except json.JSONDecodeError:
+        except ValueError:
             held = {}
-        now = json.loads(text)
+        held, now = held if isinstance(held, dict) else {}, json.loads(text)
         pairs = {name: (held.get(name), now.get(name)) for name in (*now, *held)}
         other = [f"{name} {one!r}, not {two!r}" for name, (one, two) in pairs.items() if one != two]
+        if not other:
+            return
         raise UserError(f"{out} holds a data set with {'; '.join(other)}: give another folder, or the same options")
     if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")

@@ -52,11 +52,13 @@ class Task:
     markers: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("beads", "target", "step", "rate", "back"):
+        for name in ("beads", "target", "step", "rate", "back", "most"):
             if not 0 < getattr(self, name) < math.inf:
                 raise UserError(f"{name} of a pouring task must be above 0, not {getattr(self, name)}")
         if self.target >= self.beads:
             raise UserError(f"the target of {self.target:g} g must be below the {self.beads:g} g in the cylinder")
+        if self.most > 180:
+            raise UserError(f"most, the steepest tilt of a pouring task, is at most 180 degrees, not {self.most:g}")
         if self.limit < 1:
             raise UserError(f"limit, the most actions of a run, must be at least 1, not {self.limit}")
 

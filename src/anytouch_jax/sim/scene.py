@@ -5,6 +5,7 @@ A touch is a place on an object; a recording is one sensor's clip of it: press, 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,10 +36,13 @@ class Scenes:
     `grade` fine: one place, depth and motion for all sensors, so that frames correspond one to one; coarse: by hand,
     with tilt, twist, offset, speed and motion of each sensor's own, only the place is shared. `depth` mm, the range of
     the deepest press; `vision` and `text`, the shares of recordings that have a photograph and a caption; `held_out`,
-    the share of objects never touched in training, by whole (primitive, texture) pairs; `fields` of FIELDS are written
+    the share of objects held out for test, by whole (primitive, texture) pairs (and half that share of the rest for
+    val, where enough are left; fewer than 12 objects are all trained on); `fields` of FIELDS are written
     beside the images. `units` each: every recording by a device of its own; one: one device of each sensor for all,
     mounted straight, as on the paper's calibrated platform. `first`: the number of the first touch; data sets of one
-    seed and number of objects whose numbers do not overlap share objects and splits, and no touch. Raises UserError
+    seed, number of objects and share held out whose numbers do not overlap share objects and splits, and no touch.
+    In coarse data the label `depth` is what the hand goes for: tilt and sliding change what a frame shows, as `force`
+    and `area` tell. Raises UserError
     for what cannot be simulated.
     """
 
@@ -64,6 +68,8 @@ class Scenes:
                 raise UserError(f"there is no sensor {name!r} to simulate; choose among {', '.join(SENSORS)}")
         if not self.sensors or len(set(self.sensors)) != len(self.sensors):
             raise UserError(f"name each sensor once, and at least one, not {', '.join(self.sensors) or 'none'}")
+        if len(set(self.fields)) != len(self.fields):
+            raise UserError(f"name each field once, not {', '.join(self.fields)}")
         for name in self.fields:
             if name not in FIELDS:
                 raise UserError(f"there is no field {name!r}; choose among {', '.join(FIELDS)}")
@@ -74,6 +80,12 @@ class Scenes:
             raise UserError(
                 f"depth is a range of mm from 0 on, lowest first, not {self.depth[0]:g} to {self.depth[1]:g}"
             )
+        thin = min(self.sensors, key=lambda name: SENSORS[name].gel.thickness)
+        if self.depth[1] >= SENSORS[thin].gel.thickness:
+            thick = f"{SENSORS[thin].gel.thickness:g} mm thick"
+            raise UserError(f"depth {self.depth[1]:g} mm goes through the gel of {thin}, which is {thick}")
+        if not 0 <= self.held_out < 1:
+            raise UserError(f"held_out is a share from 0 to below 1, not {self.held_out:g}")
         for name in ("vision", "text"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f"{name} is a share between 0 and 1, not {getattr(self, name):g}")
@@ -133,9 +145,13 @@ def cast(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, ...]]:
     objects = catalogue(scenes.seed, scenes.objects)
     if scenes.held_out <= 0 or scenes.objects < 12:  # too few to hold out whole pairs
         return objects, ("train",) * len(objects)
-    seen, unseen = hold_out(objects, scenes.held_out, scenes.seed)
+    try:
+        seen, unseen = hold_out(objects, scenes.held_out, scenes.seed)
+    except UserError as error:
+        raise UserError(f"--objects {scenes.objects} and --held-out {scenes.held_out:g}: {error}") from None
     held = {thing.name: "test" for thing in unseen}
-    held |= {thing.name: "val" for thing in hold_out(seen, scenes.held_out / 2, scenes.seed + 1)[1]}
+    with contextlib.suppress(UserError):  # too few are left for a validation set
+        held |= {thing.name: "val" for thing in hold_out(seen, scenes.held_out / 2, scenes.seed + 1)[1]}
     return objects, tuple(held.get(thing.name, "train") for thing in objects)
 
 

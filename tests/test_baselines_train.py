@@ -10,6 +10,7 @@ from runs import arrays_of, read_metrics, run_config, train
 from touch_world import make_touches
 
 from anytouch_jax import baselines
+from anytouch_jax.cli import main
 from anytouch_jax.evaluate.features import load_encoder
 from anytouch_jax.io import checkpoint
 from anytouch_jax.io.tree import flatten
@@ -51,3 +52,5 @@ def test_a_baseline_trains_and_embeds(data, tmp_path, compiled_once, name, stage
     assert told_apart == (name != "tlv_link")  # without tokens all sensors are one
     stored = flatten(checkpoint.load_params(tmp_path / "r")[0])
     assert ("force/kernel" in stored) == (name == "force_heads" and stage == 1)
+    if name == "force_heads":
+        assert main(["convert", str(tmp_path / "r"), str(tmp_path / "w.safetensors")]) == 0

@@ -295,6 +295,27 @@ def test_patches_that_matching_drops_have_no_influence():
     np.testing.assert_array_equal(np.sort(np.nonzero(felt)[1].reshape(4, 4), 1), np.sort(kept, 1))
 
 
+@pytest.mark.parametrize("stage", [1, 2])
+def test_no_key_is_used_twice(monkeypatch, stage):
+    """Masks, tokens and kept patches are drawn apart: a key that is used again ties them together."""
+    drawn, uniform = [], jax.random.uniform
+
+    def spy(key, *given, **options):
+        drawn.append(jax.random.key_data(key).tobytes())
+        return uniform(key, *given, **options)
+
+    monkeypatch.setattr(jax.random, "uniform", spy)
+    u8 = lambda *shape: jnp.zeros((*shape, 28, 28, 3), jnp.uint8)  # noqa: E731
+    if stage == 1:
+        batch, net, params, config, loss = TouchBatch(u8(4, 1), SENSOR), NET1, PARAMS1, CONFIG1, objectives.stage1_loss
+    else:
+        align = ALIGN._replace(clip=u8(4, 1), image=u8(len(ALIGN.image)))
+        batch = Stage2Batch(align, MatchBatch(u8(4, 1), SENSOR, u8(4, 1), SENSOR, u8(4, 1), SENSOR))
+        net, params, config, loss = NET2, PARAMS2, changed(CONFIG2, match_keep=0.5), objectives.stage2_loss
+    loss(params, batch, jax.random.key(3), jnp.asarray(0.5), net=net, config=config)
+    assert len(drawn) == len(set(drawn)) == (2 if stage == 1 else 6)
+
+
 def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
     terms = lambda p, b: objectives.stage2_terms(p, b, None, net=NET2, config=CONFIG2)[0]  # noqa: E731
     both = flops(terms, PARAMS2, Stage2Batch(ALIGN, MATCH))

@@ -9,11 +9,12 @@ if [ -n "${PROCESS:-}" ]; then
     JAX_PROCESS_ID="$PROCESS" exec "$anytouch" train "$@"
 fi
 export JAX_PLATFORMS=cpu
-for ((process = 1; process < JAX_NUM_PROCESSES; process++)); do
+for ((process = 0; process < JAX_NUM_PROCESSES; process++)); do
     JAX_PROCESS_ID="$process" "$anytouch" train "$@" &
 done
+trap 'kill -TERM $(jobs -pr) 2>/dev/null' TERM  # they save, and end
+trap 'kill -INT $(jobs -pr) 2>/dev/null' INT
 status=0
-JAX_PROCESS_ID=0 "$anytouch" train "$@" || status=$?
 while [ -n "$(jobs -pr)" ]; do
     wait -n || status=$?
 done

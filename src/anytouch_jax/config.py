@@ -15,7 +15,7 @@ from anytouch_jax.model import FIELD_SENSORS as FIELD_SENSORS
 from anytouch_jax.model import SENSORS as SENSORS
 from anytouch_jax.model import UNIVERSAL as UNIVERSAL
 from anytouch_jax.model import Model, Stack, TextTower
-from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NOT_NEGATIVE, SHARE, build, in_range
+from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NOT_NEGATIVE, SEED, SHARE, build, in_range
 from anytouch_jax.strict_json import ConfigError as ConfigError
 from anytouch_jax.strict_json import UserError as UserError
 
@@ -95,7 +95,7 @@ class Optim:
     accumulate: int = 1
 
     def __post_init__(self) -> None:
-        in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=SHARE, accumulate=COUNT)
+        in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=BELOW_1, accumulate=COUNT)
         others = ("learning_rate", "min_rate", "warmup", "eps", "weight_decay")
         in_range("--optim.", self, **dict.fromkeys(others, NOT_NEGATIVE))
 
@@ -152,7 +152,7 @@ class Run:
     fsdp: int = 1
 
     def __post_init__(self) -> None:
-        in_range("--loop.", self, steps=COUNT, keep=COUNT, fsdp=COUNT)
+        in_range("--loop.", self, seed=SEED, steps=COUNT, keep=COUNT, fsdp=COUNT)
         in_range("--loop.", self, save_every=NOT_NEGATIVE, figure_every=NOT_NEGATIVE, max_skipped=NOT_NEGATIVE)
 
 

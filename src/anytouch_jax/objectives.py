@@ -253,7 +253,7 @@ def stage2_loss(
     params: Params, batch: Stage2Batch, key: Array, progress: Array, *, net: Net, config: Config
 ) -> tuple[Array, Metrics]:
     """`stage2_terms` of a uint8 batch, masks and sensor tokens drawn from `key`; `progress` drives p_u."""
-    key_noise, key_align, key_match = jax.random.split(key, 3)
+    key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
     align, match, noise, own, metrics = batch.align, batch.match, None, None, {}
     match_noise = None
     if align is not None:
@@ -265,7 +265,7 @@ def stage2_loss(
         metrics["p_u"], match = _draw_match(match, key_match, progress, net, config)
         if config.objective.match_keep < 1:
             shape = (2 if net.model.match_head == "cosine" else 3, len(match.sensor), net.model.patches)
-            match_noise = jax.random.uniform(jax.random.fold_in(key_match, 1), shape)
+            match_noise = jax.random.uniform(key_keep, shape)
     loss, terms = stage2_terms(
         params,
         Stage2Batch(align, match),

@@ -30,6 +30,7 @@ COUNT = Range(1, math.inf, "1 or more")
 NOT_NEGATIVE = Range(0, math.inf, "0 or more")
 ABOVE_0 = Range(math.ulp(0.0), math.inf, "above 0")
 SHARE = Range(0, 1, "0 to 1")
+SEED = Range(0, 2**32 - 1, "0 to 4294967295")
 BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
 
 

@@ -10,7 +10,8 @@ import pytest
 from tiny_models import tiny_config
 
 from anytouch_jax.cli import main
-from anytouch_jax.evaluate import memory, startup, workloads
+from anytouch_jax.commands import bench
+from anytouch_jax.evaluate import memory, speed, startup, workloads
 from anytouch_jax.io import release
 from anytouch_jax.nn.functional import build
 
@@ -42,6 +43,21 @@ def test_a_table_of_numbers_of_words_and_a_figure(tiny, tmp_path, capsys):
     assert figure.read_bytes()[:4] == b"\x89PNG" and f"figures/{figure.name}" in text
     assert "Not for comparison" in text and "of its peak" in text
     assert "| bfloat16 | 1 |" in capsys.readouterr().out
+
+
+def test_what_was_measured_outlives_what_fails_later(tiny, tmp_path, capsys, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
+
+    monkeypatch.setattr(speed, "errors", fail)
+    assert run("embed", "--quick", "--out", tmp_path) == 0
+    assert "no errors, the float64 reference failed: RESOURCE_EXHAUSTED" in capsys.readouterr().err
+    (rows,) = json.loads((tmp_path / "speed.json").read_text())["results"].values()
+    assert all(row["ratio"] > 0 and row["error_output"] is None for row in rows)
+    monkeypatch.setitem(bench._SECTIONS, "loader", fail)
+    with pytest.raises(RuntimeError):
+        main(["bench", "embed", "loader", "--quick", "--out", str(tmp_path / "second")])
+    assert "embed one still" in (tmp_path / "second" / "speed.md").read_text()
 
 
 def test_loader_and_simulator(tmp_path):

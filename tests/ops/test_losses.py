@@ -102,6 +102,9 @@ def test_groups_keep_negatives_in_their_share():
     ours = info_nce(jnp.asarray(a), jnp.asarray(b), jnp.asarray(9.0), jnp.asarray(present), groups=2)
     shares = [loop_info_nce(a[s], b[s], 9.0, present[s]) for s in (slice(0, 4), slice(4, 8))]
     np.testing.assert_allclose(ours, np.mean(shares), rtol=1e-5)
+    half = present & (np.arange(8) < 4)  # the other share has no pair: 0, and it counts in the mean
+    ours = info_nce(jnp.asarray(a), jnp.asarray(b), jnp.asarray(9.0), jnp.asarray(half), groups=2)
+    np.testing.assert_allclose(ours, loop_info_nce(a[:4], b[:4], 9.0, half[:4]) / 2, rtol=1e-5)
 
 
 def test_alignment_weighs_the_pairs_and_counts_them():

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import jax
@@ -18,7 +20,7 @@ from anytouch_jax.config import ConfigError, UserError
 from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
-from anytouch_jax.train.optim import ema_params, moments
+from anytouch_jax.train.optim import moments
 from anytouch_jax.train.record import TIMING
 
 TOY = Path(__file__).parent / "train_toy.py"
@@ -108,7 +110,7 @@ def test_ema_and_clipping_go_on_too(tmp_path):
     run(tmp_path / "parts", config, batches=clips, stop_after=2)
     parts = run(tmp_path / "parts", config, batches=clips)
     assert_same(parts.state, whole.state)
-    mean = ema_params(whole.state.opt_state)["trunk"]["kernel"]
+    mean = whole.state.opt_state.ema["trunk"]["kernel"]
     assert not np.array_equal(mean, whole.params["trunk"]["kernel"])
 
 
@@ -193,9 +195,25 @@ class Clock:
         return self.now
 
 
-@pytest.mark.parametrize("busy", [False, True])
-def test_the_time_that_a_step_waits_for_its_batch_is_written(tmp_path, monkeypatch, busy):
-    """A batch takes 3 s and the rest of a step 1 s. Where the step before still runs, nothing waits."""
+class Step:
+    """A step that ends `after` seconds after it began (None: never) by that clock."""
+
+    def __init__(self, clock, after):
+        self.clock, self.after, self.pool = clock, after, contextlib.nullcontext()
+
+    def began(self, metrics):
+        self.start = self.clock.now
+
+    def ended(self):
+        done = self.after is not None and self.start + self.after <= self.clock.now
+        return self.start + self.after if done else None
+
+
+@pytest.mark.parametrize(
+    ("after", "first", "other"), [(0, 6, 3), (1, 5, 2), (None, 3, 0)], ids=["at once", "in a second", "busy"]
+)
+def test_the_time_that_a_step_waits_for_its_batch_is_written(tmp_path, monkeypatch, after, first, other):
+    """A batch takes 3 s and the rest of a step 1 s. What counts is the time in which no step runs."""
     clock = Clock()
 
     def batches(start, stop):
@@ -210,23 +228,29 @@ def test_the_time_that_a_step_waits_for_its_batch_is_written(tmp_path, monkeypat
     put_batch = loop.put_batch
     monkeypatch.setattr(loop, "put_batch", put)
     monkeypatch.setattr(loop, "time", clock)
-    monkeypatch.setattr(loop, "_ended", lambda metrics: not busy)
+    monkeypatch.setattr(loop, "LastStep", lambda: Step(clock, after))
     run(tmp_path, toy_config(save_every=0), batches=batches, stop_after=4)
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     # A line is written when the next batch has come: the first one tells of two batches, the last one of none.
-    assert [line["wait"] for line in lines] == ([3, 0, 0, 0] if busy else [6, 3, 3, 0])
-    assert [line["wait_share"] for line in lines] == ([3 / 8, 0, 0, 0] if busy else [0.75, 0.75, 0.75, 0])
+    assert [line["wait"] for line in lines] == [first, other, other, 0]
+    assert [line["wait_share"] for line in lines] == [first / 8, other / 4, other / 4, 0]
 
 
-def test_a_step_has_ended_when_its_metrics_are_there():
-    there = jax.block_until_ready(jnp.ones(3) + 1)
-    assert loop._ended({"loss": there})
+def test_a_step_ends_when_its_metrics_are_there():
+    last = loop.LastStep()
+    assert last.ended() is None
+    last.began({"loss": jnp.ones(3) + 1})
+    last.end.result()
+    assert last.ended() <= time.perf_counter()
+    last.began({"loss": Failing()})
+    with pytest.raises(RuntimeError):
+        last.end.result()
+    assert last.ended() is None  # the loop itself meets the error where it reads the metrics
 
-    class Running:
-        def is_ready(self):
-            return False
 
-    assert not loop._ended({"loss": there, "grad_norm": Running()})
+class Failing:
+    def block_until_ready(self):
+        raise RuntimeError
 
 
 class Unread:

@@ -127,7 +127,7 @@ def test_a_coordinator_that_does_not_answer_is_one_sentence(monkeypatch, capfd):
 
 def test_a_ballot_gives_the_largest_vote():
     ballot = processes.Ballot(make_mesh(fsdp=2))
-    assert [int(ballot.cast(number)) for number in (0, 15)] == [0, 15]
+    assert [[int(one) for one in ballot.cast(number, 3)] for number in (0, 15)] == [[0, 3], [15, 3]]
 
 
 # Two processes ------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.commands.output import check_folder
@@ -20,13 +21,25 @@ Section = tuple[str, str, list[Any]]  # title, Markdown, records
 
 def run(options: Bench) -> int:
     """Measure what was asked for, write speed.md, speed.json and a figure a workload, and print the tables."""
-    from anytouch_jax.evaluate import machine, speed_report
+    from anytouch_jax.evaluate import machine
 
     check_folder(options.out / "speed.md")
     here = machine.describe()
     say(here.sentence())
     wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)
-    sections = [section for name in wanted for section in _SECTIONS[name](options, name)]
+    sections: list[Section] = []
+    for name in wanted:
+        for section in _SECTIONS[name](options, name):
+            sections.append(section)
+            path = _write(options, here, sections)  # after each: what was measured is not lost with what fails later
+            print(section[1])
+    say(f"{path}, speed.json and figures/ beside it")
+    return 0
+
+
+def _write(options: Bench, here: Any, sections: list[Section]) -> Path:
+    from anytouch_jax.evaluate import speed_report
+
     quick = "A quick run: two rounds on tiny batches, to see that everything works. Not for comparison.\n\n"
     text = f"# Speed against error\n\n{here.sentence()}\n\n{quick if options.quick else ''}{speed_report.NOTES}\n"
     text += "".join(f"\n## {title}\n\n{body}" for title, body, _ in sections)
@@ -37,11 +50,7 @@ def run(options: Bench) -> int:
         "quick": options.quick,
         "results": {title: [speed_report.as_dict(row) for row in rows] for title, _, rows in sections},
     }
-    path = speed_report.write(options.out, "speed", text, numbers)
-    for _, body, _ in sections:
-        print(body)
-    say(f"{path}, speed.json and figures/ beside it")
-    return 0
+    return speed_report.write(options.out, "speed", text, numbers)
 
 
 def _rounds(options: Bench) -> int:

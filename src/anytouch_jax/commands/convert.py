@@ -43,6 +43,9 @@ def run(options: Convert) -> int:
     else:
         if "matcher" in params and model.match_head == "mlp":
             say("the matching MLP of recipe paper is stored as cross_sensor_mlp.*: the authors' code does not read it")
+        if "force" in params:
+            say("the force heads are left out: the authors' files have none (--names own keeps them)")
+            params = {name: tree for name, tree in params.items() if name != "force"}
         arrays = release.to_release(params, model, allow_extra=True)
         release.write_safetensors(options.target, arrays, about | {"format": "pt"})
     print(f"{options.target}: written")

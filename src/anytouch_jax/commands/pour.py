@@ -10,6 +10,7 @@ from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Pour
+from anytouch_jax.strict_json import SEED, in_range
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.features import Encoder
@@ -23,6 +24,7 @@ def run(options: Pour) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
+    in_range("--", options, seed=SEED)
     if options.record is not None:
         return _record(options, options.record)
     out = _home(options)

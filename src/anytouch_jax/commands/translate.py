@@ -13,6 +13,7 @@ from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Translate
+from anytouch_jax.strict_json import SEED, in_range
 
 
 def run(options: Translate) -> int:
@@ -20,6 +21,7 @@ def run(options: Translate) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
+    in_range("--", options, seed=SEED)
     if options.fit and options.images:
         raise UserError("--fit takes its images from --data; translate in a second call")
     return _fit(options) if options.fit else _translate(options)

@@ -61,6 +61,10 @@ class Loader:
                 f"a batch of {config.data.batch_size} does not divide by objective.groups={config.objective.groups}"
             )
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
+        if config.stage == 2 and config.model.match_head == "cosine" and self._match_size % config.objective.groups:
+            raise UserError(
+                f"{self._match_size} touches to match do not divide by objective.groups={config.objective.groups}"
+            )
         for name, number in (("devices", devices), ("batch_size", config.data.batch_size)):
             self._shard.check(number, name)
         self._reader = Reader(manifest, config)

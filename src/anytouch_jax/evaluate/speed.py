@@ -175,7 +175,10 @@ def measure(
     wrong: list[dict[str, float]] = [{} for _ in programs]
     if with_errors:
         say(f"{work.name}: errors against float64")
-        wrong = errors([program.variant for program in programs], work, whole)
+        try:
+            wrong = errors([program.variant for program in programs], work, whole)
+        except RuntimeError as error:  # most often out of memory: the times are still worth something
+            say(f"{work.name}: no errors, the float64 reference failed: {str(error).splitlines()[0]}")
     rows = [_row(p, times[i], times[0], best, wrong[i]) for i, p in enumerate(programs)]
     return rows + [_empty(work, variant, note) for variant, note in failed]
 

@@ -71,7 +71,8 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     """InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
     `scale` is 1 / tau. Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair
-    gives 0. With `groups` > 1 the batch is cut in that many shares and negatives come from a row's own share.
+    gives 0. With `groups` > 1 the batch is cut in that many shares, negatives come from a row's own share, and the mean
+    is over all shares, as over the devices of the release.
     """
     e = a.shape[-1]
     present = present.reshape(groups, -1)
@@ -83,8 +84,7 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     own = jnp.diagonal(logits, axis1=1, axis2=2)
     loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)
     pairs = jnp.sum(present, axis=1)
-    shares = jnp.sum(loss, axis=1) / jnp.maximum(pairs, 1)
-    return jnp.sum(shares) / jnp.maximum(jnp.sum(pairs > 0), 1)
+    return jnp.mean(jnp.sum(loss, axis=1) / jnp.maximum(pairs, 1))
 
 
 def centred(x: Array, present: Array) -> Array:

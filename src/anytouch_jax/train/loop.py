@@ -7,6 +7,7 @@ import functools
 import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, m
 from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
 
 Tree = Any
-_SIGNAL = "signal"  # beside the metrics of a step: what its ballot says
+_SIGNAL, _SKIPPED = "signal", "skipped_samples"  # beside the metrics of a step: what its ballot says
 # batches(start, stop) -> (step, batch, what the loader wants in the log) for each step of the range
 Item = tuple[int, Any, Mapping[str, Any]]
 Batches = Callable[[int, int], Iterator[Item]]
@@ -135,7 +136,7 @@ class _Loop:
         self.traces = 0
         self.ballot = Ballot(mesh) if jax.process_count() > 1 else None
         self.told: signal.Signals | None = None  # with several processes: the signal that one of them got
-        self.clock, self.waited = time.perf_counter(), 0.0
+        self.clock, self.waited, self.last = time.perf_counter(), 0.0, LastStep()
 
     def run(
         self,
@@ -152,13 +153,15 @@ class _Loop:
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
         done, saved, reported, placed = start, start, start, None
-        with contextlib.closing(_checked(batches, start, stop)) as feed:
+        with self.last.pool, contextlib.closing(_checked(batches, start, stop)) as feed:
             for step, batch, info in self.awaited(feed):
                 placed = put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key)
                 if self.ballot:
-                    metrics = metrics | {_SIGNAL: self.ballot.cast(int(interrupt[0]) if interrupt else 0)}
+                    votes = self.ballot.cast(int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0)))
+                    metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), votes, strict=True))
                 self.log()  # of the step before, while this one runs
+                self.last.began(metrics)
                 self.pending = (step, metrics, {"samples": _rows(batch)} | dict(info))
                 done = step + 1
                 if every > 0 and done % every == 0:
@@ -179,11 +182,12 @@ class _Loop:
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
     def awaited(self, feed: Iterator[Item]) -> Iterator[Item]:
-        """The feed, with its waiting counted: the time until a batch came, where the step before had ended by then."""
+        """The feed, with its waiting counted: for how long there was neither a batch nor a step that still ran."""
         asked = time.perf_counter()
         for item in feed:
-            if self.pending is None or _ended(self.pending[1]):
-                self.waited += time.perf_counter() - asked
+            ended = self.last.ended() if self.pending else asked
+            if ended is not None:
+                self.waited += time.perf_counter() - max(asked, ended)
             yield item
             asked = time.perf_counter()
 
@@ -213,6 +217,8 @@ class _Loop:
         numbers = jax.device_get(metrics)
         if number := int(numbers.pop(_SIGNAL, 0)):
             self.told = signal.Signals(number)
+        if _SKIPPED in numbers:  # by all processes, not by this one alone
+            info[_SKIPPED] = int(numbers.pop(_SKIPPED))
         now = time.perf_counter()
         elapsed = max(now - self.clock, 1e-9)
         rate = {
@@ -289,9 +295,24 @@ def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, N
             close()
 
 
-def _ended(metrics: Mapping[str, Any]) -> bool:
-    """Whether the step that gives these metrics is done; asks without waiting."""
-    return all(value.is_ready() for value in metrics.values())
+class LastStep:
+    """When the latest step ended, seen by a thread that waits for it."""
+
+    def __init__(self) -> None:
+        self.pool, self.end = ThreadPoolExecutor(1, "last step"), Future[float]()
+
+    def began(self, metrics: Mapping[str, Any]) -> None:
+        """The step that gives these metrics has been sent off."""
+        self.end = self.pool.submit(self._wait, metrics)
+
+    def ended(self) -> float | None:
+        """When it ended; None while it runs, and where it failed."""
+        return self.end.result() if self.end.done() and not self.end.exception() else None
+
+    @staticmethod
+    def _wait(metrics: Mapping[str, Any]) -> float:
+        jax.block_until_ready(metrics)
+        return time.perf_counter()
 
 
 def _rows(batch: Any) -> int:

@@ -163,16 +163,23 @@ def _last_words(place: Place) -> subprocess.Popen[bytes]:
 
 
 class Ballot:
-    """Has any process been told to stop? Cast at every step and read a step later, so that no step waits for it."""
+    """What the processes tell each other of a step: has one been told to stop, how many samples were skipped by all?
+
+    Cast at every step and read a step later, so that no step waits for it.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         self._place = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
-        self._largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, PartitionSpec()))
+        own = self._place.num_devices // jax.process_count()  # devices of a process: all cast the same
+        self._count = jax.jit(
+            lambda votes: (jnp.max(votes[:, 0]), jnp.sum(votes[:, 1]) // own),
+            out_shardings=NamedSharding(mesh, PartitionSpec()),
+        )
 
-    def cast(self, number: int) -> jax.Array:
-        """The largest number that any process casts at this turn, i32 (): to be read later, the same for all."""
-        shape, vote = (self._place.num_devices,), np.full(1, number, np.int32)
-        return self._largest(jax.make_array_from_callback(shape, self._place, lambda _: vote))
+    def cast(self, number: int, skipped: int) -> tuple[jax.Array, jax.Array]:
+        """The largest `number` and the sum of `skipped` over the processes at this turn, i32 (): to be read later."""
+        shape, vote = (self._place.num_devices, 2), np.array([[number, skipped]], np.int32)
+        return self._count(jax.make_array_from_callback(shape, self._place, lambda _: vote))
 
 
 def whole(tree: Tree) -> Tree:

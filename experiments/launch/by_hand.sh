@@ -12,10 +12,12 @@ export JAX_PLATFORMS=cpu
 for ((process = 0; process < JAX_NUM_PROCESSES; process++)); do
     JAX_PROCESS_ID="$process" "$anytouch" train "$@" &
 done
-trap 'kill -TERM $(jobs -pr) 2>/dev/null' TERM  # they save, and end
-trap 'kill -INT $(jobs -pr) 2>/dev/null' INT
-status=0
+trap 'told=1; kill -TERM $(jobs -pr) 2>/dev/null' TERM  # they save, and end
+trap 'told=1; kill -INT $(jobs -pr) 2>/dev/null' INT
+status=0 told=
 while [ -n "$(jobs -pr)" ]; do
-    wait -n || status=$?
+    code=0
+    wait -n || code=$?
+    if [ -n "$told" ]; then told= ; elif [ "$code" -ne 0 ]; then status=$code; fi  # a signal ends the waiting, not a process
 done
 exit "$status"

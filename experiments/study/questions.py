@@ -105,8 +105,8 @@ def q2(runs: Sequence[Run]) -> Part:
         Pair("retrieval: alignment above masked modelling", "aligned", "masked", finds),
         Pair("retrieval: matching above alignment", "matched", "aligned", finds),
         Pair("retrieval: matching above no pre-training", "matched", "untrained", finds),
-        Pair("retrieval: matching above raw pixels", "matched", "pixels", finds),
-        Pair("retrieval: matching above area, place and force", "matched", "contact", finds),
+        Pair("our control: matching above raw pixels", "matched", "pixels", finds),
+        Pair("our control: matching above area, place and force", "matched", "contact", finds),
     ])  # fmt: skip
     table = Table("q2", names, SPACE)
     return Part("Q2: the space of touches (Figure 4)", f"{_chances(runs)}{block(runs, table, found)}", found)

@@ -15,8 +15,9 @@ from .tables import by_chance, tally
 
 _INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
 again from them without running anything. Every number is the mean over seeds of training, with its 95 % interval over
-seeds (Student's t; with one seed that of the run itself, over test objects). Accuracies are in %, by a linear probe of
-frozen features on objects never touched in training. Protocol `honest`: the penalty is chosen without the test set.
+seeds (Student's t; of two seeds the two numbers themselves, and with one seed the interval of the run itself, over
+test objects). Accuracies are in %, by a linear probe of frozen features on objects never touched in training. Protocol
+`honest`: the penalty is chosen without the test set.
 
 An interval over seeds is one of trainings for these test objects, which are the same for every seed: it does not say
 how other objects would come out (the JSON files hold no numbers by object, so these cannot be drawn anew here).

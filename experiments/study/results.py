@@ -115,6 +115,11 @@ def values(runs: Sequence[Run], question: str, name: str, column: Column, protoc
     }
 
 
+def over_seeds(several: list[float]) -> tuple[float | None, float | None]:
+    """The 95 % interval of Student's t; of two seeds, where it is as wide as the scale, the two themselves."""
+    return (min(several), max(several)) if len(several) == 2 else interval(several)
+
+
 def spread(
     runs: Sequence[Run], question: str, name: str, column: Column
 ) -> tuple[float, float | None, float | None] | None:
@@ -122,7 +127,7 @@ def spread(
     found = values(runs, question, name, column)
     if not found:
         return None
-    mean, (low, high) = float(np.mean(list(found.values()))), interval(list(found.values()))
+    mean, (low, high) = float(np.mean(list(found.values()))), over_seeds(list(found.values()))
     if len(found) == 1:
         run = next(one for one in runs if (one.question, one.name, one.seed) == (question, name, *found))
         row = run.row(column) or {}
@@ -140,7 +145,7 @@ def change(first: Seeds, second: Seeds, expected: float | None, better: int = 1)
     if not seeds:
         return Change("not run")
     several = [better * (first[seed] - second[seed]) for seed in seeds]
-    mean, (low, high) = float(np.mean(several)), interval(several)
+    mean, (low, high) = float(np.mean(several)), over_seeds(several)
     shown = [None if one is None else better * one for one in (mean, low, high)]
     sides = shown if better > 0 else [shown[0], shown[2], shown[1]]
     if len(seeds) < CLAIM:

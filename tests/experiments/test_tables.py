@@ -152,7 +152,9 @@ def test_every_question_has_its_signs(rendered):
     words = [one.row.word for one in found["q2"].statements]
     assert words == ["agrees", "disagrees", "disagrees", *["agrees"] * 6]
     against_pixels = found["q2"].statements[7]
-    assert against_pixels.label == "our control: matching above raw pixels" and against_pixels.row.seeds == 3  # one number, whatever the seed
+    assert (
+        against_pixels.label == "our control: matching above raw pixels" and against_pixels.row.seeds == 3
+    )  # one number, whatever the seed
     assert found["q1"].statements[-1].row.word == "agrees"  # more sensors help the unseen one
     assert found["q1"].statements[1].columns["seen"].word == "disagrees"  # it falls in the paper
     assert {one.row.word for one in found["q3"].statements} == {"agrees"}

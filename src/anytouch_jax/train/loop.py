@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import signal
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -153,7 +153,7 @@ class _Loop:
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
         done, saved, reported, placed = start, start, start, None
-        with self.last.pool, contextlib.closing(_checked(batches, start, stop)) as feed:
+        with contextlib.closing(_checked(batches, start, stop)) as feed:
             for step, batch, info in self.awaited(feed):
                 placed = put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key)
@@ -299,20 +299,23 @@ class LastStep:
     """When the latest step ended, seen by a thread that waits for it."""
 
     def __init__(self) -> None:
-        self.pool, self.end = ThreadPoolExecutor(1, "last step"), Future[float]()
+        self._end: list[float] = []
 
     def began(self, metrics: Mapping[str, Any]) -> None:
         """The step that gives these metrics has been sent off."""
-        self.end = self.pool.submit(self._wait, metrics)
+        self._end = []  # a new one: the thread of an older step keeps its own
+        # A daemon: where a step never ends, because a process is lost, the run must.
+        threading.Thread(target=_see, args=(metrics, self._end), name="last step", daemon=True).start()
 
     def ended(self) -> float | None:
         """When it ended; None while it runs, and where it failed."""
-        return self.end.result() if self.end.done() and not self.end.exception() else None
+        return self._end[0] if self._end else None
 
-    @staticmethod
-    def _wait(metrics: Mapping[str, Any]) -> float:
+
+def _see(metrics: Mapping[str, Any], end: list[float]) -> None:
+    with contextlib.suppress(Exception):  # the loop itself meets the error where it reads the metrics
         jax.block_until_ready(metrics)
-        return time.perf_counter()
+        end.append(time.perf_counter())
 
 
 def _rows(batch: Any) -> int:

@@ -12,7 +12,7 @@ from anytouch_jax.evaluate import plots
 
 from . import adaptation, paper, questions, real
 from .results import Column, Run, change, spread, values
-from .tables import title
+from .tables import commonest, title
 
 STAGES = (
     ("untrained", "no pre-training"),
@@ -85,12 +85,12 @@ def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | No
 
 
 def q1(runs: Sequence[Run], path: Path) -> Path:
-    """The columns of Table 1 as sensors are added."""
+    """The columns of Table 1 as sensors are added: the material, as there, and the form of the indenter."""
     names = list(paper.TABLE1)
     figure, axes = _panels(1, len(questions.FOUR), 3.0, 3.2)
-    for axis, column, theirs in zip(axes, questions.FOUR, questions.FOUR_PAPER, strict=True):
-        found = [spread(runs, "q1", name, column) for name in names]
-        _line(axis, found, "ours", "C0")
+    for axis, column, form, theirs in zip(axes, questions.FOUR, questions.FORM, questions.FOUR_PAPER, strict=True):
+        _line(axis, [spread(runs, "q1", name, column) for name in names], "material", "C0")
+        _line(axis, [spread(runs, "q1", name, form) for name in names], "form", "C1")
         axis.set_title(f"{column.title}\n(grey, right axis: paper, {theirs})", fontsize=8)
         axis.set_xticks(
             range(len(names)),
@@ -105,36 +105,43 @@ def q1(runs: Sequence[Run], path: Path) -> Path:
         )
         right.tick_params(labelsize=7, colors="#999999")
     axes[0].set_ylabel("accuracy, %")
+    axes[0].legend(frameon=False, fontsize=7, loc="lower right")
     plots.write_figure(path, figure)
     return path
 
 
 def q3(runs: Sequence[Run], path: Path) -> Path:
-    """Static and dynamic tasks, a panel a task, a line a model: mean and interval."""
+    """Static and dynamic tasks, a panel a task, a line a model: mean and interval; dotted, one answer for all."""
     names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
     columns = (*questions.SIX[:3], questions.FOUR[2], *questions.dynamic("clips"))
     figure, axes = _lines(names, columns)
     for axis, column in zip(axes, columns, strict=False):
         for place, name in enumerate(names):
             _dot(axis, place, spread(runs, "q3", name, column), "C0" if name == "anytouch" else "#7a94b0")
+        chance = commonest(runs, "q3", column)
+        if chance is not None:
+            axis.axvline(chance, linestyle=":", color="#222222", linewidth=1)
     plots.write_figure(path, figure)
     return path
 
 
 def ablations(runs: Sequence[Run], path: Path) -> Path:
-    """What leaving out a part changes, in points, beside the paper's change (grey diamonds)."""
+    """What leaving out a part changes, in points: the material beside the paper's change, and the form."""
     names = [name for name in paper.TABLE6 if name != "anytouch"]
     figure, axes = _lines(names, questions.FOUR)
     for number, (axis, column) in enumerate(zip(axes, questions.FOUR, strict=True)):
-        whole = values(runs, "ablations", "anytouch", column)
         for place, name in enumerate(names):
-            found = change(values(runs, "ablations", name, column), whole, None)
-            if found.mean is not None:
-                _dot(axis, place, (found.mean, found.low, found.high), "C0")
+            for shift, colour, one in ((-0.15, "C0", column), (0.15, "C1", questions.FORM[number])):
+                whole = values(runs, "ablations", "anytouch", one)
+                found = change(values(runs, "ablations", name, one), whole, None)
+                if found.mean is not None:
+                    _dot(axis, place + shift, (found.mean, found.low, found.high), colour)
             theirs = paper.TABLE6[name][number] - paper.TABLE6["anytouch"][number]  # type: ignore[operator]
             axis.scatter(theirs, place, s=22, marker="D", color="#bbbbbb", zorder=1)
         axis.axvline(0, color="#222222", linewidth=0.7)
-        axis.set_xlabel(f"points; diamonds: paper, {questions.FOUR_PAPER[number]}", fontsize=8)
+        axis.set_xlabel(
+            f"blue: material, orange: form, points\ndiamonds: paper, {questions.FOUR_PAPER[number]}", fontsize=7
+        )
     plots.write_figure(path, figure)
     return path
 
@@ -152,6 +159,9 @@ def dynamics(runs: Sequence[Run], path: Path) -> Path:
         axis.set_title(questions.dynamic("clips")[i].title, fontsize=9)
         axis.set_xticks(range(len(views)), views, rotation=30, fontsize=8)
         axis.axhline(0, color="#222222", linewidth=0.6)
+        chance = commonest(runs, "dynamics", questions.dynamic("clips")[i])
+        if chance:
+            axis.axhline(chance, linestyle=":", color="#222222", linewidth=1)
     axes[0].set_ylabel("%; blue: AnyTouch, grey: stills only")
     plots.write_figure(path, figure)
     return path

@@ -136,18 +136,20 @@ def _ours(runs: Sequence[Run], table: Table) -> str:
             cells = ["not run"] * len(table.columns)
         theirs = table.paper.get(name, (None,) * len(table.paper_titles))
         lines.append((title(name), str(len(seeds)), *cells, *("-" if one is None else f"{one:.2f}" for one in theirs)))
-    chances = [_chance(runs, table.question, column) for column in table.columns]
-    if any(one != "-" for one in chances):
-        lines.append(("*the commonest answer*", "-", *chances, *("-" for _ in table.paper_titles)))
+    chances = [commonest(runs, table.question, column) for column in table.columns]
+    if any(one is not None for one in chances):
+        pairs = zip(chances, table.columns, strict=True)
+        shown = ["-" if one is None else f"{one:.{column.digits}f}" for one, column in pairs]
+        lines.append(("*the commonest answer*", "-", *shown, *("-" for _ in table.paper_titles)))
     return markdown(head, lines)
 
 
-def _chance(runs: Sequence[Run], question: str, column: Column) -> str:
-    """What one answer for all gives on the test rows of a column of accuracies; R2 is 0 then."""
+def commonest(runs: Sequence[Run], question: str, column: Column) -> float | None:
+    """What one answer for all gives on the test rows of a column of accuracies, as printed; 0 for R2."""
     if column.metric == "r2":
-        return f"{0:.{column.digits}f}"
+        return 0.0
     found = [row["chance"] for run in runs if run.question == question and (row := run.row(column)) and "chance" in row]
-    return f"{column.factor * np.mean(found):.{column.digits}f}" if found and column.metric == "accuracy" else "-"
+    return column.factor * float(np.mean(found)) if found and column.metric == "accuracy" else None
 
 
 def _published(runs: Sequence[Run], table: Table) -> str:

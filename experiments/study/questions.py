@@ -219,7 +219,7 @@ def new_sensor(runs: Sequence[Run]) -> Part:
         f"{plan.UNSEEN} is left out of training. Tokens: the universal ones as they are, or fitted with all else\n"
         "frozen, by reconstruction of unlabelled frames or by the material that labelled ones show. Labelled frames\n"
         "also stand among the training rows of the probe; without them it has learned from the other sensors alone.\n"
-        "In brackets: share of the gap to a model trained on the sensor that is closed (- where it is below 3 points).\n"
+        "In brackets: share of the gap to a model trained on the sensor that is closed (- below 3 points of gap).\n"
         "One seed: no claim. Reconstruction goes through the decoder of stage 1, which stage 2 has left behind.\n\n"
     )
     return Part("A new sensor", text + markdown(("tokens, frames", *adaptation.TASKS), lines), ())

@@ -10,7 +10,7 @@ from anytouch_jax.train.record import write_atomic
 
 from . import pictures, questions, real_table
 from .questions import Part
-from .results import CLAIM, Run, comparable, differences, read, simulated
+from .results import CLAIM, Run, comparable, differences, drawn, read, simulated
 from .tables import by_chance, tally
 
 _INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
@@ -88,6 +88,9 @@ def provenance(runs: Sequence[Run]) -> str:
     notes += f" {last} trainings were gone on with and note their last part alone." if last else ""
     simulators = sorted({simulated(run.about) for run in runs})
     notes += f" Version of the simulator: {', '.join(map(str, simulators)) or '-'}."
+    if again := drawn(runs):
+        notes += " Simulated on more than one kind of processor, whose rounding makes other bytes of the same touches: "
+        notes += f"{again}."
     head = ("question", "runs", "trainings", "training, min", "scores, min", "files")
     return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"
 

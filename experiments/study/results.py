@@ -83,8 +83,9 @@ def simulated(about: Mapping[str, Any]) -> int:
 def differences(records: Sequence[Mapping[str, Any]]) -> str:
     """What records of one table must share and do not, in words; empty where they can be compared.
 
-    Simulator, settings, and the content of every data set by its name. Records that do not note their settings are
-    told apart by the name of their size.
+    Simulator, settings, and, within a seed, the content of every data set by its name: signs are taken seed by seed.
+    The data of another seed may be of another processor, whose rounding makes other bytes of the same touches. Records
+    that do not note their settings are told apart by the name of their size.
     """
     found: dict[str, set[str]] = {}
     untold = any(not about.get("settings") for about in records)
@@ -94,10 +95,23 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
             if name not in LABELS:
                 found.setdefault(name, set()).add(str(value))
         for name, value in about.get("data", {}).items():
-            found.setdefault(f"data set {name}", set()).add(value[:8])
+            found.setdefault(f"data set {name} of seed {about.get('seed')}", set()).add(value[:8])
         if untold:
             found.setdefault("size", set()).add(str(about.get("size")))
     return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in found.items() if len(several) > 1)
+
+
+def drawn(runs: Sequence[Run]) -> str:
+    """Which data sets were made more than once, by content and seeds, in words; empty where none was."""
+    found: dict[str, dict[str, set[int]]] = {}
+    for run in runs:
+        for name, value in run.about.get("data", {}).items():
+            found.setdefault(name, {}).setdefault(value[:8], set()).add(run.seed)
+    return "; ".join(
+        f"{name} " + ", ".join(f"{value} (seeds {', '.join(map(str, sorted(of)))})" for value, of in several.items())
+        for name, several in sorted(found.items())
+        if len(several) > 1
+    )
 
 
 def comparable(runs: Sequence[Run]) -> list[Run]:

@@ -28,6 +28,7 @@ from anytouch_jax.evaluate.workloads import Workload, first_state, make_batch, n
 from anytouch_jax.io import release
 from anytouch_jax.train.step import merge
 
+WHAT = ("stage1", "stage2", "embed")
 RIVALS = ("eager float32", "compiled float32", "eager bfloat16", "compiled bfloat16")
 OURS = (variants.BASELINE, variants.Variant("bfloat16", variants.BFLOAT16))
 _SETTLE = 0.02  # seconds for our idle threads to stop spinning before the other process works
@@ -264,7 +265,7 @@ def to_markdown(work: Workload, found: dict[str, Any], preset: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="*", default=["stage1", "stage2", "embed"])
+    parser.add_argument("what", nargs="*", default=WHAT, metavar="|".join(WHAT))
     parser.add_argument("--torch", type=Path, required=True, help="the Python that has torch and transformers")
     parser.add_argument("--preset", default="small", choices=("tiny", "small", "base", "large"))
     parser.add_argument("--batch", type=int)
@@ -273,6 +274,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
     options = parser.parse_args()
+    if unknown := set(options.what) - {*WHAT}:
+        parser.error(f"{', '.join(sorted(unknown))}: choose among {', '.join(WHAT)}")
     here = machine.describe()
     if here.load > 0.3 * here.cores:
         print(f"load {here.load:.1f}: PyTorch's threads suffer more than ours from other work; wait", file=sys.stderr)

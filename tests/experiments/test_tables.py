@@ -168,7 +168,7 @@ def test_every_question_has_its_signs(rendered):
         ({"simulator": 1}, "simulator version 1 and 2"),
         ({"settings": {"steps1": 400}}, "steps1 150 and 400"),
         ({"settings": None, "size": "changed"}, "size changed and full"),
-        ({"data": {"own": "1" * 64, "aligned": "2" * 64}}, "data set own 00000000 and 11111111"),
+        ({"data": {"own": "1" * 64, "aligned": "2" * 64}}, "data set own of seed 1 00000000 and 11111111"),
     ],
 )
 def test_runs_of_other_data_or_settings_stand_in_no_table(change, words, tmp_path, rendered):
@@ -180,6 +180,17 @@ def test_runs_of_other_data_or_settings_stand_in_no_table(change, words, tmp_pat
     assert f"**No table: these runs differ in what they must share ({words}).**" in lines and "|" not in lines
     assert "| Ablations (Table 6) |" not in after
     assert section(after, "Dynamics") == section(text, "Dynamics")
+
+
+def test_another_seed_may_have_been_simulated_on_another_processor(tmp_path):
+    leaves = [leaf for leaf in LEAVES if leaf.question == "ablations"]
+    for path in synthetic.write(tmp_path, leaves):
+        about = json.loads(path.read_text())
+        if about["seed"] == 2:
+            path.write_text(json.dumps(about | {"data": {"own": "1" * 64}}))
+    runs = read(tmp_path)
+    assert len(comparable(runs)) == len(leaves)
+    assert "own 00000000 (seeds 0, 1), 11111111 (seeds 2)." in report.text(runs)
 
 
 def test_old_records_are_of_the_first_simulator_and_go_together(tmp_path):

@@ -72,10 +72,10 @@ class Dense(nnx.Module):
 
     def __call__(self, x: Array, outputs: int | None = None) -> Array:
         """All outputs, or the first `outputs` of them: what nobody reads is not computed."""
-        y = x.astype(self.dtype) @ self.kernel[...][:, :outputs].astype(self.dtype)
-        if self.bias is None:
-            return y
-        return y + jnp.expand_dims(self.bias[...][:outputs].astype(self.dtype), range(y.ndim - 1))
+        # As a matrix: of two contracted axes XLA's CPU back end writes a transposed copy before the gradient's product.
+        y = x.astype(self.dtype).reshape(-1, x.shape[-1]) @ self.kernel[...][:, :outputs].astype(self.dtype)
+        y = y if self.bias is None else y + self.bias[...][None, :outputs].astype(self.dtype)
+        return y.reshape(*x.shape[:-1], y.shape[-1])
 
 
 class LayerNorm(nnx.Module):
@@ -95,17 +95,19 @@ class LayerNorm(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """Multi-head self-attention (B, S, D) -> (B, S, D); `mask` (B, S) bool marks the keys that may be read."""
+    """Multi-head self-attention: `project` (B, S, D) to q, k, v (B, S, H, D / H), `attend`, then `out`."""
 
     def __init__(self, stack: Stack, model: Model) -> None:
         self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
         self.heads, self.how = stack.heads, model.attention
 
-    def __call__(self, x: Array, *, causal: bool = False, mask: Array | None = None) -> Array:
+    def project(self, x: Array) -> tuple[Array, Array, Array]:
         heads = (*x.shape[:2], self.heads, -1)
-        q, k, v = (layer(x).reshape(heads) for layer in (self.query, self.key, self.value))
-        out = attention(q, k, v, how=self.how, causal=causal, mask=mask)
-        return self.out(out.reshape(x.shape))
+        return self.query(x).reshape(heads), self.key(x).reshape(heads), self.value(x).reshape(heads)
+
+    def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:
+        """(B, S, D) of heads side by side; `mask` (B, S) bool marks the keys that may be read."""
+        return attention(q, k, v, how=self.how, causal=causal, mask=mask).reshape(*q.shape[:2], -1)
 
 
 class Mlp(nnx.Module):
@@ -120,6 +122,11 @@ class Mlp(nnx.Module):
         return self.down(self.act(self.up(x)))
 
 
+# A method whose backward pass keeps the products of its matrices and does the rest anew (norms, activations, sums):
+# on two CPU cores less to write and read back is 15 to 25 % off a step and a third to a half off its memory.
+lean = nnx.remat(prevent_cse=False, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
+
+
 class Block(nnx.Module):
     """Pre-norm transformer block: x + attention(norm1 x), then x + mlp(norm2 x)."""
 
@@ -130,7 +137,16 @@ class Block(nnx.Module):
         self.mlp = Mlp(stack.width, stack.mlp, model, act)
 
     def __call__(self, x: Array, *, causal: bool = False, mask: Array | None = None) -> Array:
-        x = x + self.attention(self.norm1(x), causal=causal, mask=mask)
+        heads = self.attention.attend(*self._before(x), causal=causal, mask=mask)
+        return self._after(x, heads)
+
+    @lean
+    def _before(self, x: Array) -> tuple[Array, Array, Array]:
+        return self.attention.project(self.norm1(x))
+
+    @lean
+    def _after(self, x: Array, heads: Array) -> Array:
+        x = x + self.attention.out(heads)
         return x + self.mlp(self.norm2(x))
 
 

@@ -1,12 +1,15 @@
 """Layers against plain formulas, and the scanned stack against the loop."""
 
 import jax
+import jax.ad_checkpoint
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 from tiny_models import STACK, touch_model
 
+from anytouch_jax.config import Stack
 from anytouch_jax.nn.functional import build
-from anytouch_jax.nn.layers import gelu, quick_gelu
+from anytouch_jax.nn.layers import Block, gelu, quick_gelu
 
 X = jnp.linspace(-6, 6, 241)
 
@@ -54,6 +57,17 @@ def test_the_stack_equals_a_loop_over_plain_blocks():
             x, jax.tree.map(lambda p, i=layer: np.asarray(p[i], np.float64), params["touch"]["blocks"]), 2, 1e-5
         )
     np.testing.assert_allclose(net.apply(params, "touch_hidden", clip, sensor), x, atol=2e-5)
+
+
+def test_a_block_keeps_its_products_alone_for_the_backward_pass(capsys):
+    width, hidden, b, s = 12, 20, 2, 7
+    model = touch_model(touch=Stack(width, 1, 2, hidden))
+    graph, state = nnx.split(Block(model.touch, model, 1e-5, gelu))
+    jax.ad_checkpoint.print_saved_residuals(lambda p, x: nnx.merge(graph, p)(x).sum(), state, jnp.ones((b, s, width)))
+    kept = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines() if " from the argument" not in line]
+    wide = [shape for shape in kept if shape in (f"f32[{b},{s},{hidden}]", f"f32[{b * s},{hidden}]")]
+    assert len(wide) == 1  # what goes into the activation, not what comes out of it
+    assert len([shape for shape in kept if shape in (f"f32[{b},{s},{width}]", f"f32[{b * s},{width}]")]) == 2
 
 
 def test_rematerialisation_and_bfloat16_change_cost_not_meaning():

@@ -50,11 +50,14 @@ def mapped(q: Array, k: Array, v: Array) -> Array:
 def _forward(q: Array, k: Array, v: Array) -> tuple[Array, tuple[Array, ...]]:
     parts = tuple(_groups(x) for x in (q, k, v))
     out, log_sum = jax.lax.map(_attend, parts)
-    return _heads(out, q.shape), (*parts, out, log_sum)
+    out = _heads(out, q.shape)
+    return out, (*parts, out, log_sum)
 
 
 def _backward(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
-    grads = jax.lax.map(_differentiate, (*saved, _groups(gradient)))
+    *parts, out, log_sum = saved
+    own = jnp.sum((gradient * out).astype(log_sum.dtype), axis=-1, keepdims=True)
+    grads = jax.lax.map(_differentiate, (*parts, log_sum, _groups(own), _groups(gradient)))
     dq, dk, dv = (_heads(x, gradient.shape) for x in grads)
     return dq, dk, dv
 
@@ -93,12 +96,11 @@ def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
 
 
 def _differentiate(part: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-    """Gradients (G, S, D) with respect to query, key and value of one group."""
-    q, k, v, out, log_sum, gradient = part
+    """Gradients (G, S, D) with respect to query, key and value of one group; `own` (G, S, 1) is gradient times out."""
+    q, k, v, log_sum, own, gradient = part
     scale = q.shape[-1] ** -0.5
     weights = jnp.exp(_product("gqd,gkd->gqk", q * scale, k) - log_sum[..., None])
     dv = _product("gqk,gqd->gkd", weights.astype(v.dtype), gradient)
-    own = jnp.sum((gradient * out).astype(log_sum.dtype), axis=-1, keepdims=True)
     dlogits = (weights * (_product("gqd,gkd->gqk", gradient, v) - own)).astype(q.dtype)
     dq = _product("gqk,gkd->gqd", dlogits, k) * scale
     dk = _product("gqk,gqd->gkd", dlogits, q * scale)

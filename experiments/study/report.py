@@ -89,7 +89,7 @@ def provenance(runs: Sequence[Run]) -> str:
     simulators = sorted({simulated(run.about) for run in runs})
     notes += f" Version of the simulator: {', '.join(map(str, simulators)) or '-'}."
     if again := drawn(runs):
-        notes += " Simulated on more than one kind of processor, whose rounding makes other bytes of the same touches: "
+        notes += " The same scenes gave tables of other content (another kind of processor, by the machines above): "
         notes += f"{again}."
     head = ("question", "runs", "trainings", "training, min", "scores, min", "files")
     return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"

@@ -113,7 +113,7 @@ def test_a_configuration_from_before_these_fields_reads_as_the_paper_model() -> 
     for section, names in {
         "model": ("patch_encoder", "force_head"),
         "objective": ("differences", "force"),
-        "data": ("require", "aligned_text"),
+        "data": ("require", "contact_only", "aligned_text"),
     }.items():
         for name in names:
             del data[section][name]

@@ -10,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.contact import contact_scores, mark_contact
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.evaluate.contacts import deepest_rows, numbers
 from anytouch_jax.evaluate.features import text_column
 
-WHOLE, STATIC, GRASP = "manifest.parquet", "static.parquet", "grasp.parquet"
+MADE, WHOLE, STATIC, GRASP = "manifest.parquet", "contact.parquet", "static.parquet", "grasp.parquet"
 SPLITS = ("train", "val", "test")
 
 
@@ -24,6 +25,12 @@ def cut(table: Manifest, rows: np.ndarray, path: Path, change: Callable[[pa.Tabl
     columns = (change(part) if change else part).to_pydict()
     manifests.write(manifests.from_columns(columns, path), path)
     return path
+
+
+def mark(folder: Path, share: float) -> None:
+    """Write the simulated manifest as WHOLE, with `label.contact`: which frames are touched (`anytouch contact`)."""
+    table = manifests.read(folder / MADE)
+    manifests.write(mark_contact(table, contact_scores(table), share=share)[0], folder / WHOLE)
 
 
 def cut_all(folder: Path) -> None:

@@ -41,7 +41,8 @@ class Size:
 
     Towers from scratch learn nothing in minutes from matching one pair against one other, as the paper does on CLIP's
     weights. So `match_head` is "cosine", each touch against all others of the batch, on a share `match_keep` of the
-    patches and weighed by `match_weight`; a row of question q2 has the paper's head. The softmax starts mild
+    patches and weighed by `match_weight`; only frames in contact are drawn, those with a share `contact` of the
+    strongest of their recording (`anytouch contact`), as the paper's are contact frames; a row of question q2 has the paper's head. The softmax starts mild
     (`temperature`): a sharp one only punishes untrained towers. Touches are shown less the untouched gel (but for
     `real`, where one in ten has no picture of it), and their colours are left as they are, since colours tell slopes.
     `seeds` are those of questions whose sign is claimed; the others take the first.
@@ -66,6 +67,7 @@ class Size:
     match_head: str = "cosine"
     match_weight: float = 4.0
     match_keep: float = 0.5
+    contact: float = 0.6
     background: Literal["keep", "subtract"] = "subtract"
     seeds: tuple[int, ...] = (0, 1, 2)
     refits: int = 5
@@ -215,7 +217,10 @@ def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests
         text = model.text and replace(model.text, stack=size.stack)
         model = replace(model, text=text, image=size.stack, temperature=size.temperature, match_head=size.match_head)
         objective = replace(objective, match_weight=size.match_weight, match_keep=size.match_keep)
-    data = replace(config.data, manifests=manifests, batch_size=batch, background=size.background, jitter=(0, 0, 0, 0))
+    data = replace(
+        config.data, manifests=manifests, batch_size=batch, background=size.background, jitter=(0, 0, 0, 0),
+        contact_only=True,
+    )  # fmt: skip
     return replace(
         config,
         model=model,

@@ -80,6 +80,7 @@ class Work:
         check_objects(size)
         start, folder = time.perf_counter(), self.folder / one.name
         simulate(_simulated(one, size), folder)
+        cuts.mark(folder, size.contact)
         cuts.cut_all(folder)
         self._finish(folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)})
 
@@ -187,7 +188,7 @@ def _simulated(one: Scenes, size: Size) -> Simulated:
 
 
 def _of(one: Scenes, size: Size) -> str:
-    return repr((one, size.frames, size.objects, size.pixels, VERSION))
+    return repr((one, size.frames, size.objects, size.pixels, size.contact, VERSION))
 
 
 def _noted(path: Path) -> dict[str, Any]:

@@ -109,7 +109,8 @@ class Data:
     `weights`: (dataset, how often it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is
     what the recipe does (the release in stage 2: RELEASE_WEIGHTS, where they are there). `negatives`: of matching, from
     any sensor or from the positive's, so that the sensor alone does not tell them apart. `require`: draw only rows that
-    have these. `aligned_text`: train on the text of rows whose touch other sensors or units felt too.
+    have these; `contact_only`: leave out rows that `label.contact` calls free (see `anytouch contact`), since the
+    paper's frames are contact frames; rows of which nothing is known stay, and a clip counts by its last frame. `aligned_text`: train on the text of rows whose touch other sensors or units felt too.
     `background` "subtract": touches are shown less the picture of the untouched gel (`background_path`), on middle
     grey: what is left is the contact, not the unit's own tint, lights and dots. Beyond the paper (its successor does).
     """
@@ -123,6 +124,7 @@ class Data:
     weights: tuple[tuple[str, float], ...] | None = None
     negatives: Literal["any", "same_sensor"] = "any"
     require: tuple[Literal["image", "text"], ...] = ()
+    contact_only: bool = False
     aligned_text: bool = True
     background: Literal["keep", "subtract"] = "keep"
     flip: float = 0.5

@@ -56,6 +56,9 @@ class Contact:
     """Leave out frames without contact; the split background and frames of which nothing is known stay."""
     threshold: tuple[tuple[str, float], ...] = ()
     """Score above which a frame is contact, by sensor: digit 5 gelsight 7."""
+    share: float = 0.0
+    """Contact also has this share of the highest score of its recording, 0 to 1: the moments when contact is made and
+    broken, which tell little of what is touched, are none. What --picture and --check show is by threshold alone."""
     picture: Path | None = None
     """PNG of kept and dropped frames by rising score: look at it before you trust a threshold."""
     check: bool = False

@@ -161,6 +161,18 @@ def test_marks_keep_what_the_dataset_says_and_what_is_unknown(world):
     assert len(manifests.read(kept.files[0])) == 4
 
 
+def test_a_share_of_the_highest_score_of_the_recording_leaves_out_where_contact_is_made_and_broken(world):
+    named = ["s", "s", "s", "t", "t", "u"]
+    manifest = world([(f"{k}.png", None, {"sequence": name}) for k, name in enumerate(named)])
+    scores = [10.0, 40.0, 19.0, 8.0, np.nan, 7.0]
+    marked, _ = _marked(manifest, scores, share=0.5)
+    assert marked.column("label.contact").to_pylist() == [0, 1, 0, 1, None, 1]
+    marked, _ = _marked(manifest, scores)
+    assert marked.column("label.contact").to_pylist() == [1, 1, 1, 1, None, 1]
+    with pytest.raises(UserError, match="--share is a part of the highest score of a sequence, 0 to 1, not 60"):
+        _marked(manifest, scores, share=60)
+
+
 def test_thresholds_by_sensor_and_an_older_score(world):
     manifest = world([(f"{k}.png", None, {"sensor": s}) for k, s in enumerate(("digit", "9dtact"))],
                      **{"label.contact_score": [1.5, 2.5]})  # fmt: skip

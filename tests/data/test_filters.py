@@ -83,6 +83,28 @@ def test_nothing_that_has_what_is_required_is_one_sentence(make, settings):
         Loader(make(rows), settings(2, require=("image", "text")))
 
 
+def test_only_frames_in_contact_are_drawn_in_alignment_and_in_matching(make, settings, read_back):
+    rows = [row | {"label.contact": {0: "0", 1: ""}.get(row["frame_index"], "1")} for row in world()]  # "": not known
+    loader = Loader(make(rows), settings(2, contact_only=True))
+    drawn = []
+    for batch in batches(loader):
+        drawn.append(batch.align.clip)
+        drawn += (batch.match.clip, batch.match.positive, batch.match.negative) if batch.match else ()
+    ends = {(clip.shape[1], int(end) % 6) for clip in drawn for end in read_back(clip)[:, -1]}
+    assert ends == {(1, 1)} | {(frames, end) for frames in (1, 3) for end in (2, 3, 4, 5)}
+    assert any("40 of 48 rows have contact; only they are drawn (data.contact_only)" in note for note in loader.notes)
+    both = Loader(make(rows), settings(2, contact_only=True, require=("text",)))
+    assert any("25 of 48 rows have text and contact" in note for note in both.notes)
+
+
+def test_contact_that_nobody_marked_is_one_sentence(make, settings):
+    with pytest.raises(UserError, match=r"'label\.contact', which `anytouch contact` writes"):
+        Loader(make(world()), settings(1, contact_only=True))
+    free = [row | {"label.contact": "0"} for row in world()]
+    with pytest.raises(UserError, match=r"data\.contact_only: no row of split 'train' has contact"):
+        Loader(make(free), settings(1, contact_only=True))
+
+
 # Withheld modalities -------------------------------------------------------------------------------------------------
 
 

@@ -122,6 +122,8 @@ def test_rates_are_what_the_committed_runs_took():
     for path in (Path(__file__).resolve().parents[2] / "experiments" / "results" / "matrix").glob("*.json"):
         taken |= {one["key"]: one["seconds"] for one in json.loads(path.read_text())["trained"]}
     found = {one.key: one for leaf in LEAVES for one in leaf.trainings if one.key in taken}
+    if not found:
+        pytest.skip("no run of today's plan is committed")
     ratios = [taken[key] / budget.of_training(one) for key, one in found.items()]
     assert 0.5 < statistics.median(ratios) < 2.5  # from one day to another these machines differ by a factor of two
 

@@ -120,6 +120,18 @@ def test_tint_gain_and_light_angle_act():
     np.testing.assert_array_equal(draw(FLAT, STILL, turned, KEY), base)
 
 
+def test_turned_lights_shade_and_shadow_a_slope_as_they_would_a_turned_one():
+    x, y = grid()
+    across, down = 0.1 * x + 0 * y, 0.1 * y + 0 * x  # at the middle of the picture neither is deeper than the other
+    turned = PLAIN._replace(light_angle=np.float32(-np.pi / 2))
+    one, other = (levels(draw(*seen, None))[23:25, 31:33].mean((0, 1)) for seen in
+                  ((across, STILL, PLAIN), (down, STILL, turned)))  # fmt: skip
+    np.testing.assert_allclose(other, one, atol=1.5)
+    flat, unturned = (levels(draw(*seen, None))[23:25, 31:33].mean((0, 1)) for seen in
+                      ((FLAT, STILL, PLAIN), (down, STILL, PLAIN)))  # fmt: skip
+    assert np.abs(one - flat).max() > 10 and np.abs(unturned - one).max() > 10
+
+
 def test_markers_follow_the_skin_and_come_back_after_one_step_of_the_lattice():
     unit = MARKED._replace(marker_phase=np.array([0.3, 0.1], np.float32))
     rest = optics.render(FLAT, STILL, PITCH, DIGIT, units.identity_unit(DIGIT), resolution=SIZE)

@@ -22,7 +22,7 @@ def run(options: Contact) -> int:
     contact.known_contact(manifest)  # a word that is no number is told before the work
     limits = dict(options.threshold)
     scores = contact.contact_scores(manifest, workers=options.threads)
-    marked, report = contact.mark_contact(manifest, scores, thresholds=limits, drop=options.drop)
+    marked, report = contact.mark_contact(manifest, scores, thresholds=limits, share=options.share, drop=options.drop)
     print("\n".join(report.lines()))
     if options.check:
         quality = contact_quality(

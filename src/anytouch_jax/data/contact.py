@@ -122,17 +122,24 @@ def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, worker
 
 
 def mark_contact(
-    manifest: Manifest, scores: ContactScores, *, thresholds: Mapping[str, float] | None = None, drop: bool = False
+    manifest: Manifest,
+    scores: ContactScores,
+    *,
+    thresholds: Mapping[str, float] | None = None,
+    share: float = 0.0,
+    drop: bool = False,
 ) -> tuple[Manifest, ContactReport]:
     """`manifest` with `label.contact_score` and `label.contact` (1, 0 or null where unknown), and what was found.
 
     A `label.contact` that the dataset gives is kept; a score column that is there is kept as `<name>_given`.
-    `thresholds` replaces entries of THRESHOLDS. `drop` leaves out the frames without contact, but never the split
+    `thresholds` replaces entries of THRESHOLDS. `share`: contact has at least this share of the highest score in its
+    sequence too; what is less is the making and the breaking of contact. `drop` leaves out the frames without contact, but never the split
     `background` nor a frame of which nothing is known.
     """
-    limits = _limits(manifest, thresholds)
-    score = scores.score
-    contact = np.where(np.isnan(score), np.nan, score > limits)
+    if not 0 <= share <= 1:
+        raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")
+    limits, score = _limits(manifest, thresholds), scores.score
+    contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * _highest(manifest, score)))
     background = np.asarray(manifest.table["split"].to_pylist(), object) == "background"
     contact[background] = 0  # what the split says
     given = known_contact(manifest)
@@ -166,6 +173,14 @@ def _limits(manifest: Manifest, thresholds: Mapping[str, float] | None) -> np.nd
     return np.array([table.get(name, DEFAULT_THRESHOLD) for name in manifest.table["sensor"].to_pylist()])
 
 
+def _highest(manifest: Manifest, score: np.ndarray) -> np.ndarray:
+    """The highest score in the sequence of every row, f64 (rows,)."""
+    codes = manifest.codes("sequence", own=True)
+    best = np.zeros(codes.max() + 1)
+    np.fmax.at(best, codes, score)
+    return np.asarray(best[codes])
+
+
 def _set(table: pa.Table, name: str, column: pa.Array, *, keep: bool = False) -> pa.Table:
     if name not in table.column_names:
         return table.append_column(name, column)
@@ -197,9 +212,9 @@ def known_contact(manifest: Manifest) -> np.ndarray:
     if "label.contact" not in manifest.table.column_names:
         return found
     for row, value in enumerate(manifest.table["label.contact"].to_pylist()):
-        if value is None:
+        word = "" if value is None else str(value).strip().lower()
+        if not word:  # an empty cell of a CSV
             continue
-        word = str(value).strip().lower()
         try:
             found[row] = words[word] if word in words else float(word)
         except ValueError:

@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config, UserError
 from anytouch_jax.data import text as texts
+from anytouch_jax.data.contact import known_contact
 from anytouch_jax.data.labels import Force, find_force
 from anytouch_jax.data.manifest import Manifest, ManifestError, sensor_rows
 from anytouch_jax.data.matching import Keys, Matches, felt_twice
@@ -117,17 +118,22 @@ def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray,
 
 
 def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """`rows` that have what `data.require` names; which rows of the manifest those are (None: any); notes."""
-    wanted = config.data.require
+    """`rows` that have what `data.require` and `contact_only` ask; which rows of the manifest (None: any); notes."""
+    wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
     if not wanted:
         return rows, None, []
     text = manifest.present("text") & ~withheld(manifest, aligned_text=config.data.aligned_text)
     has = {"image": manifest.present("image_path"), "text": text}
+    if config.data.contact_only:
+        if "label.contact" not in manifest.table.column_names:
+            raise UserError("--loader.contact-only reads the column 'label.contact', which `anytouch contact` writes")
+        has["contact"] = known_contact(manifest) != 0  # or nothing is known
     drawn = np.logical_and.reduce([has[name] for name in wanted])
     kept, what = rows[drawn[rows]], " and ".join(wanted)
+    named = "data.contact_only" if wanted == ["contact"] else "data.require"
     if not kept.size:
-        raise UserError(f"data.require: no row of split {config.data.split!r} has {what}")
-    return kept, drawn, [f"{len(kept)} of {len(rows)} rows have {what}; only they are drawn (data.require)"]
+        raise UserError(f"{named}: no row of split {config.data.split!r} has {what}")
+    return kept, drawn, [f"{len(kept)} of {len(rows)} rows have {what}; only they are drawn ({named})"]
 
 
 def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:

@@ -93,7 +93,8 @@ def render(
         halo = _halo(displacement, matrices, pitch, sensor)
     glow: tuple[Array, ...] | None = None
     if shadow and halo is not None:
-        glow = tuple(jnp.clip(f, -most, most) for f, most in zip(halo, photometry.widest, strict=True))
+        lit = (*_turned(halo[0], halo[1], unit), halo[2])
+        glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
     ink = None
     if sensor.markers is not None and halo is not None:
         ink = unit.marked * _ink(tangential, halo, matrices, place, sensor.markers, sensor, unit)
@@ -161,7 +162,11 @@ def _slopes(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor,
     if sensor.skin:
         by, bx = (splines.blur(n, sensor.skin / pitch) for n in displacement.shape)
         displacement = by @ displacement @ bx.T
-    x, y = ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch
+    return _turned(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit)
+
+
+def _turned(x: Array, y: Array, unit: Unit) -> tuple[Array, Array]:
+    """Slopes along x and y as the unit's lights meet them."""
     c, s = jnp.cos(unit.light_angle), jnp.sin(unit.light_angle)
     return c * x - s * y, s * x + c * y
 

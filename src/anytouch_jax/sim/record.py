@@ -53,7 +53,7 @@ class Take(NamedTuple):
 
     `image` u8 (T, h, w, 3) and `background` u8 (h, w, 3), or None for a sensor of fields; `field` f32: (T, 20, 20, 6)
     of such a sensor, displacement mm and force N, or (T, h0, w0, channels) of the fields asked for, or None; `labels`
-    f32 (T,): force N, depth mm, area mm2, x and y mm of the pressure's centroid in the picture, slip (share of the
+    f32 (T,): force N, depth mm of the deepest point, area mm2, x and y mm of the pressure's centroid in the picture, slip (share of the
     contact that slides), and for fidelity exact whether it converged.
     """
 
@@ -108,9 +108,10 @@ def record(
         sensor.gel, modulus=sensor.gel.modulus * clip.unit.modulus, thickness=sensor.gel.thickness * clip.unit.thickness
     )
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
-    contact = jax.vmap(press)(surfaces(clip, x, y), clip.depth)
+    relief = surfaces(clip, x, y)
+    contact = jax.vmap(press)(relief, clip.depth)
     sheared = _sheared(clip, contact, gel, pitch, fidelity) if slides else _unsheared(contact)
-    labels = _labels(clip, contact, sheared, pitch)
+    labels = _labels(clip, contact, sheared, pitch) | {"depth": _depth(clip, relief)}
     if fidelity == "fast":
         del labels["converged"]  # a few rounds are not meant to converge
     if sensor.kind == "field":
@@ -163,13 +164,20 @@ def _labels(clip: Clip, contact: Contact, sheared: shear.Shear, pitch: float) ->
     shown = (centre - clip.unit.window[None]) * clip.unit.mirror[None]
     return {
         "force": contact.force,
-        "depth": clip.depth,
         "area": jax.vmap(lambda p: mechanics.area(p, pitch))(contact.pressure),
         "x": shown[:, 0],
         "y": shown[:, 1],
         "slip": sheared.slip_fraction,
         "converged": (contact.converged & sheared.converged).astype(jnp.float32),
     }
+
+
+def _depth(clip: Clip, relief: Array) -> Array:
+    """How far the object's highest point under the gel (`relief` (T, h, w) mm) lies below the untouched skin, mm (T,).
+
+    Tilt and sliding bring other points under the gel, so it is not the depth that the hand goes for.
+    """
+    return jnp.maximum(clip.depth + jnp.max(relief, axis=(1, 2)), 0)
 
 
 def _fields(

@@ -41,9 +41,7 @@ class Scenes:
     beside the images. `units` each: every recording by a device of its own; one: one device of each sensor for all,
     mounted straight, as on the paper's calibrated platform. `first`: the number of the first touch; data sets of one
     seed, number of objects and share held out whose numbers do not overlap share objects and splits, and no touch.
-    In coarse data the label `depth` is what the hand goes for: tilt and sliding change what a frame shows, as `force`
-    and `area` tell. Raises UserError
-    for what cannot be simulated.
+    Raises UserError for what cannot be simulated.
     """
 
     touches: int = 400

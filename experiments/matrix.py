@@ -3,7 +3,8 @@
 Runs what is not done yet, one JSON file a run, and renders `experiments/results/README.md` from all of them. What is
 run stands in `study/plan.py`, what it costs in `study/budget.py`; `--plan` prints both. The same command again goes on,
 and the same command in another terminal helps: what one works on the other leaves to it. `--jobs 2` does just that.
-A folder of results is of one version of the simulator and of one size: runs of another go to a new one, `--out`.
+The results of a question are of one version of the simulator and of one size: those of another go to a new folder,
+`--out`, or are moved away first.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
         except ValueError:
             raise UserError(f"--set {change}: {text!r} is no number") from None
         size = dataclasses.replace(size, **{name: value})
-    return size if not changes or quick else dataclasses.replace(size, name="changed")
+    same = quick or plan.settings(size) == plan.settings(plan.FULL)
+    return size if same else dataclasses.replace(size, name="changed")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

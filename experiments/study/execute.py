@@ -61,20 +61,20 @@ def is_done(leaf: Leaf, out: Path) -> bool:
 
 
 def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
-    """Raise UserError where `out` holds results of another simulator or of other settings than these runs.
+    """Raise UserError where `out` holds results of one of these questions of another simulator or of other settings.
 
-    In one folder they would stand in one table, and a part of what is there would be written over.
+    They would stand in one table, and a part of what is there would be written over.
     """
     if not leaves:
         return
-    size = leaves[0].size
+    size, questions = leaves[0].size, {leaf.question for leaf in leaves}
     ours = {"simulator": plan.simulator(), "settings": plan.settings(size), "size": size.name}
     for path in sorted(out.glob("*.json")):
         try:
             theirs = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             continue  # broken: it is made again
-        if not isinstance(theirs, dict):
+        if not isinstance(theirs, dict) or theirs.get("question") not in questions:
             continue
         if simulated(theirs) != ours["simulator"]:
             what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
@@ -83,7 +83,8 @@ def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
         else:
             continue
         raise UserError(
-            f"{out} holds results of {what}: give a new folder, for example make experiments OUT=runs/study"
+            f"{out} holds results of {theirs['question']} of {what}: give a new folder, for example "
+            f"make experiments OUT=runs/study, or move {theirs['question']}-*.json away to make them anew"
         )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.train.record import write_atomic
 
 from . import pictures, questions, real_table
+from .plan import LABELS
 from .questions import Part
 from .results import CLAIM, Run, comparable, differences, drawn, read, simulated
 from .tables import by_chance, tally
@@ -59,7 +61,7 @@ def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
         tally({p.title: p.statements for p in found.values() if p.statements}),
         by_chance([one for part in found.values() for one in part.statements]),
     ]
-    sizes = sorted({str(run.about.get("size")) for run in runs})
+    sizes = sorted({size_of(run, runs) for run in runs})
     if sizes not in ([], ["full"]):
         lines.append(f"**Sizes in these results: {', '.join(sizes)}. Numbers of toy sizes mean nothing.**")
     for name, part in found.items():
@@ -67,6 +69,18 @@ def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
         if name in by_name:
             lines.append(f"![{part.title}](figures/{by_name[name].name})")
     return "\n\n".join([*lines, "## The runs", provenance(runs)]) + "\n"
+
+
+def size_of(run: Run, runs: Sequence[Run]) -> str:
+    """The name of a run's size: "full" where its settings are those of a run that is."""
+    ours = run.about.get("settings")
+    return "full" if ours and any(_alike(ours, one) for one in runs) else str(run.about.get("size"))
+
+
+def _alike(settings: Mapping[str, Any], other: Run) -> bool:
+    theirs = other.about.get("settings") or {}
+    names = (settings.keys() | theirs.keys()) - set(LABELS)
+    return other.about.get("size") == "full" and all(settings.get(name) == theirs.get(name) for name in names)
 
 
 def provenance(runs: Sequence[Run]) -> str:

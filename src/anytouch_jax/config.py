@@ -104,15 +104,16 @@ class Optim:
 class Data:
     """What is read and how it is augmented. `jitter` is (brightness, contrast, saturation, hue).
 
-    `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the
-    release). `split_steps`: stage 2 takes align and match batches in separate steps (the release).
-    `weights`: (dataset, how often it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is
-    what the recipe does (the release in stage 2: RELEASE_WEIGHTS, where they are there). `negatives`: of matching, from
-    any sensor or from the positive's, so that the sensor alone does not tell them apart. `require`: draw only rows that
-    have these; `contact_only`: leave out rows that `label.contact` calls free (see `anytouch contact`), since the
-    paper's frames are contact frames; rows of which nothing is known stay, and a clip counts by its last frame. `aligned_text`: train on the text of rows whose touch other sensors or units felt too.
-    `background` "subtract": touches are shown less the picture of the untouched gel (`background_path`), on middle
-    grey: what is left is the contact, not the unit's own tint, lights and dots. Beyond the paper (its successor does).
+    `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the release).
+    `split_steps`: stage 2 takes align and match batches in separate steps (the release). `weights`: (dataset, how often
+    it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is what the recipe does (the release
+    in stage 2: RELEASE_WEIGHTS, where they are there). `negatives`: of matching, from any sensor or from the
+    positive's, so that the sensor alone does not tell them apart. `require`: draw only rows that have these;
+    `contact_only`: leave out rows that `label.contact` calls free (see `anytouch contact`), since the paper's frames
+    are contact frames; rows of which nothing is known stay, and a clip counts by its last frame. `aligned_text`: train
+    on the text of rows whose touch other sensors or units felt too. `background` "subtract": touches are shown less the
+    picture of the untouched gel (`background_path`), on middle grey: what is left is the contact, not the unit's own
+    tint, lights and dots. Beyond the paper (its successor does).
     """
 
     manifests: tuple[str, ...] = ()

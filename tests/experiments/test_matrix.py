@@ -11,7 +11,9 @@ from pathlib import Path
 import matrix
 import pytest
 import synthetic
-from study import plan, results, work
+from study import execute, plan, results, work
+
+from anytouch_jax.config import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = ("untrained", "pixels")  # without a training
@@ -88,16 +90,31 @@ def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(t
     words += ["--minutes", "0.01"]
     paths = synthetic.write(tmp_path / "matrix", plan.leaves(plan.QUICK, real=False)[:2])
     for change, sentence in (
-        ({"simulator": 1}, "holds results of version 1 of the simulator, and these runs are of version"),
+        ({"simulator": 1}, "holds results of {question} of version 1 of the simulator, and these runs are of version"),
         ({"settings": {"steps1": 999}}, "of other settings than these runs (steps1 6 and 999): give a new folder"),
     ):
         text = json.dumps(json.loads(paths[1].read_text()) | change)
         paths[1].write_text(text)
         assert matrix.main([*words, "--jobs", "3"]) == 1
         out, error = capsys.readouterr()
+        sentence = sentence.format(question=json.loads(text)["question"])
         assert sentence in error and "make experiments OUT=runs/study" in error and len(error.splitlines()) == 1
         assert not out and paths[1].read_text() == text and not (tmp_path / "work").exists()
         paths[1].write_text(paths[0].read_text())
+
+
+def test_results_of_a_question_that_is_not_asked_for_may_be_of_another_simulator(tmp_path):
+    leaves = plan.leaves(plan.QUICK, real=False)
+    path = synthetic.write(tmp_path, leaves[:1])[0]
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"simulator": 1}))
+    execute.check_folder([leaf for leaf in leaves if leaf.question != leaves[0].question], tmp_path)
+    with pytest.raises(UserError, match=rf"move {leaves[0].question}-\*\.json away to make them anew"):
+        execute.check_folder(leaves, tmp_path)
+
+
+def test_seeds_alone_make_no_other_size():
+    assert matrix.size_of(False, ["seeds=2"]).name == "full"
+    assert matrix.size_of(False, ["seeds=2", "steps1=7"]).name == "changed"
 
 
 def test_the_committed_results_are_of_one_simulator_and_can_be_shown():

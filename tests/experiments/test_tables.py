@@ -165,7 +165,7 @@ def test_every_question_has_its_signs(rendered):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"simulator": 1}, "simulator version 1 and 2"),
+        ({"simulator": 1}, f"simulator version 1 and {plan.simulator()}"),
         ({"settings": {"steps1": 400}}, "steps1 150 and 400"),
         ({"settings": None, "size": "changed"}, "size changed and full"),
         ({"data": {"own": "1" * 64, "aligned": "2" * 64}}, "data set own of seed 1 00000000 and 11111111"),

@@ -133,8 +133,8 @@ def mark_contact(
 
     A `label.contact` that the dataset gives is kept; a score column that is there is kept as `<name>_given`.
     `thresholds` replaces entries of THRESHOLDS. `share`: contact has at least this share of the highest score in its
-    sequence too; what is less is the making and the breaking of contact. `drop` leaves out the frames without contact, but never the split
-    `background` nor a frame of which nothing is known.
+    sequence too; what is less is the making and the breaking of contact. `drop` leaves out the frames without contact,
+    but never the split `background` nor a frame of which nothing is known.
     """
     if not 0 <= share <= 1:
         raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")

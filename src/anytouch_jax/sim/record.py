@@ -53,8 +53,8 @@ class Take(NamedTuple):
 
     `image` u8 (T, h, w, 3) and `background` u8 (h, w, 3), or None for a sensor of fields; `field` f32: (T, 20, 20, 6)
     of such a sensor, displacement mm and force N, or (T, h0, w0, channels) of the fields asked for, or None; `labels`
-    f32 (T,): force N, depth mm of the deepest point, area mm2, x and y mm of the pressure's centroid in the picture, slip (share of the
-    contact that slides), and for fidelity exact whether it converged.
+    f32 (T,): force N, depth mm of the deepest point, area mm2, x and y mm of the pressure's centroid in the picture,
+    slip (share of the contact that slides), and for fidelity exact whether it converged.
     """
 
     image: Any

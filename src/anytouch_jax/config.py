@@ -113,7 +113,7 @@ class Data:
     are contact frames; rows of which nothing is known stay, and a clip counts by its last frame. `aligned_text`: train
     on the text of rows whose touch other sensors or units felt too. `background` "subtract": touches are shown less the
     picture of the untouched gel (`background_path`), on middle grey: what is left is the contact, not the unit's own
-    tint, lights and dots. Beyond the paper (its successor does).
+    tint, lights and dots. Beyond the paper (its successor does). `cache`: MB of frames that are kept in memory.
     """
 
     manifests: tuple[str, ...] = ()
@@ -134,11 +134,14 @@ class Data:
     tokenizer: str | None = None
     threads: int = 2
     prefetch: int = 4
+    cache: int = 512
     on_bad_sample: Literal["error", "skip"] = "error"
 
     def __post_init__(self) -> None:
         in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE, jitter=NOT_NEGATIVE)
-        in_range("--loader.", self, rotation=NOT_NEGATIVE, threads=NOT_NEGATIVE, prefetch=NOT_NEGATIVE)
+        in_range(
+            "--loader.", self, rotation=NOT_NEGATIVE, threads=NOT_NEGATIVE, prefetch=NOT_NEGATIVE, cache=NOT_NEGATIVE
+        )
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data import text
+from anytouch_jax.data import samples, text
+from anytouch_jax.data.images import decode
 from anytouch_jax.data.loader import Loader, SampleError
 from anytouch_jax.data.manifest import ManifestError, read, write
 from anytouch_jax.data.samples import fill_slot
+from anytouch_jax.data.transforms import TOUCH, augmentation_rng, subtract_background, touch_transform
 
 
 def _clips(sequences=3, length=7, stride=1, **extra):
@@ -58,6 +60,43 @@ def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, setti
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("anytouch-data")]
     changed = Loader(manifest, replace(config, run=replace(config.run, seed=1)))
     assert any(not np.array_equal(a, b) for a, b in zip(_leaves(changed.batch(0)), _leaves(first[0][1]), strict=False))
+
+
+def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, monkeypatch):
+    rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
+    manifest = make(rows)
+    noise = np.random.default_rng(0)
+    for name in (*(f"f{i}" for i in range(8)), "gel0", "gel1"):
+        path = Path(manifest.file(0)).with_name(f"{name}.png")
+        assert cv2.imwrite(str(path), noise.integers(0, 255, (45, 60, 3), np.uint8))
+    read: list[str] = []
+    monkeypatch.setattr(samples, "decode", lambda path: (read.append(Path(path).name), decode(path))[1])
+    whole, counts = [], []
+    for cache in (0, 512):
+        config = settings(1, plain=False, background="subtract", cache=cache)
+        batches = [Loader(manifest, config).batch(step).clip for step in range(2)]
+        read.clear()
+        loader = Loader(manifest, config)
+        batches += [loader.batch(step).clip for step in range(2, 8)]
+        whole.append(batches)
+        counts.append(len(read))
+    for one, other in zip(*whole, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert counts[0] > 60 and counts[1] == len(set(read)) == 10
+    config = settings(1, plain=False, background="subtract")
+    rng = augmentation_rng(config.run.seed, 3, 3, TOUCH)
+    files = [decode(manifest.file(row)) for row in range(4)] + [decode(manifest.file(3, "background_path"))]
+    *seen, gel = touch_transform(files, config.model.image_size, rng, config.data)
+    made = samples.Reader(manifest, config).touch(np.arange(4), 3)
+    np.testing.assert_array_equal(made, subtract_background(seen, gel))
+
+
+def test_contrast_reads_no_third_touch(make, settings, rich):
+    config = settings(2, plain=True)
+    config = replace(config, model=replace(config.model, match_head="cosine"))
+    for step in range(2):
+        match = Loader(make(rich), config).batch(step).match
+        assert match.clip.any() and match.positive.any() and not match.negative.any()
 
 
 def test_augmentation_does_not_depend_on_the_batch(make, settings):

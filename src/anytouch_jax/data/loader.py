@@ -274,8 +274,11 @@ class Loader:
         anchor = int(pairs.matches.anchors[index])
         row = int(pairs.windows[anchor, -1])
         rng = np.random.default_rng([self.config.run.seed % 2**63, _TRIPLE, epoch, row])
-        for (clip, sensor), chosen in zip(parts, (anchor, *pairs.matches.draw(anchor, rng)), strict=True):
-            rows = pairs.windows[chosen]
+        positive, negative = pairs.matches.draw(anchor, rng)
+        alone = self.config.model.match_head == "cosine"  # the batch is the negatives: a third touch is not read
+        triple = (anchor, positive) if alone else (anchor, positive, negative)
+        for (clip, sensor), touch in zip(parts, triple, strict=False):
+            rows = pairs.windows[touch]
             self._reader.touch(rows, epoch, clip[slot])
             sensor[slot] = self._sensor[rows[-1]]
 

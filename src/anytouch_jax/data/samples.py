@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -34,10 +34,15 @@ class SampleError(UserError):
 
 @dataclass(frozen=True)
 class Reader:
-    """Reads samples of `manifest` at the model's size, augmented as `config` says."""
+    """Reads samples of `manifest` at the model's size, augmented as `config` says.
+
+    Frames are kept in memory as they are after resizing, the first that fit into `data.cache` MB: a small data set is
+    read once, not once an epoch. What a sample holds does not depend on it.
+    """
 
     manifest: Manifest
     config: Config
+    _kept: dict[Path, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     def touch(self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None) -> np.ndarray:
         """The frames of a window of rows as u8 (T, size, size, 3); `epoch` None means no augmentation.
@@ -47,9 +52,11 @@ class Reader:
         change both: a change of brightness alone would outshine the contact. Raises SampleError.
         """
         size, data = self.config.model.image_size, self.config.data
-        frames = [read_picture(self.manifest, row) for row in rows]
-        gel = self._background(int(rows[-1])) if data.background == "subtract" else None
-        if epoch is None or not (data.flip or any(data.jitter)):
+        plain = epoch is None or not (data.flip or any(data.jitter))
+        how = None if plain else self._resized
+        frames = [read_picture(self.manifest, row, how=how) for row in rows]
+        gel = self._background(int(rows[-1]), how or _gel) if data.background == "subtract" else None
+        if epoch is None or plain:
             return touch_evaluation(frames if gel is None else subtract_background(frames, gel), size, out)
         rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
         if gel is None:
@@ -70,13 +77,24 @@ class Reader:
         """The caption of a row."""
         return str(self.manifest.value(row, "text"))
 
-    def _background(self, row: int) -> np.ndarray:
+    def _resized(self, file: Path) -> np.ndarray:
+        """The picture of a file at the model's size, read-only; `touch_transform` finds nothing to resize any more."""
+        found = self._kept.get(file)
+        if found is None:
+            size = self.config.model.image_size
+            found = touch_evaluation([decode(file)], size)[0]
+            found.flags.writeable = False
+            if (len(self._kept) + 1) * found.nbytes <= self.config.data.cache * 1_000_000:
+                self._kept[file] = found
+        return found
+
+    def _background(self, row: int, how: Callable[[Path], np.ndarray]) -> np.ndarray:
         if self.manifest.value(row, "background_path") is None:
             raise SampleError(
                 f"{self.manifest.where(row)} has no background_path, which --loader.background subtract takes off; "
                 "name one, or train with --loader.background keep"
             )
-        return read_picture(self.manifest, row, "background_path", _gel)
+        return read_picture(self.manifest, row, "background_path", how)
 
 
 def read_picture(

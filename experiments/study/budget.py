@@ -1,12 +1,13 @@
 """What the matrix costs, and how it is cut.
 
 Rates are medians of the 83 trainings and 96 runs of `results/matrix/`, most made two at a time on two slow CPU cores
-with a load of 2 to 8; alone on a quiet machine a training takes about two thirds. At preset tiny with 112 pixels:
-stage 1 1.15 s a step of 64; stage 2 4.7 s a step of 32, of which the touch to align 1.2 s, photographs 0.3 s, text
-0.2 s and the three touches of a match 3.0 s; in proportion to the tokens for smaller pictures, to the weights for
-smaller towers; 100 simulated frames a second and 10 s for the program of a sensor; about 25 s to start and end a
-training; a run's scores 6 to 350 s. `matrix.py --plan` prints the sum for any size; eight chunks, each of which makes
-its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do `JOBS` times as much an hour.
+with a load of 2 to 8; alone on a quiet machine a training takes about two thirds. At preset tiny with 112 pixels: stage
+1 1.15 s a step of 64; stage 2 4.7 s a step of 32, of which the touch to align 1.2 s, photographs 0.3 s, text 0.2 s and
+the three touches of a match 3.0 s; in proportion to the tokens for smaller pictures, to the weights for smaller towers
+(but seven tenths of stage 1, its decoder and pixels, are the same for all); 100 simulated frames a second and 10 s for
+the program of a sensor; about 25 s to start and end a training; a run's scores 6 to 350 s. `matrix.py --plan` prints
+the sum for any size; eight chunks, each of which makes its data again, stay below 75 minutes. Two processes side by
+side (`--jobs 2`) do `JOBS` times as much an hour.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ SCORES: Mapping[str, float] = {
     "real": 95,
 }  # fmt: skip
 _TOY = 0.12  # a toy's share of these
+_DECODER = 0.7  # of a step of stage 1 at preset tiny
 
 
 def of_training(one: Training) -> float:
@@ -32,14 +34,14 @@ def of_training(one: Training) -> float:
     config = one.config
     batch, steps = config.data.batch_size, config.run.steps
     picture = (config.model.patches + 6) / 70  # tokens beside those of 112 pixels
+    stack = config.model.touch
+    share = max(_TOY, stack.width**2 * stack.depth / (192**2 * 6))  # of the work of preset tiny
     if config.stage == 1:
-        step = 1.15 * picture * batch / 64
+        step = 1.15 * picture * batch / 64 * (_DECODER / share + 1 - _DECODER)
     else:
         touches = (0.7 if config.model.match_head == "cosine" else 1.0) * config.objective.match_keep
         parts = (1.2, 0.3 * bool(config.model.image), 3.0 * touches * matches(one))
         step = (sum(parts) * picture + 0.2 * bool(config.model.text)) * batch / 32
-    stack = config.model.touch
-    share = max(_TOY, stack.width**2 * stack.depth / (192**2 * 6))  # of the work of preset tiny
     return (START if share > _TOY else START * _TOY) + steps * step * share
 
 

@@ -64,11 +64,28 @@ def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
     sizes = sorted({size_of(run, runs) for run in runs})
     if sizes not in ([], ["full"]):
         lines.append(f"**Sizes in these results: {', '.join(sizes)}. Numbers of toy sizes mean nothing.**")
+    if unlike := recipes(runs):
+        lines.append(f"The questions are of different recipes: {unlike}. A table never mixes them.")
     for name, part in found.items():
         lines += [f"## {part.title}", part.text]
         if name in by_name:
             lines.append(f"![{part.title}](figures/{by_name[name].name})")
     return "\n\n".join([*lines, "## The runs", provenance(runs)]) + "\n"
+
+
+def recipes(runs: Sequence[Run]) -> str:
+    """Which questions are of which simulator and settings, those that differ, in words; empty where none does."""
+    by_question: dict[str, dict[str, str]] = {}
+    for run in comparable(runs):
+        settings = {name: str(value) for name, value in (run.about.get("settings") or {}).items() if name not in LABELS}
+        by_question[run.question] = {"simulator": str(simulated(run.about)), **settings}
+    names = dict.fromkeys(name for one in by_question.values() for name in one)
+    differ = [name for name in names if len({one.get(name) for one in by_question.values()}) > 1]
+    groups: dict[str, list[str]] = {}
+    for question, one in by_question.items():
+        words = ", ".join(f"{name} {one[name]}" for name in differ if name in one)
+        groups.setdefault(words, []).append(question)
+    return "; ".join(f"{', '.join(of)}: {words}" for words, of in groups.items()) if len(groups) > 1 else ""
 
 
 def size_of(run: Run, runs: Sequence[Run]) -> str:

@@ -166,7 +166,7 @@ def test_every_question_has_its_signs(rendered):
     ("change", "words"),
     [
         ({"simulator": 1}, f"simulator version 1 and {plan.simulator()}"),
-        ({"settings": {"steps1": 400}}, "steps1 150 and 400"),
+        ({"settings": {"steps1": 999}}, "steps1 400 and 999"),
         ({"settings": None, "size": "changed"}, "size changed and full"),
         ({"data": {"own": "1" * 64, "aligned": "2" * 64}}, "data set own of seed 1 00000000 and 11111111"),
     ],
@@ -180,6 +180,17 @@ def test_runs_of_other_data_or_settings_stand_in_no_table(change, words, tmp_pat
     assert f"**No table: these runs differ in what they must share ({words}).**" in lines and "|" not in lines
     assert "| Ablations (Table 6) |" not in after
     assert section(after, "Dynamics") == section(text, "Dynamics")
+
+
+def test_questions_of_another_recipe_are_named(tmp_path, rendered):
+    text, _ = rendered(lambda question, name: 0.0)
+    assert "different recipes" not in text
+    for path in tmp_path.glob("q2-*.json"):
+        about = json.loads(path.read_text())
+        about["settings"] |= {"contact": 0.7}
+        path.write_text(json.dumps(about | {"simulator": 9}))
+    line = next(line for line in report.text(read(tmp_path)).splitlines() if "different recipes" in line)
+    assert "q2: simulator 9, contact 0.7" in line and f"simulator {plan.simulator()}, contact 0.6" in line
 
 
 def test_another_seed_may_have_been_simulated_on_another_processor(tmp_path):

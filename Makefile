@@ -62,7 +62,7 @@ help: ## list the targets
 
 setup: $(STAMP) ## make .venv with the pinned versions
 
-demo: $(STAMP) ## simulate, train both stages, probe and report, in some ten minutes: [DEMO=]
+demo: $(STAMP) ## simulate, train both stages, probe and report, in some eleven minutes: [DEMO=]
 	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
 	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1 $(DEMO1)

@@ -116,8 +116,11 @@ def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
     done = make("-n", "demo", "DEMO=d")
     steps = [line for line in done.stdout.splitlines() if "anytouch_jax " in line and "pip" not in line]
     words = [line.split("anytouch_jax ")[1].split()[0] for line in steps]
-    assert words == ["simulate", "train", "train", "report"]
-    assert "--stage 1" in steps[1] and "--stage 2" in steps[2] and "--init d/stage1" in steps[2]
+    assert words == ["simulate", "contact", "train", "train", "report"]
+    assert steps[1].startswith("test -e d/scenes/contact.parquet || ")  # a second run does not mark again
+    assert "--stage 1" in steps[2] and "--stage 2" in steps[3] and "--init d/stage1" in steps[3]
+    for step in steps[2:4]:
+        assert "--data d/scenes/contact.parquet" in step and "--loader.contact-only" in step
 
 
 def test_notebooks_run_in_their_own_folder_and_find_their_helpers() -> None:

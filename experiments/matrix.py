@@ -2,7 +2,8 @@
 
 Runs what is not done yet, one JSON file a run, and renders `experiments/results/README.md` from all of them. What is
 run stands in `study/plan.py`, what it costs in `study/budget.py`; `--plan` prints both. The same command again goes on,
-and the same command in another terminal helps: what one works on the other leaves to it. `--jobs 2` does just that.
+and the same command in another terminal helps: what one works on the other leaves to it. `--jobs` does just that, each
+process on its own share of the cores.
 The results of a question are of one version of the simulator and of one size: those of another go to a new folder,
 `--out`, or are moved away first.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -32,7 +34,7 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="toy sizes: does it work?")
     parser.add_argument("--minutes", type=float, help="stop before a run that would not fit")
     parser.add_argument("--chunk", help="i/n: only part i of n, of about equal cost")
-    parser.add_argument("--jobs", type=int, default=1, help="processes side by side (two: a third more an hour)")
+    parser.add_argument("--jobs", type=int, default=min(2, len(cores())), help="processes (default: 2 on two cores)")
     parser.add_argument("--only", nargs="+", help="only these questions")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=0,1")
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
@@ -73,15 +75,28 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _render(chosen)
         check_folder(chosen.leaves, chosen.out / "matrix")
         _check_objects(chosen)
-        again = [sys.executable, __file__, *words, "--jobs", "1"]
-        helpers = [subprocess.Popen(again) for _ in range(asked.jobs - 1)]
-        return max(_execute(chosen, asked.minutes), *(helper.wait() for helper in helpers), 0)
+        return _execute(chosen, asked.minutes) if asked.jobs == 1 else _side_by_side(words, asked.jobs)
     except UserError as error:
         print(f"matrix: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted; the same command goes on", file=sys.stderr)
         return 130
+
+
+def cores() -> list[int]:
+    """Those that this process may use."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def _side_by_side(words: Sequence[str], jobs: int) -> int:
+    """The same command in `jobs` processes, each on cores of its own: pools of threads that share cores wait."""
+    again = [sys.executable, __file__, *words, "--jobs", "1"]
+    helpers = [subprocess.Popen(again) for _ in range(jobs)]
+    if hasattr(os, "sched_setaffinity") and jobs <= len(cores()):
+        for number, helper in enumerate(helpers):
+            os.sched_setaffinity(helper.pid, cores()[number::jobs])
+    return max(abs(helper.wait()) for helper in helpers)  # a signal's number is negative
 
 
 class Chosen(NamedTuple):

@@ -122,6 +122,27 @@ def test_the_committed_results_are_of_one_simulator_and_can_be_shown():
     assert len({results.simulated(run.about) for run in runs}) == 1 and len(results.comparable(runs)) == len(runs)
 
 
+def test_processes_side_by_side_have_cores_of_their_own(tmp_path, monkeypatch):
+    started, shares = [], []
+
+    class Process:
+        def __init__(self, words):
+            started.append(words)
+            self.pid = len(started)
+
+        def wait(self):
+            return -9 if self.pid == 2 else 0
+
+    monkeypatch.setattr(matrix.subprocess, "Popen", Process)
+    monkeypatch.setattr(matrix, "cores", lambda: [3, 4, 5])
+    monkeypatch.setattr(matrix.os, "sched_setaffinity", lambda pid, cores: shares.append((pid, cores)), raising=False)
+    words = ["--quick", "--only", "q2", "--work", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    assert matrix.main(words) == 9  # one was killed
+    assert [one[-2:] for one in started] == [["--jobs", "1"]] * 2 and started[0][2 : 2 + len(words)] == words
+    assert shares == [(1, [3, 5]), (2, [4])]
+    assert matrix.main([*words, "--jobs", "4"]) == 0 and len(shares) == 2  # more than cores: they are shared
+
+
 def test_changed_sizes_are_written_beside_the_data():
     default = ROOT / "experiments" / "results"
     assert matrix.choose(matrix.options([])).out == default
@@ -145,7 +166,7 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
     sizes = {"own": 24, "fine": 24, "coarse": 24, "other": 24, "objects": 24, "frames": 6, "steps1": 2, "steps2": 2}
     words = ["--quick", "--set", *(f"{name}={number}" for name, number in sizes.items())]
     words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
-    words += ["--real", str(tmp_path / "none.csv")]
+    words += ["--real", str(tmp_path / "none.csv"), "--jobs", "1"]
     assert matrix.main(words) == 0, capsys.readouterr().err
     files = sorted(path.name for path in (tmp_path / "out" / "matrix").iterdir())
     names = ("q2-aligned", "q2-masked", "q2-matched", "q2-pixels", "q2-untrained", "grasp-anytouch")

@@ -123,7 +123,7 @@ export-onnx: $(ONNX)/.made
 export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]
 	$(PY) experiments/onnx_export/run.py --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
 
-experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=2 MINUTES=75 CHUNK=2/5 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
+experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=1 MINUTES=75 CHUNK=2/5 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
 	$(PY) experiments/matrix.py$(if $(QUICK), --quick)$(if $(JOBS), --jobs $(JOBS))$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(RENDER), --render)$(if $(PLAN), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
 notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..." RUN= DATA=]

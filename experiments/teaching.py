@@ -20,7 +20,7 @@
 #    tokens. Linear probes on its features, for labels that captions name (hardness, roughness, material) and for one
 #    that they do not (indenter).
 #
-# `.venv/bin/python experiments/teaching.py` does all of it, run by run, in about an hour: what is finished is not done
+# `.venv/bin/python experiments/teaching.py` does all of it, run by run, in over an hour: what is finished is not done
 # again. `TOUCHES=260 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where
 # runs and results go.
 

@@ -40,7 +40,7 @@ import numpy as np
 from study import page
 
 from anytouch_jax.config import preset
-from anytouch_jax.evaluate import plots, pouring, pouring_bounds, pouring_policy, pouring_table
+from anytouch_jax.evaluate import plots, pouring, pouring_bounds, pouring_policy, pouring_table, pouring_tuning
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
 from anytouch_jax.sim.pouring import VERSION, Task
@@ -63,7 +63,7 @@ for word in words:
 RUNS = {name: paths.split(",") for name, paths in (word.split("=", 1) for word in words)}
 SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
 MODES = (os.environ.get("MODES") or ("frozen" if QUICK else "frozen,fine-tuned")).split(",")
-TRIALS, DEMOS, TUNE = setting("TRIALS", 10, 10), setting("DEMOS", 40, 12), setting("TUNE", 150, 20)
+TRIALS, DEMOS, TUNE = setting("TRIALS", 10, 10), setting("DEMOS", 200, 12), setting("TUNE", 400, 20)
 OUT = Path(os.environ.get("OUT") or "experiments/results")
 FOLDER, PAGE = OUT / ("pouring-quick" if QUICK else "pouring"), OUT / ("pouring-quick.md" if QUICK else "pouring.md")
 TASK = Task()
@@ -174,7 +174,7 @@ def do_seed(seed: int) -> None:
         policy = pouring_policy.learn_frozen(encoder, demonstrations(side), learning, stills=stills)
         for mode in todo:
             if mode == "fine-tuned":
-                since, policy = time.time(), pouring_policy.fine_tune(policy, demonstrations(side), learning)
+                since, policy = time.time(), pouring_tuning.fine_tune(policy, demonstrations(side), learning)
             trials = pouring.run(TASK, setups, keys, policy, side=side, grasps=grasps(side))
             write(name, mode, trials, source, since, loss=round(policy.loss, 4))
 

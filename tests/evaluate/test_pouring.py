@@ -13,13 +13,14 @@ from PIL import Image
 from tiny_models import tiny_config
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate import pouring, pouring_bounds, pouring_policy, pouring_table
+from anytouch_jax.evaluate import pouring, pouring_bounds, pouring_policy, pouring_table, pouring_tuning
 from anytouch_jax.evaluate.features import random_encoder
+from anytouch_jax.evaluate.pouring import START
 from anytouch_jax.evaluate.pouring_policy import Learning
 from anytouch_jax.sim.pouring import POUR, RETRACT, WAIT, Task
 
 TASK, SIDE = Task(), 28
-FAST = Learning(steps=600, width=32, tune_steps=2, tune_batch=4)
+FAST = Learning(steps=600, width=32, tune_steps=2, tune_runs=2)
 
 
 @pytest.fixture(scope="module")
@@ -204,12 +205,47 @@ def test_touch_sees_in_a_run_what_it_learned_from(shown, encoder):
 def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encoder):
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     before = jax.tree.map(np.array, encoder.params)
-    tuned = pouring_policy.fine_tune(policy, shown, FAST)
+    tuned = pouring_tuning.fine_tune(policy, shown, FAST)
     moved = jax.tree.map(lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()), tuned.encoder.params, before)
     assert max(jax.tree.leaves(moved)) > 1e-5
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, encoder.params), before)
     found = pouring.run(replace(TASK, limit=9), *pouring.draw_runs(TASK, 3, 2), tuned, side=SIDE)
     assert found.poured.shape == (2,) and found.frames is None
+
+
+def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
+    """Before the first step, the logits of a chain are those of the frozen policy at its moments."""
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
+    z = pouring_policy.features(encoder, shown, stills=False, batch=8)
+    wanted = np.asarray(pouring_policy.forward(policy.head, pouring_policy.input_table(z).reshape(8, -1)))
+    chains = pouring_tuning.draw(np.random.default_rng(0), shown.steps, 6, 3)
+    where = np.stack([chains.numbers, np.broadcast_to(chains.runs[:, None], chains.numbers.shape)], -1)
+    clips = pouring_policy.segments(encoder, shown.frames, where.reshape(-1, 2), 3).reshape(6, 6, 3, SIDE, SIDE, 3)
+    params = {"encoder": encoder.params, "head": {"basis": policy.head.basis, "layers": policy.head.layers}}
+    row = encoder.sensor_row(policy.sensor)
+    found = pouring_tuning.logits_of(params, clips, net=encoder.net, mean=policy.head.mean, sensor=row)
+    moment = chains.numbers[:, 3:] - pouring_policy.LIFTED
+    runs = np.broadcast_to(chains.runs[:, None], moment.shape)
+    expected = wanted.reshape(4, 2, 3)[moment, runs]
+    np.testing.assert_allclose(found[chains.inside], expected[chains.inside], atol=1e-4 * np.abs(wanted).max())
+
+
+def test_every_moment_of_choice_is_as_likely_in_a_chain():
+    steps = np.array([START + 1, START + 20])
+    chains = pouring_tuning.draw(np.random.default_rng(0), steps, 30_000, 3)
+    now, before = chains.numbers[:, 3:], chains.numbers[:, 2:-1]
+    np.testing.assert_array_equal(np.maximum(now - pouring_policy.LAG, pouring_policy.LIFTED)[chains.inside],
+                                  before[chains.inside])  # fmt: skip
+    for run, moments in enumerate(steps - START):
+        met = np.bincount((now - pouring_policy.LIFTED)[(chains.runs == run)[:, None] & chains.inside])
+        assert len(met) == moments and met.min() > 0.9 * met.mean() and met.max() < 1.1 * met.mean()
+
+
+def test_a_mirror_turns_whole_runs(shown, encoder):
+    where, sides = np.array([[0, 0], [3, 1]]), np.array([[1, 0], [0, 1]])
+    plain, turned = (pouring_policy.segments(encoder, shown.frames, where, 3, one) for one in (None, sides))
+    np.testing.assert_array_equal(turned[0], plain[0, :, ::-1])
+    np.testing.assert_array_equal(turned[1], plain[1, :, :, ::-1])
 
 
 def test_without_a_look_nothing_is_drawn(monkeypatch):

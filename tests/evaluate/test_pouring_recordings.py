@@ -14,14 +14,14 @@ from tiny_models import tiny_config
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.evaluate import pouring, pouring_policy, pouring_recordings
+from anytouch_jax.evaluate import pouring, pouring_policy, pouring_recordings, pouring_tuning
 from anytouch_jax.evaluate.features import random_encoder
 from anytouch_jax.evaluate.pouring_policy import Learning
 from anytouch_jax.sim.pouring import POUR, RETRACT, WAIT, Task
 
 SIDE, COUNT = 28, 4
 TASK = replace(Task(), limit=9)
-FAST = Learning(steps=20, width=8, tune_steps=2, tune_batch=4)
+FAST = Learning(steps=20, width=8, tune_steps=2, tune_runs=2)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_recordings_teach_what_the_demonstrations_teach(shown, manifest, encoder
 def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder, tmp_path, stills):
     found = pouring_recordings.read(manifest, SIDE)
     policy = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=stills, sensor=found.sensor)
-    policy = pouring_policy.fine_tune(policy, found.part(False), FAST)
+    policy = pouring_tuning.fine_tune(policy, found.part(False), FAST)
     pouring_recordings.save_policy(tmp_path, policy)
     again = pouring_recordings.load_policy(tmp_path)
     said = []

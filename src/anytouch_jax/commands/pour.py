@@ -54,12 +54,12 @@ def _record(options: Pour, folder: Path) -> int:
 
 def _policy(options: Pour, encoder: Encoder, shown: Trials, sensor: str) -> tuple[Touch, Learning]:
     """The policy learned from demonstrations, as the options say."""
-    from anytouch_jax.evaluate import pouring_policy
+    from anytouch_jax.evaluate import pouring_policy, pouring_tuning
 
     learning = pouring_policy.Learning(seed=options.seed, **({"steps": options.steps} if options.steps else {}))
     say("learning from it")
     policy = pouring_policy.learn_frozen(encoder, shown, learning, stills=options.stills, sensor=sensor)
-    return (pouring_policy.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning
+    return (pouring_tuning.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning
 
 
 def _recorded(options: Pour, path: Path, out: Path) -> int:

@@ -1,15 +1,13 @@
 """Imitation learning of the pouring task: features of the last segments -> pour, wait or retract (a small MLP).
 
-The encoder is frozen (its features are computed once) or fine-tuned with the MLP. A blind policy has the same MLP and
-knows only the time and its own actions.
+The encoder is frozen, so that its features are computed once (`pouring_tuning` trains it too). A blind policy has the
+same MLP and knows only the time and its own actions.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -20,8 +18,6 @@ import optax
 
 from ..config import UserError
 from ..data.transforms import touch_evaluation
-from ..nn.functional import Net
-from ..objectives import normalise_touch
 from ..sim.pouring import ACTIONS, WAIT, Setup, State, Task
 from .features import Encoder
 from .pouring import FRAMES, SENSOR, START, Expert, Replay, Trials, draw_runs, run
@@ -29,7 +25,7 @@ from .pouring import FRAMES, SENSOR, START, Expert, Replay, Trials, draw_runs, r
 Array = npt.NDArray[Any]
 Params = Any
 UNSEEN = 10_000  # added to a seed: runs that no demonstration met
-VERSION = 2  # of how a policy learns from the same demonstrations
+VERSION = 3  # of how a policy learns from the same demonstrations
 LATEST = 80  # moments, 20 degrees
 LOOKS = 30  # times that the held-out demonstrations are looked at while a policy learns
 LAG = 3  # moments from the segment before to the last one
@@ -52,13 +48,14 @@ class Learning:
     decay: float = 1e-2
     components: int = 32
     held_out: float = 0.2
-    tune_steps: int = 150
-    tune_batch: int = 16
-    tune_rate: float = 1e-4
+    tune_steps: int = 400
+    tune_runs: int = 16
+    tune_moments: int = 4
+    tune_rate: float = 5e-4
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "width", "components", "tune_steps", "tune_batch"):
+        for name in ("steps", "batch", "width", "components", "tune_steps", "tune_runs", "tune_moments"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} of the policy's learning must be at least 1, not {getattr(self, name)}")
 
@@ -103,8 +100,19 @@ def demonstrate(
     return plain._replace(frames=frames)
 
 
-def features(encoder: Encoder, trials: Trials, *, stills: bool, sensor: str = SENSOR, batch: int = 64) -> Array:
-    """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end."""
+def features(
+    encoder: Encoder,
+    trials: Trials,
+    *,
+    stills: bool,
+    sensor: str = SENSOR,
+    batch: int = 64,
+    sides: Array | None = None,
+) -> Array:
+    """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end.
+
+    `sides` (B, 2): in which mirrors the runs are shown (`segments`).
+    """
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
     where = np.argwhere(trials.taken[FRAMES - 1 :])
@@ -113,7 +121,9 @@ def features(encoder: Encoder, trials: Trials, *, stills: bool, sensor: str = SE
     for start in range(0, len(where), batch):
         part = where[start : start + batch]
         padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
-        found[tuple(part.T)] = encoder.embed(_clips(encoder, trials.frames, padded, ahead), sensor)[: len(part)]
+        found[tuple(part.T)] = encoder.embed(segments(encoder, trials.frames, padded, ahead, sides), sensor)[
+            : len(part)
+        ]
     return found
 
 
@@ -125,11 +135,19 @@ def seen(encoder: Encoder, frames: Array, first: Array) -> Array:
     return np.clip(frames.astype(np.int16) - first + 128, 0, 255).astype(np.uint8)
 
 
-def _clips(encoder: Encoder, frames: Array, where: Array, ahead: int) -> Array:
-    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `seen`."""
+def segments(encoder: Encoder, frames: Array, where: Array, ahead: int, sides: Array | None = None) -> Array:
+    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `seen`.
+
+    A gel in a mirror bears the same load: runs are shown upside down where the first of `sides` (B, 2) is 1, left to
+    right where the second is.
+    """
     ends, runs = where[:, 0] + FRAMES - 1, where[:, 1]
     first = frames[0, runs]
-    return np.stack([seen(encoder, frames[ends - back, runs], first) for back in range(ahead - 1, -1, -1)], 1)
+    clips = np.stack([seen(encoder, frames[ends - back, runs], first) for back in range(ahead - 1, -1, -1)], 1)
+    if sides is None:
+        return clips
+    turns = 1 - 2 * sides[runs]
+    return np.stack([clip[:, ::up, ::left] for clip, (up, left) in zip(clips, turns, strict=True)])
 
 
 def inputs(now: Any, before: Any, lifted: Any, standing: Any, xp: Any = np) -> Any:
@@ -229,7 +247,7 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
 class Touch:
     """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features.
 
-    `loss`: of imitation, on the demonstrations held out.
+    `loss`: of imitation, on the demonstrations held out (of a fine-tuned one: of its last steps).
     """
 
     looks = True
@@ -270,53 +288,12 @@ def moments(trials: Trials, x: Array) -> tuple[Array, Array, Array]:
 
 
 def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR) -> Touch:
-    """A policy over frozen features, from demonstrations with frames of `sensor`."""
-    z = features(encoder, trials, stills=stills, sensor=sensor)
-    head, loss = imitate(*moments(trials, input_table(z)), learning)
-    return Touch(encoder, head, stills=stills, sensor=sensor, loss=loss)
-
-
-def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
-    """Go on from a policy over frozen features with the encoder's parameters trained too."""
-    assert trials.frames is not None
-    encoder, head, stills = policy.encoder, policy.head, policy.stills
-    ahead = 1 if stills else FRAMES
-    where = np.argwhere(trials.taken[START:])
-    step, state, params = _tuner(encoder, encoder.sensor_row(policy.sensor), head, learning)
-    rng = np.random.default_rng(learning.seed % 2**63)
-    for _ in range(learning.tune_steps):
-        at = where[rng.integers(len(where), size=learning.tune_batch)]
-        now, lifted = at[:, 0] + LIFTED, np.full(len(at), LIFTED)
-        numbers = (now, np.maximum(now - LAG, LIFTED), lifted, 0 * lifted)
-        clips = [_clips(encoder, trials.frames, np.stack([number, at[:, 1]], 1), ahead) for number in numbers]
-        params, state = step(params, state, head, np.concatenate(clips), trials.choices[at[:, 0] + START, at[:, 1]])
-    tuned = replace(encoder, params=params["encoder"], source=f"{encoder.source}, fine-tuned")
-    return Touch(tuned, head._replace(layers=params["head"]), stills=stills, sensor=policy.sensor, loss=policy.loss)
-
-
-def _tuner(
-    encoder: Encoder, sensor: int, head: Head, learning: Learning
-) -> tuple[Callable[..., tuple[Params, Any]], Any, Params]:
-    """The compiled step of fine-tuning, its optimiser's state and its parameters."""
-    params = {"encoder": encoder.params, "head": head.layers}
-    optimiser = optax.multi_transform(
-        {"encoder": optax.adamw(learning.tune_rate), "head": optax.adamw(learning.rate / 10)},
-        {"encoder": "encoder", "head": "head"},
+    """A policy over frozen features, from demonstrations with frames of `sensor`: each as it is, and in a mirror."""
+    mirrors = np.array([[0, 1], [1, 0], [1, 1]])
+    sides = np.random.default_rng(learning.seed % 2**63).choice(mirrors, len(trials.steps))
+    views = [features(encoder, trials, stills=stills, sensor=sensor, sides=side) for side in (None, sides)]
+    x, actions, runs = (
+        np.concatenate(both) for both in zip(*(moments(trials, input_table(z)) for z in views), strict=True)
     )
-    apply = partial(_tuned_logits, net=encoder.net, sensor=sensor)
-
-    @jax.jit
-    def step(params: Params, state: Any, head: Head, clips: jax.Array, actions: jax.Array) -> tuple[Params, Any]:
-        slope = jax.grad(lambda p: imitation_loss(apply(p, clips, head=head), actions))(params)
-        change, state = optimiser.update(slope, state, params)
-        return optax.apply_updates(params, change), state
-
-    return step, optimiser.init(params), params
-
-
-def _tuned_logits(params: Params, clips: jax.Array, *, net: Net, head: Head, sensor: int) -> jax.Array:
-    """Logits (n, 3) of 4 n clips: of n moments the last segments, those before, the lifted and the standing ones."""
-    rows = jnp.full(len(clips), sensor, jnp.int32)
-    z = net.apply(params["encoder"], "encode", normalise_touch(clips), rows, "mean").astype(jnp.float32)
-    now, before, lifted, standing = jnp.split(z, 4)
-    return forward(head._replace(layers=params["head"]), inputs(now, before, lifted, standing, jnp))
+    head, loss = imitate(x, actions, runs, learning)
+    return Touch(encoder, head, stills=stills, sensor=sensor, loss=loss)

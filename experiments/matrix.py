@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -90,13 +91,21 @@ def cores() -> list[int]:
 
 
 def _side_by_side(words: Sequence[str], jobs: int) -> int:
-    """The same command in `jobs` processes, each on cores of its own: pools of threads that share cores wait."""
+    """The same command in `jobs` processes, each on cores of its own: pools of threads that share cores wait.
+
+    A SIGTERM is passed on: each saves and ends, and the same command goes on.
+    """
     again = [sys.executable, __file__, *words, "--jobs", "1"]
-    helpers = [subprocess.Popen(again) for _ in range(jobs)]
-    if hasattr(os, "sched_setaffinity") and jobs <= len(cores()):
-        for number, helper in enumerate(helpers):
-            os.sched_setaffinity(helper.pid, cores()[number::jobs])
-    return max(abs(helper.wait()) for helper in helpers)  # a signal's number is negative
+    helpers: list[subprocess.Popen[bytes]] = []
+    before = signal.signal(signal.SIGTERM, lambda *_: [helper.terminate() for helper in helpers])
+    try:
+        helpers += [subprocess.Popen(again) for _ in range(jobs)]
+        if hasattr(os, "sched_setaffinity") and jobs <= len(cores()):
+            for number, helper in enumerate(helpers):
+                os.sched_setaffinity(helper.pid, cores()[number::jobs])
+        return max(abs(helper.wait()) for helper in helpers)  # a signal's number is negative
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class Chosen(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
@@ -141,6 +142,31 @@ def test_processes_side_by_side_have_cores_of_their_own(tmp_path, monkeypatch):
     assert [one[-2:] for one in started] == [["--jobs", "1"]] * 2 and started[0][2 : 2 + len(words)] == words
     assert shares == [(1, [3, 5]), (2, [4])]
     assert matrix.main([*words, "--jobs", "4"]) == 0 and len(shares) == 2  # more than cores: they are shared
+
+
+def test_sigterm_is_passed_on(tmp_path, monkeypatch):
+    ended = []
+
+    class Process:
+        pid = 0
+
+        def __init__(self, words):
+            pass
+
+        def wait(self):
+            if not ended:
+                signal.raise_signal(signal.SIGTERM)
+            return 130
+
+        def terminate(self):
+            ended.append(self)
+
+    monkeypatch.setattr(matrix.subprocess, "Popen", Process)
+    monkeypatch.setattr(matrix, "cores", lambda: [0])
+    before = signal.getsignal(signal.SIGTERM)
+    words = ["--quick", "--only", "q2", "--work", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    assert matrix.main([*words, "--jobs", "2"]) == 130 and len(set(ended)) == 2
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_changed_sizes_are_written_beside_the_data():

@@ -78,7 +78,7 @@ def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
             continue
         if simulated(theirs) != ours["simulator"]:
             what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
-        elif wrong := differences([theirs, ours]):
+        elif wrong := differences([theirs, ours | {"scoring": plan.scoring(theirs["question"])}]):
             what = f"other settings than these runs ({wrong})"
         else:
             continue
@@ -169,7 +169,7 @@ def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
                 work.train(training)
     begin()
     about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
-    about |= {"identity": leaf.identity, "simulator": plan.simulator()}
+    about |= {"identity": leaf.identity, "simulator": plan.simulator(), "scoring": plan.scoring(leaf.question)}
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
     return True

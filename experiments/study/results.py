@@ -83,14 +83,15 @@ def simulated(about: Mapping[str, Any]) -> int:
 def differences(records: Sequence[Mapping[str, Any]]) -> str:
     """What records of one table must share and do not, in words; empty where they can be compared.
 
-    Simulator, settings, and, within a seed, the content of every data set by its name: signs are taken seed by seed.
-    The data of another seed may be of another processor, where the same scenes gave another content hash. Records that
+    Simulator, scoring, settings, and, within a seed, the content of every data set by its name: signs are taken seed by
+    seed. The data of another seed may be of another processor, where the same scenes gave another content hash. Records that
     do not note their settings are told apart by the name of their size.
     """
     found: dict[str, set[str]] = {}
     untold = any(not about.get("settings") for about in records)
     for about in records:
         found.setdefault("simulator version", set()).add(str(simulated(about)))
+        found.setdefault("scoring version", set()).add(str(about.get("scoring", 1)))
         for name, value in (about.get("settings") or {}).items():
             if name not in LABELS:
                 found.setdefault(name, set()).add(str(value))

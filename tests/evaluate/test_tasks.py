@@ -71,6 +71,13 @@ def test_slip_is_a_share_above_a_half_or_a_mark():
     assert select(marked, TASKS["slip"]).labels.tolist() == ["yes"]
 
 
+def test_force_tells_contact_before_a_score():
+    told = ((0.2, 1.0), (0.0, 9.0), (3.0, None))  # soft: it touches and hardly shows
+    rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__force=f, label__contact_score=s)
+            for i, (f, s) in enumerate(told)]  # fmt: skip
+    assert select(table(rows), TASKS["object"]).rows.tolist() == [[0], [2]]
+
+
 def test_a_file_with_scores_takes_scored_contact_only():
     scores = (9.0, 7.0, None)
     rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact_score=s)

@@ -30,7 +30,7 @@ def write_one(folder: Path, leaf: plan.Leaf, mean: Mean = level) -> Path:
     rows = [row for view, task, metric in _columns(leaf) for row in _rows(leaf, view, task, metric, mean)]
     about: dict[str, Any] = {
         "question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity,
-        "simulator": plan.simulator(), "settings": plan.settings(leaf.size),
+        "simulator": plan.simulator(), "settings": plan.settings(leaf.size), "scoring": plan.scoring(leaf.question),
         "size": leaf.size.name, "trained": [{"key": one.key, "seconds": 60.0} for one in leaf.trainings],
         "data": {"own": "0" * 64}, "version": "0", "source": "s", "machine": "a machine; load 1", "seconds": 30.0,
         "rows": rows, "points": _points(leaf.seed) if leaf.question == "q2" else [],

@@ -84,6 +84,13 @@ def test_a_result_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypat
     assert not later & set(again.values())
 
 
+def test_a_result_hangs_on_how_its_question_is_scored(monkeypatch):
+    again = {leaf.file: leaf.identity for leaf in LEAVES}
+    monkeypatch.setitem(plan.SCORING, "q2", 7)
+    for leaf in plan.leaves(plan.FULL):
+        assert (leaf.identity == again[leaf.file]) == (leaf.question != "q2")
+
+
 def test_without_real_data_there_is_no_real_run():
     assert {leaf.question for leaf in LEAVES} - {leaf.question for leaf in plan.leaves(plan.FULL, real=False)} == {
         "real"

@@ -166,6 +166,7 @@ def test_every_question_has_its_signs(rendered):
     ("change", "words"),
     [
         ({"simulator": 1}, f"simulator version 1 and {plan.simulator()}"),
+        ({"scoring": 1}, "scoring version 1 and 2"),
         ({"settings": {"steps1": 999}}, "steps1 400 and 999"),
         ({"settings": None, "size": "changed"}, "size changed and full"),
         ({"data": {"own": "1" * 64, "aligned": "2" * 64}}, "data set own of seed 1 00000000 and 11111111"),

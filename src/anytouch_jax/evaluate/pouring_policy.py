@@ -38,7 +38,8 @@ class Learning:
 
     Features are many and demonstrations few: the MLP is given the first `components` principal components of its
     inputs, and the weights are kept that did best on a share `held_out` of the demonstrations. Fine-tuning goes on for
-    `tune_steps` on `tune_batch` moments at `tune_rate` (the encoder's; the MLP's is a tenth of `rate`).
+    `tune_steps` on `tune_moments` of each of `tune_runs` runs, at `tune_rate` (the encoder's; the MLP's is twice
+    `rate`), which rises for a tenth of the steps and then falls.
     """
 
     steps: int = 1500

@@ -23,7 +23,7 @@ from .features import text_column
 Array = npt.NDArray[Any]
 Which = Literal["all", "press", "contact", "moving"]
 
-SCORE, FORCE = 7.0, 0.05  # label.contact_score (real_touch) and newtons (simulated) above which a frame is contact
+FORCE, SCORE = 0.05, 7.0  # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
 DIRECTIONS = ("label.twist", "label.slide")
 _TURNED = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 _ACROSS, _DOWN = {"right": "left", "left": "right"}, {"up": "down", "down": "up"}
@@ -205,12 +205,15 @@ def _best(rows: Array, sequence: Array, first: Array, second: Array) -> Array:
 
 
 def _touching(table: Manifest) -> Array:
-    """Whether a frame is contact, bool (rows,): by score, by force or by mark; all of a file without these."""
+    """Whether a frame is contact, bool (rows,): by force, by score or by mark; all of a file without these.
+
+    Force first: a score is of the picture, and would leave out soft objects, by sensors unequally.
+    """
     score, force, mark = (_number(table, f"label.{name}") for name in ("contact_score", "force", "contact"))
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
         here = table.source == source
-        for values, least in ((score, SCORE), (force, FORCE), (mark, 0.5)):
+        for values, least in ((force, FORCE), (score, SCORE), (mark, 0.5)):
             if np.isfinite(values[here]).any():
                 touches[here] = np.nan_to_num(values[here], nan=-1.0) > least
                 break

@@ -97,13 +97,23 @@ def _side_by_side(words: Sequence[str], jobs: int) -> int:
     """
     again = [sys.executable, __file__, *words, "--jobs", "1"]
     helpers: list[subprocess.Popen[bytes]] = []
-    before = signal.signal(signal.SIGTERM, lambda *_: [helper.terminate() for helper in helpers])
+    ended: list[int] = []
+
+    def end(number: int, frame: Any) -> None:
+        ended.append(number)
+        for helper in helpers:
+            helper.terminate()
+
+    before = signal.signal(signal.SIGTERM, end)
     try:
-        helpers += [subprocess.Popen(again) for _ in range(jobs)]
+        while len(helpers) < jobs and not ended:
+            helpers.append(subprocess.Popen(again))
+        for helper in helpers if ended else ():  # one was being started
+            helper.terminate()
         if hasattr(os, "sched_setaffinity") and jobs <= len(cores()):
             for number, helper in enumerate(helpers):
                 os.sched_setaffinity(helper.pid, cores()[number::jobs])
-        return max(abs(helper.wait()) for helper in helpers)  # a signal's number is negative
+        return max((abs(helper.wait()) for helper in helpers), default=130)  # a signal's number is negative
     finally:
         signal.signal(signal.SIGTERM, before)
 

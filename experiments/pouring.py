@@ -20,7 +20,7 @@
 # `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3" .venv/bin/python experiments/pouring.py`, or
 # `make pouring RUNS=...`. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without
 # a path an untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only),
-# `anytouch`. `name=a,b,c` gives each seed an encoder of its own. A row without a run is left out, aloud. What is
+# `anytouch`. `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is
 # finished is not done again. QUICK=1 is a trial of minutes;
 # TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS, TUNE (steps of fine-tuning), MODES and OUT in the environment
 # change the size and the place.
@@ -83,7 +83,7 @@ if unknown:
 def path_of(name: str, seed: int) -> str | None:
     """The run of a row: one for all seeds, or one each."""
     paths = RUNS.get(name) or (RUNS.get("anytouch") if name == "static" else None)
-    return paths[SEEDS.index(seed) % len(paths)] if paths else None
+    return paths[seed % len(paths)] if paths else None
 
 
 @cache
@@ -211,17 +211,21 @@ if not os.environ.get("TABLE") or not (figures / "pouring.gif").exists():
 
 # %%
 rows = pouring_table.read_rows(FOLDER)
-seeds = len({run.split("/")[0] for run in rows[0].runs})
+runs = {run for row in rows for run in row.runs}
+seeds = len({run.split("/")[0] for run in runs})
+fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
 picture = f"{FOLDER.name}.png"
 pouring_table.draw(figures / picture, rows)
 text = f"""# Pouring by touch alone (simulated)
 
-{len(rows[0].runs)} runs a row ({seeds} seeds of learning, {len(rows[0].runs) // seeds} trials each); mean
+{len(runs)} runs a row ({seeds} seeds of learning, {len(runs) // seeds} trials each{
+    "; fewer: " + ", ".join(fewer) if fewer else ""
+}); mean
 |poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
 compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
 claimed of fewer than three. Each row has one encoder unless several are named below. Settings (`version` is that of the
 flow and the load, {VERSION} now):
-{min((row.settings for row in rows), key=len)}.
+{max((row.settings for row in rows), key=len)}.
 
 {pouring_table.table(rows)}
 ![errors](figures/{picture})

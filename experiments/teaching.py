@@ -177,7 +177,7 @@ def points(change: tuple[float, float | None, float | None]) -> str:
 
 
 def percent(values: list[float]) -> str:
-    return f"{100 * np.mean(values):.1f} %" + (f" +- {100 * np.std(values):.1f}" if len(values) > 1 else "")
+    return f"{100 * np.mean(values):.1f} %" + (f" +- {100 * np.std(values, ddof=1):.1f}" if len(values) > 1 else "")
 
 
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
@@ -199,6 +199,11 @@ def retrieval_table(scored: dict[str, list[retrieval.Retrieval]], pooled: dict[s
     )
 
 
+def by_seed(several: list[results.ProbeResult], rivals: list[results.ProbeResult]) -> str:
+    """How far ahead in each seed: the interval over objects is of these encoders, not of others trained alike."""
+    return ", ".join(points((a.accuracy - b.accuracy, None, None)) for a, b in zip(several, rivals, strict=True))
+
+
 def probe_table(probed: list[dict[str, dict[str, results.ProbeResult]]]) -> str:
     """Accuracies by label, and of all that captions name together; and how far stage 2 is ahead."""
     rows = []
@@ -209,9 +214,12 @@ def probe_table(probed: list[dict[str, dict[str, results.ProbeResult]]]) -> str:
     ]:
         seeds = {name: [averaged([found[label][name] for label in labels]) for found in probed] for name in NAMES[:5]}
         mean = {name: averaged(several) for name, several in seeds.items()}
-        changes = [points(results.difference(mean["stage 2"], mean[name])) for name in RIVALS]
+        changes = [
+            points(results.difference(mean["stage 2"], mean[name])) + "; " + by_seed(seeds["stage 2"], seeds[name])
+            for name in RIVALS
+        ]
         rows.append((title, *(percent([one.accuracy for one in several]) for several in seeds.values()), *changes))
-    head = ("label", *NAMES[:5], *(f"stage 2 ahead of {name} (points, 95 % over objects)" for name in RIVALS))
+    head = ("label", *NAMES[:5], *(f"stage 2 ahead of {name} (points, 95 % over objects; by seed)" for name in RIVALS))
     return markdown(head, rows)
 
 

@@ -103,7 +103,7 @@ def execute(
     How long things take is estimated by `budget`, corrected by what they took in this call. A run that fails is told
     and left out; the others go on. Raises UserError when not even the first run fits.
     """
-    start, planned = clock(), 0.0
+    start, planned, waited = clock(), 0.0, 0.0
     result = Outcome([], [], [], {})
     waiting, told = list(leaves), set[str]()
     while waiting:
@@ -113,7 +113,7 @@ def execute(
                 result.found.append(leaf.file)
                 continue
             expected, spent = budget.cost(leaf, work.ready(leaf)), clock() - start
-            seconds = expected * (max(1.0, spent / planned) if planned else 1.0)
+            seconds = expected * (max(1.0, (spent - waited) / planned) if planned else 1.0)
             if minutes is not None and spent + seconds > 60 * minutes:
                 if not (result.made or result.failed or told):
                     raise UserError(
@@ -142,7 +142,9 @@ def execute(
             elif done is not None:
                 later.append(leaf)
         if len(later) == len(waiting):
+            since = clock()
             pause(PAUSE)
+            waited += clock() - since
         waiting = later
     return result
 

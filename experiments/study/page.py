@@ -19,7 +19,7 @@ from anytouch_jax.evaluate.sections import markdown
 
 from . import budget, pictures, plan, report, scores
 from .results import Run, differences, read
-from .work import DONE, Work
+from .work import Work
 
 ROOT = Path(__file__).resolve().parents[2]
 DEFAULT = ROOT / "experiments" / "results" / "matrix"
@@ -98,7 +98,7 @@ def yours(question: str, several: list[Run]) -> list[dict[str, object]]:
     work, name = Given(run, folder, real), BESIDE.get(question, "anytouch")
     leaf = plan.Leaf(question, name, 0, plan.training(SIZE, "anytouch", 0), SIZE)
     for one in plan.scenes(SIZE) if question != plan.REAL else ():
-        if not (folder / one.name / DONE).exists():
+        if not work.made(one, SIZE):
             text(f"{folder / one.name} is made, about {budget.of_scenes(one, SIZE) / 60:.0f} minutes.")
             work.make(one, SIZE)
     found = scores.score(leaf, work)["rows"]

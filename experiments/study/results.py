@@ -84,8 +84,8 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
     """What records of one table must share and do not, in words; empty where they can be compared.
 
     Simulator, scoring, settings, and, within a seed, the content of every data set by its name: signs are taken seed by
-    seed. The data of another seed may be of another processor, where the same scenes gave another content hash. Records that
-    do not note their settings are told apart by the name of their size.
+    seed. The data of another seed may be of another processor, where the same scenes gave another content hash. Records
+    that do not note their settings are told apart by the name of their size.
     """
     found: dict[str, set[str]] = {}
     untold = any(not about.get("settings") for about in records)

@@ -47,7 +47,7 @@ class Work:
         self.folder, self.real, self.say = folder, real, say
 
     def ready(self, leaf: Leaf) -> set[str]:
-        sets = {one.name for one in plan.scenes(leaf.size) if self._made(one, leaf.size)}
+        sets = {one.name for one in plan.scenes(leaf.size) if self.made(one, leaf.size)}
         return sets | {one.key for one in leaf.trainings if self._trained(one, sets)}
 
     def run_of(self, one: Training) -> Path:
@@ -84,7 +84,7 @@ class Work:
         cuts.cut_all(folder)
         self._finish(folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)})
 
-    def _made(self, one: Scenes, size: Size) -> bool:
+    def made(self, one: Scenes, size: Size) -> bool:
         """Whether a data set is there, and of this size and this simulator."""
         return bool(_noted(self.folder / one.name / DONE).get("of") == _of(one, size))
 

@@ -213,6 +213,12 @@ def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encode
     assert found.poured.shape == (2,) and found.frames is None
 
 
+def test_fine_tuning_that_goes_astray_is_told(shown, encoder):
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
+    with pytest.raises(UserError, match=r"went astray .*lower tune_rate"):
+        pouring_tuning.fine_tune(policy, shown, replace(FAST, tune_steps=12, tune_rate=1e30))
+
+
 def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
     """Before the first step, the logits of a chain are those of the frozen policy at its moments."""
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
@@ -347,6 +353,11 @@ def test_a_broken_or_mixed_result_is_named(tmp_path):
     with pytest.raises(UserError, match="different settings"):
         pouring_table.read_rows(tmp_path)
     (tmp_path / "anytouch-frozen-0.json").unlink()
+    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=10)  # nor with a static one tuned for 9 steps
+    with pytest.raises(UserError, match="different settings"):
+        pouring_table.read_rows(tmp_path)
+    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=9)
+    pouring_table.read_rows(tmp_path)
     (tmp_path / "static-frozen-1.json").write_text(json.dumps({"row": "static"}))
     with pytest.raises(UserError, match="static-frozen-1"):
         pouring_table.read_rows(tmp_path)

@@ -249,6 +249,16 @@ def test_the_deepest_frame_of_each_touch(touched: manifests.Manifest) -> None:
         deepest_rows(with_columns(touched, ("touch",)))
 
 
+def test_the_deepest_frame_goes_by_what_its_file_has(touched: manifests.Manifest, tmp_path: Any) -> None:
+    told = {"f": ("label.depth",), "d": ("label.force",), "bare": ("label.force", "label.depth")}
+    for name, without in told.items():
+        manifests.write(with_columns(touched, without), touched.files[0].parent / f"{name}.parquet")
+    joined = manifests.read([touched.files[0].parent / f"{name}.parquet" for name in told])
+    rows = deepest_rows(joined)
+    for source, frame in enumerate((2, 2, 1)):
+        assert (np.asarray(joined.column("frame_index"))[rows[joined.source[rows] == source]] == frame).all()
+
+
 def texture_features(manifest: manifests.Manifest, rows: Array) -> Array:
     """A perfect encoder: noise that depends on the touch alone."""
     return noise(1000)[manifest.codes("touch")[rows]]

@@ -124,6 +124,19 @@ def test_a_slow_machine_is_noticed(tmp_path):
         assert work.time <= 60 * minutes
 
 
+def test_waiting_for_others_is_no_slow_machine(tmp_path):
+    by_itself, work, leaves = Notes(), Notes(), LEAVES[:2]
+    work.elsewhere = {leaves[1].file}
+
+    def pause(seconds):  # the other process is lost after an hour, with nothing done
+        work.time += 60 * 60
+        work.elsewhere = set()
+
+    run(by_itself, tmp_path / "a", leaves=leaves)
+    result, _ = run(work, tmp_path / "b", leaves=leaves, minutes=by_itself.time / 60 + 61, pause=pause)
+    assert not result.left
+
+
 def test_a_budget_for_nothing_is_a_sentence(tmp_path):
     with pytest.raises(UserError, match=r"takes about \d+ minutes .* MINUTES is 1; give more"):
         run(Notes(), tmp_path, minutes=1)

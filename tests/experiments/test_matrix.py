@@ -144,17 +144,20 @@ def test_processes_side_by_side_have_cores_of_their_own(tmp_path, monkeypatch):
     assert matrix.main([*words, "--jobs", "4"]) == 0 and len(shares) == 2  # more than cores: they are shared
 
 
-def test_sigterm_is_passed_on(tmp_path, monkeypatch):
-    ended = []
+@pytest.mark.parametrize("when", ["start", "wait"])
+def test_sigterm_is_passed_on(when, tmp_path, monkeypatch):
+    started, ended = [], []
 
     class Process:
         pid = 0
 
         def __init__(self, words):
-            pass
+            if when == "start" and started:
+                signal.raise_signal(signal.SIGTERM)
+            started.append(self)
 
         def wait(self):
-            if not ended:
+            if when == "wait" and not ended:
                 signal.raise_signal(signal.SIGTERM)
             return 130
 

@@ -54,14 +54,16 @@ def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = 
 
 
 def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
-    for name in ("label.force", "label.depth"):
-        if name in manifest.table.column_names:
-            depth = numbers(manifest, (name,), rows)[:, 0]
-            if np.isfinite(depth).any():
-                return np.where(np.isfinite(depth), depth, -np.inf)
+    """How deep each row (n,) is among those of its contact, by what the rows of its file have."""
     frame = np.asarray(manifest.column("frame_index"))[rows].astype(np.float64)
     middle = np.array([np.median(frame[contact == one]) for one in range(contact.max() + 1)])
-    return -np.abs(frame - middle[contact])
+    found = -np.abs(frame - middle[contact])
+    for name in ("label.depth", "label.force"):
+        if name in manifest.table.column_names:
+            depth, source = numbers(manifest, (name,), rows)[:, 0], manifest.source[rows]
+            told = np.isin(source, source[np.isfinite(depth)])
+            found[told] = np.where(np.isfinite(depth), depth, -np.inf)[told]
+    return found
 
 
 def contact_vector(manifest: Manifest, rows: Array) -> Array:

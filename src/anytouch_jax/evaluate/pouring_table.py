@@ -88,17 +88,23 @@ def read_rows(folder: Path) -> list[Row]:
             raise UserError(f"{path} is not the result of a pouring row ({bad}); remove it and run again") from None
     if not found:
         raise UserError(f"no result of a pouring row in {folder}; run experiments/pouring.py")
-    common = {json.dumps(_common(one), sort_keys=True) for parts in found.values() for one in parts}
-    if len(common) > 1:
-        raise UserError(
-            f"rows of {folder} were run with different settings ({'; '.join(sorted(common))}); remove the old"
-        )
+    for tuned in (False, True):
+        common = {json.dumps(one, sort_keys=True) for one in _settings(found, tuned)}
+        if len(common) > 1:
+            raise UserError(
+                f"rows of {folder} were run with different settings ({'; '.join(sorted(common))}); remove the old"
+            )
     return [_row(name, mode, parts) for (name, mode), parts in found.items()]
 
 
-def _common(one: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that rows must share to be compared: all but those of fine-tuning."""
-    return {name: value for name, value in one["settings"].items() if not name.startswith("tune")}
+def _settings(found: Mapping[tuple[str, str], Sequence[Mapping[str, Any]]], tuned: bool) -> list[dict[str, Any]]:
+    """The settings that rows must share to be compared: all those of fine-tuned ones; of all rows those but of that."""
+    return [
+        {name: value for name, value in one["settings"].items() if tuned or not name.startswith("tune")}
+        for (_, mode), parts in found.items()
+        for one in parts
+        if mode == "fine-tuned" or not tuned
+    ]
 
 
 def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:

@@ -7,6 +7,7 @@ one of a moment is the one before of the next.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import optax
 
+from ..config import UserError
 from ..nn.functional import Net
 from ..objectives import normalise_touch
 from .features import Encoder
@@ -54,7 +56,7 @@ def draw(rng: np.random.Generator, steps: Array, runs: int, moments: int) -> Cha
 def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     """Go on from a policy over frozen features with the encoder's parameters trained too, on all demonstrations.
 
-    The policy's `loss` then is that of its last tenth of steps.
+    The policy's `loss` then is that of its last tenth of steps. Raises UserError when that is not finite.
     """
     assert trials.frames is not None
     encoder, stills, runs = policy.encoder, policy.stills, learning.tune_runs
@@ -73,6 +75,8 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     tuned = replace(encoder, params=params["encoder"], source=f"{encoder.source}, fine-tuned")
     head = policy.head._replace(**params["head"])
     late = float(np.mean(jax.device_get(losses[-max(1, learning.tune_steps // 10) :])))
+    if not math.isfinite(late):
+        raise UserError(f"fine-tuning went astray (its loss is {late}); lower tune_rate, {learning.tune_rate:g} now")
     return Touch(tuned, head, stills=stills, sensor=policy.sensor, loss=late)
 
 
@@ -98,7 +102,7 @@ def _tuner(
 
     def loss_of(params: Params, clips: jax.Array, choices: jax.Array, inside: jax.Array) -> jax.Array:
         losses = optax.softmax_cross_entropy_with_integer_labels(logits(params, clips), choices)
-        return jnp.sum(losses * inside) / jnp.sum(inside)
+        return jnp.sum(losses * inside) / jnp.maximum(jnp.sum(inside), 1)
 
     @jax.jit
     def step(params: Params, state: Any, clips: jax.Array, choices: jax.Array, inside: jax.Array) -> Any:

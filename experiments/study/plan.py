@@ -44,10 +44,11 @@ class Size:
     Towers from scratch learn nothing in minutes from matching one pair against one other, as the paper does on CLIP's
     weights. So `match_head` is "cosine", each touch against all others of the batch, on a share `match_keep` of the
     patches and weighed by `match_weight`; only frames in contact are drawn, those with a share `contact` of the
-    strongest of their recording (`anytouch contact`), as the paper's are contact frames; a row of question q2 has the
-    paper's head. The softmax starts mild (`temperature`): a sharp one only punishes untrained towers. Touches are shown
-    less the untouched gel (but for `real`, where one in ten has no picture of it), and their colours are left as they
-    are, since colours tell slopes. `seeds` are those of questions whose sign is claimed; the others take the first.
+    strongest of their recording (`anytouch contact`), as the paper's are contact frames (those of `real` are not
+    marked, and all drawn); a row of question q2 has the paper's head. The softmax starts mild (`temperature`): a sharp
+    one only punishes untrained towers. Touches are shown less the untouched gel (but for `real`, where one in ten has
+    no picture of it), and their colours are left as they are, since colours tell slopes. `seeds` are those of questions
+    whose sign is claimed; the others take the first.
     """
 
     name: str = "full"

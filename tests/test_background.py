@@ -162,10 +162,10 @@ def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
             np.testing.assert_allclose(one.embed(clips, sensor), run.embed(clips, sensor), atol=1e-6)
 
 
-def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder, monkeypatch):
+def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder):
     frames = RNG.integers(100, 150, (9, 2, 28, 28, 3), np.uint8)
     where = np.array([[0, 1], [3, 0]])
-    clips = pouring_policy._clips(encoder, frames, where, 3)
+    clips = pouring_policy.segments(encoder, frames, where, 3)
     np.testing.assert_array_equal(clips[1, 2], frames[5, 0].astype(int) - frames[0, 0] + 128)
     np.testing.assert_array_equal(clips[0, 0], np.full_like(GEL, 128))
 

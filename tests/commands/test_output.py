@@ -23,6 +23,20 @@ WORK = {
 }
 
 
+def test_what_is_read_is_not_written_over(tmp_path):
+    path, other = tmp_path / "m.csv", tmp_path / "other.csv"
+    path.write_text("mine")
+    check_folder(other, read=(path,))
+    check_folder(path, read=(other,))  # a result of before is made anew
+    (tmp_path / "link").symlink_to(tmp_path)
+    for same in (path, tmp_path / "link" / "m.csv"):
+        with pytest.raises(UserError, match=r"m.csv is a file that is read; name another one with --out"):
+            check_folder(same, read=(other, path))
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="pipe is no regular file"):
+        check_folder(tmp_path / "pipe")
+
+
 @pytest.mark.parametrize(
     ("words", "option"),
     [
@@ -69,3 +83,17 @@ def test_the_folder_is_made_where_it_can_be(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of somebody else
     with pytest.raises(UserError, match="cannot be written to; choose another --out"):
         check_folder(tmp_path / "c.json")
+
+
+def test_commands_do_not_write_over_their_input(anytouch, tiny_run, tmp_path):
+    mine = tmp_path / "m.csv"
+    mine.write_text("path,sensor,sequence,frame_index\n")
+    for words in (
+        ["embed", "--run", tiny_run, "--input", mine, "--out", mine],
+        ["probe", "--data", mine, "--label", "object", "--run", tiny_run, "--out", mine],
+        ["retrieve", "--data", mine, "--run", tiny_run, "--out", mine],
+        ["convert", tiny_run, tiny_run / "config.json"],
+    ):
+        said = anytouch(*words)
+        assert said.status == 1 and "is a file that is read" in said.err, words
+    assert mine.read_text().startswith("path,sensor")

@@ -31,6 +31,7 @@ def run(options: Annotate) -> int:
     target = options.out or beside(options.manifest, "captions")
     if not options.estimate:
         check_new(manifest, target)
+        check_folder(target, read=() if options.captions is None else (options.captions,))
     if options.sheet is not None:
         check_folder(options.sheet, "--sheet")
     if options.captions is not None:

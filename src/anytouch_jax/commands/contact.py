@@ -18,7 +18,7 @@ def run(options: Contact) -> int:
     if target is not None:
         check_new(manifest, target)
     if options.picture is not None:
-        check_folder(options.picture, "--picture")
+        check_folder(options.picture, "--picture", read=manifest.files)
     contact.known_contact(manifest)  # a word that is no number is told before the work
     limits = dict(options.threshold)
     scores = contact.contact_scores(manifest, workers=options.threads)

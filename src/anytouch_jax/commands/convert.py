@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UNIVERSAL, Model
 from anytouch_jax.options import Convert
@@ -19,6 +20,7 @@ def run(options: Convert) -> int:
     from anytouch_jax.io import checkpoint, release
 
     source: Path = options.source
+    check_folder(options.target, "TARGET", read=source.iterdir() if source.is_dir() else (source,))
     about = {"source": str(source)}
     if source.is_dir():
         params, text, told = checkpoint.load_params(source)

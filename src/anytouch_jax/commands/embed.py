@@ -26,7 +26,8 @@ def run(options: Embed) -> int:
     from anytouch_jax.evaluate import features
 
     if not (options.stream and str(options.out) == "-"):
-        check_folder(options.out)  # before what takes long: what is embedded must have a place
+        # before what takes long: what is embedded must have a place
+        check_folder(options.out, read=(options.run, options.input))
     encoder = features.load_encoder(options.run)
     features.check_frames(encoder.config.model, options.frames)
     if options.batch < 1:

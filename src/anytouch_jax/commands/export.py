@@ -10,7 +10,7 @@ def run(options: Export) -> int:
     """Write the artefact and its description, after a comparison with the live model; say how far they differ."""
     from anytouch_jax.evaluate import export, features
 
-    check_folder(options.out)
+    check_folder(options.out, read=(options.run,))
     encoder = features.load_encoder(options.run)
     platforms = [name.strip() for name in options.platforms.split(",") if name.strip()]
     about = export.export(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,14 +42,19 @@ def write_new(manifest: Manifest, path: Path) -> Path:
     return target
 
 
-def check_folder(path: Path, option: str = "--out") -> None:
+def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path] = ()) -> None:
     """Make the folder of a file that will be written after long work; `option` named it.
 
-    Raises UserError where that cannot be, and where `path` is a folder itself.
+    Raises UserError where that cannot be, where `path` is a folder or a device, and where it is one of the files that
+    are `read`.
     """
     try:
         if path.is_dir():
             raise UserError(f"{path} is a folder; name a file with {option}")
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path} is no regular file; name one with {option}")
+        if path.exists() and path.resolve() in {Path(one).expanduser().resolve() for one in read}:
+            raise UserError(f"{path} is a file that is read; name another one with {option}")
         for folder in reversed(path.parents):
             if folder.exists() and not folder.is_dir():
                 raise UserError(f"{folder} is a file, not a folder; choose another {option}")

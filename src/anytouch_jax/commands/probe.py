@@ -22,7 +22,7 @@ def run(options: Probe) -> int:
     """Probe frozen features on a label column or on tasks, print a table, write JSON when asked."""
     check_options(options)
     if options.out is not None:
-        check_folder(options.out)
+        check_folder(options.out, read=(*options.data, *options.run))
     if options.tasks or options.benchmark:
         from anytouch_jax.evaluate import battery_command
 

@@ -27,7 +27,7 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate.sections import markdown
 
     if options.out is not None:
-        check_folder(options.out)
+        check_folder(options.out, read=(options.data, *options.run))
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]

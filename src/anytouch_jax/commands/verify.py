@@ -26,7 +26,7 @@ def run(options: Verify) -> int:
         if target is not None:
             check_new(manifest, target)
     if options.out is not None:
-        check_folder(options.out)
+        check_folder(options.out, read=(*manifest.files, *(path for path in (options.repair,) if path)))
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)
     print(report.to_markdown(), end="")
     if options.out is not None:

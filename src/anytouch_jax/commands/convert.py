@@ -20,7 +20,8 @@ def run(options: Convert) -> int:
     from anytouch_jax.io import checkpoint, release
 
     source: Path = options.source
-    check_folder(options.target, "TARGET", read=source.iterdir() if source.is_dir() else (source,))
+    of_run = (path for path in source.iterdir() if path.suffix != ".safetensors") if source.is_dir() else (source,)
+    check_folder(options.target, "TARGET", read=of_run)
     about = {"source": str(source)}
     if source.is_dir():
         params, text, told = checkpoint.load_params(source)

@@ -24,7 +24,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from functools import partial
@@ -32,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import page
+from study import asked, page
 
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import machine, plots, probe, tasks
@@ -40,10 +39,10 @@ from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder
 from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.train.record import write_atomic
 
-RUN, DATA = Path(os.environ.get("RUN", "runs/stage2")), os.environ.get("DATA", "data/scenes/manifest.parquet")
-QUICK = os.environ.get("QUICK", "") not in ("", "0")
-OUT, NAME = Path(os.environ.get("OUT") or "experiments/results"), "long_clips-quick" if QUICK else "long_clips"
-ROWS = int(os.environ.get("ROWS") or (100 if QUICK else 1500))
+RUN, DATA = asked.path("RUN", "runs/stage2"), asked.path("DATA", "data/scenes/manifest.parquet")
+QUICK = asked.switch("QUICK")
+OUT, NAME = asked.path("OUT", "experiments/results"), "long_clips-quick" if QUICK else "long_clips"
+ROWS = asked.number("ROWS", 100 if QUICK else 1500)
 ROUNDS, BATCH = (3, 8) if QUICK else (9, 32)
 LOOKS = [(1, "mean"), (3, "mean"), *((frames, join) for frames in (5, 7) for join in ("mean", "sum", "concat"))]
 LONGEST = max(frames for frames, _ in LOOKS)

@@ -29,7 +29,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from dataclasses import asdict
 from functools import cache
@@ -37,9 +36,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import page
+from study import asked, page
 
-from anytouch_jax.config import preset
+from anytouch_jax.config import UserError, preset
 from anytouch_jax.evaluate import plots, pouring, pouring_bounds, pouring_policy, pouring_table, pouring_tuning
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
@@ -49,28 +48,20 @@ from anytouch_jax.train.record import write_atomic
 
 enable_compilation_cache()
 
-QUICK = os.environ.get("QUICK", "") not in ("", "0")
-
-
-def setting(name: str, full: int, quick: int) -> int:
-    return int(os.environ.get(name) or (quick if QUICK else full))
-
-
-words = os.environ.get("RUNS", "").split()
-for word in words:
-    if "=" not in word or not all(Path(path).exists() for path in word.split("=", 1)[1].split(",")):
-        raise SystemExit(f"RUNS: {word!r} is not name=path, or name=path,path,path, of runs that are there")
-RUNS = {name: paths.split(",") for name, paths in (word.split("=", 1) for word in words)}
-SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
-MODES = (os.environ.get("MODES") or ("frozen" if QUICK else "frozen,fine-tuned")).split(",")
-TRIALS, DEMOS, TUNE = setting("TRIALS", 10, 10), setting("DEMOS", 200, 12), setting("TUNE", 400, 20)
-OUT = Path(os.environ.get("OUT") or "experiments/results")
+QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
+RUNS = {name: paths.split(",") for name, paths in asked.runs().items()}
+SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
+MODES = asked.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", pouring_table.MODES)
+TRIALS, DEMOS = asked.number("TRIALS", 10), asked.number("DEMOS", 12 if QUICK else 200)
+TUNE = asked.number("TUNE", 20 if QUICK else 400)
+OUT = asked.path("OUT", "experiments/results")
 FOLDER, PAGE = OUT / ("pouring-quick" if QUICK else "pouring"), OUT / ("pouring-quick.md" if QUICK else "pouring.md")
 TASK = Task()
 
-unknown = set(RUNS) - set(pouring_table.PAPER) | set(MODES) - set(pouring_table.MODES)
-if unknown:
-    raise SystemExit(f"RUNS names {', '.join(pouring_table.PAPER)} and MODES frozen, fine-tuned; not {unknown}")
+if unknown := set(RUNS) - set(pouring_table.PAPER):
+    raise UserError(f"RUNS names {', '.join(pouring_table.PAPER)}, not {', '.join(sorted(unknown))}")
+if lost := [path for paths in RUNS.values() for path in paths if not Path(path).exists()]:
+    raise UserError(f"RUNS: there is no run {lost[0]}")
 
 # %% [markdown]
 # ## The rows
@@ -179,7 +170,7 @@ def do_seed(seed: int) -> None:
             write(name, mode, trials, source, since, loss=round(policy.loss, 4))
 
 
-if not os.environ.get("TABLE"):
+if not TABLE:
     for seed in SEEDS:
         do_seed(seed)
 
@@ -191,7 +182,7 @@ if not os.environ.get("TABLE"):
 
 # %%
 figures = OUT / "figures"
-if not os.environ.get("TABLE") or not (figures / "pouring.gif").exists():
+if not TABLE or not (figures / "pouring.gif").exists():
     one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
     last = int(one.steps[0]) - 1
     moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])

@@ -23,11 +23,12 @@ import time
 
 import numpy as np
 from sklearn.linear_model import LogisticRegression
+from study import asked
 
 from anytouch_jax.evaluate import heads, logistic
 from anytouch_jax.evaluate.heads import Problem
 
-ROWS, OTHERS = int(os.environ.get("ROWS", "100000")), 10_000
+ROWS, OTHERS = asked.number("ROWS", 100_000), 10_000
 WIDTH, CLASSES = 384, 20
 
 rng = np.random.default_rng(0)
@@ -50,7 +51,7 @@ print(
 )
 
 # %%
-if os.environ.get("SKLEARN"):
+if asked.switch("SKLEARN"):
     x = (features[train] - features[train].mean(0)) / features[train].std(0)
     ours = next(logistic.path(x, labels[train], CLASSES, [penalty])).loss
     start, spent = time.perf_counter(), time.process_time()

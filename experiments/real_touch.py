@@ -25,16 +25,15 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from study import asked
 
 from anytouch_jax.config import Config, from_json
 from anytouch_jax.data import manifest as manifests
@@ -49,12 +48,9 @@ from anytouch_jax.ops import masking
 from anytouch_jax.options import Probe
 from anytouch_jax.train.loop import fit
 
-DATA = Path(os.environ.get("DATA", "../shared/real_touch/manifest.csv"))
-STAGE1 = Path(os.environ.get("STAGE1", "runs/stage1"))
-STAGE2 = Path(os.environ.get("STAGE2", "runs/stage2"))
-LABELLED = Path(os.environ.get("LABELLED", "runs/labelled"))
-LABELLED_STEPS = int(os.environ.get("LABELLED_STEPS", "200"))
-OUT = Path(os.environ.get("OUT", "experiments/results"))
+DATA, OUT = asked.path("DATA", "../shared/real_touch/manifest.csv"), asked.path("OUT", "experiments/results")
+STAGE1, STAGE2 = asked.path("STAGE1", "runs/stage1"), asked.path("STAGE2", "runs/stage2")
+LABELLED, LABELLED_STEPS = asked.path("LABELLED", "runs/labelled"), asked.number("LABELLED_STEPS", 200)
 
 manifest = manifests.read(DATA)
 params, text, about = checkpoint.load_params(STAGE1)

@@ -28,12 +28,12 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from study import asked
 
 from anytouch_jax.cli import main
 from anytouch_jax.data import manifest as manifests
@@ -44,13 +44,10 @@ from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.record import write_atomic
 
-WORK = Path(os.environ.get("WORK", "runs/teaching"))
-OUT = Path(os.environ.get("OUT", "experiments/results"))
-TOUCHES = int(os.environ.get("TOUCHES", "500"))
-STEPS1 = int(os.environ.get("STEPS1", "600"))
-STEPS2 = int(os.environ.get("STEPS2", "1000"))
-SEEDS = [int(seed) for seed in os.environ.get("SEEDS", "0,1,2").split(",")]
-GRADES = os.environ.get("GRADES", "fine,coarse").split(",")
+WORK, OUT = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results")
+TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 500), asked.number("STEPS1", 600), asked.number("STEPS2", 1000)
+SEEDS = asked.numbers("SEEDS", "0,1,2")
+GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
 SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
 STACK = {"width": 128, "depth": 2, "heads": 4, "mlp": 512}
 TABLE = ["gelsight_mini", "digit", "duragel", "universal"]

@@ -37,9 +37,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import page
+from study import asked, page
 
-from anytouch_jax.config import preset
+from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import generation, pairs
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
@@ -53,18 +53,13 @@ from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.record import write_atomic
 
-QUICK = os.environ.get("QUICK", "") not in ("", "0")
+QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
 NAME = "translation_quick" if QUICK else "translation"
-WORK = Path(os.environ.get("WORK") or "runs/translation")
-OUT = Path(os.environ.get("OUT") or "experiments/results")
-words = (os.environ.get("RUNS") or "anytouch=runs/stage2 t3=runs/t3").split()
-if any("=" not in word for word in words):
-    raise SystemExit(f"RUNS: name=path for every run, not {' '.join(words)!r}")
-RUNS = dict(word.split("=", 1) for word in words)
-TOUCHES = int(os.environ.get("TOUCHES") or (24 if QUICK else 400))
-STEPS = int(os.environ.get("STEPS") or (40 if QUICK else 600))
-SEEDS = [int(seed) for seed in (os.environ.get("SEEDS") or ("0" if QUICK else "0,1,2")).split(",")]
-TUNE = (os.environ.get("TUNE") or "frozen").split(",")
+WORK, OUT = asked.path("WORK", "runs/translation"), asked.path("OUT", "experiments/results")
+RUNS = asked.runs("anytouch=runs/stage2 t3=runs/t3")
+TOUCHES, STEPS = asked.number("TOUCHES", 24 if QUICK else 400), asked.number("STEPS", 40 if QUICK else 600)
+SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
+TUNE = asked.names("TUNE", "frozen", ("frozen", "fine"))
 TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
 PIXELS = "pixels"
 RUN_FILES = OUT / NAME
@@ -230,7 +225,7 @@ def all_runs() -> None:
             one_run(about, encoder, (*data[about["size"], about["subtracts"]], shown), file)
 
 
-if not os.environ.get("TABLE"):
+if not TABLE:
     all_runs()
 
 # %% [markdown]
@@ -240,10 +235,12 @@ if not os.environ.get("TABLE"):
 MEAN = "mean of the training targets"
 TITLES = {"gelsight_mini": "GelSight Mini", "digit": "DIGIT", "duragel": "DuraGel", "tac3d": "Tac3D"}
 records = [json.loads(file.read_text()) for file in sorted(RUN_FILES.glob("*-*.json"))]
+if not records:
+    raise UserError(f"{RUN_FILES} holds no results; run this page without TABLE=1")
 known_objects = json.loads((RUN_FILES / "overlap.json").read_text())
 sizes = {(r["settings"]["touches"], r["settings"].get("pairs"), r["settings"]["fit"]["steps"]) for r in records}
 if len(sizes) > 1:
-    raise SystemExit(
+    raise UserError(
         f"{RUN_FILES} holds runs on other pairs or of other steps, {sorted(map(str, sizes))}: remove the old"
     )
 
@@ -267,7 +264,7 @@ def spread(values: list[float]) -> str:
 
 for name in {row_name(record) for record in records}:
     if len(several := {r["settings"]["encoder"] for r in records if row_name(r) == name}) > 1:
-        raise SystemExit(
+        raise UserError(
             f"{RUN_FILES}: the runs of {name} are of several encoders, {sorted(several)}: remove the old ones"
         )
 names = sorted({row_name(record) for record in records}, key=lambda name: ("pixels" in name, name))

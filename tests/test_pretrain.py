@@ -115,6 +115,9 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
 
     shutil.rmtree(init)  # what goes on needs it no more, whether or not it is named
     assert train(config, tmp_path / "r", said, init=init, stop_after=2).step == 2
+    assert not any("is not read" in line for line in said)
+    assert train(config, tmp_path / "r", said, init=run, stop_after=2).step == 2
+    assert f"was begun from {init}: {run} is not read" in said[-1] + "".join(said)
     last = train(config, tmp_path / "r", said)
     assert (last.resumed, last.step, last.traces) == (2, 4, 1)
     assert not any("without a stage-1 run" in line for line in said)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 from anytouch_jax import __version__, baselines, pages
 from anytouch_jax.config import Config, UserError, preset
@@ -112,6 +112,7 @@ def _parse(kind: Any, name: str, args: list[str], default: Any = None, closing: 
     """The options of a command; `closing`, which takes --help away, stands below a mistake instead of a hint to it."""
     import tyro
 
+    _refuse_twice(kind, args)
     extra = {} if default is None else {"default": default}
     config: list[Any] = [tyro.conf.AvoidSubcommands]
     if kind in _POSITIONAL:
@@ -128,6 +129,15 @@ def _parse(kind: Any, name: str, args: list[str], default: Any = None, closing: 
         if closing:
             print(closing, file=sys.stderr)
         raise
+
+
+def _refuse_twice(kind: Any, args: list[str]) -> None:
+    """Raise UserError for an option of several values that comes again: its first values would be lost."""
+    several = [name.replace("_", "-") for name, hint in get_type_hints(kind).items() if get_origin(hint) is tuple]
+    given = [arg.split("=")[0].replace("_", "-") for arg in args]
+    for option in (f"--{name}" for name in several):
+        if given.count(option) > 1:
+            raise UserError(f"{option} is given twice; write it once, with all its values behind it")
 
 
 def _parse_train(args: list[str]) -> tuple[Train, Config]:

@@ -64,6 +64,8 @@ def pretrain(
     params = net.init(jax.random.key(config.run.seed))
     if not steps(run / "checkpoints"):  # else only their shapes matter
         params = _first_params(params, config, init, clip, say)
+    else:
+        _same_init(run, init, say)
     _same_data(run, manifest)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
@@ -102,6 +104,14 @@ def _same_data(run: Path, manifest: manifests.Manifest) -> None:
                 f"the rows of the manifests have changed since {run} was begun; restore them, or begin another run "
                 f"with --init {run}"
             )
+
+
+def _same_init(run: Path, init: str | Path | None, say: Say) -> None:
+    """Say so where a run that goes on is given another start than it had: it is not read again."""
+    with suppress(checkpoint.CheckpointError):
+        before = (checkpoint.read_metadata(run).get("source") or {}).get("init")
+        if init is not None and (before is None or Path(before).resolve() != Path(init).resolve()):
+            say(f"{run} goes on and was begun {f'from {before}' if before else 'without --init'}: {init} is not read")
 
 
 def _describe(

@@ -37,12 +37,12 @@ BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
 def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
     """Raise ConfigError for a field of `settings` outside its range; `prefix` is its section on the command line.
 
-    None is in every range, NaN in none; of a tuple every entry counts.
+    None is in every range, NaN and infinity in none; of a tuple every entry counts.
     """
     for name, (low, high, words) in ranges.items():
         value = getattr(settings, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not low <= number <= high:
+            if number is not None and not (low <= number <= high and number < math.inf):
                 spelled = f"{prefix}{name.replace('_', '-')}" if prefix else name
                 raise ConfigError(f"{spelled} must be {words}, not {number}")
 

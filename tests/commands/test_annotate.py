@@ -159,3 +159,5 @@ def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, tmp_path
     assert said.status == 0, said.err
     assert manifests.read(tmp_path / "m_captions.csv").column("text").to_pylist() == ["rough and hard"]
     assert "1 of 1 rows have a caption" in said.out
+    said = anytouch("annotate", path, "--captions", tmp_path / "captions.csv", "--limit", 1, "--split", "train")
+    assert said.status == 1 and "--split, --limit do nothing with --captions" in said.err

@@ -92,8 +92,11 @@ def test_commands_do_not_write_over_their_input(anytouch, tiny_run, tmp_path):
         ["embed", "--run", tiny_run, "--input", mine, "--out", mine],
         ["probe", "--data", mine, "--label", "object", "--run", tiny_run, "--out", mine],
         ["retrieve", "--data", mine, "--run", tiny_run, "--out", mine],
-        ["convert", tiny_run, tiny_run / "config.json"],
     ):
         said = anytouch(*words)
         assert said.status == 1 and "is a file that is read" in said.err, words
     assert mine.read_text().startswith("path,sensor")
+    weights = tmp_path / "w.safetensors"
+    assert anytouch("convert", tiny_run, weights, "--names", "own").status == 0
+    assert "must end in .safetensors" in anytouch("convert", tiny_run, tiny_run / "config.json").err
+    assert "is a file that is read" in anytouch("convert", weights, weights).err

@@ -31,7 +31,10 @@ def test_a_run_pours(anytouch, tiny_run, tmp_path):
         (["--run", "x", "--trials", "0"], "--trials must be at least 1"),
         (["--run", "x", "--demos", "0"], "--demos must be at least 1"),
         (["--run", "x", "--steps", "0"], "--steps must be at least 1"),
-        (["--run", "x", "--record", "y"], "--record only writes demonstrations"),
+        (["--run", "x", "--record", "y"], "--run does nothing with --record, which only writes demonstrations"),
+        (["--record", "y", "--trials", "3", "--stills"], "--trials, --stills do nothing with --record"),
+        (["--run", "x", "--recordings", "y", "--demos", "9"], "--demos does nothing with --recordings"),
+        (["--run", "x", "--size", "56"], "--size does nothing without --record"),
     ],
 )
 def test_mistakes_are_one_sentence(anytouch, words, sentence):

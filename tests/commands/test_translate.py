@@ -82,6 +82,8 @@ def test_a_generator_of_its_own_place(run, world_of_pairs, anytouch, tmp_path):
     assert said.status == 0 and "objects never seen" in said.out
     said = anytouch("translate", picture(world_of_pairs), "--generator", home, *words, "--out", tmp_path / "f.npy")
     assert said.status == 0 and np.load(tmp_path / "f.npy").shape == (20, 20, 6)
+    said = anytouch("translate", "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
+    assert said.status == 1 and "mine holds a translation already; remove it" in said.err
 
 
 def test_mistakes(run, world_of_pairs, mistake, tmp_path):
@@ -106,7 +108,7 @@ def test_mistakes(run, world_of_pairs, mistake, tmp_path):
         (("--fit", "--run", run), "the pairs of --data"),
         (("--fit", *data, "--run", run, "--to", "allsight"), "no rows of sensor 'allsight'"),
         (("--fit", *data, "--run", run, "--from", "tac3d"), "measures a field"),
-        (("--fit", *data, "--run", run, "--steps", 0), "at least 1"),
+        (("--fit", *data, "--run", run, "--steps", 0, "--out", tmp_path / "new"), "at least 1"),
     ]
     for given, says in cases:
         assert says in mistake("translate", *given), given

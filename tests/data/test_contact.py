@@ -185,6 +185,8 @@ def test_thresholds_by_sensor_and_an_older_score(world):
     assert again.table.column_names.count("label.contact_score_given") == 1
     with pytest.raises(UserError, match="sensor 'tacto', which the manifest does not have"):
         _marked(manifest, [1, 1], thresholds={"tacto": 3})
+    with pytest.raises(UserError, match="the threshold of digit must be a number, not nan"):
+        _marked(manifest, [1, 1], thresholds={"digit": float("nan")})
     with pytest.raises(UserError, match="nothing would be left"):
         _marked(manifest, [0.0, 0.0], drop=True)
     with pytest.raises(UserError, match="workers"):

@@ -124,6 +124,12 @@ def test_a_model_without_universal_tokens_starts_from_the_mean_of_its_sensors(ru
     np.testing.assert_array_equal(tokens[9], params["touch"]["sensor_tokens"][9])  # of others nothing changes
 
 
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"steps": -3}, {"frames": -1}])
+def test_numbers_that_make_no_sense_are_refused(run, table, wrong):
+    with pytest.raises(UserError, match="frames are 0 or more and steps 1 or more"):
+        adapt(run, table, "gelslim", **wrong)
+
+
 def test_frames_come_from_as_many_recordings_as_there_are(table):
     rows = choose(table, "gelslim", "train", 12)
     sequence = [table.value(row, "sequence") for row in rows]
@@ -187,7 +193,7 @@ def test_a_run_that_does_not_tell_what_it_saw_is_taken_at_its_word(run, table, t
     config = replace(from_json(text), stage=2)
     stored(tmp_path / "two", config, params, seen=["digit"])
     said.clear()
-    adapt(tmp_path / "two", table, "gelslim", frames=2, steps=0, say=said.append)
+    adapt(tmp_path / "two", table, "gelslim", frames=2, steps=1, say=said.append)
     assert "the decoder of this run is that of its stage 1" in said[0]
 
 

@@ -9,7 +9,7 @@ import pytest
 from runs import run_config
 from tiny_models import touch_model
 
-from anytouch_jax.config import Config, UserError, to_json
+from anytouch_jax.config import Config, UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import touch_evaluation
@@ -153,6 +153,18 @@ def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
         load_encoder(tmp_path)
     with pytest.raises(UserError, match="unknown type"):
         load_encoder(world)
+    np.savez(tmp_path / "features.npz", values=np.zeros((2, 3), np.float32), path=np.array(["a.png", "b.png"]))
+    with pytest.raises(UserError, match=r"features\.npz holds no weights: path is <U5, not numbers"):
+        load_encoder(tmp_path / "features.npz")
+
+
+def test_weights_that_are_not_finite_embed_nothing(tmp_path, tiny_run):
+    params, text, _ = checkpoint.load_params(tiny_run)
+    params["touch"]["class_token"] = np.full_like(params["touch"]["class_token"], np.nan)
+    about = {release.MODEL_KEY: to_json(from_json(text).model)}
+    checkpoint.export_safetensors(tmp_path / "w.safetensors", params, about)
+    with pytest.raises(UserError, match="weights that are not finite: its training diverged"):
+        load_encoder(tmp_path / "w.safetensors")
 
 
 def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):

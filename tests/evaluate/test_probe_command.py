@@ -89,6 +89,22 @@ def test_a_group_that_is_not_there_is_no_recording(manifest):
         read(manifest, label="object", group="taste")
 
 
+def test_labels_never_stand_for_the_columns_of_a_manifest(manifest):
+    table = manifests.read(manifest)
+    odd = table.table.to_pydict() | {"label.sensor": ["gelslim"] * COUNT, "label.split": ["train"] * COUNT}
+    manifests.write(manifests.from_columns(odd | {"label.sequence": ["one"] * COUNT}, manifest), manifest)
+    task = read(manifest, label="slip", sensor="digit")
+    assert set(task.split) == {"train", "test"} and len(np.unique(task.groups)) == COUNT // 2
+
+
+def test_a_label_of_lists_is_refused(manifest, tmp_path):
+    columns = manifests.read(manifest).table.to_pydict() | {"label.pose": [[1.0, 2.0]] * COUNT}
+    path = tmp_path / "lists.parquet"
+    manifests.write(manifests.from_columns(columns, path), path)
+    with pytest.raises(UserError, match=r"'label\.pose' holds lists; a probe wants one value a row"):
+        read(path, label="pose")
+
+
 def test_raw_pixels_name_the_row_and_the_column_of_a_bad_picture(tmp_path):
     picture = np.zeros((24, 32, 3), np.uint8)
     for name in ("a.png", "gel.png"):

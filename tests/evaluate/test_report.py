@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from touch_world import SENSORS, make_touches
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import plots
+from anytouch_jax.evaluate.features import load_encoder
 from anytouch_jax.evaluate.matching import MatchScore
 from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, demo_report, write_report
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval
@@ -42,10 +44,10 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
     numbers = {"x": np.float32(0.5), "bad": float("nan"), "list": np.arange(2), "path": Path("a"), "part": parts[1]}
     path = write_report(out, parts, title="Title", numbers=numbers)
     assert path.read_text() == (
-        "# Title\n\n## First\n\nWords.\n\n![First](figures/01_shot.png)\n\n"
+        "# Title\n\n## First\n\nWords.\n\n![First](figures/shot.png)\n\n"
         "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## Second\n\n![Second](figures/mine.png)\n"
     )
-    assert [one.name for one in pictures_of(path)] == ["01_shot.png", "mine.png"]
+    assert [one.name for one in pictures_of(path)] == ["shot.png", "mine.png"]
     plain = json.loads((out / "report.json").read_text())
     assert (plain["x"], plain["bad"], plain["list"], plain["path"]) == (0.5, None, [0, 1], "a")
     assert plain["part"]["title"] == "Second"
@@ -258,4 +260,30 @@ def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, tmp_path: 
         demo_report(touched, tmp_path / "none", tiny_run, tmp_path / "out")
     with pytest.raises(UserError, match="there is no manifest"):
         demo_report(tmp_path / "none.csv", tiny_run, tiny_run, tmp_path / "out")
+    with pytest.raises(UserError, match=r"--stage2 .*w\.safetensors is a weights file"):
+        (tmp_path / "w.safetensors").write_bytes(b"")
+        demo_report(touched, tiny_run, tmp_path / "w.safetensors", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_stage_two_does_not_stand_for_stage_one(touched: Path, tiny_run: Path, monkeypatch: Any) -> None:
+    encoder = load_encoder(tiny_run)
+    later = replace(encoder, config=replace(encoder.config, stage=2))
+    monkeypatch.setattr("anytouch_jax.evaluate.report.load_encoder", lambda _: later)
+    with pytest.raises(UserError, match="is a run of stage 2; give the one of stage 1 that it began from"):
+        demo_report(touched, tiny_run, tiny_run, tiny_run.parent / "never")
+
+
+def test_a_report_that_fails_leaves_the_one_before(
+    demo: tuple[Path, list[str]], touched: Path, tiny_run: Path, monkeypatch: Any
+) -> None:
+    folder = demo[0].parent
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    def fail(*args: Any) -> None:
+        raise UserError("in the midst of it")
+
+    monkeypatch.setattr("anytouch_jax.evaluate.report._probes", fail)
+    with pytest.raises(UserError, match="in the midst of it"):
+        demo_report(touched, tiny_run, tiny_run, folder, lambda _: None, touches=12, gallery_size=10, seed=1)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before

@@ -169,6 +169,16 @@ def test_packed_slots_are_refused_by_accumulation_and_empty_ones_are_not():
     assert micro_batches(stage2(0), 2).align.clip.shape == (2, 2, 3, 2, 2, 3)
 
 
+def test_an_update_that_is_not_finite_changes_nothing_and_is_counted():
+    config = toy_config()
+    state = init_state(toy_params(), config)
+    tx = optax.sgd(float("inf"))  # loss and gradient are fine
+    state = state._replace(opt_state=tx.init(state.trainable))
+    after, metrics = jax.jit(make_step(toy_loss, tx, total_steps=config.run.steps))(state, toy_batch(0), KEY)
+    assert metrics["skipped"] == 1 and metrics["update_norm"] == 0 and np.isfinite(metrics["grad_norm"])
+    assert_same(after.trainable, state.trainable)
+
+
 @pytest.mark.parametrize("what", ["loss", "gradient"])
 def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(what):
     def loss(params, batch, key, progress):  # finite value, infinite slope

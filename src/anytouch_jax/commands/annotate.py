@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Annotate
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from anytouch_jax.data.annotate import Annotated, Estimate
     from anytouch_jax.data.endpoint import Endpoint
     from anytouch_jax.data.manifest import Manifest
+
+
+_ASKING = ("split", "limit", "sheet", "estimate", "family", "answers", "second_image")
 
 
 class _OnlyAnEstimate(Exception):
@@ -35,6 +39,7 @@ def run(options: Annotate) -> int:
     if options.sheet is not None:
         check_folder(options.sheet, "--sheet")
     if options.captions is not None:
+        refuse(options, _ASKING, "with --captions, which asks nothing")
         return _attach(options, manifest, target)
     try:
         found = annotate(

@@ -10,7 +10,7 @@ import numpy as np
 
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import UNIVERSAL, Model
+from anytouch_jax.config import UNIVERSAL, Model, UserError
 from anytouch_jax.options import Convert
 
 
@@ -20,8 +20,9 @@ def run(options: Convert) -> int:
     from anytouch_jax.io import checkpoint, release
 
     source: Path = options.source
-    of_run = (path for path in source.iterdir() if path.suffix != ".safetensors") if source.is_dir() else (source,)
-    check_folder(options.target, "TARGET", read=of_run)
+    if options.target.suffix != ".safetensors":
+        raise UserError(f"{options.target} must end in .safetensors, the form that is written")
+    check_folder(options.target, "TARGET", read=() if source.is_dir() else (source,))
     about = {"source": str(source)}
     if source.is_dir():
         params, text, told = checkpoint.load_params(source)

@@ -129,6 +129,7 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
 
 def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame."""
+    from anytouch_jax.data.images import frames_told
     from anytouch_jax.data.loader import frames_from_folder, frames_from_video
     from anytouch_jax.evaluate import features
 
@@ -154,6 +155,9 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
         if len(waiting) == options.batch:
             flush()
     flush()
+    told = 0 if options.input.is_dir() else frames_told(options.input)
+    if told > count:
+        say(f"{options.input} tells of {told} frames and {count} could be read; is it whole?")
     if not values:
         raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames}")
     stacked = np.concatenate(values)

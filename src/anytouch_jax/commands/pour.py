@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Pour
@@ -149,7 +150,12 @@ def _check(options: Pour) -> None:
     for name in ("trials", "demos"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, not {getattr(options, name)}")
-    if options.record is not None and not (options.run is None and options.recordings is None and options.out is None):
-        raise UserError("--record only writes demonstrations; leave --run, --recordings and --out out")
+    if options.record is not None:
+        learning = ("run", "recordings", "out", "trials", "stills", "fine_tune", "steps")
+        refuse(options, learning, "with --record, which only writes demonstrations")
+    elif options.recordings is not None:
+        refuse(options, ("demos", "trials", "markers"), "with --recordings, which are what there is to learn from")
+    if options.record is None:
+        refuse(options, ("size",), "without --record")
     if options.steps is not None and options.steps < 1:
         raise UserError(f"--steps must be at least 1, not {options.steps}")

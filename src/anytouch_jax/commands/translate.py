@@ -51,6 +51,8 @@ def _fit(options: Translate) -> int:
     if options.run is None or not options.data:
         raise UserError("--fit needs the encoder of --run and the pairs of --data")
     check_home(home)
+    if (home / generator.FILE).exists():
+        raise UserError(f"{home} holds a translation already; remove it, or choose another folder with --out")
     how = generator.Fit(
         steps=options.steps,
         batch=options.batch,

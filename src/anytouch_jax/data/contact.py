@@ -170,6 +170,8 @@ def _limits(manifest: Manifest, thresholds: Mapping[str, float] | None) -> np.nd
     wrong = [name for name in thresholds or {} if name not in manifest.table["sensor"].to_pylist()]
     if wrong:
         raise UserError(f"a threshold is given for the sensor {wrong[0]!r}, which the manifest does not have")
+    if strange := [name for name, least in table.items() if not np.isfinite(least)]:
+        raise UserError(f"the threshold of {strange[0]} must be a number, not {table[strange[0]]}")
     return np.array([table.get(name, DEFAULT_THRESHOLD) for name in manifest.table["sensor"].to_pylist()])
 
 

@@ -233,6 +233,15 @@ def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
         video.release()
 
 
+def frames_told(path: str | Path) -> int:
+    """The number of frames that a video's header tells of, 0 where it tells nothing."""
+    video = cv2.VideoCapture(str(path))
+    try:
+        return max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
+    finally:
+        video.release()
+
+
 def pictures_in(folder: str | Path) -> list[Path]:
     """The picture files of a folder in natural order (2 before 10). Raises ImageError when there are none."""
     folder = Path(folder)

@@ -23,13 +23,13 @@ import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model
 from anytouch_jax.data.paths import resolve
-from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, load_table, typed
+from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, is_manifest, load_table, typed
 from anytouch_jax.data.windows import windows
 
 KEYS = ("sequence", "touch", "grasp_group")  # what two manifests may call alike and is not the same
 __all__ = [
     "PATHS", "REQUIRED", "SCHEMA", "SPLITS", "Manifest", "ManifestError",
-    "from_columns", "read", "resolve", "sensor_rows", "write",
+    "from_columns", "is_manifest", "read", "resolve", "sensor_rows", "write",
 ]  # fmt: skip
 
 

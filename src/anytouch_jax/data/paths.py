@@ -24,7 +24,9 @@ def resolve(root: str | Path, relative: str | None) -> Path:
     path = f"{_real_folder(root, head)}/{name}"
     if name in ("", ".", "..") or os.path.islink(path):
         path = os.path.realpath(path)
-    if relative[0] == "/" or not path.startswith(root if root[-1] == "/" else f"{root}/"):
+    if relative[0] == "/":
+        raise ManifestError(f"the path {relative!r} is absolute; write it relative to the manifest's folder, {root}")
+    if not path.startswith(root if root[-1] == "/" else f"{root}/"):
         raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}")
     return Path(path)
 

@@ -62,6 +62,19 @@ def load_table(path: Path) -> pa.Table:
         raise ManifestError(f"{path} cannot be read as a {kind[1:]} table: {reason}") from None
 
 
+def is_manifest(path: Path) -> bool:
+    """Whether the file in `path` has the columns of a manifest; its values are not looked at."""
+    try:
+        if path.suffix.lower() == ".parquet":
+            names = pa.parquet.read_schema(path).names
+        else:
+            with path.open(encoding="utf-8-sig", newline="") as file:
+                names = next(csv.reader(file), [])
+    except (pa.ArrowException, UnicodeDecodeError, csv.Error):
+        return False
+    return set(REQUIRED) <= set(names)
+
+
 def _load_parquet(path: Path) -> pa.Table:
     """Column by column, so that a large table is never in the memory twice."""
     with pa.parquet.ParquetFile(path) as file:

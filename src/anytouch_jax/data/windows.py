@@ -32,6 +32,8 @@ def windows(
         one, two = sorted(int(at if order is None else order[at]) for at in (twice[0], twice[0] + 1))
         raise repeated(one, two) if repeated else ValueError(f"rows {one} and {two} are the same frame")
     kind = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # millions of windows are held
+    if length > np.bincount(sequence, minlength=1).max():
+        return np.empty((0, length), kind)
     found, count = np.empty((len(key), length), kind), 0
     for start in range(0, len(key), _BLOCK):
         here = np.arange(start, min(start + _BLOCK, len(key)))

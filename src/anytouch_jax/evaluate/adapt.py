@@ -65,6 +65,8 @@ def adapt(
     reconstruction (Eq. 1) through the run's decoder. With `labels`, a column, each frame's embedding is drawn to its
     class: the mean embedding of the known sensors' frames of that class in `manifest`. Raises UserError.
     """
+    if frames < 0 or steps < 1:
+        raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
     params, text, about = checkpoint.load_params(run)
     config, params, row = _with_row(from_json(text), params, about, sensor, run, say)
     seen = {"seen": [*about["seen"], sensor]} if "seen" in about else {}
@@ -252,7 +254,7 @@ def _fit(
     loss: Loss, params: Params, row: int, clip: np.ndarray, target: np.ndarray, *, steps: int, rate: float, seed: int
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """The tokens (S, D) of the row after `steps` of Adam with a falling rate, and the loss of each step."""
-    tx = optax.adam(optax.cosine_decay_schedule(rate, max(steps, 1)))
+    tx = optax.adam(optax.cosine_decay_schedule(rate, steps))
     arrays = jax.device_put((params, clip, target))
 
     @jax.jit

@@ -155,7 +155,7 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
 
     Only the touch encoder is kept. A sensor that a run was not trained on is served by the universal tokens (Sec. 3.5),
     whether or not the table has its name. A bad sample stops what it embeds, whatever training did with such. Raises
-    UserError when there is no touch encoder.
+    UserError when there is no touch encoder, or weights that are not finite.
     """
     path = Path(path)
     if not path.exists():
@@ -177,6 +177,8 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
         params, config = release.to_params(weights, model), Config(model, data=Data(background=shown))
     if "touch" not in params:
         raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
+    if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(params["touch"])):
+        raise UserError(f"{path} holds weights that are not finite: its training diverged; take an earlier checkpoint")
     known = None if seen is None else tuple(seen)
     return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path), known, drawn)
 

@@ -59,7 +59,7 @@ class Fit:
     def __post_init__(self) -> None:
         if self.steps < 1 or self.batch < 1:
             raise UserError(f"steps and batch are at least 1, not {self.steps} and {self.batch}")
-        if self.adversarial < 0 or self.penalty < 0 or self.learning_rate <= 0:
+        if not (0 <= self.adversarial < np.inf and 0 <= self.penalty < np.inf and 0 < self.learning_rate < np.inf):
             raise UserError("the adversarial weight and the penalty are 0 or more, and the learning rate is above 0")
 
 

@@ -204,13 +204,15 @@ def imitation_loss(logits: jax.Array, choices: jax.Array) -> jax.Array:
 def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[Head, float]:
     """Train the MLP on inputs (n, d), actions (n,) of the demonstrations `runs` (n,); also its loss on those held out.
 
-    A single demonstration is held out and learned from. Raises UserError on inputs of NaN.
+    A single demonstration is held out and learned from. Raises UserError on inputs of NaN, and on a single input.
     """
     if not np.isfinite(x).all():
         raise UserError("the policy's inputs are not finite; look at the encoder's weights")
     names = np.unique(runs)
     late = np.isin(runs, names[len(names) - max(1, round(learning.held_out * len(names))) :])
     known = late if late.all() else ~late
+    if known.sum() < 2:
+        raise UserError("there is one moment of choice to learn from; record more or longer runs")
     head = new_head(x[known], learning)
     optimiser = optax.adamw(optax.cosine_decay_schedule(learning.rate, learning.steps), weight_decay=learning.decay)
     data = tuple((jnp.asarray(x[part], jnp.float32), jnp.asarray(actions[part])) for part in (known, late))

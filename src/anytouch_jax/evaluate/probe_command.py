@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.samples import read_picture
 from anytouch_jax.evaluate import baseline, probe
-from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder
+from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 
 if TYPE_CHECKING:
     from anytouch_jax.options import Probe
@@ -97,12 +98,12 @@ def read_task(options: Probe, say: Say) -> Task:
             raise UserError(f"--where {name}: that column holds words, not numbers") from None
         kept &= number > least
     if options.sensor is not None:
-        kept &= np.array(_column(table, "sensor")) == options.sensor
-    fields = kept & np.isin(_column(table, "sensor"), FIELD_SENSORS)
+        kept &= text_column(manifest, "sensor") == options.sensor
+    fields = kept & np.isin(text_column(manifest, "sensor"), FIELD_SENSORS)
     if fields.any():
         say(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
         kept &= ~fields
-    split = np.array(_column(table, "split"))
+    split = text_column(manifest, "split")
     kept &= np.isin(split, ("train", "val", "test"))
     if (options.frames or 1) > 1:
         kept &= np.isin(np.arange(len(manifest)), manifest.clips(options.frames or 1)[:, -1])
@@ -121,6 +122,8 @@ def read_task(options: Probe, say: Say) -> Task:
 def _column(table: Any, name: str) -> list[Any]:
     for candidate in (f"label.{name}", name):
         if candidate in table.column_names:
+            if pa.types.is_nested(table[candidate].type):
+                raise UserError(f"the column {candidate!r} holds lists; a probe wants one value a row")
             values: list[Any] = table[candidate].to_pylist()
             return values
     raise UserError(f"the manifest has no column {name!r} or 'label.{name}'; it has {', '.join(table.column_names)}")
@@ -129,7 +132,7 @@ def _column(table: Any, name: str) -> list[Any]:
 def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
     """The column left out or asked for, the sequence where it is empty, or where there is no default column."""
     table = manifests.with_own_keys(manifest, manifest.table)  # recordings of two files are never one
-    sequence = _column(table, "sequence")
+    sequence = table["sequence"].to_pylist()
     name = options.leave_out or options.group
     if name == GROUP and not {name, f"label.{name}"} & set(table.column_names):
         return np.array([sequence[r] for r in rows])

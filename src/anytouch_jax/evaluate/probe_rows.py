@@ -115,7 +115,7 @@ def _text(value: Any) -> str:
     if isinstance(value, float | np.floating):
         if np.isnan(value):
             return ""
-        if value != int(value):
+        if not np.isfinite(value) or value != int(value):
             raise UserError(f"the label holds {value:g}, a measured quantity and no class; use the regression probe")
         return str(int(value))
     return str(value)

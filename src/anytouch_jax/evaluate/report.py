@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -52,12 +53,15 @@ def write_report(
     report that is there is whole. Raises UserError for a figure that is not there and for a full disk.
     """
     lines = [f"# {title}"]
+    drawn = [section.figure.name for section in sections if section.figure is not None]
     for number, section in enumerate(sections, 1):
         lines.append(f"## {section.title}")
         if section.text:
             lines.append(section.text.strip())
         if section.figure is not None:
-            lines.append(f"![{section.title}](figures/{_place(section.figure, folder, number)})")
+            own = section.figure.name
+            name = f"{number:02d}_{own}" if drawn.count(own) > 1 else own
+            lines.append(f"![{section.title}](figures/{_placed(section.figure, folder / 'figures' / name)})")
         lines += [part.strip() for part in (section.table, section.notes) if part]
     if numbers is not None:
         plots.write_bytes(folder / "report.json", (_json(numbers) + "\n").encode())
@@ -65,15 +69,13 @@ def write_report(
     return folder / "report.md"
 
 
-def _place(figure: Path, folder: Path, number: int) -> str:
-    """The name of a figure in figures/, copied there when it lies elsewhere."""
+def _placed(figure: Path, target: Path) -> str:
+    """The name of a figure, copied to its place in the report."""
     if not figure.is_file():
         raise UserError(f"there is no figure {figure} for the report; draw it first or leave it out")
-    if figure.resolve().parent == (folder / "figures").resolve():
-        return figure.name
-    name = f"{number:02d}_{figure.name}"
-    plots.write_bytes(folder / "figures" / name, figure.read_bytes())
-    return name
+    if figure.resolve() != target.resolve():
+        plots.write_bytes(target, figure.read_bytes())
+    return target.name
 
 
 def _json(numbers: Mapping[str, Any]) -> str:
@@ -124,18 +126,41 @@ def demo_report(
     """What two runs learned of a manifest, on its split test: samples, losses, pictures, space, retrieval, probes.
 
     `touches` bounds how many touches of test are looked at, and half as many of train and of val, each by its deepest
-    frame. Writes the folder `out` as `write_report` does; gives back the path of report.md. Raises UserError.
+    frame. Writes the folder `out` as `write_report` does; gives back the path of report.md. Figures are drawn elsewhere
+    until all is done, so that a report that fails leaves an earlier one as it was. Raises UserError, also for a run of
+    stage 2 in the place of stage 1, and for weights files.
     """
     clock, out = time.perf_counter(), Path(out)
     table = manifests.read(manifest)
-    first, second = load_encoder(stage1), load_encoder(stage2)
+    with tempfile.TemporaryDirectory(prefix="anytouch-report-") as drawn:
+        sections, numbers = _contents(table, Path(stage1), Path(stage2), Path(drawn), say, touches, gallery_size, seed)
+        numbers = {"manifest": str(manifest), **numbers, "seconds": round(time.perf_counter() - clock, 1)}
+        path = write_report(out, sections, title="What the demo learned", numbers=numbers)
+    say(f"{path}: written in {numbers['seconds']:.0f} s")
+    return path
+
+
+def _of_stage(run: Path, stage: int) -> Encoder:
+    """The encoder of a run. Raises UserError for a weights file, which has no losses to show, and for one of stage 2
+    in the place of stage 1."""
+    if run.is_file():
+        raise UserError(f"--stage{stage} {run} is a weights file; give the folder of a run of stage {stage}")
+    encoder = load_encoder(run)
+    if stage == 1 and encoder.config.stage == 2:
+        raise UserError(f"--stage1 {run} is a run of stage 2; give the one of stage 1 that it began from")
+    return encoder
+
+
+def _contents(
+    table: Manifest, stage1: Path, stage2: Path, out: Path, say: Say, touches: int, gallery_size: int, seed: int
+) -> tuple[list[Section], dict[str, Any]]:
+    """The sections of a report, their figures drawn in `out`, and its numbers."""
+    first, second = _of_stage(stage1, 1), _of_stage(stage2, 2)
     encoders = {RANDOM: random_encoder(first.config, seed), "stage 1": first, "stage 2": second}
-    numbers: dict[str, Any] = {
-        "manifest": str(manifest), "data": table.content_hash, "stage1": str(stage1), "stage2": str(stage2),
-    }  # fmt: skip
+    numbers: dict[str, Any] = {"data": table.content_hash, "stage1": str(stage1), "stage2": str(stage2)}
     sections = [_facts(table, first, second), *samples_section(table, out, seed=seed)]
-    sections.append(losses_section({"stage 1": Path(stage1), "stage 2": Path(stage2)}, out))
-    sections.append(reconstructions_section(table, Path(stage1), out))
+    sections.append(losses_section({"stage 1": stage1, "stage 2": stage2}, out))
+    sections.append(reconstructions_section(table, stage1, out))
     say("report: samples, losses and reconstructions are drawn")
     study = _study(table, encoders, touches, seed, say)
     say(f"report: {len(study.rows)} touches embedded by {len(encoders)} encoders")
@@ -144,15 +169,11 @@ def demo_report(
     say("report: t-SNE is drawn")
     section, numbers["retrieval"] = _retrieval(study, out, gallery_size)
     sections.append(section)
-    section, numbers["matching"] = _matching(study, Path(stage2))
+    section, numbers["matching"] = _matching(study, stage2)
     sections.append(section)
     say("report: retrieval and matching are scored")
     section, numbers["probes"] = _probes(study, out)
-    sections.append(section)
-    numbers["seconds"] = round(time.perf_counter() - clock, 1)
-    path = write_report(out, sections, title="What the demo learned", numbers=numbers)
-    say(f"{path}: written in {numbers['seconds']:.0f} s")
-    return path
+    return [*sections, section], numbers
 
 
 def _facts(table: Manifest, first: Encoder, second: Encoder) -> Section:

@@ -82,6 +82,8 @@ def read_weights(path: str | Path) -> dict[str, np.ndarray]:
         arrays = read_torch(path)
     else:
         raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt or .bin file")
+    if words := [name for name, array in arrays.items() if array.dtype.kind in "USOMm"]:
+        raise WeightsError(f"{path} holds no weights: {words[0]} is {arrays[words[0]].dtype}, not numbers")
     integers = ("i", "u", "b")
     return {name: array if array.dtype.kind in integers else as_float32(array) for name, array in arrays.items()}
 

@@ -107,16 +107,17 @@ def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps:
 def _finish(
     state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
-    """Apply the update where loss and gradient are finite, and report."""
+    """Apply the update where loss, gradient and update are finite, and report."""
     layout = packing(state.trainable)
     grad_norm = norm(layout.pack(grads))
-    good = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
+    update_norm = norm(layout.pack(updates))
+    good = jnp.isfinite(loss) & jnp.isfinite(grad_norm) & jnp.isfinite(update_norm)
     rate = getattr(opt_state, "learning_rate", jnp.nan)
     metrics = metrics | {
         "loss": loss,
         "grad_norm": grad_norm,
         "param_norm": norm(layout.pack(state.trainable)),
-        "update_norm": jnp.where(good, norm(layout.pack(updates)), 0.0),
+        "update_norm": jnp.where(good, update_norm, 0.0),
         "learning_rate": jnp.asarray(rate),
         "skipped": jnp.where(good, 0.0, 1.0),
     }

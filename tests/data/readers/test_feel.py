@@ -59,6 +59,12 @@ def test_the_fold_is_chosen_and_objects_in_no_list_are_unused(tmp_path, read):
     assert table.reasons["grasp of an object that is in no list of split 3 (split unused)"] == 2
 
 
+def test_a_fold_that_is_not_there_is_told(tmp_path, read):
+    _tree(tmp_path)
+    with pytest.raises(UserError, match=r"no split_99\.npy or \.json for --fold 99"):
+        read("feel", fold=99)
+
+
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_split_files_are_scanned_as_numpy_writes_them(tmp_path, protocol):
     same = "an object in both"

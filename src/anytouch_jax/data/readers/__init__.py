@@ -159,6 +159,8 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
         )
     if name == "real_touch" and target == base / "manifest.csv":
         raise UserError(f"{target} is the pack's own manifest; name another file with --out")
+    if target.exists() and not manifests.is_manifest(target):
+        raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
     return target
 
 

@@ -100,6 +100,8 @@ def _grasp(rows: Rows, notes: Notes, prefix: str, name: str, number: int, succes
 def _splits(base: Path, options: Options, notes: Notes) -> dict[str, str] | None:
     """object -> split, from split_<fold>.json or .npy; None without a file."""
     path = find_file([f"split_{options.fold}.json", f"split_{options.fold}.npy"], options.lists, base)
+    if path is None and options.fold:
+        raise DatasetError(f"there is no split_{options.fold}.npy or .json for --fold {options.fold} under {base}")
     if path is None:
         notes.say(f"no split_{options.fold}.npy or .json: split by hash of the object")
         return None

@@ -1,0 +1,60 @@
+"""Mistakes at the command line that would lose something, or do nothing, without a word."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "data" / "readers"))  # reader_world.py
+
+from reader_world import fill
+
+
+def test_values_given_in_two_parts_are_not_lost(mistake):
+    said = mistake("probe", "--data", "a.csv", "--label", "object", "--data=b.csv", "--run", "r")
+    assert "--data is given twice; write it once, with all its values behind it" in said
+    assert "--run is given twice" in mistake("retrieve", "--data", "a.csv", "--run", "r", "--run", "s")
+
+
+def test_a_manifest_is_not_written_over_another_table(anytouch, mistake, tmp_path):
+    fill(tmp_path, [f"real/mug/dataset_{k}/frames/frame_{i:07d}.jpg" for k in range(2) for i in range(3)])
+    table = tmp_path / "labels.csv"
+    table.write_text("name,hardness\nmug,hard\n")
+    assert "labels.csv is there and is no manifest; name another file" in mistake(
+        "index", "ycb_slide", tmp_path, "--out", table
+    )
+    assert table.read_text().startswith("name,hardness")
+    for _ in range(2):  # a manifest may be made anew
+        assert anytouch("index", "ycb_slide", tmp_path, "--out", tmp_path / "m.csv").status == 0
+    (tmp_path / "broken.parquet").write_bytes(b"no parquet")
+    assert "is no manifest" in mistake("index", "ycb_slide", tmp_path, "--out", tmp_path / "broken.parquet")
+
+
+def test_weights_that_are_written_may_be_read_by_others(anytouch, tiny_run, tmp_path):
+    assert anytouch("convert", tiny_run, tmp_path / "w.safetensors", "--names", "own").status == 0
+    assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o644
+
+
+def test_an_absolute_path_is_called_so(mistake, tiny_run, tmp_path):
+    picture, manifest = tmp_path / "a.png", tmp_path / "m.csv"
+    cv2.imwrite(str(picture), np.zeros((32, 32, 3), np.uint8))
+    manifest.write_text(f"path,sensor,sequence,frame_index,split\n{picture},digit,s,0,train\n")
+    said = mistake("embed", "--run", tiny_run, "--input", manifest, "--out", tmp_path / "f.npz")
+    assert "is absolute; write it relative to the manifest's folder" in said
+
+
+def test_a_video_that_ends_early_is_told_of(anytouch, tiny_run, tmp_path):
+    film = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 64))
+    for shade in np.random.default_rng(0).integers(0, 255, (30, 64, 64, 3), np.uint8):
+        writer.write(shade)
+    writer.release()
+    said = anytouch("embed", "--run", tiny_run, "--input", film, "--sensor", "digit", "--out", tmp_path / "f.npz")
+    assert said.status == 0 and "is it whole" not in said.err
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    said = anytouch("embed", "--run", tiny_run, "--input", film, "--sensor", "digit", "--out", tmp_path / "f.npz")
+    assert said.status == 0 and "could be read; is it whole?" in said.err

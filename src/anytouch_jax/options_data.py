@@ -11,12 +11,14 @@ Paths = tuple[Path, ...]
 
 @dataclass(frozen=True)
 class Index:
-    """Turn a downloaded dataset into a manifest: one row a tactile frame, beside the count that the paper gives.
+    """Turn a downloaded dataset, or recordings of your own, into a manifest: one row a tactile frame.
 
     Example: anytouch index ycb_slide ~/data/YCB-Slide --out ~/data/YCB-Slide/ycb_slide.parquet
 
     Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel,
-    objectfolder, real_touch, taxim_presses. What is left out is counted, with the reason and the first file.
+    objectfolder, real_touch, taxim_presses, recordings. The last is for your own: a folder of pictures each, as
+    OBJECT/RECORDING/0.png, with background.png, photo.jpg and caption.txt beside them or above. What is left out is
+    counted, with the reason and the first file.
     """
 
     name: str
@@ -37,6 +39,8 @@ class Index:
     """feel: which of its split_<k>.npy decides the split."""
     export: bool = False
     """Let the reader write pictures into ROOT, where the dataset comes as arrays."""
+    sensor: str | None = None
+    """recordings: the sensor that made them, as in the configuration's table, or a new name."""
 
 
 @dataclass(frozen=True)

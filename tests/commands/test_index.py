@@ -57,4 +57,4 @@ def test_the_help_names_every_reader_and_the_defaults_are_the_readers():
     assert Index.__doc__ is not None
     assert [name for name in READERS if f"{name}," not in Index.__doc__ and f"{name}." not in Index.__doc__] == []
     given = Index("x", Path())
-    assert Options() == Options(given.val, given.test, given.lists, given.task, given.fold, given.export)
+    assert Options() == Options(given.val, given.test, given.lists, given.task, given.fold, given.export, given.sensor)

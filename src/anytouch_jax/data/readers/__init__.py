@@ -16,6 +16,7 @@ from anytouch_jax.data.readers import (
     objectfolder_real,
     octopi,
     real_touch,
+    recordings,
     ssvtp,
     tacquad,
     taxim_presses,
@@ -42,6 +43,7 @@ READERS: dict[str, Reader] = {
     "objectfolder": objectfolder.READER,
     "real_touch": real_touch.READER,
     "taxim_presses": taxim_presses.READER,
+    "recordings": recordings.READER,
 }
 
 

@@ -1,0 +1,107 @@
+"""Recordings of one's own: a folder of pictures is a recording, in ROOT or at any depth below it.
+
+    mine/mug/pour_1/000.png ...         the object is the first folder; the recording is the folder itself
+    mine/mug/background.png             the untouched gel of every recording in or below this folder
+    mine/mug/photo.jpg                  a photograph of what is touched, likewise
+    mine/mug/caption.txt                words for what is felt, likewise
+
+Frames are taken in natural order (2 before 10). Their numbers are those at the end of their names where these count
+frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. The object, or the
+recording where there is none, is the group of the hash split.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+from typing import Any
+
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UserError
+from anytouch_jax.data.images import SUFFIXES
+from anytouch_jax.data.readers.common import (
+    Columns,
+    DatasetError,
+    Notes,
+    Options,
+    Reader,
+    Rows,
+    add_recording,
+    hash_split,
+    natural,
+    walk,
+)
+
+BACKGROUND, PHOTO, CAPTION = "background", "photo", "caption.txt"
+
+
+def read(root: Path, options: Options, notes: Notes) -> Columns:
+    """Every folder of pictures. Raises UserError without a sensor, DatasetError when there is no picture."""
+    if options.sensor is None or options.sensor in FIELD_SENSORS:
+        known = ", ".join(name for name in SENSORS if name not in FIELD_SENSORS)
+        raise UserError(f"say by --sensor what made these pictures: {known}, or the name of a new sensor")
+    rows = Rows("object", "background_path", "image_path", "text", "dataset")
+    beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
+    for folder, _, files in walk(root, notes):
+        beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
+        frames = _frames(files, notes, folder)
+        if not frames:
+            continue
+        obj = folder.split("/")[0] or None
+        split = hash_split(root.name, obj or folder, options)
+        add_recording(rows, frames, folder, split=split, sensor=options.sensor, sequence=folder or root.name,
+                      object=obj, dataset=root.name, **beside[folder])  # fmt: skip
+    columns = rows.columns()
+    if not columns["path"]:
+        raise DatasetError(f"{root} and the folders in it hold no pictures ({', '.join(SUFFIXES)})")
+    columns["path"] = [path.lstrip("/") for path in columns["path"]]
+    for split in ("val", "test"):
+        if split not in columns["split"] and getattr(options, split):
+            notes.say(f"no object or recording fell to split {split}; with few of them give a larger --{split}")
+    return columns
+
+
+def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
+    """Background, photograph and caption that lie in a folder. Raises DatasetError for a caption that is no text."""
+    found: dict[str, Any] = {}
+    for name in files:
+        path = f"{folder}/{name}".lstrip("/")
+        stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
+        if name.lower() == CAPTION:
+            try:
+                found["text"] = " ".join((root / path).read_text(encoding="utf-8-sig").split()) or None
+            except (OSError, UnicodeDecodeError) as error:
+                raise DatasetError(f"{root / path} cannot be read as UTF-8 text: {error}") from None
+        elif suffix in SUFFIXES and stem in (BACKGROUND, PHOTO):
+            found["background_path" if stem == BACKGROUND else "image_path"] = path
+    return found
+
+
+def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]]:
+    """The pictures of a folder in natural order with their numbers."""
+    names = []
+    for name in sorted(files, key=natural):
+        stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
+        if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
+            names.append(name)
+        elif suffix not in SUFFIXES and name.lower() != CAPTION:
+            notes.skip("file that is no picture (a film is to be cut into pictures first)", f"{folder}/{name}")
+    ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
+    numbers = [int(end[1]) for end in ends if end]
+    steps = {b - a for a, b in itertools.pairwise(numbers)}
+    if len(numbers) == len(names) and min(steps, default=0) == 1:
+        return list(zip(numbers, names, strict=True))
+    return list(enumerate(names))
+
+
+READER = Reader(
+    name="recordings",
+    read=read,
+    sensor="",
+    license="as their owner says",
+    commercial=False,
+    about="folders of pictures, a recording each",
+    url="",
+    citation="nothing, unless their owner says so",
+    uses=("val", "test", "sensor"),
+)

@@ -13,10 +13,11 @@ from anytouch_jax import __version__, baselines, pages
 from anytouch_jax.config import Config, UserError, preset
 from anytouch_jax.options import Bench, Convert, Embed, Parity, Probe, Report, Retrieve, Sections, Simulate, Train
 from anytouch_jax.options_data import Annotate, Contact, Index, Pack, Verify
-from anytouch_jax.options_use import Adapt, Export, Pour, Translate
+from anytouch_jax.options_use import Adapt, Export, Info, Pour, Translate
 
 _COMMANDS: dict[str, tuple[type, str]] = {
     "simulate": (Simulate, "touch scenes by several sensors, with photographs, captions and forces"),
+    "info": (Info, "what a run, weights, a manifest or features are"),
     "index": (Index, "a downloaded dataset becomes a manifest"),
     "contact": (Contact, "which frames are touched"),
     "verify": (Verify, "check a manifest and its files; repair; rows for commercial use"),
@@ -36,7 +37,7 @@ _COMMANDS: dict[str, tuple[type, str]] = {
     "bench": (Bench, "speed against error, on this machine"),
 }
 # What these require is given by place, not by name.
-_POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert, Translate)
+_POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert, Translate, Info)
 
 
 def console() -> int:

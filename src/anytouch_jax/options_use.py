@@ -10,6 +10,17 @@ Paths = tuple[Path, ...]
 
 
 @dataclass(frozen=True)
+class Info:
+    """Say what a file or folder is: a run, weights, a manifest, features, a translation.
+
+    Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
+    """
+
+    paths: Paths
+    """Files and folders."""
+
+
+@dataclass(frozen=True)
 class Export:
     """Write a trained touch encoder as one file that needs jax alone, checked against the live model.
 

@@ -1,0 +1,148 @@
+"""`anytouch info`: what a run, a weights file, a manifest, features or a translation is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from anytouch_jax.config import UNIVERSAL, Config, Model, UserError
+from anytouch_jax.options_use import Info
+
+_WEIGHTS = (".safetensors", ".pth", ".pt", ".bin", ".npz")
+
+
+def run(options: Info) -> int:
+    """Print some lines on every path."""
+    for number, path in enumerate(options.paths):
+        print("\n" * bool(number) + "\n".join(_lines(path)))
+    return 0
+
+
+def _lines(path: Path) -> list[str]:
+    from anytouch_jax.evaluate import generator
+
+    if not path.exists():
+        raise UserError(f"there is no {path}")
+    if path.is_dir():
+        if (path / generator.FILE).is_file():
+            return _translation(path)
+        held = next((path / name for name in ("manifest.parquet", "manifest.csv") if (path / name).is_file()), None)
+        return _run(path) if held is None else _manifest(held)
+    if path.name == generator.FILE:
+        return _translation(path)
+    if path.suffix.lower() in (".csv", ".parquet"):
+        return _manifest(path)
+    if path.suffix == ".npz" and (found := _features(path)):
+        return found
+    if path.suffix in _WEIGHTS:
+        return _weights(path)
+    raise UserError(f"{path} is none of a run, weights ({', '.join(_WEIGHTS)}), a manifest (.csv, .parquet), features")
+
+
+def _run(path: Path) -> list[str]:
+    from anytouch_jax.config import from_json
+    from anytouch_jax.io import checkpoint
+
+    about = checkpoint.read_metadata(path)
+    config: Config = from_json(about["config"])
+    kept = checkpoint.steps(path / "checkpoints")
+    source = about.get("source") or {}
+    began = [f"{name} {place}" for name, place in source.items() if place is not None]
+    loss = about.get("metrics", {}).get("loss")
+    return [
+        f"{path}: a run of stage {config.stage}, step {about['step']} of {config.run.steps}"
+        + (f"; checkpoints at {', '.join(map(str, kept))}" if kept else ""),
+        f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
+        _model(config.model),
+        _sensors(config.model, about.get("seen")),
+        f"touches are seen {'less the untouched gel' if config.data.background == 'subtract' else 'as they are'}",
+        f"began from {', '.join(began)}" if began else "began from nothing trained",
+        f"data: {', '.join(config.data.manifests) or 'none named'}"
+        + (f" (content {about['data'][:12]})" if about.get("data") else ""),
+        *([f"loss {loss:.4g}, the mean since the checkpoint before"] if loss is not None else []),
+    ]
+
+
+def _model(model: Model) -> str:
+    touch = model.touch
+    return (
+        f"touch encoder of width {touch.width}, depth {touch.depth}, {touch.heads} heads; pictures of "
+        f"{model.image_size} pixels in patches of {model.patch}; features of {model.embed}"
+    )
+
+
+def _sensors(model: Model, seen: list[str] | None) -> str:
+    named = [name for name in model.sensors if name != UNIVERSAL]
+    if seen is None:
+        return f"sensors: {', '.join(named)}; which of them it was trained on is not told"
+    return f"sensors trained on: {', '.join(seen) or 'none'}; every other one counts as never seen"
+
+
+def _weights(path: Path) -> list[str]:
+    from anytouch_jax.io import release
+    from anytouch_jax.io.detect import detect_layout
+
+    weights, told = release.read_weights(path), release.read_metadata(path)
+    names = {"own": "our own", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
+    layout = detect_layout(weights)
+    model = release.model_of(path, weights)
+    seen = told[release.SEEN_KEY].split(",") if release.SEEN_KEY in told else None
+    count = sum(array.size for array in weights.values())
+    finite = all(np.isfinite(array).all() for array in weights.values() if array.dtype.kind == "f")
+    return [
+        f"{path}: {len(weights)} arrays of {count:,} numbers by {names.get(layout, f'the authors ({layout})')} names",
+        _model(model),
+        *([] if layout in ("clip", "openclip") else [_sensors(model, seen)]),
+        *([] if finite else ["some of them are not finite: nothing can be embedded with them"]),
+    ]
+
+
+def _manifest(path: Path) -> list[str]:
+    from collections import Counter
+
+    from anytouch_jax.data import manifest as manifests
+
+    table = manifests.read(path)
+    count = {name: Counter(table.column(name).to_pylist()) for name in ("split", "sensor")}
+    listed = {
+        name: ", ".join(f"{key} {number:,}" for key, number in sorted(one.items())) for name, one in count.items()
+    }
+    columns = table.table.column_names
+    optional = ("image_path", "text", "background_path", "touch", "object", "field_path")
+    there = [f"{name} {int(table.present(name).sum()):,}" for name in optional if name in columns]
+    labels = [name.removeprefix("label.") for name in columns if name.startswith("label.")]
+    return [
+        f"{path}: a manifest of {len(table):,} rows in {int(table.codes('sequence').max()) + 1:,} recordings, "
+        f"{len(table.clips(3)):,} clips of three frames",
+        f"splits: {listed['split']}",
+        f"sensors: {listed['sensor']}",
+        f"rows with {', '.join(there) or 'nothing optional'}",
+        f"labels: {', '.join(labels) or 'none'}",
+        f"content {table.content_hash[:12]}",
+    ]
+
+
+def _features(path: Path) -> list[str]:
+    """What `anytouch embed` wrote; [] for another .npz."""
+    from anytouch_jax.io.tensors import read_npz
+
+    arrays = read_npz(path)
+    if not {"features", "rows"} <= arrays.keys():
+        return []
+    values = arrays["features"]
+    keys = [name.removeprefix("key/") for name in arrays if name.startswith("key/")]
+    told = [f"{name.removeprefix('about/')}: {arrays[name]}" for name in arrays if name.startswith("about/")]
+    return [f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}", *told]
+
+
+def _translation(path: Path) -> list[str]:
+    from anytouch_jax.evaluate import generator
+
+    design = generator.load(path).design
+    what = f"fields of {' x '.join(map(str, design.shape.field))}" if design.shape.field else "images"
+    return [
+        f"{path}: a translation of {design.source} into {what} of {design.target}",
+        f"encoder {design.encoder or 'none'} ({design.fit.tune}), {design.fit.steps} steps on {design.pairs} pairs",
+        _model(design.shape.model),
+    ]

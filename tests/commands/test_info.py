@@ -1,0 +1,52 @@
+"""`anytouch info`: what lies there, told from the thing itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from tiny_models import touch_model
+
+from anytouch_jax.config import to_json
+from anytouch_jax.evaluate import generator, pairs
+from anytouch_jax.io import release
+from anytouch_jax.io.checkpoint import export_safetensors
+from anytouch_jax.nn.functional import build
+
+
+def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
+    features = tmp_path / "f.npz"
+    assert anytouch("embed", "--run", tiny_run, "--input", world, "--out", features).status == 0
+    said = anytouch("info", tiny_run, world, features)
+    assert said.status == 0, said.err
+    run, manifest, found = said.out.strip().split("\n\n")
+    assert run.startswith(f"{tiny_run}: a run of stage 1, step 2 of 4; checkpoints at 2\n")
+    assert "every other one counts as never seen" in run
+    assert "began from nothing trained" in run and f"data: {world} (content " in run and "loss " in run
+    assert f"{world}: a manifest of 12 rows in 3 recordings, 4 clips of three frames" in manifest
+    assert "splits: test 2, train 8, val 2" in manifest and "sensors: digit 8, gelsight_mini 4" in manifest
+    assert "rows with image_path 1, text 4, touch 12, object 12" in manifest and "labels: object" in manifest
+    assert f"{features}: 12 features of 12, with path, sensor, sequence, split, frame_index" in found
+    assert f"encoder: {tiny_run}" in found and anytouch("info", world.parent).out.startswith(str(world))
+
+
+def test_weights_tell_whose_names_they_have(anytouch, tmp_path):
+    import jax
+
+    model = touch_model()
+    params = build(model).init(jax.random.key(0))
+    ours, theirs = tmp_path / "ours.safetensors", tmp_path / "theirs.safetensors"
+    export_safetensors(ours, params, {release.MODEL_KEY: to_json(model), release.SEEN_KEY: "digit"})
+    release.write_safetensors(theirs, release.to_release(params, model), {release.MODEL_KEY: to_json(model)})
+    assert "by our own names" in (said := anytouch("info", ours)).out and "trained on: digit;" in said.out
+    assert "by the authors (stage1) names" in (said := anytouch("info", theirs)).out and "is not told" in said.out
+    params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
+    export_safetensors(ours, params, {release.MODEL_KEY: to_json(model)})
+    assert "not finite: nothing can be embedded" in anytouch("info", ours).out
+
+
+def test_what_is_none_of_these_is_one_sentence(mistake, tmp_path):
+    (tmp_path / "notes.txt").write_text("x")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    assert "there is no" in mistake("info", tmp_path / "gone")
+    assert "is none of a run, weights" in mistake("info", tmp_path / "notes.txt")
+    assert "these are not weights" in mistake("info", tmp_path / "other.npz")
+    assert "no complete checkpoint" in mistake("info", tmp_path)

@@ -6,7 +6,6 @@ import numpy as np
 from tiny_models import touch_model
 
 from anytouch_jax.config import to_json
-from anytouch_jax.evaluate import generator, pairs
 from anytouch_jax.io import release
 from anytouch_jax.io.checkpoint import export_safetensors
 from anytouch_jax.nn.functional import build

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from anytouch_jax.config import UserError
 from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.train.record import write_atomic
 
@@ -34,6 +35,7 @@ probe (their kinds may have been met in pre-training); *unseen sensor* a sensor 
 Recipes of one stage are trained for that stage's steps alone, AnyTouch for both. *No tactile pre-training* is the image
 tower of our AnyTouch: it never saw a touch, but was trained here towards touch, photographs and text; the paper's CLIP
 never met touch. Statements on dynamic tasks and on the grasp test the paper's claim, not a number of its."""
+_TITLE = "# The paper's questions, answered"
 CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not agree
 
 
@@ -56,7 +58,7 @@ def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
     found = parts(runs)
     by_name = {path.stem: path for path in figures}
     lines = [
-        "# The paper's questions, answered",
+        _TITLE,
         _INTRO,
         tally({p.title: p.statements for p in found.values() if p.statements}),
         by_chance([one for part in found.values() for one in part.statements]),
@@ -127,12 +129,17 @@ def provenance(runs: Sequence[Run]) -> str:
 
 
 def write(folder: Path, out: Path) -> Path:
-    """Render the JSON files in `folder` to `out`/README.md and `out`/figures; gives back the page."""
-    runs = read(folder)
+    """Render the JSON files in `folder` to `out`/README.md and `out`/figures; gives back the page.
+
+    Raises UserError where `out`/README.md is another page.
+    """
+    runs, page = read(folder), out / "README.md"
+    if page.exists() and not page.read_text(encoding="utf-8", errors="replace").startswith(_TITLE):
+        raise UserError(f"{page} is not a page of these results; give another folder with --out")
     figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / "README.md", whole(runs, figures, out))
-    return out / "README.md"
+    write_atomic(page, whole(runs, figures, out))
+    return page
 
 
 def whole(runs: Sequence[Run], figures: Sequence[Path], out: Path) -> str:

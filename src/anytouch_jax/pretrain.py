@@ -58,6 +58,7 @@ def pretrain(
     say = say if jax.process_index() == 0 else silent
     if config.model.attention == "cudnn" and jax.default_backend() != "gpu":
         raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
+    _same_stage(run, config)
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
     net = build(config.model)
@@ -93,6 +94,15 @@ def _warmed(config: Config, run: Path, loader: Loader) -> Config:
     if config.optim.warmup is not None or (begun is not None and begun.optim.warmup is None):
         return config
     return replace(config, optim=replace(config.optim, warmup=min(loader.steps_per_epoch, config.warmup)))
+
+
+def _same_stage(run: Path, config: Config) -> None:
+    """Raise UserError for a file, and for a folder with a run of the other stage."""
+    if run.is_file():
+        raise UserError(f"{run} is a file, not a folder; choose another --run")
+    begun = begun_with(run)
+    if begun is not None and begun.stage != config.stage:
+        raise UserError(f"{run} holds a run of stage {begun.stage}; choose another --run for stage {config.stage}")
 
 
 def _same_data(run: Path, manifest: manifests.Manifest) -> None:

@@ -39,6 +39,19 @@ def test_weights_that_are_written_may_be_read_by_others(anytouch, tiny_run, tmp_
     assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o644
 
 
+def test_what_cannot_be_is_told_before_the_work(mistake, tiny_run, world, tmp_path):
+    (tmp_path / "afile").write_text("")
+    (tmp_path / "semi.csv").write_text("path;sensor;sequence;frame_index;split\na.png;digit;s;0;train\n")
+    said = mistake("train", "--data", world, "--run", tmp_path / "afile")
+    assert "afile is a file, not a folder; choose another --run" in said
+    said = mistake("train", "--stage", 2, "--data", world, "--run", tiny_run)
+    assert "holds a run of stage 1; choose another --run for stage 2" in said
+    assert "has semicolons between its columns; save it with commas" in mistake("info", tmp_path / "semi.csv")
+    out = tmp_path / "o.csv"
+    assert "name the same file" in mistake("verify", world, "--repair", out, "--commercial-only", out)
+    assert "--gallery must be 2 or more" in mistake("retrieve", "--data", world, "--run", tiny_run, "--gallery", 1)
+
+
 def test_an_absolute_path_is_called_so(mistake, tiny_run, tmp_path):
     picture, manifest = tmp_path / "a.png", tmp_path / "m.csv"
     cv2.imwrite(str(picture), np.zeros((32, 32, 3), np.uint8))

@@ -86,6 +86,18 @@ def section(text, title):
     return re.search(rf"^## {re.escape(title)}$(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL).group(1)
 
 
+def test_another_page_is_not_written_over(tmp_path):
+    folder = tmp_path / "matrix"
+    folder.mkdir()
+    synthetic.write(folder, LEAVES[:1], noisy(lambda question, name: 0.0))
+    page = report.write(folder, tmp_path)
+    assert report.write(folder, tmp_path) == page and page.read_text().startswith("# The paper's questions")
+    page.write_text("# Mine")
+    with pytest.raises(UserError, match=r"README\.md is not a page of these results"):
+        report.write(folder, tmp_path)
+    assert page.read_text() == "# Mine"
+
+
 def test_ablations_that_hurt_agree(rendered):
     text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"))
     lines = [line for line in section(text, "Ablations (Table 6)").splitlines() if line.startswith("- ")]

@@ -26,6 +26,8 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
     from anytouch_jax.evaluate.sections import markdown
 
+    if options.gallery < 2:
+        raise UserError(f"--gallery must be 2 or more, the touch and at least one other, not {options.gallery}")
     if options.out is not None:
         check_folder(options.out, read=(options.data, *options.run))
     table = manifests.read(options.data)

@@ -21,6 +21,8 @@ def run(options: Verify) -> int:
 
     if options.swap and options.repair is None:
         raise UserError("--swap exchanges files in the repaired copy: say where it goes with --repair OUT")
+    if options.repair is not None and options.repair == options.commercial_only:
+        raise UserError("--repair and --commercial-only name the same file; give each its own")
     manifest = manifests.read(options.manifests)
     for target in (options.repair, options.commercial_only):
         if target is not None:

@@ -111,6 +111,8 @@ def _check_names(names: Sequence[str], rows: int, where: str) -> None:
     if twice:
         raise ManifestError(f"{where}: column {twice[0]!r} is there twice")
     missing = [name for name in REQUIRED if name not in names]
+    if len(names) == 1 and ";" in names[0]:
+        raise ManifestError(f"{where} has semicolons between its columns; save it with commas")
     if missing:
         raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {', '.join(names)}")
     if not rows:

@@ -287,10 +287,11 @@ def against(task: tuple[str, str], better: str, worse: str) -> str:
     return f"{np.mean(change):+.4f}{said}, {word}"
 
 
-ours = next((name for name in names if name.startswith("anytouch,")), None)
-rivals = [name for name in names if ours and name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
-rivals += [*(name for name in names if "pixels" in name), MEAN] if ours else []
-claims = [(f"{ours} below {rival}", *(against(task, str(ours), rival) for task in TASKS)) for rival in rivals]
+claims = []
+for ours in (name for name in names if name.startswith("anytouch,")):
+    rivals = [name for name in names if name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
+    rivals += [*(name for name in names if "pixels" in name), MEAN]
+    claims += [(f"{ours} below {rival}", *(against(task, ours, rival) for task in TASKS)) for rival in rivals]
 head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
 
 # %% [markdown]

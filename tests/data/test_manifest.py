@@ -167,10 +167,10 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
     (root / "inside.png").symlink_to(root / "in" / "a.png")
     assert m.resolve(root, "in/../in/a.png") == root / "in" / "a.png"
     assert m.resolve(root, "inside.png") == root / "in" / "a.png"
-    for bad in ("../secret.png", "in/../../secret.png", "../data2/x", str(root / "a.png"), "link.png", "out/x.png"):
+    for bad in ("../secret.png", "in/../../secret.png", "../data2/x", "link.png", "out/x.png"):
         with pytest.raises(m.ManifestError, match="leaves the folder"):
             m.resolve(root, bad)
-    for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name")):
+    for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name"), (str(root / "a.png"), "absolute")):
         with pytest.raises(m.ManifestError, match=words):
             m.resolve(root, bad)
 

@@ -17,7 +17,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UserError
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
 from anytouch_jax.data.images import SUFFIXES
 from anytouch_jax.data.readers.common import (
     Columns,
@@ -38,7 +38,7 @@ BACKGROUND, PHOTO, CAPTION = "background", "photo", "caption.txt"
 def read(root: Path, options: Options, notes: Notes) -> Columns:
     """Every folder of pictures. Raises UserError without a sensor, DatasetError when there is no picture."""
     if options.sensor is None or options.sensor in FIELD_SENSORS:
-        known = ", ".join(name for name in SENSORS if name not in FIELD_SENSORS)
+        known = ", ".join(name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL))
         raise UserError(f"say by --sensor what made these pictures: {known}, or the name of a new sensor")
     rows = Rows("object", "background_path", "image_path", "text", "dataset")
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings

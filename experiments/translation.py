@@ -311,13 +311,16 @@ def in_units(found: list[dict[str, Any]]) -> str:
 
 physical = [(name, *(in_units(of(task, name)) for task in TASKS)) for name in names]
 first = records[0]
+tunes = {r["settings"]["fit"]["tune"] for r in records if r["settings"]["name"] != PIXELS}
+named = " ".join(f"{name}=..." for name in sorted({r["settings"]["name"] for r in records} - {PIXELS}))
 steps = sorted({r["settings"]["fit"]["steps"] for r in records})  # more than one: some runs are of another size
 lines = [
     "# One sensor's touch as another would feel it",
     "",
     f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, {first['pairs'][2]} of "
     f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
-    f"{len({r['settings']['fit']['seed'] for r in records})} seeds. By `make translation`.",
+    f"{len({r['settings']['fit']['seed'] for r in records})} seeds of the translation, each over the same encoder. By "
+    f'`{"TUNE=frozen,fine " if len(tunes) > 1 else ""}make translation RUNS="{named}"`.',
     "",
     markdown(head, cells),
     "",

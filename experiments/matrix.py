@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from study import budget, plan
+from study import budget, plan, report
 from study.execute import check_folder, execute, is_done
 
 from anytouch_jax.config import UserError
@@ -75,6 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if asked.render:
             return _render(chosen)
         check_folder(chosen.leaves, chosen.out / "matrix")
+        report.check_page(chosen.out)
         _check_objects(chosen)
         return _execute(chosen, asked.minutes) if asked.jobs == 1 else _side_by_side(words, asked.jobs)
     except UserError as error:
@@ -163,8 +164,6 @@ def _check_objects(chosen: Chosen) -> None:
 
 
 def _render(chosen: Chosen) -> int:
-    from study import report
-
     print(report.write(chosen.out / "matrix", chosen.out))
     return 0
 
@@ -182,9 +181,9 @@ def _execute(chosen: Chosen, minutes: float | None) -> int:
     result = execute(chosen.leaves, work, chosen.out / "matrix", minutes=minutes)
     made, found, left = (len(part) for part in result[:3])
     print(f"{made} runs made, {found} were there, {left} left, {len(result.failed)} failed")
-    _render(chosen)
     for name, error in result.failed.items():
         print(f"failed: {name}: {error}", file=sys.stderr)
+    _render(chosen)
     return 1 if result.failed else 0
 
 

@@ -64,7 +64,7 @@ def _plainly(kind: type[BaseException], error: BaseException, trace: TracebackTy
     if issubclass(kind, UserError):
         print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
     else:
-        sys.__excepthook__(kind, error, trace)
+        _before(kind, error, trace)
 
 
-sys.excepthook = _plainly
+_before, sys.excepthook = sys.excepthook, _plainly

@@ -128,14 +128,20 @@ def provenance(runs: Sequence[Run]) -> str:
     return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"
 
 
+def check_page(out: Path) -> None:
+    """Raise UserError where `out`/README.md is another page than that of `write`."""
+    page = out / "README.md"
+    if page.exists() and page.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0] != _TITLE:
+        raise UserError(f"{page} is not a page of these results; give another folder with --out")
+
+
 def write(folder: Path, out: Path) -> Path:
     """Render the JSON files in `folder` to `out`/README.md and `out`/figures; gives back the page.
 
     Raises UserError where `out`/README.md is another page.
     """
+    check_page(out)
     runs, page = read(folder), out / "README.md"
-    if page.exists() and not page.read_text(encoding="utf-8", errors="replace").startswith(_TITLE):
-        raise UserError(f"{page} is not a page of these results; give another folder with --out")
     figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(page, whole(runs, figures, out))

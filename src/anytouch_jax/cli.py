@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import make_dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from anytouch_jax import __version__, baselines, pages
 from anytouch_jax.config import Config, UserError, preset
@@ -134,11 +134,20 @@ def _parse(kind: Any, name: str, args: list[str], default: Any = None, closing: 
 
 def _refuse_twice(kind: Any, args: list[str]) -> None:
     """Raise UserError for an option of several values that comes again: its first values would be lost."""
-    several = [name.replace("_", "-") for name, hint in get_type_hints(kind).items() if get_origin(hint) is tuple]
+    several = [name.replace("_", "-") for name in _several(kind)]
     given = [arg.split("=")[0].replace("_", "-") for arg in args]
     for option in (f"--{name}" for name in several):
         if given.count(option) > 1:
             raise UserError(f"{option} is given twice; write it once, with all its values behind it")
+
+
+def _several(kind: Any) -> Iterator[str]:
+    """The options that take several values, those of a section as section.name."""
+    for name, hint in get_type_hints(kind).items():
+        if is_dataclass(hint):
+            yield from (f"{name}.{inner}" for inner in _several(hint))
+        elif tuple in (get_origin(hint), *map(get_origin, get_args(hint))):
+            yield name
 
 
 def _parse_train(args: list[str]) -> tuple[Train, Config]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 from tiny_models import touch_model
 
@@ -49,3 +51,26 @@ def test_what_is_none_of_these_is_one_sentence(mistake, tmp_path):
     assert "is none of a run, weights" in mistake("info", tmp_path / "notes.txt")
     assert "these are not weights" in mistake("info", tmp_path / "other.npz")
     assert "no complete checkpoint" in mistake("info", tmp_path)
+    assert "name a file or a folder" in mistake("info")
+
+
+def test_a_folder_is_the_run_in_it_else_its_manifest(anytouch, tiny_run, world, tmp_path):
+    shutil.copytree(tiny_run, tmp_path / "run")
+    shutil.copy(world, tmp_path / "run" / "manifest.csv")
+    assert "a run of stage 1" in anytouch("info", tmp_path / "run").out
+    (tmp_path / "mine").mkdir()
+    for name in ("mine.csv", "mine_contact.csv"):
+        shutil.copy(world, tmp_path / "mine" / name)
+    (tmp_path / "mine" / "labels.csv").write_text("name,hardness\n")
+    said = anytouch("info", tmp_path / "mine").out
+    assert "mine.csv: a manifest of 12 rows" in said and "also in this folder: mine_contact.csv" in said
+
+
+def test_an_adapted_run_and_an_export(anytouch, tiny_run, world, tmp_path):
+    words = ("--run", tiny_run, "--data", world, "--sensor", "my_gel", "--frames", 0, "--out", tmp_path / "new")
+    assert anytouch("adapt", *words).status == 0
+    said = anytouch("info", tmp_path / "new").out
+    assert f"the run {tiny_run}, with tokens of my_gel fitted to 0 frames" in said and "step" not in said
+    (tmp_path / "encoder.bin").write_bytes(b"x")
+    (tmp_path / "encoder.bin.json").write_text('{"frames": 3}')
+    assert "an exported encoder; how to call it\n" in anytouch("info", tmp_path / "encoder.bin").out

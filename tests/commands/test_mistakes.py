@@ -17,6 +17,10 @@ from reader_world import fill
 def test_values_given_in_two_parts_are_not_lost(mistake):
     said = mistake("probe", "--data", "a.csv", "--label", "object", "--data=b.csv", "--run", "r")
     assert "--data is given twice; write it once, with all its values behind it" in said
+    words = ("probe", "--data", "a.csv", "--label", "object", "--where", "force", 1, "--where", "slip", 2)
+    assert "--where is given twice" in mistake(*words)
+    words = ("train", "--data", "a.csv", "--run", "r", "--model.sensors", "digit", "--model.sensors", "gelslim")
+    assert "--model.sensors is given twice" in mistake(*words)
     assert "--run is given twice" in mistake("retrieve", "--data", "a.csv", "--run", "r", "--run", "s")
 
 

@@ -156,7 +156,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
             flush()
     flush()
     told = 0 if options.input.is_dir() else frames_told(options.input)
-    if told > count:
+    if 0.98 * told > count + 2:  # some containers only estimate it
         say(f"{options.input} tells of {told} frames and {count} could be read; is it whole?")
     if not values:
         raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames}")

@@ -9,35 +9,53 @@ import numpy as np
 from anytouch_jax.config import UNIVERSAL, Config, Model, UserError
 from anytouch_jax.options_use import Info
 
+_TABLES = (".csv", ".parquet")
 _WEIGHTS = (".safetensors", ".pth", ".pt", ".bin", ".npz")
 
 
 def run(options: Info) -> int:
     """Print some lines on every path."""
+    if not options.paths:
+        raise UserError("name a file or a folder")
     for number, path in enumerate(options.paths):
         print("\n" * bool(number) + "\n".join(_lines(path)))
     return 0
 
 
 def _lines(path: Path) -> list[str]:
-    from anytouch_jax.evaluate import generator
+    from anytouch_jax.evaluate import export, generator
 
     if not path.exists():
         raise UserError(f"there is no {path}")
     if path.is_dir():
-        if (path / generator.FILE).is_file():
-            return _translation(path)
-        held = next((path / name for name in ("manifest.parquet", "manifest.csv") if (path / name).is_file()), None)
-        return _run(path) if held is None else _manifest(held)
+        return _folder(path)
     if path.name == generator.FILE:
         return _translation(path)
-    if path.suffix.lower() in (".csv", ".parquet"):
+    if export.describes(path).is_file():
+        return [f"{path}: an exported encoder; how to call it", export.describes(path).read_text("utf-8").strip()]
+    if path.suffix.lower() in _TABLES:
         return _manifest(path)
     if path.suffix == ".npz" and (found := _features(path)):
         return found
     if path.suffix in _WEIGHTS:
         return _weights(path)
     raise UserError(f"{path} is none of a run, weights ({', '.join(_WEIGHTS)}), a manifest (.csv, .parquet), features")
+
+
+def _folder(path: Path) -> list[str]:
+    """A run, else a translation, else the manifest that is meant: by its name, or the only one."""
+    from anytouch_jax.data.table import is_manifest
+    from anytouch_jax.evaluate import generator
+    from anytouch_jax.io.record import steps
+
+    if not steps(path / "checkpoints") and (path / generator.FILE).is_file():
+        return _translation(path)
+    found = [one for one in sorted(path.iterdir()) if one.suffix.lower() in _TABLES and is_manifest(one)]
+    named = [one for one in found if one.stem == "manifest"] or found
+    if steps(path / "checkpoints") or not named:
+        return _run(path)
+    others = [f"also in this folder: {', '.join(one.name for one in found if one != named[0])}"]
+    return [*_manifest(named[0]), *(others if len(found) > 1 else [])]
 
 
 def _run(path: Path) -> list[str]:
@@ -48,8 +66,14 @@ def _run(path: Path) -> list[str]:
     config: Config = from_json(about["config"])
     kept = checkpoint.steps(path / "checkpoints")
     source = about.get("source") or {}
-    began = [f"{name} {place}" for name, place in source.items() if place is not None]
+    began = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
     loss = about.get("metrics", {}).get("loss")
+    if "sensor" in source:
+        return [
+            f"{path}: the run {source['run']}, with tokens of {source['sensor']} fitted to {source['frames']} frames",
+            _model(config.model),
+            _sensors(config.model, about.get("seen")),
+        ]
     return [
         f"{path}: a run of stage {config.stage}, step {about['step']} of {config.run.steps}"
         + (f"; checkpoints at {', '.join(map(str, kept))}" if kept else ""),

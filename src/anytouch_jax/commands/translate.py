@@ -74,11 +74,11 @@ def _fit(options: Translate) -> int:
     if how.adversarial and not made.design.has_critic and not made.design.shape.field:
         say("no critic took part: the encoder knows touches less the untouched gel, and the targets are whole pictures")
     ours, mean = generation.errors(made, test_x, test_y), generation.mean_errors(made, test_y)
-    generator.save(made, home)
     picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}
     report["critic"] = made.design.has_critic
     write_bytes(home / "report.json", (json.dumps(report, indent=2) + "\n").encode())
+    generator.save(made, home)  # last: a folder that holds it is whole
     print(f"{home}: error {ours.mean():.4f} on objects never seen (copying the mean target: {mean.mean():.4f})")
     return 0
 

@@ -30,7 +30,9 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
         path.parent.mkdir(parents=True, exist_ok=True)
         # the library ignores strides: a transposed view would be written in the wrong order
         save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, temporary, dict(metadata))
-        os.chmod(temporary, 0o644)  # the library gives a file that only its owner may read
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)  # the library gives a file that only its owner may read
         os.replace(temporary, path)
     except Exception as error:  # the library wraps OSError in its own kind
         with contextlib.suppress(OSError):

@@ -33,30 +33,34 @@ from anytouch_jax.data.readers.common import (
 )
 
 BACKGROUND, PHOTO, CAPTION = "background", "photo", "caption.txt"
+MANIFESTS = (".csv", ".parquet")  # such as an earlier index
 
 
 def read(root: Path, options: Options, notes: Notes) -> Columns:
-    """Every folder of pictures. Raises UserError without a sensor, DatasetError when there is no picture."""
-    if options.sensor is None or options.sensor in FIELD_SENSORS:
-        known = ", ".join(name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL))
-        raise UserError(f"say by --sensor what made these pictures: {known}, or the name of a new sensor")
+    """Every folder of pictures. Raises UserError without a sensor."""
+    known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
+    if options.sensor is None or options.sensor in (*FIELD_SENSORS, UNIVERSAL):
+        raise UserError(f"say by --sensor what made these pictures: {', '.join(known)}, or the name of a new sensor")
+    if options.sensor not in known and options.sensor.lower() in known:
+        raise UserError(f"--sensor {options.sensor}: the sensor is called {options.sensor.lower()}")
     rows = Rows("object", "background_path", "image_path", "text", "dataset")
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
     for folder, _, files in walk(root, notes):
         beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
+        if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
+            notes.skip(f"folder called {BACKGROUND} or {PHOTO}, of which one picture is wanted", folder)
+            continue
         frames = _frames(files, notes, folder)
         if not frames:
             continue
         obj = folder.split("/")[0] or None
         split = hash_split(root.name, obj or folder, options)
-        add_recording(rows, frames, folder, split=split, sensor=options.sensor, sequence=folder or root.name,
+        add_recording(rows, frames, folder, split=split, sensor=options.sensor, sequence=folder or ".",
                       object=obj, dataset=root.name, **beside[folder])  # fmt: skip
     columns = rows.columns()
-    if not columns["path"]:
-        raise DatasetError(f"{root} and the folders in it hold no pictures ({', '.join(SUFFIXES)})")
     columns["path"] = [path.lstrip("/") for path in columns["path"]]
     for split in ("val", "test"):
-        if split not in columns["split"] and getattr(options, split):
+        if columns["path"] and split not in columns["split"] and getattr(options, split):
             notes.say(f"no object or recording fell to split {split}; with few of them give a larger --{split}")
     return columns
 
@@ -78,20 +82,32 @@ def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
 
 
 def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]]:
-    """The pictures of a folder in natural order with their numbers."""
+    """The pictures of a folder in order with their numbers; arrays count where there is nothing else."""
     names = []
-    for name in sorted(files, key=natural):
+    for name in sorted(files, key=_order):
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
-        elif suffix not in SUFFIXES and name.lower() != CAPTION:
+        elif suffix not in (*SUFFIXES, *MANIFESTS) and name.lower() != CAPTION:
             notes.skip("file that is no picture (a film is to be cut into pictures first)", f"{folder}/{name}")
+    pictures = [name for name in names if Path(name).suffix.lower() != ".npy"]
+    if pictures and len(pictures) < len(names):
+        notes.skip(
+            "array beside pictures", f"{folder}/{(set(names) - set(pictures)).pop()}", len(names) - len(pictures)
+        )
+        names = pictures
     ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
     numbers = [int(end[1]) for end in ends if end]
     steps = {b - a for a, b in itertools.pairwise(numbers)}
     if len(numbers) == len(names) and min(steps, default=0) == 1:
         return list(zip(numbers, names, strict=True))
     return list(enumerate(names))
+
+
+def _order(name: str) -> tuple[float, list[tuple[int, str]]]:
+    """Time stamps with a point as the numbers that they are, all else with 2 before 10."""
+    stem = Path(name).stem
+    return (float(stem), []) if re.fullmatch(r"\d+\.\d+", stem) else (0.0, natural(name))
 
 
 READER = Reader(

@@ -1,0 +1,101 @@
+"""Recordings of one's own: what counts as a recording, as its frames, and as what lies beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from reader_world import fill
+
+from anytouch_jax.config import UserError
+
+
+def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
+    fill(tmp_path, [f"mug/{take}/{n}.png" for take in ("one", "two") for n in range(12)])
+    fill(tmp_path, [f"ball/{n}.jpg" for n in (3, 4, 6)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
+    assert set(table["sensor"]) == {"digit"} and set(table["dataset"]) == {tmp_path.name}
+    assert [row["frame_index"] for path, row in table.rows.items() if "mug/one" in path] == list(range(12))
+    of_ball = [clip for clip in table.clips(2) if "ball" in clip[0]]
+    assert of_ball == [["ball/3.jpg", "ball/4.jpg"]]  # 5 is not there: no clip reaches over it
+
+
+def test_frames_whose_names_do_not_count_are_counted(tmp_path, read):
+    fill(tmp_path, [f"a/{stamp}.png" for stamp in (1700000033, 1700000066, 1700000100)])
+    fill(tmp_path, ["b/first.png", "b/second.png", "c/1.png", "c/1.jpg"])
+    table = read("recordings", sensor="my_gel", val=0, test=0)
+    of = {name: [row["frame_index"] for row in table.rows.values() if row["sequence"] == name] for name in "abc"}
+    assert of == {"a": [0, 1, 2], "b": [0, 1], "c": [0, 1]}
+
+
+def test_what_lies_beside_or_above_belongs_to_a_recording(tmp_path, read):
+    fill(tmp_path, ["background.png", "mug/photo.jpg", "mug/one/0.png", "mug/one/1.png", "mug/two/0.png"])
+    fill(tmp_path, ["mug/two/Background.png", "ball/0.png"])
+    (tmp_path / "mug" / "caption.txt").write_text("smooth,\n cold\n", encoding="utf-8")
+    (tmp_path / "mug" / "one" / "film.mp4").write_bytes(b"")
+    table = read("recordings", sensor="digit", val=0, test=0)
+    one, two, ball = (table.rows[path] for path in ("mug/one/1.png", "mug/two/0.png", "ball/0.png"))
+    assert len(table.rows) == 4
+    assert (one["background_path"], one["image_path"], one["text"]) == (
+        "background.png",
+        "mug/photo.jpg",
+        "smooth, cold",
+    )
+    assert (two["background_path"], two["image_path"]) == ("mug/two/Background.png", "mug/photo.jpg")
+    assert (ball["background_path"], ball["image_path"], ball["text"]) == ("background.png", None, None)
+    assert table.reasons == {"file that is no picture (a film is to be cut into pictures first)": 1}
+
+
+def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
+    fill(tmp_path / "mine", ["0.png", "1.png"])
+    table = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0)
+    assert list(table.rows) == ["0.png", "1.png"] and set(table["sequence"]) == {"."}
+    assert "no object or recording fell to split test" in " ".join(
+        read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0.001).report.notes
+    )
+
+
+def test_an_object_is_never_on_two_sides(tmp_path, read):
+    fill(tmp_path, [f"thing {n}/take {k}/0.png" for n in range(30) for k in range(3)])
+    table = read("recordings", sensor="digit", val=0.3, test=0.3)
+    sides = {}
+    for row in table.rows.values():
+        sides.setdefault(row["object"], set()).add(row["split"])
+    assert all(len(one) == 1 for one in sides.values()) and set.union(*sides.values()) == {"train", "val", "test"}
+
+
+def test_mistakes(tmp_path, read):
+    fill(tmp_path, ["a/0.png"])
+    with pytest.raises(UserError, match="--sensor DIGIT: the sensor is called digit"):
+        read("recordings", sensor="DIGIT")
+    for sensor in (None, "tac3d", "universal"):
+        with pytest.raises(UserError, match="say by --sensor what made these pictures: gelsight"):
+            read("recordings", sensor=sensor)
+    (tmp_path / "a" / "caption.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match=r"caption\.txt cannot be read as UTF-8 text"):
+        read("recordings", sensor="digit")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "film.mp4").write_bytes(b"")
+    with pytest.raises(UserError, match=r"no frame of recordings .*a film is to be cut into pictures first"):
+        read("recordings", tmp_path / "empty", sensor="digit")
+
+
+def test_arrays_count_where_there_is_nothing_else(tmp_path, read):
+    fill(tmp_path, ["a/1.png", "a/2.png", "a/4.png"])
+    for name in ("a/force.npy", "a/2.npy", "b/0.npy"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        np.save(tmp_path / name, np.zeros((8, 8, 3), np.uint8))
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert {path: row["frame_index"] for path, row in table.rows.items()} == {
+        "a/1.png": 1, "a/2.png": 2, "a/4.png": 4, "b/0.npy": 0
+    }  # fmt: skip
+    assert table.reasons == {"array beside pictures": 2}
+
+
+def test_what_is_no_recording(tmp_path, read):
+    fill(tmp_path, ["mug/background/0.png", "mug/1700000000.5.png", "mug/1700000000.1234567.png"])
+    fill(tmp_path, [f"{tmp_path.name}/0.png", "0.png"])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
+    assert table.reasons == {"folder called background or photo, of which one picture is wanted": 1}
+    assert set(table["sequence"]) == {".", "mug", tmp_path.name}

@@ -70,7 +70,7 @@ class Pour:
     stills: bool = False
     """Features of single frames, not of segments of three."""
     fine_tune: bool = False
-    """Train the encoder too: minutes, for a third to two thirds less error in our table."""
+    """Train the encoder too: minutes, for a third to a half less error in our table."""
     steps: int | None = None
     """Steps of the policy's training (default 1500)."""
     markers: bool = True

@@ -92,9 +92,8 @@ def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]
             notes.skip("file that is no picture (a film is to be cut into pictures first)", f"{folder}/{name}")
     pictures = [name for name in names if Path(name).suffix.lower() != ".npy"]
     if pictures and len(pictures) < len(names):
-        notes.skip(
-            "array beside pictures", f"{folder}/{(set(names) - set(pictures)).pop()}", len(names) - len(pictures)
-        )
+        arrays = [name for name in names if name not in pictures]
+        notes.skip("array beside pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = pictures
     ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
     numbers = [int(end[1]) for end in ends if end]

@@ -70,9 +70,9 @@ def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps:
     """Build `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
-    differentiated, and those that the batch does not use are skipped (golden H_mixed). When the loss or the gradient
-    norm is not finite the update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: the
-    loss's own, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
+    differentiated, and those that the batch does not use are skipped (golden H_mixed). When the loss, the gradient's
+    norm or the update's is not finite the update is not applied, `step` advances and `skipped` is 1. Metrics are f32
+    scalars: the loss's own, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
 
     `accumulate` micro-batches (rows m, m + accumulate, ...) run one after the other and their losses, gradients and
     metrics are averaged. That equals the large batch for a mean over rows; InfoNCE negatives stay within a

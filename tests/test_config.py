@@ -186,6 +186,8 @@ def test_impossible_models_are_errors():
         (Optim, {"clip_norm": 0.0}, "--optim.clip-norm must be above 0, not 0.0"),
         (Optim, {"learning_rate": float("nan")}, "--optim.learning-rate must be 0 or more, not nan"),
         (Optim, {"learning_rate": float("inf")}, "--optim.learning-rate must be 0 or more, not inf"),
+        (Optim, {"learning_rate": 1e200}, r"--optim.learning-rate must be 0 or more, not 1e\+200"),
+        (Optim, {"eps": 0.0}, r"--optim.eps must be 1.2e-38 or more \(float32\), not 0.0"),
         (Optim, {"beta2": 1.0}, "--optim.beta2 must be 0 or more and below 1, not 1.0"),
         (Data, {"flip": 7.0}, "--loader.flip must be 0 to 1, not 7.0"),
         (Data, {"clip_share": -1.0}, "--loader.clip-share must be 0 to 1, not -1.0"),

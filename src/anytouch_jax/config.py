@@ -15,7 +15,7 @@ from anytouch_jax.model import FIELD_SENSORS as FIELD_SENSORS
 from anytouch_jax.model import SENSORS as SENSORS
 from anytouch_jax.model import UNIVERSAL as UNIVERSAL
 from anytouch_jax.model import Model, Stack, TextTower
-from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NOT_NEGATIVE, SEED, SHARE, build, in_range
+from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NORMAL, NOT_NEGATIVE, SEED, SHARE, build, in_range
 from anytouch_jax.strict_json import ConfigError as ConfigError
 from anytouch_jax.strict_json import UserError as UserError
 
@@ -96,7 +96,8 @@ class Optim:
 
     def __post_init__(self) -> None:
         in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=BELOW_1, accumulate=COUNT)
-        others = ("learning_rate", "min_rate", "warmup", "eps", "weight_decay")
+        in_range("--optim.", self, eps=NORMAL)  # without it a gradient of 0 is divided by 0
+        others = ("learning_rate", "min_rate", "warmup", "weight_decay")
         in_range("--optim.", self, **dict.fromkeys(others, NOT_NEGATIVE))
 
 

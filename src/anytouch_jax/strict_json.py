@@ -29,6 +29,8 @@ class Range(NamedTuple):
 COUNT = Range(1, math.inf, "1 or more")
 NOT_NEGATIVE = Range(0, math.inf, "0 or more")
 ABOVE_0 = Range(math.ulp(0.0), math.inf, "above 0")
+FLOAT32 = 3.4e38  # what is larger is infinite where it is used
+NORMAL = Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")
 SHARE = Range(0, 1, "0 to 1")
 SEED = Range(0, 2**32 - 1, "0 to 4294967295")
 BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
@@ -37,12 +39,12 @@ BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
 def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
     """Raise ConfigError for a field of `settings` outside its range; `prefix` is its section on the command line.
 
-    None is in every range, NaN and infinity in none; of a tuple every entry counts.
+    None is in every range, NaN and what is infinite in float32 in none; of a tuple every entry counts.
     """
     for name, (low, high, words) in ranges.items():
         value = getattr(settings, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not (low <= number <= high and number < math.inf):
+            if number is not None and not (low <= number <= high and number < FLOAT32):
                 spelled = f"{prefix}{name.replace('_', '-')}" if prefix else name
                 raise ConfigError(f"{spelled} must be {words}, not {number}")
 

@@ -70,9 +70,9 @@ def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps:
     """Build `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
-    differentiated, and those that the batch does not use are skipped (golden H_mixed). When the loss, the gradient's
-    norm or the update's is not finite the update is not applied, `step` advances and `skipped` is 1. Metrics are f32
-    scalars: the loss's own, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
+    differentiated, and those that the batch does not use are skipped (golden H_mixed). When the loss or the gradient
+    norm is not finite the update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: the
+    loss's own, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
 
     `accumulate` micro-batches (rows m, m + accumulate, ...) run one after the other and their losses, gradients and
     metrics are averaged. That equals the large batch for a mean over rows; InfoNCE negatives stay within a
@@ -107,23 +107,26 @@ def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps:
 def _finish(
     state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
-    """Apply the update where loss, gradient and update are finite, and report."""
+    """Apply the update where loss and gradient are finite, and report.
+
+    The update itself is read once, where it is added: of what has two readers XLA keeps a copy as large as the
+    parameters. So its norm is that of what the parameters changed by, and does not decide.
+    """
     layout = packing(state.trainable)
     grad_norm = norm(layout.pack(grads))
-    update_norm = norm(layout.pack(updates))
-    good = jnp.isfinite(loss) & jnp.isfinite(grad_norm) & jnp.isfinite(update_norm)
-    rate = getattr(opt_state, "learning_rate", jnp.nan)
-    metrics = metrics | {
-        "loss": loss,
-        "grad_norm": grad_norm,
-        "param_norm": norm(layout.pack(state.trainable)),
-        "update_norm": jnp.where(good, update_norm, 0.0),
-        "learning_rate": jnp.asarray(rate),
-        "skipped": jnp.where(good, 0.0, 1.0),
-    }
+    good = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
     new = (optax.apply_updates(state.trainable, updates), opt_state)
     old = (state.trainable, state.opt_state)
     trainable, opt_state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+    before = layout.pack(state.trainable)
+    metrics = metrics | {
+        "loss": loss,
+        "grad_norm": grad_norm,
+        "param_norm": norm(before),
+        "update_norm": norm([a - b for a, b in zip(layout.pack(trainable), before, strict=True)]),
+        "learning_rate": jnp.asarray(getattr(new[1], "learning_rate", jnp.nan)),
+        "skipped": jnp.where(good, 0.0, 1.0),
+    }
     metrics = {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()}
     return TrainState(state.step + 1, trainable, state.frozen, opt_state), metrics
 

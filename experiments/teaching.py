@@ -46,6 +46,7 @@ from anytouch_jax.train.record import write_atomic
 
 WORK, OUT = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results")
 TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 500), asked.number("STEPS1", 600), asked.number("STEPS2", 1000)
+OBJECTS = asked.number("OBJECTS", TOUCHES // 2)
 SEEDS = asked.numbers("SEEDS", "0,1,2")
 GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
 SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
@@ -64,8 +65,8 @@ def anytouch(*words: Any) -> None:
 # %% [markdown]
 # ## Data and runs
 #
-# One data set a grade, and one by the sensor that is left out, with three times the touches of the same objects (at
-# two touches an object a probe cannot tell encoders apart). Places differ from grade to grade; objects, and which of
+# One data set a grade, and one by the sensor that is left out, with six touches of each of the same objects (at two
+# touches an object a probe cannot tell encoders apart). Places differ from grade to grade; objects, and which of
 # them are held out, do not. Both stages for every seed, on all grades together as on TacQuad's two parts, at preset
 # tiny with smaller towers and pictures: less work a step, and more is learned in a minute.
 #
@@ -94,8 +95,8 @@ TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 4.0, "--o
 def scenes(grade: str) -> Path:
     """The manifest of a grade, its contact frames marked; and more touches of its objects by the sensor left out."""
     folder = WORK / f"scenes-{grade}"
-    for out, sensors, touches in ((folder, SENSORS, TOUCHES), (WORK / f"{LEFT_OUT}-{grade}", LEFT_OUT, 3 * TOUCHES)):
-        common = ["--objects", TOUCHES // 2, "--grade", grade, "--size", 128]
+    for out, sensors, touches in ((folder, SENSORS, TOUCHES), (WORK / f"{LEFT_OUT}-{grade}", LEFT_OUT, 6 * OBJECTS)):
+        common = ["--objects", OBJECTS, "--grade", grade, "--size", 128]
         first = touches * GRADES.index(grade)
         anytouch("simulate", "--out", out, "--sensors", sensors, "--touches", touches, "--first", first, *common)
     marked = folder / "manifest_contact.parquet"
@@ -179,7 +180,8 @@ def percent(values: list[float]) -> str:
 
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
 RIVALS = ("untrained", "pixels")  # of the probes
-SIZE = f"TOUCHES={TOUCHES} STEPS1={STEPS1} STEPS2={STEPS2} SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
+SIZE = f"TOUCHES={TOUCHES} OBJECTS={OBJECTS} STEPS1={STEPS1} STEPS2={STEPS2} "
+SIZE += f"SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
 NETWORK = f"preset tiny with towers of {STACK['width']} x {STACK['depth']} at 84 pixels"
 
 
@@ -222,7 +224,8 @@ def probe_table(probed: list[dict[str, dict[str, results.ProbeResult]]]) -> str:
 
 # %%
 lines = ["# Simulated scenes as teachers", "", f"Made by `{SIZE} python experiments/teaching.py`, {NETWORK}.", ""]
-record: dict[str, Any] = {"touches": TOUCHES, "steps": [STEPS1, STEPS2], "seeds": SEEDS, "simulator": VERSION}
+record: dict[str, Any] = {"touches": TOUCHES, "objects": OBJECTS, "steps": [STEPS1, STEPS2]}
+record |= {"seeds": SEEDS, "simulator": VERSION}
 runs_of = {seed: prepare(seed) for seed in SEEDS}
 for grade in GRADES:
     scored: dict[str, list[retrieval.Retrieval]] = {name: [] for name in NAMES}

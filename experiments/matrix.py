@@ -188,4 +188,6 @@ def _execute(chosen: Chosen, minutes: float | None) -> int:
 
 
 if __name__ == "__main__":
+    if "--quick" in sys.argv:
+        os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # a toy compiles for longer than it runs
     sys.exit(main())

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 from study import budget, plan, report
 from study.execute import check_folder, execute, is_done
 
@@ -189,5 +190,5 @@ def _execute(chosen: Chosen, minutes: float | None) -> int:
 
 if __name__ == "__main__":
     if "--quick" in sys.argv:
-        os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # a toy compiles for longer than it runs
+        jax.config.update("jax_disable_most_optimizations", True)  # a toy compiles for longer than it runs
     sys.exit(main())

@@ -83,7 +83,7 @@ def test_memory_and_compile_are_asked_of_other_processes(monkeypatch, tmp_path, 
 
     monkeypatch.setattr(memory, "simulate", simulate)
     monkeypatch.setattr(
-        startup, "ask", lambda module, question: asdict(startup.Start("w", "tiny", 2, False, 1.0, 2.0, 3.0))
+        startup, "ask", lambda module, question: asdict(startup.Start("w", "paper", "tiny", 2, False, 1.0, 2.0, 3.0))
     )
     assert run("memory", "compile", "--quick", "--preset", "large", "--out", tmp_path) == 0
     assert asked == [("large", 1, 1, 2), ("large", 2, 1, 2), ("large", 2, 2, 2)]

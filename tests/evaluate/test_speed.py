@@ -347,7 +347,7 @@ def test_data_parallel_sends_every_gradient_once_around_and_sharding_halves_the_
 
 def test_what_a_child_process_says_is_told(tmp_path):
     with pytest.raises(UserError, match="unknown preset"):
-        memory.ask("startup", json.dumps(["stage1", "huge", 1, False, str(tmp_path), 0.0]))
+        memory.ask("startup", json.dumps(["stage1", "stage1 clips", "paper", "huge", 1, False, str(tmp_path), 0.0]))
 
 
 # The accelerator's path ---------------------------------------------------------------------------------------------

@@ -92,8 +92,8 @@ def _compile(options: Bench, _: str) -> list[Section]:
     from anytouch_jax.evaluate import startup
 
     say("compile: fresh processes, without and with the cache")
-    whats = ("stage1",) if options.quick else ("stage1", "stage2")
-    found = startup.starts(options.preset, whats, _batch(options))
+    steps = startup.STAGE1 if options.quick else startup.STEPS
+    found = startup.starts(options.preset, steps, _batch(options))
     title = f"First step of a fresh process, preset {options.preset}"
     return [(title, startup.to_markdown(found), list(found))]
 

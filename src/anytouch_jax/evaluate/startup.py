@@ -16,12 +16,22 @@ from anytouch_jax.evaluate.speed_report import table
 from anytouch_jax.evaluate.workloads import abstract_state, make_batch, step_of, workloads
 from anytouch_jax.train.mesh import donated, enable_compilation_cache
 
+# The programs of training: what to ask `workloads` for, its name there, the recipe. The release reconstructs in stage 2.
+STAGE1 = (("stage1", "stage1 clips", "paper"),)
+STEPS = (
+    *STAGE1,
+    ("stage2", "stage2 align", "paper"),
+    ("stage2", "stage2 match", "paper"),
+    ("stage2", "stage2 align", "release"),
+)
+
 
 @dataclass(frozen=True)
 class Start:
     """Seconds of a fresh process; `imports` counts from its start. `cached`: it finds its program in the cache."""
 
     workload: str
+    recipe: str
     preset: str
     samples: int
     cached: bool
@@ -34,36 +44,36 @@ class Start:
         return self.imports + self.trace + self.compile
 
 
-def starts(preset: str, whats: Sequence[str] = ("stage1",), batch: int | None = None) -> list[Start]:
-    """Two fresh processes for the first workload of each of `whats`: one fills a new cache, the next reads it."""
+def starts(preset: str, steps: Sequence[tuple[str, str, str]] = STEPS, batch: int | None = None) -> list[Start]:
+    """Two fresh processes for each of `steps`: one fills a new cache, the next reads it."""
     found = []
-    for what in whats:
+    for step in steps:
         with tempfile.TemporaryDirectory() as folder:
             for cached in (False, True):
-                found.append(Start(**ask("startup", json.dumps([what, preset, batch, cached, folder, time.time()]))))
+                found.append(Start(**ask("startup", json.dumps([*step, preset, batch, cached, folder, time.time()]))))
     return found
 
 
 def answer(question: str) -> None:
     """What the child process does."""
-    what, preset, batch, cached, folder, begun = json.loads(question)
+    what, name, recipe, preset, batch, cached, folder, begun = json.loads(question)
     enable_compilation_cache(folder)
-    work = workloads(what, preset, batch)[0]
+    work = next(work for work in workloads(what, preset, batch, recipe) if work.name == name)
     args = abstract_state(work.config), make_batch(work), jax.eval_shape(lambda: jax.random.key(0))
     imports, ready = time.time() - begun, time.perf_counter()
     lowered = jax.jit(step_of(work.config), donate_argnums=donated()).lower(*args)
     traced = time.perf_counter()
     lowered.compile()
     done = time.perf_counter()
-    start = Start(work.name, preset, work.samples, cached, imports, traced - ready, done - traced)
+    start = Start(work.name, recipe, preset, work.samples, cached, imports, traced - ready, done - traced)
     sys.stdout.write(json.dumps(asdict(start)) + "\n")
 
 
 def to_markdown(found: Sequence[Start]) -> str:
     """A line a process."""
-    heads = ("workload", "preset", "batch", "cache", "imports s", "trace s", "compile s", "sum s")
+    heads = ("workload", "recipe", "preset", "batch", "cache", "imports s", "trace s", "compile s", "sum s")
     rows = [
-        [s.workload, s.preset, str(s.samples), "filled" if s.cached else "empty"]
+        [s.workload, s.recipe, s.preset, str(s.samples), "filled" if s.cached else "empty"]
         + [f"{x:.2f}" for x in (s.imports, s.trace, s.compile, s.total)]
         for s in found
     ]

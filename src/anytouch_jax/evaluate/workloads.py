@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
-from anytouch_jax.config import Config, Model, preset
+from anytouch_jax.config import Config, Model, Recipe, preset
 from anytouch_jax.evaluate import flops
 from anytouch_jax.nn.functional import build
 from anytouch_jax.ops import losses
@@ -71,14 +71,14 @@ def _share(samples: int, share: float) -> int:
     return max(1, round(samples * share))
 
 
-def workloads(what: str, name: str, batch: int | None = None) -> list[Workload]:
-    """The workloads of stage1, stage2 (recipe release, towers from scratch) or embed for a preset."""
+def workloads(what: str, name: str, batch: int | None = None, recipe: Recipe = "release") -> list[Workload]:
+    """The workloads of stage1, stage2 (towers from scratch; by `recipe`) or embed for a preset."""
     batch = batch or BATCHES[name]
     one = replace(preset(name), run=replace(preset(name).run, steps=_STEPS))
     if what == "stage1":
         return [Workload("stage1 clips", one, batch, 4), Workload("stage1 stills", one, batch, 1)]
     if what == "stage2":
-        two = preset(name, stage=2, recipe="release", towers="scratch")
+        two = preset(name, stage=2, recipe=recipe, towers="scratch")
         two = replace(two, run=one.run)
         return [Workload("stage2 align", two, batch, 4), Workload("stage2 match", two, max(2, batch // 2), 3)]
     return [Workload("embed one still", one, 1, 1), Workload("embed one clip", one, 1, 3)] + (

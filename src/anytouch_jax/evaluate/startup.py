@@ -16,7 +16,7 @@ from anytouch_jax.evaluate.speed_report import table
 from anytouch_jax.evaluate.workloads import abstract_state, make_batch, step_of, workloads
 from anytouch_jax.train.mesh import donated, enable_compilation_cache
 
-# The programs of training: what to ask `workloads` for, its name there, the recipe. The release reconstructs in stage 2.
+# Programs of training: what to ask `workloads` for, its name there, the recipe (the release reconstructs in stage 2).
 STAGE1 = (("stage1", "stage1 clips", "paper"),)
 STEPS = (
     *STAGE1,

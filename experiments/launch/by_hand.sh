@@ -18,6 +18,6 @@ status=0 told=
 while [ -n "$(jobs -pr)" ]; do
     code=0
     wait -n || code=$?
-    if [ -n "$told" ]; then told= ; elif [ "$code" -ne 0 ]; then status=$code; fi  # a signal ends the waiting, not a process
+    if [ -n "$told" ]; then told=; else status=$((status ? status : code)); fi  # a signal ends the waiting, not a process
 done
 exit "$status"

@@ -120,7 +120,8 @@ def test_from_four_devices_to_one_and_back_the_parameters_are_the_same(alone, wo
     agree(run, tmp_path / "r")
     wanted, found = arrays_of(result), arrays_of(part)
     for name, array in wanted.items():
-        if not name.startswith("opt_state"):
+        # A key's bias moves no output: its gradient is rounding, and Adam makes whole steps of its sign.
+        if not name.startswith("opt_state") and not name.endswith("attention/key/bias"):
             np.testing.assert_allclose(found[name], array, rtol=0, atol=1e-6, err_msg=name)
 
 
@@ -156,5 +157,7 @@ def test_the_script_starts_processes_by_hand(world, tmp_path):
         timeout=900,
         check=False,
     )
-    assert done.returncode == 1 and "run.seed was 0 and is now 1" in done.stderr, done.stderr
+    assert done.returncode == 1 and "was killed" not in done.stderr, done.stderr
+    for process in range(2):  # each finds the mistake by itself, and none is aborted by the other's end
+        assert f"process {process} of 2: the run in" in done.stderr and "run.seed was 0 and is now 1" in done.stderr
     assert jax.process_count() == 1

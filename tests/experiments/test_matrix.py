@@ -198,8 +198,8 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
     words += ["--real", str(tmp_path / "none.csv"), "--jobs", "1"]
     assert matrix.main(words) == 0, capsys.readouterr().err
     files = sorted(path.name for path in (tmp_path / "out" / "matrix").iterdir())
-    names = ("q2-aligned", "q2-masked", "q2-matched", "q2-pixels", "q2-untrained", "grasp-anytouch")
-    assert files == sorted(f"{name}-0.json" for name in names)
+    ways = ("aligned", "contact", "masked", "matched", "matched_mlp", "pixels", "untrained")
+    assert files == sorted(["grasp-anytouch-0.json", *(f"q2-{way}-0.json" for way in ways)])
     stored = json.loads((tmp_path / "out" / "matrix" / "q2-matched-0.json").read_text())
     assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"]["run"]["steps"] == 2
     assert all(len(value) == 64 for value in stored["data"].values()) and stored["machine"] and stored["source"]
@@ -210,8 +210,8 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
     assert about["untrained"]["untrained"]["model"]["embed"] == 32 and about["pixels"]["untrained"] is None
     assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(stored["points"]) > 4
     trained = sorted((tmp_path / "work" / "trained").iterdir())
-    assert len(trained) == 3  # one stage 1, two stages 2
+    assert len(trained) == 4  # one stage 1, three stages 2
     capsys.readouterr()
     assert matrix.main(words) == 0  # all is there
-    assert "0 runs made, 6 were there, 0 left, 0 failed" in capsys.readouterr().out
+    assert "0 runs made, 8 were there, 0 left, 0 failed" in capsys.readouterr().out
     assert "toy sizes mean nothing" in (tmp_path / "out" / "README.md").read_text()

@@ -29,7 +29,7 @@ from anytouch_jax.train.mesh import (
 )
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.processes import Ballot, check_shared, told_by_first, whole
-from anytouch_jax.train.record import Record, open_run, writing
+from anytouch_jax.train.record import Record, goes_on, open_run, writing
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
 
@@ -89,6 +89,7 @@ def fit(
     if lead:
         open_run(run_dir, config)
     else:
+        goes_on(run_dir, config)  # so that each process finds a mistake by itself
         say = silent
     check_shared(run_dir / "figures")
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from anytouch_jax.train.watch import Terminated
 
 Tree = Any
 HEARTBEAT = 60  # seconds until a process that is silent counts as lost, where no collective has told before
+PATIENCE = 10  # seconds for the others to find the mistake that this one has found
 _GO_ON = "the same command goes on from the last complete checkpoint"
 # What libraries say when a collective or the coordination between processes has failed.
 _PEERS = re.compile(r"gloo|nccl|rccl|peer|connection|unavailable|coordination|heartbeat|barrier|deadline", re.I)
@@ -108,6 +110,8 @@ def joined(environ: Mapping[str, str] = os.environ) -> Iterator[Place | None]:
             sys.stdout.flush()
             sys.stderr.write(f"{sentence}\n")
             sys.stderr.flush()
+        if isinstance(error, UserError):
+            _leave_together()
         os._exit(status)  # the threads and exit handlers of jax would wait for processes that are no more
     speaker.communicate(b".")
 
@@ -146,6 +150,18 @@ def _farewell(error: BaseException, place: Place) -> tuple[str, int]:
     if isinstance(error, UserError):
         return f"{place}: {error}", 1
     return "".join(traceback.format_exception(error)) + f"{place} ends for the error above; {_GO_ON}", 1
+
+
+def _leave_together() -> None:
+    """Wait for those who found the same mistake: jax aborts a process whose coordinator leaves before it."""
+
+    def leave() -> None:
+        with contextlib.suppress(Exception):
+            jax.distributed.shutdown()
+
+    leaving = threading.Thread(target=leave, daemon=True)
+    leaving.start()
+    leaving.join(PATIENCE)
 
 
 def _short(error: BaseException) -> str:

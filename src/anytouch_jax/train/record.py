@@ -71,16 +71,24 @@ def begun_with(run_dir: Path) -> Config | None:
 def open_run(run_dir: Path, config: Config) -> None:
     """Make a run folder with its config.json, or check that the one there was started with the same settings.
 
-    A folder without a complete checkpoint was left by a start that failed, and is begun anew. Settings in `HARMLESS`
-    may differ. Raises UserError that names each other setting with both values.
+    A folder without a complete checkpoint was left by a start that failed, and is begun anew. Raises UserError as
+    `goes_on`, and for a full disk.
     """
     path = run_dir / "config.json"
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
-        begun = begun_with(run_dir)
-        if begun is None:
+        if not goes_on(run_dir, config):
             write_atomic(path, to_json(config) + "\n")
-            return
+
+
+def goes_on(run_dir: Path, config: Config) -> bool:
+    """Whether a folder holds a run that was begun, with the same settings; those in `HARMLESS` may differ.
+
+    Raises UserError that names each other setting with both values.
+    """
+    begun = begun_with(run_dir)
+    if begun is None:
+        return False
     before = _flat(dataclasses.asdict(begun))
     now = _flat(dataclasses.asdict(config))
     changed = [
@@ -93,6 +101,7 @@ def open_run(run_dir: Path, config: Config) -> None:
             f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. "
             "Use the same settings to go on with it, or choose another run folder"
         )
+    return True
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

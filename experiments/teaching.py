@@ -21,8 +21,9 @@
 #    that they do not (indenter).
 #
 # `.venv/bin/python experiments/teaching.py` does all of it, run by run, in an hour or more a seed: what is finished is
-# not done again. `TOUCHES=500 STEPS2=1000` gets three quarters as far in a third of the time; `TOUCHES=260 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where
-# runs and results go.
+# not done again. `TOUCHES=500 STEPS2=1000` is less than half the work, and less is learned;
+# `TOUCHES=260 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs and
+# results go.
 
 # %%
 from __future__ import annotations

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -16,13 +17,15 @@ from jax import Array
 
 from ..config import UserError
 from ..sim.mechanics import Contact, Fidelity, Gel, press
+from ..sim.optics import render
 from ..sim.sensors import SENSORS
 from ..sim.shear import Shear, shear_step
+from ..sim.units import identity_unit
 
 Fields = npt.NDArray[Any]
 Surface = Callable[[Fields, Fields], Fields]
-# (displacement (H, W), tangential (H, W, 2)) and the same of the reference, in mm on its grid -> an error
-ImageError = Callable[[Fields, Fields, Fields, Fields], float]
+SENSOR = SENSORS["gelsight_mini"]  # its gel and its optics; a bonded layer, as every sensor's
+LEVELS = 2  # grey levels that a pixel of the reference's picture must differ from the untouched one's to be scored
 
 
 def _sphere(x: Fields, y: Fields) -> Fields:
@@ -68,7 +71,8 @@ class Row:
     `press_ms`, `shear_ms`: median milliseconds a frame of one step, a batch of all scenes at a time. `rms`, `largest`:
     scene -> error of the normal displacement, brought to the reference's grid by cubic interpolation. `shear`: the
     root mean square of the tangential one. `force`: of the normal force, over the force. `converged`: of the scenes.
-    `image`: scene -> what the caller's measure of images says.
+    `image`: scene -> mean absolute error in grey levels (0..255) of the picture rendered from the variant's own grid,
+    beside that of the reference, over the pixels that the touch changes.
     """
 
     fidelity: str
@@ -81,7 +85,7 @@ class Row:
     shear: float
     force: float
     converged: int
-    image: dict[str, float] = field(default_factory=dict)
+    image: dict[str, float]
 
     def as_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -95,7 +99,7 @@ class Setting:
     depth: float = 0.4
     motion: tuple[float, float, float] = (0.15, 0.05, 0.02)
     friction: float = 0.6
-    gel: Gel = SENSORS["gelsight_mini"].gel  # a bonded layer, as that of every sensor
+    gel: Gel = SENSOR.gel
 
 
 def speed_against_error(
@@ -105,7 +109,6 @@ def speed_against_error(
     setting: Setting | None = None,
     reference: int = 224,
     rounds: int = 9,
-    image_error: ImageError | None = None,
 ) -> list[Row]:
     """Time a frame and error of every variant, against the converged float64 solution on `reference` pixels a side.
 
@@ -127,7 +130,7 @@ def speed_against_error(
                 times[turn, number, kind] = time.perf_counter() - start
     milliseconds = np.median(times, 0) * 1e3 / len(scenes)
     return [
-        _row(variant, milliseconds[number], list(scenes), *found[number], right, image_error)
+        _row(variant, setting, milliseconds[number], list(scenes), *found[number], right)
         for number, variant in enumerate(variants)
     ]
 
@@ -179,14 +182,15 @@ def _solvers(
 
 def _row(
     variant: Variant,
+    setting: Setting,
     milliseconds: Fields,
     names: list[str],
     contact: Contact,
     slid: Shear,
     right: list[tuple[Fields, Fields, float]],
-    image_error: ImageError | None,
 ) -> Row:
     rms, largest, image, shear, force = {}, {}, {}, 0.0, 0.0
+    bare = _picture(np.zeros_like(right[0][0]), np.zeros_like(right[0][1]), setting)
     for number, name in enumerate(names):
         displacement, tangential, load = right[number]
         moved = _resized(contact.displacement[number], displacement.shape)
@@ -195,8 +199,8 @@ def _row(
         rms[name], largest[name] = float(np.sqrt(np.mean(error**2)) / top), float(abs(error).max() / top)
         shear = max(shear, float(np.sqrt(np.mean((dragged - tangential) ** 2)) / abs(tangential).max()))
         force = max(force, abs(float(contact.force[number]) / load - 1))
-        if image_error is not None:
-            image[name] = image_error(moved, dragged, displacement, tangential)
+        own = _picture(contact.displacement[number], slid.displacement[number], setting)
+        image[name] = _picture_error(own, _picture(displacement, tangential, setting), bare)
     press_ms, shear_ms = map(float, milliseconds)
     converged = int(np.sum(np.asarray(contact.converged)))
     return Row(
@@ -212,22 +216,40 @@ def _row(
     )
 
 
+@functools.cache
+def _renderer() -> Callable[..., Array]:
+    unit = identity_unit(SENSOR)._replace(marked=np.float32(1))  # markers, no noise
+    return jax.jit(lambda displacement, tangential, pitch: render(displacement, tangential, pitch, SENSOR, unit))
+
+
+def _picture(displacement: Any, tangential: Any, setting: Setting) -> Fields:
+    """What the sensor sees of displacements (h, w) and (h, w, 2) in mm, f32 (H, W, 3) in grey levels."""
+    fields = (jnp.asarray(values, jnp.float32) for values in (displacement, tangential))
+    return np.asarray(_renderer()(*fields, setting.size / len(displacement)), np.float32)
+
+
+def _picture_error(found: Fields, right: Fields, bare: Fields) -> float:
+    """Mean absolute difference over the pixels that the touch changes by more than `LEVELS`; 0 where there are none."""
+    changed = abs(right - bare).max(-1) > LEVELS
+    return float(abs(found - right)[changed].mean()) if changed.any() else 0.0
+
+
 def _resized(values: Any, shape: tuple[int, ...]) -> Fields:
     return np.asarray(jax.image.resize(values, shape, "cubic"))
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
-    """A table with a line a variant; errors in percent of the largest displacement, times in milliseconds a frame."""
+    """A table with a line a variant; errors in percent of the largest displacement, or grey levels of the picture
+    (see `Row.image`), times in milliseconds a frame."""
     names = list(rows[0].rms) if rows else []
     heads = ["fidelity", "grid", "iterations", "press ms", "shear ms"]
     heads += [f"{name}: rms / max %" for name in names] + ["shear rms %", "force %", "converged"]
-    if any(row.image for row in rows):
-        heads += [f"{name}: image" for name in names]
+    heads += [f"{name}: picture" for name in names]
     lines = [heads, ["---"] * len(heads)]
     for row in rows:
         cells = [row.fidelity, str(row.grid), "own" if row.iterations is None else str(row.iterations)]
         cells += [f"{row.press_ms:.2f}", f"{row.shear_ms:.2f}"]
         cells += [f"{100 * row.rms[name]:.2f} / {100 * row.largest[name]:.2f}" for name in names]
         cells += [f"{100 * row.shear:.2f}", f"{100 * row.force:.2f}", f"{row.converged} of {len(row.rms)}"]
-        lines.append(cells + [f"{row.image[name]:.4g}" for name in names if name in row.image])
+        lines.append(cells + [f"{row.image[name]:.2f}" for name in names])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"

@@ -92,7 +92,8 @@ def joined(environ: Mapping[str, str] = os.environ) -> Iterator[Place | None]:
     """Join the other processes of a run while the block runs; where `find_place` finds one alone, nothing happens.
 
     Must be entered before anything asks jax for a device. When the block fails, or another process is lost, this one
-    says so in one sentence and ends at once with status 1 (130 after Ctrl-C): it must not wait for the others.
+    says so in one sentence and ends at once with status 1 (130 after Ctrl-C): it must not wait for the others, but
+    `PATIENCE` seconds after a mistake that they are likely to find as well.
     """
     place = find_place(environ)
     if place is None:

@@ -144,6 +144,16 @@ def test_the_front_of_a_pareto_plot(tmp_path: Path, drawn: list[Any]) -> None:
             plots.pareto(tmp_path / "q.png", bad)
 
 
+@pytest.mark.parametrize(("most", "between"), [(4.0, True), (2000.0, False)])
+def test_numbers_between_powers_of_ten_stand_where_there_is_room(
+    tmp_path: Path, drawn: list[Any], most: float, between: bool
+) -> None:
+    plots.pareto(tmp_path / "p.png", {"quick": (2.0, 1.0), "slow": (most, 0.1)})
+    axis = drawn[0].axes[0]
+    assert any(tick.label1.get_text() for tick in axis.xaxis.get_minor_ticks()) == between
+    assert any(tick.label1.get_text() for tick in axis.xaxis.get_major_ticks())
+
+
 def test_names_of_a_pareto_plot_lie_on_nothing(tmp_path: Path, drawn: list[Any]) -> None:
     rng = np.random.default_rng(0)
     crowd = {f"variant number {i}": (1.0 + 0.02 * rng.random(), 1e-6 * (1 + 0.3 * rng.random())) for i in range(12)}

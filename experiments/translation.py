@@ -199,7 +199,9 @@ def all_runs() -> None:
         raise SystemExit(0)
     RUN_FILES.mkdir(parents=True, exist_ok=True)
     known = encoders(table)
-    write_atomic(RUN_FILES / "overlap.json", json.dumps({name: count for name, (_, count) in known.items()}) + "\n")
+    counts = RUN_FILES / "overlap.json"
+    before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
+    write_atomic(counts, json.dumps(before | {name: count for name, (_, count) in known.items()}) + "\n")
     content = table.content_hash[:16]
     plain = max(seen_by(one) for one, _ in known.values())  # the references see what the encoders see
     plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]

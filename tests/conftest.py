@@ -24,8 +24,16 @@ jax.config.update("jax_num_cpu_devices", 4)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_cache_in_the_home(tmp_path_factory):
+    """Commands keep compiled programs: not in the home of whoever runs the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
-def compiled_once(tmp_path_factory):
+def compiled_once(_no_cache_in_the_home):
     """Compile each program once for the whole session, the command line's own cache included; nothing in the home."""
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -35,12 +43,10 @@ def compiled_once(tmp_path_factory):
         "jax_persistent_cache_min_entry_size_bytes": -1,
     }
     before = {name: getattr(jax.config, name) for name in settings}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        for name, value in settings.items():
-            jax.config.update(name, value)
-        enable_compilation_cache()
-        yield
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    enable_compilation_cache()
+    yield
     for name, value in before.items():
         jax.config.update(name, value)
 

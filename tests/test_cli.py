@@ -23,6 +23,7 @@ from anytouch_jax.evaluate.features import load_encoder
 from anytouch_jax.io import release
 from anytouch_jax.io.checkpoint import export_safetensors
 from anytouch_jax.nn.functional import build
+from anytouch_jax.train import mesh
 
 SIZES = [
     "--model.image-size",
@@ -52,7 +53,7 @@ SIZES = [
 
 @pytest.fixture(autouse=True)
 def _own_cache(compiled_once):
-    """`anytouch train` keeps compiled programs: not in the home of whoever runs the tests."""
+    """`anytouch train` keeps compiled programs, also those that took no time."""
 
 
 def run(*args) -> int:
@@ -304,11 +305,48 @@ def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
     with np.load(out) as file:
         np.testing.assert_allclose(file["features"], from_manifest, atol=1e-6)
         assert file["key/frame_index"].tolist() == [0, 1] and str(file["about/input"]) == str(folder)
+        assert file["key/path"].tolist() == ["c2.png", "c3.png"]
     capsys.readouterr()
     assert run(*args, "--sensor", "new_sensor") == 0
     assert "'new_sensor'" in (error := capsys.readouterr().err) and "universal tokens" in error
     with np.load(out) as file:
         assert np.abs(file["features"] - from_manifest).max() > 1e-4
+
+
+def test_embed_leaves_a_bad_picture_of_a_folder_out(tmp_path, world, tiny_run, capsys):
+    folder, out = tmp_path / "frames", tmp_path / "features.npz"
+    folder.mkdir()
+    for place, name in enumerate(("a0", "a1", "a2", "a3", "b0", "b1", "b2")):
+        shutil.copy(world.parent / f"{name}.png", folder / f"{place}.png")
+    (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:-20])
+    args = ("embed", "--run", tiny_run, "--input", folder, "--out", out, "--batch", 4, "--sensor", "gelsight_mini")
+    assert "2.png" in mistake(capsys, *args) and not out.exists()
+    for frames, ends in ((1, [0, 1, 3, 4, 5, 6]), (3, [5, 6])):  # no clip reaches over what is missing
+        assert run(*args, "--on-bad-sample", "skip", "--frames", frames) == 0
+        told = f"{len(ends)} features of 12 values, {8 - frames - len(ends)} skipped"
+        assert told in capsys.readouterr().out
+        with np.load(out) as file:
+            assert file["rows"].tolist() == file["key/frame_index"].tolist() == ends
+            assert file["key/path"].tolist() == [f"{end}.png" for end in ends]
+    with np.load(out) as file:
+        last = file["features"][-1]
+    assert run("embed", "--run", tiny_run, "--input", world, "--frames", 3, "--out", out, "--batch", 4) == 0
+    with np.load(out) as file:
+        np.testing.assert_allclose(file["features"][file["rows"] == 6], last[None], atol=1e-6)
+
+
+@pytest.mark.parametrize("command", ["embed", "probe", "retrieve", "export"])
+def test_compiled_programs_are_kept_on_disk(tmp_path, world, tiny_run, capsys, monkeypatch, command):
+    kept = []
+    monkeypatch.setattr(mesh, "enable_compilation_cache", lambda: kept.append(command))
+    words = {
+        "embed": ("--input", world, "--out", tmp_path / "f.npz"),
+        "probe": ("--data", world, "--label", "no_such_label"),
+        "retrieve": ("--data", tmp_path / "no.csv"),
+        "export": ("--out", tmp_path / "f.jaxexport", "--platforms", "no_such"),
+    }
+    run(command, "--run", tiny_run, *words[command])
+    assert kept == [command]
 
 
 def test_embed_finds_first_that_it_cannot_write(tmp_path, world, capsys):

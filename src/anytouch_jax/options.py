@@ -104,7 +104,7 @@ class Embed:
     stride: int = 1
     """Frames from one frame of a streamed clip to its next: what the clips of the training data have."""
     on_bad_sample: Literal["error", "skip"] = "error"
-    """A row of a manifest that cannot be read stops the command, or is left out and counted."""
+    """A row of a manifest or a picture of a folder that cannot be read stops the command, or is left out and counted."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Simulate:
     fidelity: Literal["fast", "exact"] = "fast"
     """Contact solved in a few rounds, or to convergence."""
     frames: int = 10
-    """Frames of a recording, at 30 a second."""
+    """Frames of a recording, at 30 a second; one gesture fills them."""
     objects: int = 200
     """Objects of the catalogue that take turns."""
     depth: tuple[float, float] = (0.3, 1.0)

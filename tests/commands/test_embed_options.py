@@ -12,6 +12,7 @@ import pytest
         (["m.parquet", "--sensor", "digit", "--stride", "2"], "--sensor, --stride do nothing with a manifest"),
         (["frames", "--split", "test"], "--split does nothing with a folder or a video: only a manifest has splits"),
         (["touch.mp4", "--stride", "5"], "--stride does nothing without --stream"),
+        (["0", "--stream", "--on-bad-sample", "skip"], "--on-bad-sample does nothing with --stream"),
         (["0", "--stream", "--split", "test", "--batch", "8"], "--split, --batch do nothing with --stream"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -245,12 +246,16 @@ def test_the_cache_goes_by_content(monkeypatch, encoder, pictures, tmp_path):
     copied = tmp_path / "elsewhere"
     copied.mkdir()
     for name in ["ground.png", *pictures.column("path").to_pylist()]:
-        (copied / name).write_bytes((pictures.files[0].parent / name).read_bytes())
+        shutil.copy2(pictures.files[0].parent / name, copied / name)
     manifests.write(manifests.from_columns(pictures.table.to_pydict(), copied / "m.parquet"), copied / "m.parquet")
     moved = manifests.read(copied / "m.parquet")
     assert encoded(encoder, moved, **plain).file(1) == store.file(1)
+    middle = copied / pictures.value(len(pictures) // 2 + 1, "path")
+    middle.write_bytes(middle.read_bytes()[:-1] + b"x")  # of the same size
+    rewritten = encoded(encoder, moved, **plain).file(1)
+    assert rewritten != store.file(1)
     (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
-    assert encoded(encoder, moved, **plain).file(1) != store.file(1)  # an equal table beside other pictures
+    assert encoded(encoder, moved, **plain).file(1) != rewritten  # an equal table beside other pictures
     before = encoded(encoder, moved, **plain).file(1)
     cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))  # another photograph of the gel
     assert encoded(encoder, moved, **plain).file(1) != before

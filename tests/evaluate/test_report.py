@@ -119,8 +119,8 @@ def same_frame(manifest: manifests.Manifest, row: int, image: Any) -> bool:
 
 
 def test_samples_of_a_force_field_and_of_a_missing_sensor(touched: Path, tmp_path: Path, grids: list[Any]) -> None:
-    field = np.zeros((20, 20, 3))
-    field[3, 4] = (3.0, 0.0, 4.0)
+    field = np.zeros((20, 20, 6))
+    field[3, 4] = (3.0, 0.0, 4.0, 9.0, 9.0, 9.0)  # mm, and the force in N, which is none of the size
     np.save(touched.parent / "field.npy", field)
     table = manifests.read(touched).table
     gelslim = [one == "gelslim" for one in table["sensor"].to_pylist()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import runpy
+import shutil
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,14 @@ def test_every_length_is_scored_on_the_same_moments(tmp_path, tiny_run, monkeypa
     runpy.run_path(str(SCRIPT))  # what is there is not done again
     assert [one.stem for one in files if one.stat().st_mtime_ns != written[one]] == ["5-sum"]
     assert (tmp_path / "out" / "long_clips.md").read_text() == text
+
+
+def test_the_committed_page_is_what_its_files_give(tmp_path, monkeypatch, capsys):
+    shutil.copytree(SCRIPT.parent / "results" / "long_clips", tmp_path / "long_clips")
+    for name, value in {"TABLE": "1", "OUT": str(tmp_path), "RUN": "nowhere", "DATA": "nowhere"}.items():
+        monkeypatch.setenv(name, value)
+    runpy.run_path(str(SCRIPT))
+    assert (tmp_path / "long_clips.md").read_text() == (SCRIPT.parent / "results" / "long_clips.md").read_text()
+    (tmp_path / "long_clips" / "7-sum.json").unlink()
+    with pytest.raises(SystemExit, match="7-sum.json: run this page without TABLE=1"):
+        runpy.run_path(str(SCRIPT))

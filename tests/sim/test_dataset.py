@@ -89,6 +89,19 @@ def test_shares_and_labels_are_as_drawn(made):
     assert {row["image_path"] is None for row in rows} == {row["text"] is None for row in rows} == {True, False}
 
 
+def test_every_recording_has_a_photograph_and_words_of_its_own(tmp_path):
+    dataset.simulate(replace(SCENES, sensors=("digit", "gelslim"), vision=1.0, text=1.0), tmp_path / "all")
+    rows = [row for row in manifests.read(tmp_path / "all" / "manifest.parquet").table.to_pylist() if row["touch"]]
+    told: dict[tuple[str, str], str] = {}
+    for touch in {row["touch"] for row in rows}:
+        pair = [{row["image_path"] for row in rows if (row["touch"], row["sensor"]) == (touch, s)} for s in SENSORS]
+        first, second = (cv2.imread(str(tmp_path / "all" / paths.pop())).astype(int) for paths in pair if paths)
+        assert np.abs(first - second).mean() > 1  # from another view
+        told |= {(touch, row["sensor"]): row["text"] for row in rows if row["touch"] == touch}
+    alike = [told[touch, "digit"] == told[touch, "gelslim"] for touch, _ in told]
+    assert sum(alike) < len(alike) / 2
+
+
 def test_images_and_fields_are_whole(made):
     for row in manifests.read(made / "manifest.parquet").table.to_pylist():
         if row["sensor"] == "tac3d":
@@ -225,14 +238,16 @@ def test_the_command_makes_a_data_set(tmp_path, capsys):
     options = ["--touches", "2", "--sensors", "digit", "--objects", "6", "--frames", "2", "--size", "32"]
     assert main(["simulate", "--out", str(out), *options]) == 0
     said = capsys.readouterr().err
-    assert said.startswith("compiling the contact solver for digit: about a minute the first time\n")
+    few, compiling, *_ = said.splitlines()
+    assert few == "of 6 objects none is held out: val and test take 12 objects or more"
+    assert compiling == "compiling the contact solver for digit: about a minute the first time"
     assert "2 touches by digit" in said
     assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
 
 
 def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(dataset, "GROUP", 1)
-    words = ["--sensors", "digit,tac3d", "--objects", "6", "--frames", "2", "--size", "32", "--vision", "0"]
+    words = ["--sensors", "digit,tac3d", "--objects", "12", "--frames", "2", "--size", "32", "--vision", "0"]
     args = ["simulate", "--out", str(tmp_path / "scenes"), "--touches", "25", *words]
     assert main(args) == 0
     first, *lines, last = capsys.readouterr().err.splitlines()

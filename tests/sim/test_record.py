@@ -115,6 +115,16 @@ def test_every_sensor_is_solved_on_square_pixels_over_its_whole_field():
         np.testing.assert_allclose((rows * pitch, columns * pitch), sensor.field, atol=2 * pitch)
 
 
+def test_a_sensor_of_fields_has_its_own_number_of_points(monkeypatch):
+    coarse = replace(SENSORS["tac3d"], resolution=(10, 10))
+    monkeypatch.setitem(SENSORS, "tac3d", coarse)
+    scenes = replace(SCENES, sensors=("tac3d",), frames=1, fields=())
+    things, splits = scene.cast(scenes)
+    touch = scene.draw_touch(scenes, 0, splits)
+    (take,) = Recorder(scenes, things, batch=1).record([scene.draw_recording(scenes, touch, "tac3d")])
+    assert take.field.shape == (1, 10, 10, 6)
+
+
 @pytest.fixture(scope="module")
 def takes(compiled_once):
     """Six touches by a camera and by a sensor of fields: [(recording, take)] by sensor."""

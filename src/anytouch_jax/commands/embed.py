@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,10 +25,12 @@ def run(options: Embed) -> int:
     """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
     _refuse_unused(options)
     from anytouch_jax.evaluate import features
+    from anytouch_jax.train.mesh import enable_compilation_cache
 
     if not (options.stream and str(options.out) == "-"):
         # before what takes long: what is embedded must have a place
         check_folder(options.out, read=(options.run, options.input))
+    enable_compilation_cache()
     encoder = features.load_encoder(options.run)
     features.check_frames(encoder.config.model, options.frames)
     if options.batch < 1:
@@ -130,15 +133,14 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
 def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame."""
     from anytouch_jax.data.images import frames_told
-    from anytouch_jax.data.loader import frames_from_folder, frames_from_video
     from anytouch_jax.evaluate import features
 
-    read = frames_from_folder if options.input.is_dir() else frames_from_video
     row, see = encoder.sensor_row(options.sensor, say), _sight(encoder, options)
     ring: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     values: list[np.ndarray] = []
-    count = 0
+    ends: list[int] = []
+    names: list[str] = []
 
     def flush() -> None:
         if waiting:
@@ -147,29 +149,51 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
             values.append(z[: len(waiting)])
             waiting.clear()
 
-    for frame in read(options.input):
-        count += 1
-        ring = [*ring, see(frame)][-options.frames :]
+    for name, frame in _named_frames(options):
+        names.append(name)
+        ring = [] if frame is None else [*ring, see(frame)][-options.frames :]
         if len(ring) == options.frames:
             waiting.append(np.stack(ring))
+            ends.append(len(names) - 1)
         if len(waiting) == options.batch:
             flush()
     flush()
+    count = len(names)
     told = 0 if options.input.is_dir() else frames_told(options.input)
     if 0.98 * told > count + 2:  # some containers only estimate it
         say(f"{options.input} tells of {told} frames and {count} could be read; is it whole?")
     if not values:
-        raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames}")
-    stacked = np.concatenate(values)
-    index = np.arange(options.frames - 1, count)
-    return features.Features(stacked, index, {"frame_index": index})
+        raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames} that can be read")
+    index = np.array(ends)
+    keys = {"frame_index": index} | ({"path": np.array(names)[index]} if options.input.is_dir() else {})
+    return features.Features(np.concatenate(values), index, keys, max(0, count - options.frames + 1) - len(index))
+
+
+def _named_frames(options: Embed) -> Iterator[tuple[str, np.ndarray | None]]:
+    """Name and RGB pixels u8 of a folder's pictures, in natural order, or of a video's frames, which have no names. A
+    picture that cannot be read is None where bad samples are skipped: no clip reaches over it."""
+    from anytouch_jax.data.images import ImageError, decode, frames_from_video, pictures_in
+
+    if not options.input.is_dir():
+        yield from (("", frame) for frame in frames_from_video(options.input))
+        return
+    for file in pictures_in(options.input):
+        try:
+            yield file.name, decode(file)
+        except ImageError:
+            if options.on_bad_sample == "error":
+                raise
+            yield file.name, None
 
 
 def _refuse_unused(options: Embed) -> None:
     if options.stream:
         refuse(options, ("split", "batch"), "with --stream, which embeds every frame by itself")
+        refuse(options, ("on_bad_sample",), "with --stream: a frame that cannot be had ends it")
     elif options.input.suffix.lower() in _MANIFESTS:
         refuse(options, ("sensor", "stride"), "with a manifest, whose rows name their sensor and stride")
     else:
         refuse(options, ("split",), "with a folder or a video: only a manifest has splits")
         refuse(options, ("stride",), "without --stream: clips of a folder or a video are of frames in a row")
+        if options.input.is_file():
+            refuse(options, ("on_bad_sample",), "with a video, of which nothing can be read behind a bad frame")

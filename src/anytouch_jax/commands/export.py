@@ -9,8 +9,10 @@ from anytouch_jax.options_use import Export
 def run(options: Export) -> int:
     """Write the artefact and its description, after a comparison with the live model; say how far they differ."""
     from anytouch_jax.evaluate import export, features
+    from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_folder(options.out, read=(options.run,))
+    enable_compilation_cache()
     encoder = features.load_encoder(options.run)
     platforms = [name.strip() for name in options.platforms.split(",") if name.strip()]
     about = export.export(

@@ -20,9 +20,12 @@ _OF_TASKS = ("frames", "pooling", "join", "heads", "protocol")  # a benchmark ha
 
 def run(options: Probe) -> int:
     """Probe frozen features on a label column or on tasks, print a table, write JSON when asked."""
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
     check_options(options)
     if options.out is not None:
         check_folder(options.out, read=(*options.data, *options.run))
+    enable_compilation_cache()
     if options.tasks or options.benchmark:
         from anytouch_jax.evaluate import battery_command
 

@@ -25,11 +25,13 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
     from anytouch_jax.evaluate.sections import markdown
+    from anytouch_jax.train.mesh import enable_compilation_cache
 
     if options.gallery < 2:
         raise UserError(f"--gallery must be 2 or more, the touch and at least one other, not {options.gallery}")
     if options.out is not None:
         check_folder(options.out, read=(options.data, *options.run))
+    enable_compilation_cache()
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]

@@ -18,7 +18,7 @@ def run(options: Simulate) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from anytouch_jax.sim.dataset import simulate
-    from anytouch_jax.sim.scene import Scenes
+    from anytouch_jax.sim.scene import Scenes, cast
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
@@ -39,6 +39,8 @@ def run(options: Simulate) -> int:
         units=options.units,
         first=options.first,
     )
+    if scenes.held_out and set(cast(scenes)[1]) == {"train"}:
+        say(f"of {scenes.objects} objects none is held out: val and test take 12 objects or more")
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:

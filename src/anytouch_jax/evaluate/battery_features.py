@@ -177,14 +177,16 @@ def digest(encoder: Encoder) -> str:
 
 
 def pictures(table: Manifest, count: int = 32) -> str:
-    """SHA-256 over what tells other pictures under an equal table: the size of every frame, the bytes of every
-    background and of some frames, evenly spaced. It is the same for a copy of the folder."""
+    """SHA-256 over what tells other pictures under an equal table: the size and the time of change of every frame, the
+    bytes of every background and of some frames, evenly spaced. A copy of the folder is the same with its times."""
     found = hashlib.sha256()
     files = distinct_files(table, ("path", "background_path"))
     for row, column in zip(files.row, files.column, strict=True):
         with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
             file = table.file(int(row), column)
-            found.update(read_file(file) if column == "background_path" else str(os.stat(file).st_size).encode())
+            about = os.stat(file)
+            plain = f"{about.st_size} {about.st_mtime_ns} ".encode()
+            found.update(read_file(file) if column == "background_path" else plain)
     for row in np.unique(np.linspace(0, len(table) - 1, count).astype(int)):
         with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
             found.update(read_file(table.file(int(row))))

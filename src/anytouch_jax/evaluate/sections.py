@@ -92,14 +92,14 @@ def _spread_out(touch: Array, sensor: Array, thing: Array, seed: int) -> list[in
 
 
 def _picture(manifest: Manifest, row: int | None) -> Array | None:
-    """The frame of a row; of a force-field sensor the size of its vectors."""
+    """The frame of a row; of a force-field sensor the size of its displacement (the first three channels), mm."""
     if row is None:
         return None
     if manifest.value(row, "sensor") not in FIELD_SENSORS:
         return _shrunk(decode(manifest.file(row)))
     column = "field_path" if manifest.value(row, "field_path") is not None else "path"
     field = np.load(manifest.file(row, column), allow_pickle=False)
-    return np.linalg.norm(field, axis=-1) if field.ndim == 3 else field
+    return np.linalg.norm(field[..., :3], axis=-1) if field.ndim == 3 else field
 
 
 def _shrunk(image: Array) -> Array:

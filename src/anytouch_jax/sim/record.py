@@ -115,7 +115,7 @@ def record(
     if fidelity == "fast":
         del labels["converged"]  # a few rounds are not meant to converge
     if sensor.kind == "field":
-        measured = jax.vmap(partial(optics.field, pitch=pitch))(
+        measured = jax.vmap(partial(optics.field, pitch=pitch, points=sensor.resolution[0]))(
             contact.displacement, sheared.displacement, contact.pressure, sheared.traction
         )
         return Take(None, None, measured, labels)

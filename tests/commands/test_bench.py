@@ -70,6 +70,9 @@ def test_loader_and_simulator(tmp_path):
     assert {row["variant"] for row in beside if "variant" in row} >= {"decode + resize", "all augmentations"}
     assert [row["stage"] for row in beside if "stage" in row] == [1, 2]
     assert {row["fidelity"] for row in numbers["Simulator"]} == {"exact", "fast"}
+    whole = numbers["Simulator, whole recordings"]
+    assert [row["sensor"] for row in whole] == ["digit", "all, two at a time"]
+    assert all(row["frames_per_second"] > 0 for row in whole)
 
 
 def test_memory_and_compile_are_asked_of_other_processes(monkeypatch, tmp_path, capsys):

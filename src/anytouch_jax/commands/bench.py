@@ -130,7 +130,12 @@ def _simulator(options: Bench, _: str) -> list[Section]:
     y = "worst scene's rms error of the displacement, %"
     plots.pareto(options.out / "figures" / name, points, x="ms a frame", y=y, title="contact and shear")
     body = fidelity.to_markdown(rows) + f"\n![contact and shear](figures/{name})\n"
-    return [("Simulator", body, list(rows))]
+    small: dict[str, Any] = {"sensors": ("digit",), "batch": 2, "frames": 2, "size": 32} if quick else {}
+    say("simulator: whole recordings, when compiled")
+    recorded = fidelity.recording_speed(rounds=_rounds(options), **small)
+    shape = "two frames at 32" if quick else "ten frames at 224"
+    beside = f"Batches of recordings of {shape} pixels, default fidelity:\n\n{fidelity.recorded_markdown(recorded)}"
+    return [("Simulator", body, list(rows)), ("Simulator, whole recordings", beside, list(recorded))]
 
 
 def _loader(options: Bench, _: str) -> list[Section]:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ from jax import Array
 from ..config import UserError
 from ..sim.mechanics import Contact, Fidelity, Gel, press
 from ..sim.optics import render
+from ..sim.record import Recorder
+from ..sim.scene import Scenes, cast, draw_recording, draw_touch
 from ..sim.sensors import SENSORS
 from ..sim.shear import Shear, shear_step
 from ..sim.units import identity_unit
@@ -236,6 +239,50 @@ def _picture_error(found: Fields, right: Fields, bare: Fields) -> float:
 
 def _resized(values: Any, shape: tuple[int, ...]) -> Fields:
     return np.asarray(jax.image.resize(values, shape, "cubic"))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Whole recordings by `sensor` (or all of them, two at a time, as `simulate` does): frames a second."""
+
+    sensor: str
+    frames_per_second: float
+
+
+def recording_speed(
+    sensors: Sequence[str] = ("gelsight_mini", "digit", "gelslim", "duragel"),
+    *,
+    batch: int = 8,
+    frames: int = 10,
+    size: int = 224,
+    rounds: int = 9,
+) -> list[Recorded]:
+    """Frames a second of the default fidelity when compiled: contact, shear with its history, picture and labels.
+
+    Batches of recordings of `frames` frames with a short side of `size` pixels, as `simulate` makes them; the median
+    over `rounds`, all in turns.
+    """
+    scenes = Scenes(touches=batch, sensors=tuple(sensors), frames=frames, size=size)
+    objects, splits = cast(scenes)
+    touches = [draw_touch(scenes, number, splits) for number in range(batch)]
+    asked = {name: [draw_recording(scenes, touch, name) for touch in touches] for name in sensors}
+    recorder = Recorder(scenes, objects, batch)
+    taken: dict[str, list[float]] = {name: [] for name in (*sensors, "all, two at a time")}
+    with ThreadPoolExecutor(2) as pool:
+        for turn in range(rounds + 1):
+            ways = {name: [one] for name, one in asked.items()} | {"all, two at a time": list(asked.values())}
+            for name, several in ways.items():
+                start = time.perf_counter()
+                list(pool.map(recorder.record, several))
+                if turn:  # the first one compiles
+                    taken[name].append(len(several) * batch * frames / (time.perf_counter() - start))
+    return [Recorded(name, float(np.median(values))) for name, values in taken.items()]
+
+
+def recorded_markdown(rows: Sequence[Recorded]) -> str:
+    """A table with a line a sensor."""
+    lines = ["| recordings by | frames/s |", "| --- | --- |"]
+    return "\n".join(lines + [f"| {row.sensor} | {row.frames_per_second:.0f} |" for row in rows]) + "\n"
 
 
 def to_markdown(rows: Sequence[Row]) -> str:

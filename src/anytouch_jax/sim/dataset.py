@@ -10,8 +10,9 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +74,13 @@ def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, 
     done = sum(len(group) for group, file in zip(groups, files, strict=True) if file.exists())
     progress(done, scenes.touches)
     recorder = Recorder(scenes, things, GROUP)
-    with ThreadPoolExecutor(threads) as pool:
+    # Two sensors at once: a program's small operations leave a core idle, and compiling takes one.
+    with ThreadPoolExecutor(threads) as pool, ThreadPoolExecutor(min(2, threads)) as solving:
         for group, file in zip(groups, files, strict=True):
             if file.exists():
                 continue
             touches = [scene.draw_touch(scenes, number, splits) for number in group]
-            rows = _write_group(scenes, things, touches, recorder, out, pool)
+            rows = _write_group(scenes, things, touches, partial(solving.map, recorder.record), out, pool)
             _write_table(rows, file)
             done += len(group)
             progress(done, scenes.touches)
@@ -112,13 +114,13 @@ def _claim(scenes: Scenes, out: Path) -> None:
 
 
 def _write_group(
-    scenes: Scenes, things: Any, touches: list[scene.Touch], recorder: Recorder, out: Path, pool: ThreadPoolExecutor
-) -> list[Row]:
+    scenes: Scenes, things: Any, touches: list[scene.Touch], record: Callable[..., Iterator[list[Take]]], out: Path,
+    pool: ThreadPoolExecutor,
+) -> list[Row]:  # fmt: skip
     """Simulate and write the recordings of a few touches, sensor by sensor; their manifest rows."""
     found = []
-    for sensor in scenes.sensors:
-        recordings = [scene.draw_recording(scenes, touch, sensor) for touch in touches]
-        takes = recorder.record(recordings)
+    asked = [[scene.draw_recording(scenes, touch, sensor) for touch in touches] for sensor in scenes.sensors]
+    for recordings, takes in zip(asked, record(asked), strict=True):
         found += [
             pool.submit(_write_recording, scenes, things[recording.touch.object], recording, take, out)
             for recording, take in zip(recordings, takes, strict=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -84,7 +84,8 @@ def surfaces(clip: Clip, x: Array, y: Array) -> Array:
         z = shapes.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
         return z + clip.tilt[0] * x + clip.tilt[1] * y
 
-    z = jax.vmap(under)(clip.motion)
+    # Several things are made of it: without the barrier XLA computes each of the sixteen reads of a point by itself.
+    z = jax.lax.optimization_barrier(jax.vmap(under)(clip.motion))
     return z - jnp.max(z[0])
 
 
@@ -198,11 +199,14 @@ def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
 
 
 class Recorder:
-    """Computes recordings of a data set in batches of one size, so that each sensor is compiled once."""
+    """Computes recordings of a data set in batches of one size, so that each sensor is compiled once.
+
+    Threads may share it, each with a sensor of its own.
+    """
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
         self._scenes, self._objects, self._batch = scenes, objects, batch
-        self._reliefs: dict[int, np.ndarray] = {}
+        self._relief = lru_cache(64)(lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING))
         self._programs: dict[str, Any] = {}
 
     def record(self, recordings: Sequence[Recording]) -> list[Take]:
@@ -236,12 +240,8 @@ class Recorder:
     def _clip(self, recording: Recording) -> Clip:
         touch = recording.touch
         thing = self._objects[touch.object]
-        if touch.object not in self._reliefs:
-            if len(self._reliefs) > 64:
-                self._reliefs.pop(next(iter(self._reliefs)))
-            self._reliefs[touch.object] = shapes.relief(thing.shape, RELIEF, SPACING)
         return Clip(
-            relief=self._reliefs[touch.object],
+            relief=self._relief(touch.object),
             place=np.asarray(touch.place, np.float32),
             start=np.asarray(recording.start, np.float32),
             motion=np.asarray(recording.motion, np.float32),

@@ -1,5 +1,6 @@
 """A recording computed: the surface under the gel, its motion, labels that agree with physics, only what is asked."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import jax
@@ -195,6 +196,16 @@ def test_an_object_that_turns_about_itself_does_not_slide():
     shear = np.asarray(take.field[-1])
     assert np.abs(shear).max() > 0.02
     assert np.abs(shear.mean((0, 1))).max() < 0.05 * np.abs(shear).max()
+
+
+def test_two_sensors_at_once_give_the_same_takes(takes):
+    things, _ = scene.cast(SCENES)
+    recorder = Recorder(SCENES, things, batch=6)
+    with ThreadPoolExecutor(2) as pool:
+        again = list(pool.map(recorder.record, [[one for one, _ in takes[name]] for name in SCENES.sensors]))
+    for name, several in zip(SCENES.sensors, again, strict=True):
+        for (_, take), other in zip(takes[name], several, strict=True):
+            jax.tree.map(np.testing.assert_array_equal, take, other)
 
 
 def test_another_batch_gives_the_same_recording(takes):

@@ -180,7 +180,7 @@ tested = ", ".join(f"{name} {one['test']}" for name, one in record[0]["tasks"].i
 text = f"""# Longer clips: what they see beside what they cost
 
 Made by `make long-clips` from the run `{time_taken["run"]}`. {time_taken["machine"]}
-Linear probes of frozen features on objects never touched in training, one fit, 95 % over test objects; moments tested: {tested}.
+Linear probes of frozen features, one fit, on objects never touched in training, 95 % over them; moments: {tested}.
 An accuracy equal to that of the commonest answer is one: the probe found nothing and gives the same answer for all.
 Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 

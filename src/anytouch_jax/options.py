@@ -104,7 +104,7 @@ class Embed:
     stride: int = 1
     """Frames from one frame of a streamed clip to its next: what the clips of the training data have."""
     on_bad_sample: Literal["error", "skip"] = "error"
-    """A row of a manifest or a picture of a folder that cannot be read stops the command, or is left out and counted."""
+    """A row or a picture of a folder that cannot be read stops the command, or is left out and counted."""
 
 
 @dataclass(frozen=True)

@@ -154,6 +154,13 @@ def test_numbers_between_powers_of_ten_stand_where_there_is_room(
     assert any(tick.label1.get_text() for tick in axis.xaxis.get_major_ticks())
 
 
+def test_errors_close_to_each_other_have_plain_numbers(tmp_path: Path, drawn: list[Any]) -> None:
+    plots.pareto(tmp_path / "p.png", {"quick": (2.0, 0.33), "slow": (4.0, 0.29)})
+    axis = drawn[0].axes[0]
+    told = [tick.label1.get_text() for tick in (*axis.yaxis.get_major_ticks(), *axis.yaxis.get_minor_ticks())]
+    assert any(told) and all(float(one) for one in told if one)  # 0.3, and no power of ten
+
+
 def test_names_of_a_pareto_plot_lie_on_nothing(tmp_path: Path, drawn: list[Any]) -> None:
     rng = np.random.default_rng(0)
     crowd = {f"variant number {i}": (1.0 + 0.02 * rng.random(), 1e-6 * (1 + 0.3 * rng.random())) for i in range(12)}

@@ -52,5 +52,5 @@ def test_the_committed_page_is_what_its_files_give(tmp_path, monkeypatch, capsys
     runpy.run_path(str(SCRIPT))
     assert (tmp_path / "long_clips.md").read_text() == (SCRIPT.parent / "results" / "long_clips.md").read_text()
     (tmp_path / "long_clips" / "7-sum.json").unlink()
-    with pytest.raises(SystemExit, match="7-sum.json: run this page without TABLE=1"):
+    with pytest.raises(SystemExit, match=r"7-sum\.json: run this page without TABLE=1"):
         runpy.run_path(str(SCRIPT))

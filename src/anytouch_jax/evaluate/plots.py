@@ -185,8 +185,11 @@ def pareto(
     axis.plot(values[best, 0], values[best, 1], drawstyle="steps-post", color="C1", linewidth=1.2, zorder=1)
     axis.scatter(values[:, 0], values[:, 1], s=26, color=np.where(np.isin(np.arange(len(values)), best), "C1", "C0"))
     axis.xaxis.set_major_formatter("{x:g}")
-    wide = values[:, 0].max() > 10 * values[:, 0].min()  # then the numbers between powers of ten have no room
-    axis.xaxis.set_minor_formatter("" if wide else "{x:g}")
+    wide = values.max(0) > 10 * values.min(0)  # then the numbers between powers of ten have no room
+    axis.xaxis.set_minor_formatter("" if wide[0] else "{x:g}")
+    if not wide[1]:
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:g}")
     axis.margins(x=0.2, y=0.1)
     axis.grid(alpha=0.25, which="both")
     _name_points(figure, axis, points)

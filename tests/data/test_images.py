@@ -180,11 +180,11 @@ def test_a_folder_comes_in_natural_order(tmp_path):
         image = np.full((4, 4, 3), number, np.uint8)
         cv2.imwrite(str(tmp_path / f"img{number}.png"), image)
     (tmp_path / "notes.txt").write_text("no picture")
-    assert [frame[0, 0, 0] for frame in images.frames_from_folder(tmp_path)] == [1, 9, 10]
+    assert [images.decode(file)[0, 0, 0] for file in images.pictures_in(tmp_path)] == [1, 9, 10]
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):
-            images.frames_from_folder(folder)
+            images.pictures_in(folder)
 
 
 def test_a_video_gives_its_frames_in_rgb(tmp_path):

@@ -253,10 +253,5 @@ def pictures_in(folder: str | Path) -> list[Path]:
     return sorted(files, key=lambda file: _natural(file.name))
 
 
-def frames_from_folder(folder: str | Path) -> Iterator[np.ndarray]:
-    """The pictures of a folder in natural order as RGB u8 (h, w, 3). Raises ImageError."""
-    return map(decode, pictures_in(folder))
-
-
 def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -15,7 +15,6 @@ import numpy as np
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config, UserError
 from anytouch_jax.data.evaluation import evaluation
-from anytouch_jax.data.images import frames_from_folder, frames_from_video
 from anytouch_jax.data.labels import UNKNOWN
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.samples import Reader, SampleError, fill_slot
@@ -25,7 +24,7 @@ from anytouch_jax.data.sources import CLIP, STILL, Pairs, Pool, find_sources
 from anytouch_jax.data.text import Tokenizer
 from anytouch_jax.data.workers import Work, do, pump
 
-__all__ = ["Loader", "SampleError", "evaluation", "frames_from_folder", "frames_from_video"]
+__all__ = ["Loader", "SampleError", "evaluation"]
 
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]

@@ -46,12 +46,13 @@ from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.record import write_atomic
 
 WORK, OUT = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results")
-TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 2500)
+TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4500)
+MORE = asked.number("MORE", 2 * TOUCHES, least=0)
 OBJECTS = asked.number("OBJECTS", min(TOUCHES // 2, 500))
 SEEDS = asked.numbers("SEEDS", "0,1,2")
 GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
 SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
-STACK = {"width": 128, "depth": 2, "heads": 4, "mlp": 512}
+STACK, DEPTH = {"width": 128, "heads": 4, "mlp": 512}, {"touch": 4, "image": 2, "text.stack": 2}
 TABLE = ["gelsight_mini", "digit", "duragel", "universal"]
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)
 
@@ -68,8 +69,10 @@ def anytouch(*words: Any) -> None:
 #
 # One data set a grade, and one by the sensor that is left out, with six touches of each of the same objects (at two
 # touches an object a probe cannot tell encoders apart). Places differ from grade to grade; objects, and which of
-# them are held out, do not. Both stages for every seed, on all grades together as on TacQuad's two parts, at preset
-# tiny with smaller towers and pictures: less work a step, and more is learned in a minute.
+# them are held out, do not. `MORE=` touches a grade, of the same objects at other places, are trained on alone, so that
+# what is scored stays the same whatever their number. Both stages for every seed, on all grades together as on
+# TacQuad's two parts, at preset tiny with smaller towers and pictures: less work a step, and more is learned in a
+# minute.
 #
 # **Contact frames.** The paper's data are contact frames. A simulated recording begins before anything shows, and pairs
 # of such a frame with one of full contact teach little: with them contrast learned more slowly. So `anytouch contact`
@@ -77,39 +80,52 @@ def anytouch(*words: Any) -> None:
 #
 # Matching departs from the paper here. Its head tells a pair from *one* other pair, on an encoder that already knows
 # pictures (CLIP); the same loss on an encoder from scratch stays at chance for as long as a CPU can wait. Cosines
-# against all other touches of the batch (`match_head=cosine`) tell 126 pairs apart at once, on half of the patches
-# each. It begins on a plateau, since stage 1 leaves the class token nearly equal for all touches; in a trial of one
-# seed it left it sooner, and came further, after 600 steps of stage 1 than after 150.
+# against all other touches of the batch (`match_head=cosine`) tell 126 pairs apart at once; all touches to be found in
+# a batch are of one sensor (`negatives=same_sensor`), as in the galleries, so that the sensor tells none of them apart.
+# It begins on a plateau, since stage 1 leaves the class token nearly equal for all touches; in a trial of one seed it
+# left it sooner, and came further, after 600 steps of stage 1 than after 150.
 
 # %%
 SMALL = ["--preset", "tiny", "--model.image-size", 84]
-SMALL += [word for name, number in STACK.items() for word in (f"--model.touch.{name}", number)]
 LESS = ["--loader.background", "subtract"]  # the contact alone: units differ more than touches do
 LESS += ["--loader.contact-only", "--loader.jitter", 0, 0, 0, 0]  # colours tell slopes
-TRAIN1 = [*SMALL, "--steps", STEPS1, "--batch", 48, "--optim.learning-rate", 1e-3]
-TRAIN2 = [*SMALL, "--steps", STEPS2, "--batch", 64, "--optim.learning-rate", 1e-3]
-TRAIN2 += [word for name, number in STACK.items() for word in (f"--model.image.{name}", number)]
-TRAIN2 += ["--model.temperature", 0.2]  # untrained towers: a sharp softmax only punishes them
-TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 4.0, "--objective.match-keep", 0.5]
+LESS += ["--loader.cache", 5000]  # all frames, once read
 
 
-def scenes(grade: str) -> Path:
-    """The manifest of a grade, its contact frames marked; and more touches of its objects by the sensor left out."""
-    folder = WORK / f"scenes-{grade}"
-    for out, sensors, touches in ((folder, SENSORS, TOUCHES), (WORK / f"{LEFT_OUT}-{grade}", LEFT_OUT, 6 * OBJECTS)):
-        common = ["--objects", OBJECTS, "--grade", grade, "--size", 128]
-        first = touches * GRADES.index(grade)
-        anytouch("simulate", "--out", out, "--sensors", sensors, "--touches", touches, "--first", first, *common)
-    marked = folder / "manifest_contact.parquet"
-    if not marked.exists():
-        anytouch("contact", folder / "manifest.parquet", "--share", 0.6, "--out", marked)
+def tower(name: str) -> list[Any]:
+    return [word for size, n in (STACK | {"depth": DEPTH[name]}).items() for word in (f"--model.{name}.{size}", n)]
+
+
+TRAIN1 = [*SMALL, *tower("touch"), "--steps", STEPS1, "--batch", 48, "--optim.learning-rate", 1e-3]
+TRAIN2 = [*SMALL, *tower("touch"), *tower("image"), *tower("text.stack"), "--steps", STEPS2, "--batch", 64]
+TRAIN2 += ["--optim.learning-rate", 1e-3, "--loader.negatives", "same_sensor"]
+TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 4.0]
+
+
+def scenes(grade: str) -> list[Path]:
+    """The manifests to train on of a grade, contact frames marked. Makes touches by the sensor left out, too."""
+    turn, marked = GRADES.index(grade), []
+    sets = {  # sensors, touches, number of the first
+        f"scenes-{grade}": (SENSORS, TOUCHES, TOUCHES * turn),
+        f"more-{grade}": (SENSORS, MORE, TOUCHES * len(GRADES) + MORE * turn),
+        f"{LEFT_OUT}-{grade}": (LEFT_OUT, 6 * OBJECTS, 6 * OBJECTS * turn),
+    }
+    for name, (sensors, touches, first) in sets.items():
+        folder, how = WORK / name, ["--objects", OBJECTS, "--grade", grade, "--size", 128]
+        if touches:
+            anytouch("simulate", "--out", folder, "--sensors", sensors, "--touches", touches, "--first", first, *how)
+        if touches and sensors == SENSORS:
+            marked.append(folder / "manifest_contact.parquet")
+            if not marked[-1].exists():
+                anytouch("contact", folder / "manifest.parquet", "--share", 0.6, "--out", marked[-1])
     return marked
 
 
 def prepare(seed: int) -> tuple[Path, Path]:
     """The runs of both stages for a seed."""
     one, two = (WORK / f"{'-'.join(GRADES)}-{seed}-stage{stage}" for stage in (1, 2))
-    data = ["--data", *map(scenes, GRADES), "--seed", seed, "--model.sensors", *TABLE, *LESS]
+    manifests_of = [manifest for grade in GRADES for manifest in scenes(grade)]
+    data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *TABLE, *LESS]
     anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
     finished(one, STEPS1)
     anytouch("train", "--stage", 2, "--run", two, "--init", one, *TRAIN2, *data)
@@ -181,9 +197,9 @@ def percent(values: list[float]) -> str:
 
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
 RIVALS = ("untrained", "pixels")  # of the probes
-SIZE = f"TOUCHES={TOUCHES} OBJECTS={OBJECTS} STEPS1={STEPS1} STEPS2={STEPS2} "
+SIZE = f"TOUCHES={TOUCHES} MORE={MORE} OBJECTS={OBJECTS} STEPS1={STEPS1} STEPS2={STEPS2} "
 SIZE += f"SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
-NETWORK = f"preset tiny with towers of {STACK['width']} x {STACK['depth']} at 84 pixels"
+NETWORK = f"preset tiny with a touch tower of {STACK['width']} x {DEPTH['touch']} at 84 pixels"
 
 
 def retrieval_table(scored: dict[str, list[retrieval.Retrieval]], pooled: dict[str, retrieval.Retrieval]) -> str:
@@ -225,7 +241,7 @@ def probe_table(probed: list[dict[str, dict[str, results.ProbeResult]]]) -> str:
 
 # %%
 lines = ["# Simulated scenes as teachers", "", f"Made by `{SIZE} python experiments/teaching.py`, {NETWORK}.", ""]
-record: dict[str, Any] = {"touches": TOUCHES, "objects": OBJECTS, "steps": [STEPS1, STEPS2]}
+record: dict[str, Any] = {"touches": TOUCHES, "more": MORE, "objects": OBJECTS, "steps": [STEPS1, STEPS2]}
 record |= {"seeds": SEEDS, "simulator": VERSION}
 runs_of = {seed: prepare(seed) for seed in SEEDS}
 for grade in GRADES:

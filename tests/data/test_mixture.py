@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -190,6 +191,17 @@ def test_with_the_option_the_sensor_alone_tells_nothing(make, settings, rich):
 
     assert told_apart(settings(2, negatives="same_sensor")) == 0.5
     assert told_apart(settings(2)) > 0.6
+
+
+def test_where_the_batch_is_the_negatives_they_are_of_one_sensor(make, settings, rich):
+    manifest, config = make(rich), settings(2, negatives="same_sensor")
+    config = replace(config, model=replace(config.model, match_head="cosine"))
+    loader = Loader(manifest, config)
+    batches = [loader.batch(step).match for step in range(12)]
+    looked_for = [set(batch.positive_sensor.tolist()) for batch in batches]
+    assert all(len(sensors) == 1 for sensors in looked_for) and len(set.union(*looked_for)) > 1
+    assert all((batch.sensor != batch.positive_sensor).all() for batch in batches)
+    assert all(np.array_equal(a, b) for a, b in zip(batches[3], Loader(manifest, config).batch(3).match, strict=True))
 
 
 def test_without_such_negatives_there_is_no_matching_and_it_is_said(make, settings):

@@ -30,7 +30,7 @@ Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 _KINDS: tuple[Literal["still"], Literal["clip"]] = ("still", "clip")
 _NEVER = -1
-_KIND, _PART, _ORDER, _TRIPLE = 1, 2, 3, 4  # tags that keep the random streams of one seed apart
+_KIND, _PART, _ORDER, _TRIPLE, _GALLERY = 1, 2, 3, 4, 5  # tags that keep the random streams of one seed apart
 
 
 class Loader:
@@ -257,25 +257,45 @@ class Loader:
         parts = [self._empty(rows, pairs.windows.shape[1]) for _ in range(3)]
         batch = MatchBatch(*(array for part in parts for array in part))
         jobs: list[Any] = []
+        sensor = self._gallery_sensor(step, pairs)
         for slot, (index, epoch) in enumerate(pairs.anchors.take(rank * rows, rows)):
             mine = self._shard.place(slot, rows)
             if mine is None:
                 continue
-            write = partial(self._write_match, parts, pairs, mine)
+            write = partial(self._write_match, parts, pairs, mine, sensor)
             # Slots of matching come after those of alignment, so that a replacement is drawn apart from theirs.
             place, size = self.config.data.batch_size + slot, len(pairs.matches.anchors)
             jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch))
         return Work(batch, jobs)
 
+    @property
+    def _alone(self) -> bool:
+        """Whether the batch is the negatives: a third touch is not read."""
+        return self.config.model.match_head == "cosine"
+
+    def _gallery_sensor(self, step: int, pairs: Pairs) -> int | None:
+        """The sensor that all touches to be found in a step's batch are of, where negatives are of the positive's."""
+        if not (self._alone and self.config.data.negatives == "same_sensor"):
+            return None
+        rng = np.random.default_rng([self.config.run.seed % 2**63, _GALLERY, step])
+        return int(rng.choice(pairs.matches.sensors))
+
     def _write_match(
-        self, parts: list[tuple[np.ndarray, np.ndarray]], pairs: Pairs, slot: int, index: int, epoch: int
+        self,
+        parts: list[tuple[np.ndarray, np.ndarray]],
+        pairs: Pairs,
+        slot: int,
+        sensor: int | None,
+        index: int,
+        epoch: int,
     ) -> None:
         anchor = int(pairs.matches.anchors[index])
         row = int(pairs.windows[anchor, -1])
         rng = np.random.default_rng([self.config.run.seed % 2**63, _TRIPLE, epoch, row])
-        positive, negative = pairs.matches.draw(anchor, rng)
-        alone = self.config.model.match_head == "cosine"  # the batch is the negatives: a third touch is not read
-        triple = (anchor, positive) if alone else (anchor, positive, negative)
+        positive, negative = pairs.matches.draw(anchor, rng, sensor)
+        if sensor is not None and self._sensor[pairs.windows[anchor, -1]] == sensor:
+            anchor, positive = positive, anchor
+        triple = (anchor, positive) if self._alone else (anchor, positive, negative)
         for (clip, sensor), touch in zip(parts, triple, strict=False):
             rows = pairs.windows[touch]
             self._reader.touch(rows, epoch, clip[slot])

@@ -26,6 +26,7 @@ class Matches:
     `anchors` ids i64 into `pool`: rows whose touch was also felt by another sensor, or else by another unit, and
     that have a negative. `one_object`: all of the pool is one known object, so negatives are its other places.
     `same_sensor`: negatives are of the positive's sensor; a partner whose sensor felt no other known place is none.
+    `sensors` i64: those that partners are of.
     """
 
     def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False) -> None:
@@ -36,6 +37,7 @@ class Matches:
         self._usable = _many_places(mine) if same_sensor else np.ones(len(pool), bool)
         self.one_object = len(thing) > 0 and bool((thing == thing[0]).all() and thing[0] >= 0)
         anchors = np.flatnonzero((touch >= 0) & _has_partner(mine, self._usable))
+        self.sensors = np.unique(mine.sensor[(touch >= 0) & self._usable])
         del mine, thing
         order = np.argsort(touch, kind="stable")
         self._order = order.astype(np.int32) if len(order) < 1 << 31 else order
@@ -44,9 +46,10 @@ class Matches:
         known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(self._sorted, touch.max(initial=-1))
         self.anchors = anchors if known else anchors[[self._negatives(int(a)).size > 0 for a in anchors]]
 
-    def draw(self, anchor: int, rng: np.random.Generator) -> tuple[int, int]:
-        """(positive, negative) for `anchor`, as ids into `pool`: partner of another sensor, or else another unit;
-        and, uniformly, a row that is surely another place, of another object where objects are known."""
+    def draw(self, anchor: int, rng: np.random.Generator, sensor: int | None = None) -> tuple[int, int]:
+        """(positive, negative) for `anchor`, as ids into `pool`: partner of another sensor (of `sensor`, where that
+        felt the place), or else another unit; and, uniformly, a row that is surely another place, of another object
+        where objects are known."""
         keys, row = self._keys, self.pool[anchor]
         low, high = np.searchsorted(self._sorted, keys.touch[row] + np.array([0, 1]))
         same = self._order[low:high]
@@ -54,17 +57,19 @@ class Matches:
         others = same[(keys.sensor[theirs] != keys.sensor[row]) & self._usable[same]]
         if not others.size:
             others = same[(keys.unit[theirs] != keys.unit[row]) & (keys.unit[theirs] >= 0)]
+        wanted = others[keys.sensor[self.pool[others]] == sensor]
+        others = wanted if wanted.size else others
         positive = int(others[rng.integers(others.size)])
-        sensor = int(keys.sensor[self.pool[positive]]) if self.same_sensor else None
-        if sensor is None:
+        theirs_alone = int(keys.sensor[self.pool[positive]]) if self.same_sensor else None
+        if theirs_alone is None:
             tries = rng.integers(len(self.pool), size=_TRIES)
         else:
-            tries = self._of_sensor(sensor)
+            tries = self._of_sensor(theirs_alone)
             tries = tries[rng.integers(len(tries), size=_TRIES)]
         fit = np.flatnonzero(self._elsewhere(anchor, tries))
         if fit.size:
             return positive, int(tries[fit[0]])
-        negatives = self._negatives(anchor, sensor)
+        negatives = self._negatives(anchor, theirs_alone)
         return positive, int(negatives[rng.integers(negatives.size)])
 
     def _negatives(self, anchor: int, sensor: int | None = None) -> np.ndarray:

@@ -46,7 +46,7 @@ from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.record import write_atomic
 
 WORK, OUT = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results")
-TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4500)
+TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4000)
 MORE = asked.number("MORE", 2 * TOUCHES, least=0)
 OBJECTS = asked.number("OBJECTS", min(TOUCHES // 2, 500))
 SEEDS = asked.numbers("SEEDS", "0,1,2")
@@ -99,7 +99,7 @@ def tower(name: str) -> list[Any]:
 TRAIN1 = [*SMALL, *tower("touch"), "--steps", STEPS1, "--batch", 48, "--optim.learning-rate", 1e-3]
 TRAIN2 = [*SMALL, *tower("touch"), *tower("image"), *tower("text.stack"), "--steps", STEPS2, "--batch", 64]
 TRAIN2 += ["--optim.learning-rate", 1e-3, "--loader.negatives", "same_sensor"]
-TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 4.0]
+TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 8.0]
 
 
 def scenes(grade: str) -> list[Path]:

@@ -271,7 +271,7 @@ class Retrieve:
     by_chance: bool = False
     """Draw the galleries by chance, not matched in position, depth and force."""
     seeds: int = 5
-    """Galleries drawn for each query."""
+    """Galleries drawn for each query (with --by-chance)."""
     controls: bool = True
     """Also score a random encoder, background-differenced pixels, and the contact's area, centroid and force."""
     out: Path | None = None

@@ -31,6 +31,9 @@ BENCHMARK = "nothing beside --benchmark, which has the authors' settings"
             "--group, --seeds do nothing beside --leave-out",
         ),
         (["--leave-out", "object", "--protocol", "published"], "--protocol does nothing beside --leave-out"),
+        (["--tasks", "slip", "--join", "concat"], "--join does nothing without --frames"),
+        (["--tasks", "slip", "--frames", "0"], "--frames must be 1 or more, not 0"),
+        (["--label", "slip", "--frames", "-1"], "--frames must be 1 or more, not -1"),
     ],
 )
 def test_what_would_do_nothing_is_refused(mistake, words, told):

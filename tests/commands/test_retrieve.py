@@ -15,7 +15,7 @@ def touches(tmp_path_factory):
 
 def test_retrieval_of_a_run_beside_its_controls(touches, tiny_run, tmp_path, capsys):
     out = tmp_path / "deep" / "found.json"
-    words = ["--run", str(tiny_run), "--data", str(touches), "--gallery", "6", "--seeds", "2", "--out", str(out)]
+    words = ["--run", str(tiny_run), "--data", str(touches), "--gallery", "6", "--out", str(out)]
     assert main(["retrieve", *words]) == 0
     table = capsys.readouterr().out
     for name in (str(tiny_run), "random encoder", "pixels minus background", "area, centroid, force"):
@@ -46,6 +46,9 @@ def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
         (["--split", "unused"], "column 'split' has no row 'unused'"),
         (["--run", "nowhere"], "nowhere"),
         (["--gallery", "5000"], "5000"),
+        (["--gallery", "1"], "--gallery must be 2 or more"),
+        (["--frames", "-1"], "--frames must be 1 or more"),
+        (["--seeds", "2"], "--seeds does nothing without --by-chance"),
     ],
 )
 def test_a_mistake_is_one_sentence(touches, capsys, words, sentence):

@@ -106,6 +106,8 @@ def test_mistakes(run, world_of_pairs, mistake, tmp_path):
         ((image, "--run", run, "--out", image), "an image that is read"),
         ((image, "--fit", *data, "--run", run), "--fit takes its images"),
         (("--fit", "--run", run), "the pairs of --data"),
+        ((image, "--run", run, "--steps", 9, "--tune", "fine"), "--steps, --tune do nothing without --fit"),
+        (("--fit", *data, "--run", run, "--background", image), "--background does nothing with --fit"),
         (("--fit", *data, "--run", run, "--to", "allsight"), "no rows of sensor 'allsight'"),
         (("--fit", *data, "--run", run, "--from", "tac3d"), "measures a field"),
         (("--fit", *data, "--run", run, "--steps", 0, "--out", tmp_path / "new"), "at least 1"),

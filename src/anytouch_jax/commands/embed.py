@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anytouch_jax.commands.output import check_folder
-from anytouch_jax.commands.unused import refuse
+from anytouch_jax.commands.unused import refuse, refuse_join
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Embed
@@ -33,6 +33,7 @@ def run(options: Embed) -> int:
     enable_compilation_cache()
     encoder = features.load_encoder(options.run)
     features.check_frames(encoder.config.model, options.frames)
+    refuse_join(options, encoder.config.model.frames)
     if options.batch < 1:
         raise UserError(f"--batch must be 1 or more, not {options.batch}")
     if options.stream:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.unused import refuse_join
 from anytouch_jax.options_use import Export
 
 
@@ -14,6 +15,7 @@ def run(options: Export) -> int:
     check_folder(options.out, read=(options.run,))
     enable_compilation_cache()
     encoder = features.load_encoder(options.run)
+    refuse_join(options, encoder.config.model.frames)
     platforms = [name.strip() for name in options.platforms.split(",") if name.strip()]
     about = export.export(
         encoder, options.out, frames=options.frames, platforms=platforms, pooling=options.pooling, join=options.join

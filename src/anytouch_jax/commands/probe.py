@@ -9,6 +9,7 @@ from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Probe
+from anytouch_jax.strict_json import COUNT, in_range
 
 _OF_LABEL = ("label", "group", "leave_out", "where", "sensor")
 _OF_SPLITS = ("group", "seeds", "protocol")  # of a label; --leave-out has folds instead
@@ -47,10 +48,13 @@ def run(options: Probe) -> int:
 
 def check_options(options: Probe) -> None:
     """Refuse what differs from its default and would do nothing. Raises UserError that names it and says why."""
+    in_range("--", options, frames=COUNT, max_rows=COUNT)
     if options.tasks or options.benchmark:
         refuse(options, _OF_LABEL, "beside --tasks or --benchmark, which have labels and groups of their own")
         if options.benchmark and not options.tasks:
             refuse(options, _OF_TASKS, "beside --benchmark, which has the authors' settings")
+        elif options.frames is None:
+            refuse(options, ("join",), "without --frames: tasks are of stills and of single segments")
         return
     refuse(options, _OF_BATTERY, "without --tasks or --benchmark", "; or name tasks: --tasks all")
     if options.leave_out is not None:

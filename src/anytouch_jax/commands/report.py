@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Report
+from anytouch_jax.strict_json import COUNT, SEED, Range, in_range
 
 
 def run(options: Report) -> int:
@@ -12,6 +15,7 @@ def run(options: Report) -> int:
     from anytouch_jax.evaluate.report import demo_report
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    in_range("--", options, touches=COUNT, gallery=Range(2, math.inf, "2 or more"), seed=SEED)
     check_home(options.out)
     enable_compilation_cache()
     demo_report(

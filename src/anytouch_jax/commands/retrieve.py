@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +11,11 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Retrieve
+from anytouch_jax.strict_json import COUNT, Range, in_range
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.features import Encoder
@@ -27,17 +30,22 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate.sections import markdown
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    if options.gallery < 2:
-        raise UserError(f"--gallery must be 2 or more, the touch and at least one other, not {options.gallery}")
+    least = Range(2, math.inf, "2 or more, the touch and at least one other")
+    in_range("--", options, gallery=least, frames=COUNT, seeds=COUNT)
+    if not options.by_chance:
+        refuse(options, ("seeds",), "without --by-chance: what resembles a touch most is not drawn")
     if options.out is not None:
         check_folder(options.out, read=(options.data, *options.run))
     enable_compilation_cache()
+    encoders = _encoders(options)
+    for encoder in encoders.values():
+        features.check_frames(encoder.config.model, options.frames)
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]
     rows = deepest_rows(table, rows, frames=options.frames)
     found: dict[str, Any] = {}
-    for name, encoder in _encoders(options).items():
+    for name, encoder in encoders.items():
         kept, found[name] = features.embed_rows(encoder, table, rows, options.frames, options.pooling, say=say)
         if len(kept) < len(rows):
             raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows could not be read; repair the manifest first")

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.commands.output import check_home
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Translate
 from anytouch_jax.strict_json import SEED, in_range
+
+_OF_FIT = ("data", "steps", "batch", "learning_rate", "tune", "adversarial", "seed")
 
 
 def run(options: Translate) -> int:
@@ -24,6 +27,10 @@ def run(options: Translate) -> int:
     in_range("--", options, seed=SEED)
     if options.fit and options.images:
         raise UserError("--fit takes its images from --data; translate in a second call")
+    if options.fit:
+        refuse(options, ("background",), "with --fit: the pairs of --data name their backgrounds")
+    else:
+        refuse(options, _OF_FIT, "without --fit, which trains a translation")
     return _fit(options) if options.fit else _translate(options)
 
 

@@ -19,3 +19,9 @@ def refuse(options: Any, names: Sequence[str], where: str, otherwise: str = "") 
     if given:
         verb, them = ("does", "it") if len(given) == 1 else ("do", "them")
         raise UserError(f"{', '.join(given)} {verb} nothing {where}; leave {them} out{otherwise}")
+
+
+def refuse_join(options: Any, segment: int) -> None:
+    """Raise UserError for a way to join segments where touches of `frames` are a single one, of `segment` at most."""
+    if (options.frames or 1) <= segment:
+        refuse(options, ("join",), f"without clips of more than {segment} frames, which alone have several segments")

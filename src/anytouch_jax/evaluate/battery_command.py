@@ -11,7 +11,7 @@ from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery
 from anytouch_jax.evaluate.benchmarks import benchmark_of
-from anytouch_jax.evaluate.features import load_encoder, random_encoder
+from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
 from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.evaluate.tasks import available
 
@@ -29,6 +29,8 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
     table = manifests.read([str(path) for path in options.data])
     tasks, settings, paper = _asked(options, table)
     encoders = {str(path): load_encoder(path) for path in options.run}
+    for encoder in encoders.values():
+        check_frames(encoder.config.model, options.frames or 1)
     if options.controls:
         first = next(iter(encoders.values()), None)
         encoders["random encoder"] = random_encoder(first.config if first else preset("tiny"))
@@ -63,7 +65,7 @@ def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], f
                 "head_names": tuple(_names(options.heads) or ())}  # fmt: skip
     if not names:
         raise UserError("the manifest has no label of any task; `anytouch probe --label COLUMN` takes any column")
-    return names, settings | ({"frames": options.frames} if options.frames else {}), None
+    return names, settings | ({} if options.frames is None else {"frames": options.frames}), None
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:

@@ -13,7 +13,7 @@ from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.samples import read_picture
 from anytouch_jax.evaluate import baseline, probe
-from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate.features import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
 
 if TYPE_CHECKING:
     from anytouch_jax.options import Probe
@@ -156,6 +156,8 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
     if options.controls:
         config: Config = encoders[0][1].config if encoders else preset("tiny")
         encoders.append(("random encoder", random_encoder(config)))
+    for _, encoder in encoders:
+        check_frames(encoder.config.model, options.frames or 1)
     for name, encoder in encoders:
         rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames or 1, options.pooling, say=say)
         if not np.array_equal(rows, task.rows):

@@ -45,7 +45,8 @@ def prepare(
 ) -> Rows:
     """The arguments of a probe as `Rows`; `measured`: float labels; `tested`: there must be test rows.
 
-    Raises UserError on lengths that differ, an empty train or test, NaN features, or labels that never change.
+    Raises UserError on lengths that differ, an empty train or test, NaN features, labels that never change, or classes
+    of which train and test share none.
     """
     x, groups, split = np.asarray(features, np.float32), np.asarray(groups).astype(str), np.asarray(split).astype(str)
     sizes = {"features": len(x), "labels": len(labels), "groups": len(groups), "split": len(split)}
@@ -73,6 +74,11 @@ def prepare(
         raise UserError(f"{what} of train; a probe needs at least two values")
     if measured and np.ptp(y[rows["test"]]) == 0:
         raise UserError(f"the label is {y[rows['test']][0]:g} on every row of test; R2 has no meaning there")
+    if tested and not measured and not np.isin(y[rows["test"]], seen).any():
+        raise UserError(
+            "no class of test is in train: whole ones are held out there; take another label, or --tasks object, which "
+            "deals recordings of the same objects anew"
+        )
     notes = _remarks(rows, y, names, groups, split, has, measured)
     return Rows(x, y, names, groups, rows["train"], rows["val"], rows["test"], notes)
 

@@ -9,7 +9,7 @@ changes the label with the picture by `mirrored`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -100,9 +100,17 @@ def task_of(task: str | Task) -> Task:
 
 def available(table: Manifest) -> tuple[str, ...]:
     """The tasks whose label the manifest holds on some row."""
-    names = table.table.column_names
-    has = {name: bool(table.present(name).any()) for name in {task.label for task in TASKS.values()} if name in names}
-    return tuple(name for name, task in TASKS.items() if has.get(task.label) and (not task.fingers or _paired(table)))
+    columns = {name: _column_of(table, task) for name, task in TASKS.items()}
+    has = {name: bool(table.present(name).any()) for name in set(columns.values()) if name in table.table.column_names}
+    return tuple(
+        name for name, task in TASKS.items() if has.get(columns[name]) and (not task.fingers or _paired(table))
+    )
+
+
+def _column_of(table: Manifest, task: Task) -> str:
+    """The column of a task's label; the object is told by a column of its own where there is no label of it."""
+    alone = task.label == "label.object" and task.label not in table.table.column_names
+    return "object" if alone else task.label
 
 
 def mirrored(label: str, value: str, *, across: bool = False, down: bool = False) -> str:
@@ -120,6 +128,7 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> Selection:
 
     A still (`frames` 1) of a task on clips takes the same rows as the clips do. Raises UserError without the label.
     """
+    task = replace(task, label=_column_of(table, task))
     if task.label not in table.table.column_names or not table.present(task.label).any():
         known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
         raise UserError(f"task {task.name}: the manifest has no label in column {task.label!r}; it has {known}")

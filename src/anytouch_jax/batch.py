@@ -40,14 +40,19 @@ class AlignBatch(NamedTuple):
 
 
 class MatchBatch(NamedTuple):
-    """Stage 2, matching triples: three times (clip u8 (B, T, H, W, 3), sensor i32 (B,))."""
+    """Stage 2, matching triples: three times (clip u8 (B, T, H, W, 3), sensor i32 (B,)).
+
+    Where the other pairs of the batch are the negatives there is no third touch, but `place` i32 (B,): equal for pairs
+    of one place, which are no negatives of each other.
+    """
 
     clip: Array
     sensor: Array
     positive: Array
     positive_sensor: Array
-    negative: Array
-    negative_sensor: Array
+    negative: Array | None = None
+    negative_sensor: Array | None = None
+    place: Array | None = None
 
 
 class Stage2Batch(NamedTuple):

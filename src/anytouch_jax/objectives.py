@@ -202,7 +202,7 @@ def stage2_terms(
     if match_noise is None:
         z_touch = touch_embeddings(params, aligned + matched, net=net)
     else:
-        kept = masking.kept(net.model.patches, objective.match_keep)
+        kept = max(1, masking.kept(net.model.patches, objective.match_keep))
         ids = jax.vmap(lambda noise: masking.random_mask(noise, kept)[0])(match_noise)
         z_touch = touch_embeddings(params, aligned, net=net) + touch_embeddings(params, matched, net=net, keep_ids=ids)
     if batch.align is not None:
@@ -224,7 +224,8 @@ def stage2_terms(
             total, metrics = total + pixels, metrics | terms
     if batch.match is not None and net.model.match_head == "cosine":
         first, second = z_touch
-        match, right = losses.contrast_loss(first, second, net.apply(params, "scale"), groups=objective.groups)
+        scale, place = net.apply(params, "scale"), batch.match.place
+        match, right = losses.contrast_loss(first, second, scale, groups=objective.groups, place=place)
         total = total + objective.match_weight * match
         metrics |= {"match": match, "match_accuracy": right}
     elif batch.match is not None:
@@ -286,11 +287,13 @@ def _draw(sensor: Array, key: Array, progress: Array, net: Net, config: Config) 
 
 
 def _draw_match(batch: MatchBatch, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, MatchBatch]:
-    """The matching triple with normalised pixels and drawn tokens; the release shares one draw a triple."""
+    """The matching pair or triple with normalised pixels and drawn tokens; the release shares one draw a triple."""
     keys = [key] * 3 if config.objective.universal_shared else list(jax.random.split(key, 3))
     p_u, sensor = _draw(batch.sensor, keys[0], progress, net, config)
     _, positive = _draw(batch.positive_sensor, keys[1], progress, net, config)
-    _, negative = _draw(batch.negative_sensor, keys[2], progress, net, config)
-    clips = (normalise_touch(c) for c in (batch.clip, batch.positive, batch.negative))
-    clip, clip_positive, clip_negative = clips
-    return p_u, MatchBatch(clip, sensor, clip_positive, positive, clip_negative, negative)
+    batch = batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
+    batch = batch._replace(positive=normalise_touch(batch.positive), positive_sensor=positive)
+    if batch.negative is not None:
+        _, negative = _draw(batch.negative_sensor, keys[2], progress, net, config)
+        batch = batch._replace(negative=normalise_touch(batch.negative), negative_sensor=negative)
+    return p_u, batch

@@ -91,12 +91,17 @@ def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, 
     np.testing.assert_array_equal(made, subtract_background(seen, gel))
 
 
-def test_contrast_reads_no_third_touch(make, settings, rich):
+def test_contrast_reads_no_third_touch_and_knows_which_pairs_are_of_one_place(make, settings, rich):
     config = settings(2, plain=True)
     config = replace(config, model=replace(config.model, match_head="cosine"))
-    for step in range(2):
-        match = Loader(make(rich), config).batch(step).match
-        assert match.clip.any() and match.positive.any() and not match.negative.any()
+    manifest, places = make(rich), set()
+    for step in range(4):
+        match = Loader(manifest, config).batch(step).match
+        assert match.clip.any() and match.positive.any() and match.negative is match.negative_sensor is None
+        found = [manifest.codes("touch", own=True)[int(clip[-1, 0, 0, 0]) - 1] for clip in match.clip]
+        np.testing.assert_array_equal(match.place, found)
+        places |= set(found)
+    assert len(places) > 1
 
 
 def test_augmentation_does_not_depend_on_the_batch(make, settings):

@@ -178,7 +178,7 @@ def test_frames_after_the_grasp_keep_the_label_and_split_of_it():
 
 def test_available_names_what_the_manifest_can_answer():
     assert available(WORLD) == ("material", "object", "slip", "force", "twist", "slide")
-    assert available(table(grasps())) == ("grasp", "grasp_after")
+    assert available(table(grasps())) == ("grasp", "grasp_after", "object")  # told by the column of that name
 
 
 @pytest.mark.parametrize("label", tasks.DIRECTIONS)

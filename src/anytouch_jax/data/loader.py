@@ -254,15 +254,16 @@ class Loader:
         pairs, rows = self._pairs[kind], self._match_size
         assert pairs is not None
         self._shard.check(rows, "the rows of a matching batch")
-        parts = [self._empty(rows, pairs.windows.shape[1]) for _ in range(3)]
-        batch = MatchBatch(*(array for part in parts for array in part))
+        parts = [self._empty(rows, pairs.windows.shape[1]) for _ in range(2 if self._alone else 3)]
+        place = np.zeros(len(parts[0][1]), np.int32) if self._alone else None
+        batch = MatchBatch(*(array for part in parts for array in part), place=place)
         jobs: list[Any] = []
         sensor = self._gallery_sensor(step, pairs)
         for slot, (index, epoch) in enumerate(pairs.anchors.take(rank * rows, rows)):
             mine = self._shard.place(slot, rows)
             if mine is None:
                 continue
-            write = partial(self._write_match, parts, pairs, mine, sensor)
+            write = partial(self._write_match, batch, pairs, mine, sensor)
             # Slots of matching come after those of alignment, so that a replacement is drawn apart from theirs.
             place, size = self.config.data.batch_size + slot, len(pairs.matches.anchors)
             jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch))
@@ -270,24 +271,22 @@ class Loader:
 
     @property
     def _alone(self) -> bool:
-        """Whether the batch is the negatives: a third touch is not read."""
+        """Whether the other pairs of the batch are the negatives, and no third touch is read."""
         return self.config.model.match_head == "cosine"
 
     def _gallery_sensor(self, step: int, pairs: Pairs) -> int | None:
-        """The sensor that all touches to be found in a step's batch are of, where negatives are of the positive's."""
+        """The sensor that touches to be found in a step's batch are of, where negatives are of the positive's.
+
+        Drawn as a partner's is, so that a sensor that felt few places is asked for as seldom.
+        """
         if not (self._alone and self.config.data.negatives == "same_sensor"):
             return None
         rng = np.random.default_rng([self.config.run.seed % 2**63, _GALLERY, step])
-        return int(rng.choice(pairs.matches.sensors))
+        partner, _ = pairs.matches.draw(int(rng.choice(pairs.matches.anchors)), rng)
+        return int(self._sensor[pairs.windows[partner, -1]])
 
     def _write_match(
-        self,
-        parts: list[tuple[np.ndarray, np.ndarray]],
-        pairs: Pairs,
-        slot: int,
-        sensor: int | None,
-        index: int,
-        epoch: int,
+        self, batch: MatchBatch, pairs: Pairs, slot: int, sensor: int | None, index: int, epoch: int
     ) -> None:
         anchor = int(pairs.matches.anchors[index])
         row = int(pairs.windows[anchor, -1])
@@ -295,11 +294,15 @@ class Loader:
         positive, negative = pairs.matches.draw(anchor, rng, sensor)
         if sensor is not None and self._sensor[pairs.windows[anchor, -1]] == sensor:
             anchor, positive = positive, anchor
-        triple = (anchor, positive) if self._alone else (anchor, positive, negative)
-        for (clip, sensor), touch in zip(parts, triple, strict=False):
+        triple = [(batch.clip, batch.sensor, anchor), (batch.positive, batch.positive_sensor, positive)]
+        if batch.place is not None:
+            batch.place[slot] = pairs.matches.place(anchor)
+        else:
+            triple.append((batch.negative, batch.negative_sensor, negative))
+        for clip, sensors, touch in triple:
             rows = pairs.windows[touch]
             self._reader.touch(rows, epoch, clip[slot])
-            sensor[slot] = self._sensor[rows[-1]]
+            sensors[slot] = self._sensor[rows[-1]]
 
 
 def _uncounted(job: Callable[[], int]) -> int:

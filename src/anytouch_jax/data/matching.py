@@ -26,7 +26,6 @@ class Matches:
     `anchors` ids i64 into `pool`: rows whose touch was also felt by another sensor, or else by another unit, and
     that have a negative. `one_object`: all of the pool is one known object, so negatives are its other places.
     `same_sensor`: negatives are of the positive's sensor; a partner whose sensor felt no other known place is none.
-    `sensors` i64: those that partners are of.
     """
 
     def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False) -> None:
@@ -37,7 +36,6 @@ class Matches:
         self._usable = _many_places(mine) if same_sensor else np.ones(len(pool), bool)
         self.one_object = len(thing) > 0 and bool((thing == thing[0]).all() and thing[0] >= 0)
         anchors = np.flatnonzero((touch >= 0) & _has_partner(mine, self._usable))
-        self.sensors = np.unique(mine.sensor[(touch >= 0) & self._usable])
         del mine, thing
         order = np.argsort(touch, kind="stable")
         self._order = order.astype(np.int32) if len(order) < 1 << 31 else order
@@ -45,6 +43,10 @@ class Matches:
         # With one place only, a row of an unknown place may be it; a usable partner's sensor felt another one.
         known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(self._sorted, touch.max(initial=-1))
         self.anchors = anchors if known else anchors[[self._negatives(int(a)).size > 0 for a in anchors]]
+
+    def place(self, anchor: int) -> int:
+        """The code of the place that `anchor` felt."""
+        return int(self._keys.touch[self.pool[anchor]])
 
     def draw(self, anchor: int, rng: np.random.Generator, sensor: int | None = None) -> tuple[int, int]:
         """(positive, negative) for `anchor`, as ids into `pool`: partner of another sensor (of `sensor`, where that

@@ -223,5 +223,5 @@ def normalised(batch: Any) -> Any:
         image = np.asarray(objectives.normalise_image(jnp.asarray(align.image)))
         align = align._replace(clip=touch(align.clip), image=image)
     if match is not None:
-        match = MatchBatch(*(touch(x) if x.ndim == 5 else x for x in match))
+        match = match._replace(**{name: touch(getattr(match, name)) for name in ("clip", "positive", "negative")})
     return Stage2Batch(align, match)

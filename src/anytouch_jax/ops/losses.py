@@ -5,6 +5,8 @@ B batch, N positions, T frames, C values of a patch, E embedding width.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -67,12 +69,12 @@ def force_loss(pred: Array, target: Array) -> tuple[Array, Metrics]:
     return force + change, {"force": force, "force_change": change}
 
 
-def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 1) -> Array:
+def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 1, place: Array | None = None) -> Array:
     """InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
     `scale` is 1 / tau. Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair
     gives 0. With `groups` > 1 the batch is cut in that many shares, negatives come from a row's own share, and the mean
-    is over all shares, as over the devices of the release.
+    is over all shares, as over the devices of the release. Rows of one `place` i32 (B,) are no negatives of each other.
     """
     e = a.shape[-1]
     present = present.reshape(groups, -1)
@@ -80,7 +82,11 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     b = jnp.where(present[..., None], _wide(b).reshape(groups, -1, e), 0.0)
     # Multiplied by up to 100: the shorter products that accelerators take by default would show in the loss.
     logits = _wide(scale) * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
-    logits = jnp.where(present[:, None, :], logits, jnp.finfo(logits.dtype).min)
+    rivals = present[:, None, :]
+    if place is not None:
+        place = place.reshape(groups, -1)
+        rivals = rivals & ((place[:, :, None] != place[:, None, :]) | jnp.eye(place.shape[1], dtype=bool)[None])
+    logits = jnp.where(rivals, logits, jnp.finfo(logits.dtype).min)
     own = jnp.diagonal(logits, axis1=1, axis2=2)
     loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)
     pairs = jnp.sum(present, axis=1)
@@ -141,15 +147,20 @@ def alignment_loss(
     return total, metrics
 
 
-def contrast_loss(first: Array, second: Array, scale: Array, *, groups: int = 1) -> tuple[Array, Array]:
-    """InfoNCE between the two touches (B, E), unit length, of each place: a matching beyond the paper, for encoders
-    from scratch. The other places of the batch are the negatives, 2 B - 2 for each pair instead of one.
+def contrast_loss(
+    first: Array, second: Array, scale: Array, *, groups: int = 1, place: Array | None = None
+) -> tuple[Array, Array]:
+    """InfoNCE between the two touches (B, E), unit length, of each pair: a matching beyond the paper, for encoders
+    from scratch. The other places of the batch are the negatives, up to 2 B - 2 for each pair instead of one; which
+    pairs are of one is said by `place` i32 (B,) (None: no two).
 
-    The mean of both directions, and the share of `first` whose own `second` is the nearest.
+    The mean of both directions, and the share of `first` to which a `second` of its own place is the nearest.
     """
     everyone = jnp.ones(first.shape[0], bool)
-    both = [info_nce(a, b, scale, everyone, groups=groups) for a, b in ((first, second), (second, first))]
-    near = jnp.argmax(_wide(first) @ _wide(second).T, axis=1) == jnp.arange(first.shape[0])
+    how: dict[str, Any] = {"groups": groups, "place": place}
+    both = [info_nce(a, b, scale, everyone, **how) for a, b in ((first, second), (second, first))]
+    own = jnp.arange(first.shape[0]) if place is None else place
+    near = own[jnp.argmax(_wide(first) @ _wide(second).T, axis=1)] == own
     return sum(both, jnp.zeros(())) / 2, jnp.mean(near.astype(jnp.float32))
 
 

@@ -25,8 +25,9 @@ from anytouch_jax.config import (
     preset,
     to_json,
 )
+from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import build
-from anytouch_jax.train.optim import flatten_names, match_rules
+from anytouch_jax.train.optim import match_rules
 
 NAMES = ("tiny", "small", "base", "large")
 ALL = [
@@ -249,7 +250,7 @@ def test_the_keep_ratio():
 def parameters(config):
     head = config.model.match_head
     model = full_model(lora_rank=min(2, config.model.lora_rank), match_head=head, decoder_sensor_tokens=True)
-    return flatten_names(build(model).abstract())
+    return flatten(build(model).abstract())
 
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
@@ -288,7 +289,7 @@ def test_what_is_frozen():
     assert paper == {"decoder/position"} | text | image
     assert release == {"decoder/position"} | text | blocks  # embeddings, norms and projection train fully
     one = preset("tiny")
-    assert {n for n, v in match_rules(one.frozen, flatten_names(build(one.model).abstract())).items() if v} == {
+    assert {n for n, v in match_rules(one.frozen, flatten(build(one.model).abstract())).items() if v} == {
         "decoder/position"
     }
 

@@ -12,9 +12,10 @@ from tiny_models import tiny_config
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import preset
+from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.mesh import batch_sharding, make_mesh, put_batch, replicated
-from anytouch_jax.train.optim import flatten_names, optimizer
+from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step, merge
 
 RNG = np.random.default_rng(0)
@@ -471,12 +472,12 @@ def test_devices_share_the_batch_and_change_nothing(stage, devices):
     for a, b in zip(found, wanted, strict=True):
         np.testing.assert_allclose(a["loss"], b["loss"], rtol=1e-5)
         np.testing.assert_allclose(a["grad_norm"], b["grad_norm"], rtol=1e-4)
-    params = [flatten_names(merge(state.trainable, state.frozen)) for state in (many, one)]
+    params = [flatten(merge(state.trainable, state.frozen)) for state in (many, one)]
     for name, value in params[1].items():
         # A key's bias has no gradient but rounding noise, which Adam blows up to a step of the learning rate.
         noise = 2 * real_config(stage).optim.learning_rate if name.endswith("key/bias") else 1e-5
         np.testing.assert_allclose(params[0][name], value, rtol=0, atol=noise, err_msg=name)
-    first = flatten_names(real_step(stage)[1].trainable)["touch/patch/kernel"]
+    first = flatten(real_step(stage)[1].trainable)["touch/patch/kernel"]
     moved = np.asarray(params[0]["touch/patch/kernel"]) - np.asarray(first)
     assert np.abs(moved).max() > 1e-4
 

@@ -15,8 +15,8 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import text as texts
 from anytouch_jax.data.loader import Loader
 from anytouch_jax.io import checkpoint, release
+from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import build
-from anytouch_jax.train.optim import flatten_names
 
 
 @pytest.fixture(autouse=True)
@@ -95,7 +95,14 @@ def test_another_preset_in_the_same_folder_is_refused(straight, world):
 
 
 def parts(params, *names):
-    return flatten_names({name: params[name] for name in names})
+    return flatten({name: params[name] for name in names})
+
+
+def as_used(run, result):
+    """What a run learned, the rows of sensors that it never saw served by the universal tokens."""
+    _, text, told = checkpoint.load_params(run)
+    assert 0 < len(told["seen"]) < len(SENSORS)
+    return release.served(result.params, from_json(text), told)
 
 
 def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp_path):
@@ -104,7 +111,7 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     init = shutil.copytree(run, tmp_path / "stage1")
     first = train(config, tmp_path / "r", said, init=init, stop_after=1)
     # the learning rate of step 0 is 0: what stage 1 learned is still whole
-    for name, array in parts(stage1.params, "touch", "decoder").items():
+    for name, array in parts(as_used(run, stage1), "touch", "decoder").items():
         np.testing.assert_array_equal(parts(first.params, "touch", "decoder")[name], array, err_msg=name)
     assert not any("without a stage-1 run" in line for line in said)
 
@@ -175,6 +182,14 @@ def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora
     assert "model.bin" in refused(config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin")
 
 
+def test_without_stage_one_the_touch_encoder_is_clips_with_or_without_an_image_tower(world, tmp_path):
+    config, clip = clip_folder(tmp_path / "clip", clips_only(run_config(world, 2, towers="pretrained")))
+    config = replace(config, model=replace(config.model, image=None, lora_rank=0))
+    result = train(config, tmp_path / "r", clip=tmp_path / "clip", stop_after=0)
+    np.testing.assert_array_equal(result.params["touch"]["position"], clip["image"]["position"])
+    np.testing.assert_array_equal(result.params["text"]["position"], clip["text"]["position"])
+
+
 def test_stage_one_starts_its_touch_encoder_from_clip(world, tmp_path):
     _, clip = clip_folder(tmp_path / "clip", run_config(world, 2))
     result = train(run_config(world), tmp_path / "r", clip=tmp_path / "clip", stop_after=0)
@@ -215,6 +230,10 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     assert "touch/projection/kernel has (16, 12) instead of (16, 16)" in refused(other, tmp_path / "b", init=run)
     other = run_config(world, 2, model={"activation": "quick_gelu"})
     assert "trained with gelu, this run would use quick_gelu" in refused(other, tmp_path / "b", init=run)
+    other = run_config(world, 2)
+    stack = replace(other.model.touch, heads=other.model.touch.heads // 2)
+    other = replace(other, model=replace(other.model, touch=stack))
+    assert f"this run would use {stack.heads}: add --model.touch.heads" in refused(other, tmp_path / "b", init=run)
     pretrained = run_config(world, 2, towers="pretrained")
     assert "--clip" in refused(pretrained, tmp_path / "c")
     assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")
@@ -237,6 +256,25 @@ def test_a_config_that_is_not_ours_is_replaced_or_named(straight, world, tmp_pat
     (tmp_path / "begun" / "config.json").write_bytes(content)
     told = refused(run_config(world), tmp_path / "begun")
     assert f"{tmp_path / 'begun' / 'config.json'} cannot be read" in told
+
+
+def test_a_run_whose_config_is_lost_goes_on_as_its_checkpoint_says(straight, world, tmp_path):
+    shutil.copytree(straight[0], tmp_path / "r")
+    (tmp_path / "r" / "config.json").unlink()
+    assert "run.seed was 0 and is now 1" in refused(run_config(world, seed=1), tmp_path / "r")
+    assert train(run_config(world), tmp_path / "r").step == 4
+    assert (tmp_path / "r" / "config.json").read_text() == (straight[0] / "config.json").read_text()
+
+
+def test_settings_that_would_do_nothing_are_one_sentence(world, tmp_path):
+    for stage, model, objective, told in (
+        (1, {"dtype": "float64"}, {}, "needs JAX_ENABLE_X64=1"),
+        (2, {}, {"force": 0.1}, "a loss of stage 1"),
+        (2, {}, {"differences": 1.0}, "needs --objective.reconstruct"),
+    ):
+        config = run_config(world, stage, model=model)
+        config = replace(config, objective=replace(config.objective, **objective))
+        assert told in refused(config, tmp_path / "r") and not (tmp_path / "r").exists()
 
 
 def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):
@@ -302,9 +340,12 @@ def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path
     names = (*SENSORS[:place], "new_sensor", *SENSORS[place:])
     config = clips_only(run_config(world, 2, model={"sensors": names}))
     tokens = train(config, tmp_path / "r", init=run, stop_after=0).params["touch"]["sensor_tokens"]
-    old = dict(zip(SENSORS, np.asarray(stage1.params["touch"]["sensor_tokens"]), strict=True))
+    old = dict(zip(SENSORS, as_used(run, stage1)["touch"]["sensor_tokens"], strict=True))
     new = dict(zip(names, np.asarray(tokens), strict=True))
     for name in SENSORS:
         np.testing.assert_array_equal(new[name], old[name], err_msg=name)
     np.testing.assert_array_equal(new["new_sensor"], old["universal"])
+    named = np.asarray(stage1.params["touch"]["sensor_tokens"])[SENSORS.index("allsight")]  # but never seen
+    np.testing.assert_array_equal(new["allsight"], old["universal"])
+    assert not np.array_equal(named, old["universal"])
     assert json.loads((tmp_path / "r" / "config.json").read_text())["model"]["sensors"] == list(names)

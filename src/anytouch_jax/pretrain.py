@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from anytouch_jax.data.loader import Loader
 from anytouch_jax.evaluate import figures
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.io.record import steps
+from anytouch_jax.model import Model
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
@@ -56,8 +58,7 @@ def pretrain(
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     say = say if jax.process_index() == 0 else silent
-    if config.model.attention == "cudnn" and jax.default_backend() != "gpu":
-        raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
+    _possible(config)
     _same_stage(run, config)
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
@@ -86,6 +87,21 @@ def pretrain(
         say=say,
         mesh=mesh,
     )
+
+
+def _possible(config: Config) -> None:
+    """Raise UserError for settings that this machine or this stage cannot follow, before anything is read."""
+    model, objective = config.model, config.objective
+    if model.attention == "cudnn" and jax.default_backend() != "gpu":
+        raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
+    if model.attention == "cudnn" and model.dtype != "bfloat16":
+        raise UserError("--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out")
+    if model.dtype == "float64" and not jax.config.jax_enable_x64:
+        raise UserError("--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32")
+    if config.stage == 2 and objective.force:
+        raise UserError("--objective.force is a loss of stage 1; leave it out in stage 2")
+    if config.stage == 2 and objective.differences and not objective.reconstruct:
+        raise UserError("--objective.differences needs --objective.reconstruct in stage 2, or leave it out")
 
 
 def _warmed(config: Config, run: Path, loader: Loader) -> Config:
@@ -180,9 +196,9 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
     if not begun:
         run.mkdir(parents=True, exist_ok=True)
         tokenizer.save(own)
-    text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
     if config.towers == "pretrained":
-        text = config.model.text
+        return config, tokenizer
+    text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
     return replace(config, model=replace(config.model, text=text)), tokenizer
 
 
@@ -210,14 +226,12 @@ def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say
         raise UserError(_NO_CLIP)
     first = None if init is None else _load(Path(init), config, say)
     weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
-    if config.stage == 2:
-        if init is None:
-            say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
-        towers = None if weights is None else release.to_params(weights, config.model)
-        return release.merge_stage2(params, stage1=first, clip=towers)
-    if weights is not None:
-        params = release.clip_to_stage1(weights, config.model, params)
-    return params if first is None else release.merge_stage2(params, stage1=first)
+    if first is None and weights is not None:
+        params = release.clip_to_touch(weights, config.model, params)
+    if config.stage == 2 and init is None:
+        say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
+    towers = None if weights is None or config.stage == 1 else release.to_params(weights, config.model)
+    return release.merge_stage2(params, stage1=first, clip=towers)
 
 
 def _read_clip(file: Path, config: Config) -> dict[str, np.ndarray]:
@@ -233,14 +247,25 @@ def _same_activation(path: Path, told: str | None, config: Config) -> None:
         raise UserError(f"{path} was trained with {told}, this run would use {ours}: add --model.activation {told}")
 
 
+def _same_form(path: Path, before: Model, config: Config) -> None:
+    """Raise UserError where weights fit by their shapes, but were trained with other heads or epsilons."""
+    for name in ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps"):
+        theirs, ours = (attrgetter(name)(model) for model in (before, config.model))
+        if theirs != ours:
+            option = f"--model.{name.replace('_', '-')} {theirs}"
+            raise UserError(f"{path} was trained with {name} {theirs}, this run would use {ours}: add {option}")
+
+
 def _load(path: Path, config: Config, say: Say) -> Params:
     """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of the model's."""
     if not path.exists():
         raise UserError(f"no run folder or weights file at {path}; train stage 1 first, or give another --init")
     if path.is_dir() and not any(path.glob("*.pth")):
-        params, text, _ = checkpoint.load_params(path)
+        params, text, told = checkpoint.load_params(path)
         before = from_json(text)
         _same_activation(path, before.model.activation, config)
+        _same_form(path, before.model, config)
+        params = release.served(params, before, told)
         stored, shown = before.model.sensors, before.data.background
         if shown != config.data.background:
             say(
@@ -252,11 +277,16 @@ def _load(path: Path, config: Config, say: Say) -> Params:
         _same_activation(file, release.told_activation(file), config)
         weights = release.read_weights(file)
         detected = release.model_of(file, weights)
+        if release.MODEL_KEY in release.read_metadata(file):  # else its heads are a guess
+            _same_form(file, detected, config)
         params, stored = release.to_params(weights, detected), detected.sensors
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
-    rows = release.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), stored, config.model.sensors)
-    return {"touch": params["touch"] | {"sensor_tokens": rows}, "decoder": params["decoder"]}
+    touch, wanted = params["touch"], config.model.sensors
+    touch = touch | {"sensor_tokens": release.match_sensors(np.asarray(touch["sensor_tokens"]), stored, wanted)}
+    if config.model.patch_encoder == "sensor" and touch["patch"]["kernel"].ndim == 4:
+        touch |= {"patch": {"kernel": release.match_sensors(np.asarray(touch["patch"]["kernel"]), stored, wanted)}}
+    return {"touch": touch, "decoder": params["decoder"]}
 
 
 def _report(step: int, params: Params, batch: Any, *, run: Path, net: Net, config: Config) -> None:

@@ -11,7 +11,7 @@ import pytest
 from anytouch_jax.config import SENSORS, UNIVERSAL, Model, Stack, TextTower, UserError, preset
 from anytouch_jax.io.release import (
     WeightsError,
-    clip_to_stage1,
+    clip_to_touch,
     detect_layout,
     detect_model,
     match_sensors,
@@ -283,22 +283,25 @@ def test_hf_and_open_clip_agree():
 
 
 @pytest.mark.parametrize("layout", ["clip", "openclip"])
-@pytest.mark.parametrize("divide", [False, True])
-def test_clip_starts_the_touch_encoder(layout, divide):
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own patch encoders"])
+def test_clip_starts_the_touch_encoder(layout, own):
     clip = weights_of(STAGE2, "clip")
     tower = to_params(clip, STAGE2)
     weights = clip if layout == "clip" else openclip_of(tower, STAGE2)
-    fresh = params_of(STAGE1, seed=1)
-    params = clip_to_stage1(weights, STAGE1, fresh, divide=divide)
+    model = dataclasses.replace(STAGE1, patch_encoder="sensor" if own else "shared")
+    fresh = params_of(model, seed=1)
+    params = clip_to_touch(weights, model, fresh)
     same(params["decoder"], fresh["decoder"])  # kept, as the sensor tokens are
     np.testing.assert_array_equal(params["touch"]["sensor_tokens"], fresh["touch"]["sensor_tokens"])
     for part in ("class_token", "position", "pre_norm", "blocks", "post_norm", "projection"):
         same({part: params["touch"][part]}, {part: tower["image"][part]})
     kernel = clip["vision_model.embeddings.patch_embedding.weight"]
-    inflated = np.repeat(kernel[:, None], 3, axis=1) / (3 if divide else 1)  # golden Q1: not divided
-    theirs = to_release(params, STAGE1)["video_patch_embedding.weight"]
-    np.testing.assert_allclose(theirs, inflated, rtol=1e-7)
-    same({"fresh": fresh}, {"fresh": params_of(STAGE1, seed=1)})  # the given tree is not written to
+    inflated = np.repeat(kernel[:, None], 3, axis=1)  # golden Q1: not divided
+    for row in params["touch"]["patch"]["kernel"] if own else [params["touch"]["patch"]["kernel"]]:
+        one = {**params, "touch": {**params["touch"], "patch": {"kernel": row}}}
+        theirs = to_release(one, STAGE1)["video_patch_embedding.weight"]
+        np.testing.assert_allclose(theirs, inflated, rtol=1e-7)
+    same({"fresh": fresh}, {"fresh": params_of(model, seed=1)})  # the given tree is not written to
 
 
 def test_stage2_takes_each_part_from_its_source():
@@ -308,9 +311,10 @@ def test_stage2_takes_each_part_from_its_source():
     sources = {"touch": stage1, "decoder": stage1, "image": clip, "text": clip, "logit_scale": clip}
     for part in fresh:
         same({part: params[part]}, {part: sources.get(part, fresh)[part]})
-    only_clip = merge_stage2(fresh, clip=clip)
-    same({"decoder": only_clip["decoder"]}, {"decoder": fresh["decoder"]})
-    same({"blocks": only_clip["touch"]["blocks"]}, {"blocks": clip["image"]["blocks"]})
+    without = merge_stage2(fresh, clip={name: part for name, part in clip.items() if name != "image"})
+    for part in ("decoder", "touch", "image"):
+        same({part: without[part]}, {part: fresh[part]})
+    same({"text": without["text"]}, {"text": clip["text"]})
     only_stage1 = merge_stage2(fresh, stage1=stage1)
     same({"image": only_stage1["image"]}, {"image": fresh["image"]})
     other = to_params(weights_of(dataclasses.replace(STAGE1, embed=13)), dataclasses.replace(STAGE1, embed=13))

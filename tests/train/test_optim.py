@@ -10,8 +10,8 @@ import pytest
 from train_toy import toy_config, toy_params
 
 from anytouch_jax.config import ConfigError, preset
+from anytouch_jax.io.tree import flatten
 from anytouch_jax.train.optim import (
-    flatten_names,
     learning_rate,
     match_rules,
     moments,
@@ -20,12 +20,6 @@ from anytouch_jax.train.optim import (
 )
 
 PEAK, FLOOR = 2e-4, 1e-6
-
-
-def test_names_are_paths_in_the_order_of_the_tree():
-    tree = {"touch": {"blocks": {"kernel": 1}, "bias": 2}, "logit_scale": 3}
-    assert flatten_names(tree) == {"logit_scale": 3, "touch/bias": 2, "touch/blocks/kernel": 1}
-    assert list(flatten_names(tree).values()) == jax.tree.leaves(tree)
 
 
 def test_the_first_rule_wins_and_a_name_without_one_is_an_error():
@@ -130,15 +124,15 @@ def test_adamw_with_skipped_parameters_equals_plain_numpy():
     got, state = run_updates(config, params, grads, uses)
     rates = [float(schedule(config)(step)) for step in range(9)]
     expected, count, m, v2 = adamw_by_hand(
-        flatten_names(params),
-        [flatten_names(g) for g in grads],
-        [flatten_names(u) for u in uses],
+        flatten(params),
+        [flatten(g) for g in grads],
+        [flatten(u) for u in uses],
         rates,
-        decay=match_rules(config.weight_decay, flatten_names(params)),
+        decay=match_rules(config.weight_decay, flatten(params)),
     )
     assert count["decoder/still_head/kernel"] == 3 and count["idle/kernel"] == 0
-    held = flatten_names(moments(state, params))
-    for name, value in flatten_names(got).items():
+    held = flatten(moments(state, params))
+    for name, value in flatten(got).items():
         np.testing.assert_allclose(value, expected[name], rtol=0, atol=2e-6, err_msg=name)
         assert held[f"{name}/updates"] == count[name], name
         np.testing.assert_allclose(held[f"{name}/mu"], m[name], rtol=1e-5, atol=1e-7 * np.abs(m[name]).max())

@@ -11,7 +11,8 @@ from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
 from anytouch_jax.config import ConfigError, preset
-from anytouch_jax.train.optim import flatten_names, moments, optimizer, schedule
+from anytouch_jax.io.tree import flatten
+from anytouch_jax.train.optim import moments, optimizer, schedule
 from anytouch_jax.train.step import init_state, make_step, merge, micro_batches, split
 
 KEY = jax.random.key(5)
@@ -37,8 +38,8 @@ def test_split_and_merge_are_inverse_and_disjoint():
     params = toy_params()
     rules = ((r"decoder/.*_head/kernel", True), (r"idle", True), (r"", False))
     trainable, frozen = split(params, rules)
-    assert set(flatten_names(frozen)) == {"decoder/still_head/kernel", "decoder/clip_head/kernel", "idle/kernel"}
-    assert not set(flatten_names(frozen)) & set(flatten_names(trainable))
+    assert set(flatten(frozen)) == {"decoder/still_head/kernel", "decoder/clip_head/kernel", "idle/kernel"}
+    assert not set(flatten(frozen)) & set(flatten(trainable))
     assert jax.tree.structure(merge(trainable, frozen)) == jax.tree.structure(params)
     assert_same(merge(trainable, frozen), params)
     with pytest.raises(ValueError, match="kernel is both"):
@@ -52,9 +53,7 @@ def test_towers_freeze_as_the_recipe_says():
         *folders, last = name.split("/")
         functools.reduce(lambda node, folder: node.setdefault(folder, {}), folders, params)[last] = np.ones(1)
     frozen = {
-        (recipe, towers): set(
-            flatten_names(split(params, preset("tiny", stage=2, recipe=recipe, towers=towers).frozen)[1])
-        )
+        (recipe, towers): set(flatten(split(params, preset("tiny", stage=2, recipe=recipe, towers=towers).frozen)[1]))
         for recipe in ("paper", "release")
         for towers in ("scratch", "pretrained")
     }
@@ -98,7 +97,7 @@ def test_a_kind_of_batch_leaves_the_head_it_does_not_use():
         now, then = (moments(s.opt_state, s.trainable)["decoder"][idle] for s in (state, before))
         assert_same(now, then)
     held = moments(state.opt_state, state.trainable)
-    counts = {k: v for k, v in flatten_names(held).items() if k.endswith("kernel/updates")}
+    counts = {k: v for k, v in flatten(held).items() if k.endswith("kernel/updates")}
     assert counts == {
         "decoder/clip_head/kernel/updates": 2,
         "decoder/still_head/kernel/updates": 3,
@@ -242,7 +241,7 @@ def test_frozen_parameters_are_not_differentiated():
     state = init_state(toy_params(), config)
     new, _ = jax.eval_shape(step, state, toy_batch(0), KEY)
     assert jax.tree.map(jnp.shape, new.frozen) == {"decoder": {"position": (4,)}}
-    assert "decoder/position" not in flatten_names(state.trainable)
+    assert "decoder/position" not in flatten(state.trainable)
     thawed = state._replace(trainable=toy_params(), frozen={}, opt_state=optimizer(config).init(toy_params()))
     with pytest.raises(AssertionError, match="frozen table"):
         jax.eval_shape(step, thawed, toy_batch(0), KEY)

@@ -29,10 +29,9 @@ def run(options: Convert) -> int:
         config = from_json(text)
         model = config.model
         about |= {release.BACKGROUND_KEY: config.data.background}
+        params = release.served(params, config, told)
         if "touch" in params and "seen" in told:
-            drawn = config.objective.universal_start + config.objective.universal_end > 0
-            touch = release.serve_unseen(params["touch"], model, told["seen"], universal_drawn=drawn)
-            params, about = params | {"touch": touch}, about | {release.SEEN_KEY: ",".join(told["seen"])}
+            about |= {release.SEEN_KEY: ",".join(told["seen"])}
     else:
         kept = release.read_metadata(source)
         about |= {key: kept[key] for key in (release.BACKGROUND_KEY, release.SEEN_KEY) if key in kept}

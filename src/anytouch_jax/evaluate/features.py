@@ -163,11 +163,8 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     if path.is_dir():
         params, config_json, about = checkpoint.load_params(path, step)
         config = from_json(config_json)
-        seen = about.get("seen")
+        seen, params = about.get("seen"), release.served(params, config, about)
         drawn = config.objective.universal_start + config.objective.universal_end > 0
-        if "touch" in params and seen is not None:
-            served = release.serve_unseen(params["touch"], config.model, seen, universal_drawn=drawn)
-            params = params | {"touch": served}
     else:
         weights = release.read_weights(path)
         model = release.model_of(path, weights)

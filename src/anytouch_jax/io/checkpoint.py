@@ -27,14 +27,13 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from anytouch_jax.io.record import CheckpointError, checked, read_record, resolve, steps, write_record
-from anytouch_jax.io.tensors import read_safetensors, write_safetensors
+from anytouch_jax.io.tensors import write_safetensors
 from anytouch_jax.io.tree import flatten, nest
 
 __all__ = [
     "CheckpointError",
     "Checkpoints",
     "export_safetensors",
-    "import_safetensors",
     "load_params",
     "read_metadata",
     "steps",
@@ -247,12 +246,6 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
 def export_safetensors(path: str | Path, params: Tree, metadata: Mapping[str, str]) -> None:
     """Write a parameter tree to one safetensors file, names joined with "/"; whole or not at all."""
     write_safetensors(path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata)
-
-
-def import_safetensors(path: str | Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """(parameter tree of numpy arrays, metadata) of a file by `export_safetensors`. Raises WeightsError."""
-    arrays, metadata = read_safetensors(path)
-    return nest(arrays), metadata
 
 
 def _owned(leaf: Any) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, UNIVERSAL, Model
+from anytouch_jax.config import SENSORS, UNIVERSAL, Config, Model
 from anytouch_jax.io.detect import (
     BACKGROUND_KEY,
     MODEL_KEY,
@@ -44,7 +44,7 @@ __all__ = [
     "MODEL_KEY",
     "SEEN_KEY",
     "WeightsError",
-    "clip_to_stage1",
+    "clip_to_touch",
     "detect_layout",
     "detect_model",
     "inflate",
@@ -167,31 +167,27 @@ def release_names(model: Model, layout: Layout | None = None) -> dict[str, str]:
     return {entry.key: entry.name for entry in entries(layout, model)}
 
 
-def clip_to_stage1(weights: Weights, model: Model, params: Params, *, divide: bool = False) -> Params:
-    """`params` of stage 1 with the touch encoder from CLIP's vision tower; the rest stays as it is.
+def clip_to_touch(weights: Weights, model: Model, params: Params) -> Params:
+    """`params` of either stage with the touch encoder from CLIP's vision tower; the rest stays as it is.
 
     The 2-D patch kernel is repeated over the frames, as the authors do, not divided by their number (golden Q1): the
-    response to a still is then three times CLIP's. `divide` makes it CLIP's. Raises WeightsError.
+    response to a still is then three times CLIP's. Raises WeightsError.
     """
     tower = dataclasses.replace(model, image=model.touch, text=None, match_head="none", lora_rank=0)
-    return inflate(params, to_params(weights, tower)["image"], divide=divide)
+    return inflate(params, to_params(weights, tower)["image"])
 
 
-def merge_stage2(
-    params: Params, *, stage1: Params | None = None, clip: Params | None = None, divide: bool = False
-) -> Params:
-    """Fresh `params` of stage 2 with touch and decoder from `stage1`, the towers and the temperature from `clip`.
+def merge_stage2(params: Params, *, stage1: Params | None = None, clip: Params | None = None) -> Params:
+    """`params` of stage 2 with touch and decoder from `stage1`, the towers and the temperature from `clip`.
 
-    Without `stage1` the touch encoder starts from CLIP's vision tower, as in `clip_to_stage1`. LoRA and the matching
-    head stay fresh. Entries of `stage1` or `clip` for parts that `params` lacks are errors. Raises WeightsError.
+    LoRA and the matching head stay fresh. Entries of `stage1` or `clip` for parts that `params` lacks are errors.
+    Raises WeightsError.
     """
     merged = dict(params)
     if clip is not None:
         merged = _grafted(merged, {part: clip[part] for part in ("image", "text", "logit_scale") if part in clip})
     if stage1 is not None:
         merged = _grafted(merged, {part: stage1[part] for part in ("touch", "decoder")})
-    elif clip is not None:
-        merged = inflate(merged, clip["image"], divide=divide)
     return merged
 
 
@@ -223,6 +219,14 @@ def serve_unseen(touch: Params, model: Model, seen: Sequence[str], *, universal_
     if model.patch_encoder == "sensor":
         touch |= {"patch": {"kernel": served(touch["patch"]["kernel"])}}
     return touch
+
+
+def served(params: Params, config: Config, told: Mapping[str, Any]) -> Params:
+    """The parameters of a run as they are used: sensors that it never saw (its metadata `told`) by `serve_unseen`."""
+    if "touch" not in params or "seen" not in told:
+        return params
+    drawn = config.objective.universal_start + config.objective.universal_end > 0
+    return params | {"touch": serve_unseen(params["touch"], config.model, told["seen"], universal_drawn=drawn)}
 
 
 def _by_key(wanted: Sequence[Entry]) -> dict[str, Entry]:
@@ -321,9 +325,9 @@ def _grafted(params: Params, parts: Params) -> Params:
 
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
-    """`params` with the touch encoder from the image tower `image`, see `clip_to_stage1`; sensor tokens stay."""
-    frames = len(params["touch"]["patch"]["kernel"])
-    kernel = np.asarray(image["patch"]["kernel"])
-    kernel = np.repeat(kernel[None], frames, axis=0) / np.float32(frames if divide else 1)
+    """`params` with the touch encoder from the image tower `image`, see `clip_to_touch`; sensor tokens stay. `divide`
+    makes the response to a still the tower's."""
+    shape = params["touch"]["patch"]["kernel"].shape  # (T, ...), one of them for each sensor where it has its own
+    kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(shape[-3] if divide else 1)
     touch = {**image, "patch": {"kernel": kernel}, "sensor_tokens": params["touch"]["sensor_tokens"]}
     return _grafted(params, {"touch": touch})

@@ -56,7 +56,7 @@ def _forward(q: Array, k: Array, v: Array) -> tuple[Array, tuple[Array, ...]]:
 
 def _backward(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
     *parts, out, log_sum = saved
-    own = jnp.sum((gradient * out).astype(log_sum.dtype), axis=-1, keepdims=True)
+    own = jnp.sum(gradient.astype(log_sum.dtype) * out, axis=-1, keepdims=True)
     grads = jax.lax.map(_differentiate, (*parts, log_sum, _groups(own), _groups(gradient)))
     dq, dk, dv = (_heads(x, gradient.shape) for x in grads)
     return dq, dk, dv

@@ -58,8 +58,13 @@ class FitResult:
 
     @property
     def params(self) -> Tree:
-        """All parameters, trained and frozen, as one nested dict."""
-        return merge(self.state.trainable, self.state.frozen)
+        """All parameters as one nested dict, see `used`."""
+        return used(self.state)
+
+
+def used(state: TrainState) -> Tree:
+    """All parameters as they are used: the trained ones (their average where a run keeps one) and the frozen ones."""
+    return merge(state.opt_state.ema or state.trainable, state.frozen)
 
 
 def fit(
@@ -257,7 +262,7 @@ class _Loop:
         if self.on_report is not None:
             self.log()
             try:
-                self.on_report(done, whole(merge(state.trainable, state.frozen)), whole(batch))
+                self.on_report(done, whole(used(state)), whole(batch))
             except Exception as error:
                 self.bar.say(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done

@@ -16,6 +16,7 @@ import numpy as np
 import optax
 
 from anytouch_jax.config import Config, ConfigError
+from anytouch_jax.io.tree import flatten
 from anytouch_jax.train.pack import Packing, norm, packing
 
 Array = jax.Array
@@ -47,12 +48,6 @@ def moments(state: OptState, params: Tree) -> Tree:
     layout = packing(params)
     counts = layout.treedef.unflatten(list(state.counts))
     return jax.tree.map(Moments, counts, layout.unpack(state.mu), layout.unpack(state.nu))
-
-
-def flatten_names(tree: Tree) -> dict[str, Any]:
-    """The leaves of a nested tree by name: the path joined with "/", in the tree's own order."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def match_rules(rules: Sequence[tuple[str, T]], names: Iterable[str]) -> dict[str, T]:
@@ -143,7 +138,7 @@ def _adamw(
     """Packed directions of AdamW before the learning rate, counts and moments; a leaf not used gets 0 and stays."""
     options = config.optim
     uses = np.asarray([True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used))
-    decays = np.asarray(list(match_rules(config.weight_decay, flatten_names(params)).values()), np.float32)
+    decays = np.asarray(list(match_rules(config.weight_decay, flatten(params)).values()), np.float32)
     count = state.counts + uses.astype(np.int32)
     first, second = (1.0 - jnp.float32(beta) ** count for beta in (options.beta1, options.beta2))  # bias corrections
     gradients = layout.pack(grads)

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from anytouch_jax.config import Config, ConfigError, UserError, from_json, to_json
-from anytouch_jax.io.record import steps
+from anytouch_jax.io.record import read_record, steps
 
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
 HARMLESS = {
+    "data.cache",
     "data.on_bad_sample",
     "data.prefetch",
     "data.threads",
@@ -57,12 +58,16 @@ def write_atomic(path: Path, text: str) -> None:
 
 def begun_with(run_dir: Path) -> Config | None:
     """The settings that the run in a folder was begun with, None without a complete checkpoint: what lies in such a
-    folder was left by a start that failed, or is not ours. Raises UserError when they cannot be read."""
-    path = run_dir / "config.json"
-    if not steps(run_dir / "checkpoints") or not path.exists():
+    folder was left by a start that failed, or is not ours. Where config.json is lost the latest checkpoint tells them.
+    Raises UserError when they cannot be read."""
+    path, done = run_dir / "config.json", steps(run_dir / "checkpoints")
+    if not done:
         return None
     try:
-        config: Config = from_json(path.read_text(encoding="utf-8"))
+        if not path.exists():
+            path = run_dir / "checkpoints" / f"{done[-1]:08d}"
+        text = read_record(path)["config"] if path.is_dir() else path.read_text(encoding="utf-8")
+        config: Config = from_json(text)
     except (ConfigError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read ({error}); choose another run folder, or mend it") from None
     return config
@@ -77,7 +82,7 @@ def open_run(run_dir: Path, config: Config) -> None:
     path = run_dir / "config.json"
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
-        if not goes_on(run_dir, config):
+        if not goes_on(run_dir, config) or not path.exists():
             write_atomic(path, to_json(config) + "\n")
 
 

@@ -11,7 +11,8 @@ import optax
 
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config, ConfigError
-from anytouch_jax.train.optim import flatten_names, match_rules, optimizer
+from anytouch_jax.io.tree import flatten, nest
+from anytouch_jax.train.optim import match_rules, optimizer
 from anytouch_jax.train.pack import norm, packing
 from anytouch_jax.train.usage import used_parameters
 
@@ -36,15 +37,10 @@ class TrainState(NamedTuple):
 
 def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
     """Cut nested parameters in (trainable, frozen) by (regex, frozen?) rules; the first match decides."""
-    parts: tuple[dict[str, Any], dict[str, Any]] = ({}, {})
-    leaves = flatten_names(params)
-    for name, frozen in match_rules(rules, leaves).items():
-        *folders, last = name.split("/")
-        node = parts[int(frozen)]
-        for folder in folders:
-            node = node.setdefault(folder, {})
-        node[last] = leaves[name]
-    return parts
+    leaves = flatten(params)
+    frozen = match_rules(rules, leaves)
+    trained, kept = ({name: leaves[name] for name in leaves if frozen[name] == part} for part in (False, True))
+    return nest(trained), nest(kept)
 
 
 def merge(trainable: Tree, frozen: Tree) -> Tree:

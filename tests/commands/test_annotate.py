@@ -161,3 +161,7 @@ def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, tmp_path
     assert "1 of 1 rows have a caption" in said.out
     said = anytouch("annotate", path, "--captions", tmp_path / "captions.csv", "--limit", 1, "--split", "train")
     assert said.status == 1 and "--split, --limit do nothing with --captions" in said.err
+    said = anytouch("annotate", path, "--captions", tmp_path / "captions.csv", "--price-in", 1, "--yes")
+    assert said.status == 1 and "--yes, --price-in do nothing with --captions" in said.err
+    said = anytouch("annotate", path, "--key", "caption_id", "--yes")
+    assert said.status == 1 and "--key does nothing without --captions" in said.err

@@ -62,6 +62,10 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
         (["--threads", "0"], "workers must be at least 1"),
         (["--drop", "--threshold", "digit", "999"], "every frame is without contact"),
         (["--check", "--reference", "label.depth"], "no column label.depth"),
+        (["--reference", "label.force"], "--reference does nothing without --check"),
+        (["--check", "--drop"], "--drop does nothing with --check alone"),
+        (["--share", "60"], "--share is a part of the highest score"),
+        (["--threshold", "gelsigth", "5"], "a threshold is given for the sensor 'gelsigth'"),
     ],
 )
 def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, told):
@@ -86,6 +90,16 @@ def test_known_contact_may_be_true_or_false_and_nothing_else(anytouch, mistake, 
     manifests.write(manifests.from_columns(columns, tmp_path / "words.csv"), tmp_path / "words.csv")
     told = mistake("contact", tmp_path / "words.csv")
     assert "row 4 of" in told and "must be a number, true or false, is 'yes'" in told
+
+
+def test_marks_that_are_kept_are_told_of_and_cannot_be_moved(anytouch, mistake, pressed, monkeypatch):
+    anytouch("contact", pressed)
+    marked = pressed.with_name("touch_contact.parquet")
+    monkeypatch.setattr("anytouch_jax.data.contact.contact_scores", lambda *_, **__: pytest.fail("scored in vain"))
+    assert "where every row has a label.contact, which is kept" in mistake("contact", marked, "--share", 0.6)
+    monkeypatch.undo()
+    said = anytouch("contact", marked)
+    assert said.status == 0 and "10 rows keep the label.contact that they had" in said.out
 
 
 def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):

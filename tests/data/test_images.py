@@ -180,7 +180,16 @@ def test_a_folder_comes_in_natural_order(tmp_path):
         image = np.full((4, 4, 3), number, np.uint8)
         cv2.imwrite(str(tmp_path / f"img{number}.png"), image)
     (tmp_path / "notes.txt").write_text("no picture")
-    assert [images.decode(file)[0, 0, 0] for file in images.pictures_in(tmp_path)] == [1, 9, 10]
+    assert [images.decode(file)[0, 0, 0] for file in images.pictures_in(tmp_path)[0]] == [1, 9, 10]
+    for name in ("background.jpg", "Photo.png"):
+        assert cv2.imwrite(str(tmp_path / name), np.zeros((4, 4, 3), np.uint8))
+    np.save(tmp_path / "000.npy", np.zeros((20, 20, 6), np.float32))
+    frames, beside = images.pictures_in(tmp_path)
+    assert len(frames) == 3 and {name: file.name for name, file in beside.items()} == {
+        "background": "background.jpg", "photo": "Photo.png"
+    }  # fmt: skip
+    order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_order)
+    assert order == ["1689.9.png", "1690.4666.png", "1690.5.png"]
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):

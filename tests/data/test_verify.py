@@ -108,6 +108,16 @@ def test_a_bad_file_is_found_named_and_repaired(make, tmp_path, how, column):
     assert not repair(manifests.read(target), verify(manifests.read(target))).done
 
 
+def test_a_frame_of_a_force_field_sensor_is_an_array_and_no_picture(make):
+    loose = make([{}, {}])
+    columns = {name: loose.column(name).to_pylist() for name in loose.table.column_names}
+    columns |= {"path": ["t.npy", "f1.png"], "field_path": ["t.npy", None], "sensor": ["tac3d", "digit"]}
+    manifest = manifests.from_columns(columns, loose.files[0])
+    np.save(manifest.file(0), np.zeros((20, 20, 6), np.float32))
+    report = verify(manifest)
+    assert report.ok and len(repair(manifest, report).manifest) == 2
+
+
 def test_odd_but_whole_pictures_are_no_fault(make):
     from PIL import Image
 

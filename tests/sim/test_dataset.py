@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -183,13 +184,18 @@ def test_a_finished_part_is_not_made_again(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="No space left on device; what is finished is kept, the same command goes on"):
         dataset.simulate(SCENES, tmp_path / "full")
     assert [path.name for path in (tmp_path / "full" / "parts").iterdir()] == ["00000.parquet"]
+    shutil.copytree(tmp_path / "full", tmp_path / "cut")
     first.clear()
     full = False
     dataset.simulate(SCENES, tmp_path / "full")
     assert first == [dataset.GROUP] * 2  # two sensors of the second part, and nothing of the first
     first.clear()
+    (tmp_path / "full" / "parts").mkdir()  # a kill between the last two moves
     dataset.simulate(SCENES, tmp_path / "full")
-    assert not first
+    assert not first and not (tmp_path / "full" / "parts").exists()
+    (tmp_path / "cut" / "parts" / "00000.parquet").write_bytes(b"")  # the name without its bytes
+    dataset.simulate(SCENES, tmp_path / "cut")
+    assert first == [0] * 2 + [dataset.GROUP] * 2 and tree(tmp_path / "cut") == tree(tmp_path / "full")
 
 
 def test_a_folder_of_something_else_is_left_alone(made, tmp_path):

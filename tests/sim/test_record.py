@@ -208,12 +208,17 @@ def test_two_sensors_at_once_give_the_same_takes(takes):
             jax.tree.map(np.testing.assert_array_equal, take, other)
 
 
-def test_another_batch_gives_the_same_recording(takes):
+def test_another_batch_gives_the_same_recording(takes, monkeypatch):
     scenes = replace(SCENES, sensors=("digit",))
     things, _ = scene.cast(scenes)
     recording, take = takes["digit"][4]
     alone = Recorder(scenes, things, batch=6).record([recording])[0]
     np.testing.assert_array_equal(alone.image, take.image)
     jax.tree.map(np.testing.assert_array_equal, alone.labels, take.labels)
+    monkeypatch.setattr(record, "AT_ONCE", 4 * 2 * scenes.frames * scenes.size**2)
+    recordings = [one for one, _ in takes["digit"]]
+    assert len(recordings) == 6  # so a program of four runs twice
+    for other, (_, take) in zip(Recorder(scenes, things, batch=6).record(recordings), takes["digit"], strict=True):
+        jax.tree.map(np.testing.assert_array_equal, other, take)
     with pytest.raises(ValueError, match="1 to 6 recordings of one sensor"):
         Recorder(scenes, things, batch=6).record([])

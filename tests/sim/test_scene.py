@@ -33,7 +33,7 @@ def recordings(scenes, number=0):
         ({"grade": "rough"}, "grade is fine or coarse"),
         ({"units": "two"}, "units is each or one, not two"),
         ({"seed": -1}, "seed must be at least 0, not -1"),
-        ({"depth": (0.5, 3.0)}, "depth 3 mm goes through the gel of"),
+        ({"depth": (0.5, 3.0)}, "depth 3 mm may go through the gel of"),
         ({"fields": ("shear", "shear")}, "each field once"),
         ({"held_out": -0.3}, "held_out is a share from 0 to below 1, not -0.3"),
         ({"first": -1}, "first must be at least 0, not -1"),

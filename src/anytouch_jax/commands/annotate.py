@@ -18,7 +18,11 @@ if TYPE_CHECKING:
     from anytouch_jax.data.manifest import Manifest
 
 
-_ASKING = ("split", "limit", "sheet", "estimate", "family", "answers", "second_image")
+_ASKING = (
+    "split", "limit", "sheet", "estimate", "family", "answers", "second_image", "url", "model", "key_variable", "yes",
+    "price_in", "price_out", "threads", "side", "timeout", "tries", "max_tokens", "token_field", "temperature",
+    "json_mode",
+)  # fmt: skip
 
 
 class _OnlyAnEstimate(Exception):
@@ -31,6 +35,12 @@ def run(options: Annotate) -> int:
     from anytouch_jax.data.annotate import annotate
     from anytouch_jax.data.sheet import sample_sheet
 
+    if options.captions is not None:
+        refuse(options, _ASKING, "with --captions, which asks nothing")
+    else:
+        refuse(options, ("key",), "without --captions, the table that it is a column of")
+    if options.sheet is None:
+        refuse(options, ("sheet_count",), "without --sheet")
     manifest = manifests.read(options.manifest)
     target = options.out or beside(options.manifest, "captions")
     if not options.estimate:
@@ -39,7 +49,6 @@ def run(options: Annotate) -> int:
     if options.sheet is not None:
         check_folder(options.sheet, "--sheet")
     if options.captions is not None:
-        refuse(options, _ASKING, "with --captions, which asks nothing")
         return _attach(options, manifest, target)
     try:
         found = annotate(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_data import Contact
 
@@ -13,14 +16,20 @@ def run(options: Contact) -> int:
     from anytouch_jax.data import manifest as manifests
     from anytouch_jax.evaluate.contact_report import contact_picture, contact_quality
 
+    if not options.check:
+        refuse(options, ("reference", "above"), "without --check, which compares with a column")
+    elif options.out is None:
+        refuse(options, ("drop",), "with --check alone, which writes no manifest", "; or name one with --out")
     manifest = manifests.read(options.manifest)
     target = options.out or (None if options.check else beside(options.manifest, "contact"))
     if target is not None:
         check_new(manifest, target)
     if options.picture is not None:
         check_folder(options.picture, "--picture", read=manifest.files)
-    contact.known_contact(manifest)  # a word that is no number is told before the work
     limits = dict(options.threshold)
+    contact.limits_of(manifest, limits, options.share)  # mistakes are told before the work
+    if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
+        refuse(options, ("threshold", "share"), "where every row has a label.contact, which is kept")
     scores = contact.contact_scores(manifest, workers=options.threads)
     marked, report = contact.mark_contact(manifest, scores, thresholds=limits, share=options.share, drop=options.drop)
     print("\n".join(report.lines()))

@@ -97,14 +97,17 @@ def _print_line(one: Embedded) -> None:
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
-    from anytouch_jax.data.images import decode
+    from anytouch_jax.data.images import BACKGROUND, decode, pictures_in
     from anytouch_jax.evaluate.features import Sight
 
-    if encoder.subtracts and options.background is None:
-        say("this encoder sees touches less the untouched gel: the first frame is taken for that (else --background)")
-    if options.background is not None and not encoder.subtracts:
+    gel = options.background
+    if gel is not None and not encoder.subtracts:
         say("--background is not used: this encoder sees touches as the camera gives them")
-    return Sight(encoder, None if options.background is None else decode(options.background))
+    if gel is None and encoder.subtracts:
+        gel = pictures_in(options.input)[1].get(BACKGROUND) if options.input.is_dir() else None
+        what = "the first frame" if gel is None else str(gel)
+        say(f"this encoder sees touches less the untouched gel: {what} is taken for that (else --background)")
+    return Sight(encoder, None if gel is None else decode(gel))
 
 
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
@@ -178,7 +181,10 @@ def _named_frames(options: Embed) -> Iterator[tuple[str, np.ndarray | None]]:
     if not options.input.is_dir():
         yield from (("", frame) for frame in frames_from_video(options.input))
         return
-    for file in pictures_in(options.input):
+    files, beside = pictures_in(options.input)
+    if beside:
+        say(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
+    for file in files:
         try:
             yield file.name, decode(file)
         except ImageError:

@@ -18,12 +18,14 @@ def run(options: Verify) -> int:
     """Print the report; 1 when there are errors that no repair took away."""
     from anytouch_jax.data import manifest as manifests
     from anytouch_jax.data import verify
+    from anytouch_jax.data.repair import check_swap
 
     if options.swap and options.repair is None:
         raise UserError("--swap exchanges files in the repaired copy: say where it goes with --repair OUT")
     if options.repair is not None and options.repair == options.commercial_only:
         raise UserError("--repair and --commercial-only name the same file; give each its own")
     manifest = manifests.read(options.manifests)
+    check_swap(manifest, options.swap)  # before the work
     for target in (options.repair, options.commercial_only):
         if target is not None:
             check_new(manifest, target)

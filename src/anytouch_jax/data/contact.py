@@ -53,24 +53,27 @@ class ContactScores:
 
 @dataclass(frozen=True)
 class ContactReport:
-    """Rows with contact, without, unknown; how many were dropped; rows by where their background is from."""
+    """Rows with contact, without, unknown; how many were dropped; how many kept the mark that the manifest gives; rows
+    by where their background is from."""
 
     rows: int
     contact: int
     free: int
     unknown: int
     dropped: int
+    kept: int
     backgrounds: dict[str, int]
     thresholds: dict[str, float]
 
     def lines(self) -> list[str]:
         """The report as lines of text."""
         limits = ", ".join(f"{sensor} {limit:g}" for sensor, limit in self.thresholds.items())
+        kept = f"; {self.kept:,} rows keep the label.contact that they had" if self.kept else ""
         return [
             f"{self.rows:,} rows: contact {self.contact:,}, no contact {self.free:,}, unknown {self.unknown:,}; "
             f"dropped {self.dropped:,}",
             "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.backgrounds.items()),
-            f"contact is a score above: {limits}",
+            f"contact is a score above: {limits}{kept}",
         ]
 
 
@@ -136,13 +139,10 @@ def mark_contact(
     sequence too; what is less is the making and the breaking of contact. `drop` leaves out the frames without contact,
     but never the split `background` nor a frame of which nothing is known.
     """
-    if not 0 <= share <= 1:
-        raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")
-    limits, score = _limits(manifest, thresholds), scores.score
+    limits, given, score = limits_of(manifest, thresholds, share), known_contact(manifest), scores.score
     contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * _highest(manifest, score)))
     background = np.asarray(manifest.table["split"].to_pylist(), object) == "background"
     contact[background] = 0  # what the split says
-    given = known_contact(manifest)
     contact = np.where(np.isnan(given), contact, given > 0)
     free = contact == 0
     table = _set(manifest.table, "label.contact_score", pa.array(score, pa.float32(), mask=np.isnan(score)), keep=True)
@@ -160,12 +160,14 @@ def mark_contact(
     used = {name: float({**THRESHOLDS, **(thresholds or {})}.get(name, DEFAULT_THRESHOLD)) for name in names}
     unknown = int(np.isnan(contact).sum())
     report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
-                           scores.counts, used)  # fmt: skip
+                           int(np.isfinite(given).sum()), scores.counts, used)  # fmt: skip
     return marked, report
 
 
-def _limits(manifest: Manifest, thresholds: Mapping[str, float] | None) -> np.ndarray:
-    """The threshold of every row, f64."""
+def limits_of(manifest: Manifest, thresholds: Mapping[str, float] | None, share: float) -> np.ndarray:
+    """The threshold of every row, f64. Raises UserError for what `mark_contact` cannot use, `share` included."""
+    if not 0 <= share <= 1:
+        raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")
     table = {**THRESHOLDS, **(thresholds or {})}
     wrong = [name for name in thresholds or {} if name not in manifest.table["sensor"].to_pylist()]
     if wrong:

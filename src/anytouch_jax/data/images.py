@@ -20,6 +20,7 @@ MOST_TIMES = (
     100  # a longer side than so many times the shorter one is a strip, which would fill the memory when resized
 )
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
+BACKGROUND, PHOTO = "background", "photo"  # pictures beside the frames of a recording that are none
 
 # Since OpenCV 4.11; orientation tags are ignored as for other files.
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
@@ -242,16 +243,27 @@ def frames_told(path: str | Path) -> int:
         video.release()
 
 
-def pictures_in(folder: str | Path) -> list[Path]:
-    """The picture files of a folder in natural order (2 before 10). Raises ImageError when there are none."""
+def pictures_in(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
+    """The frames of a folder in order (`frame_order`), arrays only where there is nothing else, and the pictures in it
+    that are no frames by name (BACKGROUND, PHOTO). Raises ImageError when there are no frames."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ImageError(f"there is no folder {folder}")
     files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
+    beside = {file.stem.lower(): file for file in files if file.stem.lower() in (BACKGROUND, PHOTO)}
+    files = [file for file in files if file.stem.lower() not in beside]
+    files = [file for file in files if file.suffix.lower() != ".npy"] or files
     if not files:
         raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)})")
-    return sorted(files, key=lambda file: _natural(file.name))
+    return sorted(files, key=lambda file: frame_order(file.name)), beside
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def frame_order(name: str) -> tuple[float, list[tuple[int, str]]]:
+    """A sort key of frames: time stamps with a point as the numbers that they are, all else with 2 before 10."""
+    stem = Path(name).stem
+    return (float(stem), []) if re.fullmatch(r"\d+\.\d+", stem) else (0.0, natural(name))
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """A sort key that puts 2 before 10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

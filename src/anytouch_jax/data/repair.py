@@ -72,16 +72,21 @@ def repair(manifest: Manifest, report: Report, *, swap: Collection[str] = ()) ->
     return Repaired(result, tuple(done), _left(report, result, exchanged))
 
 
-def _exchange(
-    manifest: Manifest, report: Report, swap: Collection[str], done: list[str]
-) -> tuple[Manifest, np.ndarray]:
-    """The manifest with touch and photograph exchanged where it is certain, and which rows those are."""
-    exchanged = np.zeros(len(manifest), bool)
+def check_swap(manifest: Manifest, swap: Collection[str]) -> None:
+    """Raise UserError for a dataset to swap that the manifest does not have."""
     names = set(manifest.column("dataset").unique().to_pylist())
     unknown = sorted(set(swap) - names)
     if unknown:
         there = ", ".join(sorted(str(name) for name in names if name))
         raise UserError(f"there is no dataset {unknown[0]!r} to swap; the manifest has {there or 'no dataset names'}")
+
+
+def _exchange(
+    manifest: Manifest, report: Report, swap: Collection[str], done: list[str]
+) -> tuple[Manifest, np.ndarray]:
+    """The manifest with touch and photograph exchanged where it is certain, and which rows those are."""
+    exchanged = np.zeros(len(manifest), bool)
+    check_swap(manifest, swap)
     for verdict in verdicts(manifest, report.scan):
         if verdict.whole and verdict.witnessed and verdict.dataset not in swap:
             exchanged[verdict.rows] = True

@@ -53,7 +53,8 @@ class Reader:
         """
         size, data = self.config.model.image_size, self.config.data
         plain = epoch is None or not (data.flip or any(data.jitter))
-        how = None if plain else self._resized
+        # Nothing but the size: frames are resized once, unless the gel is to be taken off frames as they are.
+        how = None if epoch is None or (plain and data.background == "subtract") else self._resized
         frames = [read_picture(self.manifest, row, how=how) for row in rows]
         gel = self._background(int(rows[-1]), how or _gel) if data.background == "subtract" else None
         if epoch is None or plain:

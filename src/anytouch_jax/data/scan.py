@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from anytouch_jax.config import UserError
+from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.files import Files, distinct_files
 from anytouch_jax.data.images import ImageError, decode_bytes
@@ -73,7 +73,8 @@ def scan(
             path = manifest.file(row, column)
         except UserError as error:
             return _Look("outside", reason=str(error))
-        return (_look if decode or split_packed(path) else _glance)(path, decode and column != "field_path")
+        field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
+        return (_look if decode or split_packed(path) else _glance)(path, decode and not field)
 
     with closing(bounded_map(look, range(count), threads, 8 * max(threads, 1))) as looks:
         for file, one in enumerate(looks):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 from anytouch_jax.config import FIELD_SENSORS, Config, Data, UserError, preset
 from anytouch_jax.data.edit import select
 from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.packed import read_file
 from anytouch_jax.data.samples import Reader
 
 FIELD = (20, 20, 6)  # points of a Tac3D; displacement x, y, z mm, force x, y, z N
@@ -142,7 +144,7 @@ def read_fields(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
             raise UserError(f"{manifest.where(row)} has no field_path; regression needs its field (.npy)")
         file = manifest.file(row, "field_path")
         try:
-            field = np.load(file, allow_pickle=False)
+            field = np.load(io.BytesIO(read_file(file)), allow_pickle=False)
         except (OSError, ValueError) as error:
             raise UserError(f"{manifest.where(row)}, column 'field_path': {file} cannot be read: {error}") from None
         if field.shape != FIELD or not np.isfinite(field).all():

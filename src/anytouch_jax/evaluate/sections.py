@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..config import FIELD_SENSORS, from_json
 from ..data.evaluation import evaluation
 from ..data.images import decode
 from ..data.manifest import Manifest
+from ..data.packed import read_file
 from ..io import checkpoint
 from ..nn.attention import usable
 from ..nn.functional import build
@@ -98,7 +100,7 @@ def _picture(manifest: Manifest, row: int | None) -> Array | None:
     if manifest.value(row, "sensor") not in FIELD_SENSORS:
         return _shrunk(decode(manifest.file(row)))
     column = "field_path" if manifest.value(row, "field_path") is not None else "path"
-    field = np.load(manifest.file(row, column), allow_pickle=False)
+    field = np.load(io.BytesIO(read_file(manifest.file(row, column))), allow_pickle=False)
     return np.linalg.norm(field[..., :3], axis=-1) if field.ndim == 3 else field
 
 

@@ -66,18 +66,20 @@ def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, 
     _claim(scenes, out)
     target = out / MANIFEST
     if target.exists():
+        shutil.rmtree(out / PARTS, ignore_errors=True)  # left by a kill in the last moment
         return target
     (out / PARTS).mkdir(parents=True, exist_ok=True)
     end = scenes.first + scenes.touches
     groups = [range(start, min(start + GROUP, end)) for start in range(scenes.first, end, GROUP)]
     files = [out / PARTS / f"{i:05d}.parquet" for i in range(len(groups))]
-    done = sum(len(group) for group, file in zip(groups, files, strict=True) if file.exists())
+    whole = {file for file in files if _is_whole(file)}
+    done = sum(len(group) for group, file in zip(groups, files, strict=True) if file in whole)
     progress(done, scenes.touches)
     recorder = Recorder(scenes, things, GROUP)
     # Two sensors at once: a program's small operations leave a core idle, and compiling takes one.
     with ThreadPoolExecutor(threads) as pool, ThreadPoolExecutor(min(2, threads)) as solving:
         for group, file in zip(groups, files, strict=True):
-            if file.exists():
+            if file in whole:
                 continue
             touches = [scene.draw_touch(scenes, number, splits) for number in group]
             rows = _write_group(scenes, things, touches, partial(solving.map, recorder.record), out, pool)
@@ -195,8 +197,19 @@ def _write_table(rows: list[Row], file: Path) -> None:
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: [row.get(name) for row in rows] for name in names})
     temporary = file.with_suffix(".tmp")
-    pq.write_table(table, temporary)
+    with temporary.open("wb") as out:
+        pq.write_table(table, out)
+        out.flush()
+        os.fsync(out.fileno())
     os.replace(temporary, file)
+
+
+def _is_whole(part: Path) -> bool:
+    """Whether a part is there and can be read: a power cut may leave a name without its bytes."""
+    try:
+        return part.exists() and pq.read_metadata(part).num_rows > 0
+    except (pa.ArrowException, OSError):
+        return False
 
 
 def _write_manifest(parts: list[Path], target: Path) -> None:

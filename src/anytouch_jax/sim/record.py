@@ -198,6 +198,9 @@ def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
     return c * x - s * y, s * x + c * y
 
 
+AT_ONCE = 24_000_000  # pixels that are computed at a time; some dozen float32 planes of them are in memory
+
+
 class Recorder:
     """Computes recordings of a data set in batches of one size, so that each sensor is compiled once.
 
@@ -206,6 +209,8 @@ class Recorder:
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
         self._scenes, self._objects, self._batch = scenes, objects, batch
+        pixels = 2 * scenes.frames * scenes.size**2  # of a recording; a picture is at most twice as long as wide
+        self._at_once = max(1, min(batch, AT_ONCE // pixels))
         self._relief = lru_cache(64)(lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING))
         self._programs: dict[str, Any] = {}
 
@@ -214,8 +219,13 @@ class Recorder:
         count = len(recordings)
         if not 0 < count <= self._batch or len({r.sensor for r in recordings}) > 1:
             raise ValueError(f"record takes 1 to {self._batch} recordings of one sensor")
-        clips = [self._clip(recording) for recording in recordings]
-        clips += clips[-1:] * (self._batch - count)  # one shape, one compilation
+        return [take for first in range(0, count, self._at_once) for take in self._take(recordings, first)]
+
+    def _take(self, recordings: Sequence[Recording], first: int) -> list[Take]:
+        """The takes of as many recordings as memory allows, from the one of number `first` on."""
+        clips = [self._clip(recording) for recording in recordings[first : first + self._at_once]]
+        count = len(clips)
+        clips += clips[-1:] * (self._at_once - count)  # one shape, one compilation
         units = stack([clip.unit for clip in clips])
         batch = Clip(*(np.stack(values) for values in zip(*(c._replace(unit=0) for c in clips), strict=True)))
         takes = jax.device_get(self._program(recordings[0].sensor)(batch._replace(unit=units)))

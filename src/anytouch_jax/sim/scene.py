@@ -17,7 +17,7 @@ from anytouch_jax.config import UserError
 
 from .objects import Object, catalogue, hold_out
 from .sensors import SENSORS
-from .units import Unit, draw_unit
+from .units import THINNEST, Unit, draw_unit
 
 Array = np.ndarray
 Grade = Literal["fine", "coarse"]
@@ -79,9 +79,9 @@ class Scenes:
                 f"depth is a range of mm from 0 on, lowest first, not {self.depth[0]:g} to {self.depth[1]:g}"
             )
         thin = min(self.sensors, key=lambda name: SENSORS[name].gel.thickness)
-        if self.depth[1] >= SENSORS[thin].gel.thickness:
-            thick = f"{SENSORS[thin].gel.thickness:g} mm thick"
-            raise UserError(f"depth {self.depth[1]:g} mm goes through the gel of {thin}, which is {thick}")
+        thinnest = SENSORS[thin].gel.thickness * (THINNEST if self.units == "each" else 1.0)
+        if self.depth[1] >= thinnest:
+            raise UserError(f"depth {self.depth[1]:g} mm may go through the gel of {thin}: stay below {thinnest:g} mm")
         if not 0 <= self.held_out < 1:
             raise UserError(f"held_out is a share from 0 to below 1, not {self.held_out:g}")
         for name in ("vision", "text"):

@@ -58,6 +58,9 @@ def identity_unit(sensor: Sensor) -> Unit:
     )  # fmt: skip
 
 
+THINNEST = 0.7  # of the nominal gel: more than four standard deviations below, see `draw_unit`
+
+
 def draw_unit(sensor: Sensor, rng: np.random.Generator) -> Unit:
     """A unit of `sensor` drawn from `rng`; the same generator state gives the same unit.
 

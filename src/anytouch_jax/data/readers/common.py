@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from anytouch_jax.config import UserError
+from anytouch_jax.data.images import natural
 
 Columns = dict[str, list[Any]]
 Frames = list[tuple[int, str]]  # (frame number, file name), by number
@@ -117,11 +118,6 @@ class Rows:
             if name in ("path", "sensor", "sequence", "frame_index", "split")
             or any(value is not None for value in column)
         }
-
-
-def natural(name: str) -> list[tuple[int, str]]:
-    """A sort key that puts 2 before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def listing(folder: Path, notes: Notes) -> tuple[list[str], list[str]]:

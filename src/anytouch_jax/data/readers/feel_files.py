@@ -13,7 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from anytouch_jax.data.readers.common import DatasetError, natural
+from anytouch_jax.data.images import natural
+from anytouch_jax.data.readers.common import DatasetError
 
 PARTS = ("train", "val", "test")
 PICTURES = {

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
-from anytouch_jax.data.images import SUFFIXES
+from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_order
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
@@ -28,11 +28,10 @@ from anytouch_jax.data.readers.common import (
     Rows,
     add_recording,
     hash_split,
-    natural,
     walk,
 )
 
-BACKGROUND, PHOTO, CAPTION = "background", "photo", "caption.txt"
+CAPTION = "caption.txt"
 MANIFESTS = (".csv", ".parquet")  # such as an earlier index
 
 
@@ -84,7 +83,7 @@ def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
 def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]]:
     """The pictures of a folder in order with their numbers; arrays count where there is nothing else."""
     names = []
-    for name in sorted(files, key=_order):
+    for name in sorted(files, key=frame_order):
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
@@ -101,12 +100,6 @@ def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]
     if len(numbers) == len(names) and min(steps, default=0) == 1:
         return list(zip(numbers, names, strict=True))
     return list(enumerate(names))
-
-
-def _order(name: str) -> tuple[float, list[tuple[int, str]]]:
-    """Time stamps with a point as the numbers that they are, all else with 2 before 10."""
-    stem = Path(name).stem
-    return (float(stem), []) if re.fullmatch(r"\d+\.\d+", stem) else (0.0, natural(name))
 
 
 READER = Reader(

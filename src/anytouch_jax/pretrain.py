@@ -226,12 +226,9 @@ def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say
         raise UserError(_NO_CLIP)
     first = None if init is None else _load(Path(init), config, say)
     weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
-    if first is None and weights is not None:
-        params = release.clip_to_touch(weights, config.model, params)
     if config.stage == 2 and init is None:
         say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
-    towers = None if weights is None or config.stage == 1 else release.to_params(weights, config.model)
-    return release.merge_stage2(params, stage1=first, clip=towers)
+    return release.first_params(params, config.model, stage1=first, clip=weights)
 
 
 def _read_clip(file: Path, config: Config) -> dict[str, np.ndarray]:

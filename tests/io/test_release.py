@@ -14,8 +14,8 @@ from anytouch_jax.io.release import (
     clip_to_touch,
     detect_layout,
     detect_model,
+    first_params,
     match_sensors,
-    merge_stage2,
     model_of,
     read_weights,
     release_names,
@@ -306,20 +306,24 @@ def test_clip_starts_the_touch_encoder(layout, own):
 
 def test_stage2_takes_each_part_from_its_source():
     fresh, stage1 = params_of(STAGE2, seed=1), to_params(weights_of(STAGE1), STAGE1)
-    clip = to_params(weights_of(STAGE2, "clip"), STAGE2)
-    params = merge_stage2(fresh, stage1=stage1, clip=clip)
+    weights = weights_of(STAGE2, "clip")
+    clip = to_params(weights, STAGE2)
+    params = first_params(fresh, STAGE2, stage1=stage1, clip=weights)
     sources = {"touch": stage1, "decoder": stage1, "image": clip, "text": clip, "logit_scale": clip}
     for part in fresh:
         same({part: params[part]}, {part: sources.get(part, fresh)[part]})
-    without = merge_stage2(fresh, clip={name: part for name, part in clip.items() if name != "image"})
-    for part in ("decoder", "touch", "image"):
-        same({part: without[part]}, {part: fresh[part]})
-    same({"text": without["text"]}, {"text": clip["text"]})
-    only_stage1 = merge_stage2(fresh, stage1=stage1)
+    only_clip = first_params(fresh, STAGE2, clip=weights)
+    same({"decoder": only_clip["decoder"]}, {"decoder": fresh["decoder"]})
+    same({"blocks": only_clip["touch"]["blocks"]}, {"blocks": clip["image"]["blocks"]})
+    no_image = dataclasses.replace(STAGE2, image=None, lora_rank=0)
+    without = first_params(params_of(no_image, seed=1), no_image, clip=weights)
+    same({"blocks": without["touch"]["blocks"], "text": without["text"]},
+         {"blocks": clip["image"]["blocks"], "text": clip["text"]})  # fmt: skip
+    only_stage1 = first_params(fresh, STAGE2, stage1=stage1)
     same({"image": only_stage1["image"]}, {"image": fresh["image"]})
     other = to_params(weights_of(dataclasses.replace(STAGE1, embed=13)), dataclasses.replace(STAGE1, embed=13))
     with pytest.raises(UserError, match=r"touch/projection/kernel has \(16, 13\) instead of \(16, 12\)"):
-        merge_stage2(fresh, stage1=other)
+        first_params(fresh, STAGE2, stage1=other)
 
 
 def test_positions_of_another_image_size_are_resized():

@@ -109,11 +109,9 @@ def _expected(key: str, source: str, files: Mapping[str, Arrays]) -> np.ndarray:
 
 def _stage_map(case: Case, name: str, sources: Mapping[str, str], model: Model, files: Mapping[str, Arrays]) -> None:
     fresh = nest(_values(param_shapes(model), 4))
-    if name.startswith("stage1"):
-        merged = release.clip_to_touch(files["clip"], model, fresh)
-    else:
-        stage1 = release.to_params(files["mae"], _two_layers()[0]) if "stage1" in name else None
-        merged = release.merge_stage2(fresh, stage1=stage1, clip=release.to_params(files["clip"], model))
+    before = "stage1" in name and not name.startswith("stage1")
+    stage1 = release.to_params(files["mae"], _two_layers()[0]) if before else None
+    merged = release.first_params(fresh, model, stage1=stage1, clip=files["clip"])
     ours, before = release.to_release(merged, model), release.to_release(fresh, model)
     used = release.release_names(model)
     for key in used:

@@ -47,9 +47,9 @@ __all__ = [
     "clip_to_touch",
     "detect_layout",
     "detect_model",
+    "first_params",
     "inflate",
     "match_sensors",
-    "merge_stage2",
     "model_of",
     "read_metadata",
     "read_weights",
@@ -177,15 +177,17 @@ def clip_to_touch(weights: Weights, model: Model, params: Params) -> Params:
     return inflate(params, to_params(weights, tower)["image"])
 
 
-def merge_stage2(params: Params, *, stage1: Params | None = None, clip: Params | None = None) -> Params:
-    """`params` of stage 2 with touch and decoder from `stage1`, the towers and the temperature from `clip`.
+def first_params(params: Params, model: Model, *, stage1: Params | None = None, clip: Weights | None = None) -> Params:
+    """Fresh `params` of a stage: touch and decoder from `stage1`, the towers and the temperature from CLIP's weights.
 
-    LoRA and the matching head stay fresh. Entries of `stage1` or `clip` for parts that `params` lacks are errors.
-    Raises WeightsError.
+    Without `stage1` the touch encoder starts from CLIP's vision tower, as in `clip_to_touch`. LoRA and the matching
+    head stay fresh. Entries for parts that `params` lacks are errors. Raises WeightsError.
     """
     merged = dict(params)
     if clip is not None:
-        merged = _grafted(merged, {part: clip[part] for part in ("image", "text", "logit_scale") if part in clip})
+        merged = merged if stage1 is not None else clip_to_touch(clip, model, merged)
+        towers = to_params(clip, model) if model.image or model.text else {}
+        merged = _grafted(merged, {part: towers[part] for part in ("image", "text", "logit_scale") if part in towers})
     if stage1 is not None:
         merged = _grafted(merged, {part: stage1[part] for part in ("touch", "decoder")})
     return merged

@@ -22,14 +22,15 @@
 #
 # `.venv/bin/python experiments/teaching.py` does all of it, run by run, in an hour or more a seed: what is finished is
 # not done again. `TOUCHES=500 STEPS2=1000` is less than half the work, and less is learned;
-# `TOUCHES=260 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs and
-# results go.
+# `TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs
+# and results go: the page `teaching.md` and the folder `teaching/`, a JSON file for each grade and seed, from which
+# `TABLE=1` makes the page anew.
 
 # %%
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +39,14 @@ from study import asked
 
 from anytouch_jax.cli import main
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.evaluate import baseline, probe, results, retrieval
+from anytouch_jax.evaluate import baseline, machine, probe, results, retrieval
 from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
-from anytouch_jax.evaluate.features import embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.record import write_atomic
 
-WORK, OUT = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results")
+WORK, OUT, TABLE = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results"), asked.switch("TABLE")
 TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4000)
 MORE = asked.number("MORE", 2 * TOUCHES, least=0)
 OBJECTS = asked.number("OBJECTS", min(TOUCHES // 2, 500))
@@ -53,7 +54,7 @@ SEEDS = asked.numbers("SEEDS", "0,1,2")
 GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
 SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
 STACK, DEPTH = {"width": 128, "heads": 4, "mlp": 512}, {"touch": 4, "image": 2, "text.stack": 2}
-TABLE = ["gelsight_mini", "digit", "duragel", "universal"]
+KNOWN = ["gelsight_mini", "digit", "duragel", "universal"]  # the sensor table of the encoders
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)
 
 
@@ -125,7 +126,7 @@ def prepare(seed: int) -> tuple[Path, Path]:
     """The runs of both stages for a seed."""
     one, two = (WORK / f"{'-'.join(GRADES)}-{seed}-stage{stage}" for stage in (1, 2))
     manifests_of = [manifest for grade in GRADES for manifest in scenes(grade)]
-    data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *TABLE, *LESS]
+    data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *KNOWN, *LESS]
     anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
     finished(one, STEPS1)
     anytouch("train", "--stage", 2, "--run", two, "--init", one, *TRAIN2, *data)
@@ -139,127 +140,169 @@ def finished(run: Path, steps: int) -> None:
         raise SystemExit(f"{run} was stopped before its {steps} steps; the same command goes on")
 
 
-def features(runs: tuple[Path, Path], seed: int, table: Any, rows: np.ndarray, pooling: Any) -> dict[str, np.ndarray]:
-    one, two = (load_encoder(run) for run in runs)
+def features(encoders: dict[str, Encoder], seed: int, table: Any, rows: np.ndarray, pooling: Any) -> dict[str, Any]:
+    one = encoders["stage 1"]
     plain = replace(one.config, data=replace(one.config.data, background="keep"))
-    encoders = {"stage 2": two, "stage 1": one, "untrained": random_encoder(one.config, seed)}
-    encoders["untrained, whole picture"] = random_encoder(plain, seed)
-    return {name: embed_rows(e, table, rows, pooling=pooling, say=lambda _: None)[1] for name, e in encoders.items()}
+    fresh = {"untrained": random_encoder(one.config, seed), "untrained, whole picture": random_encoder(plain, seed)}
+    every = (encoders | fresh).items()
+    return {name: embed_rows(e, table, rows, pooling=pooling, say=lambda _: None)[1] for name, e in every}
 
 
 # %% [markdown]
-# ## Retrieval on objects never seen
+# ## Retrieval and probes on objects never seen
+#
+# Of every set of features what is kept is how many queries, or touches, of each object it got right: the share, and its
+# interval over objects, need no more.
 
 
 # %%
-def retrieve(grade: str, seed: int, runs: tuple[Path, Path]) -> list[retrieval.Retrieval]:
+def by_object(groups: np.ndarray, right: dict[str, np.ndarray]) -> dict[str, Any]:
+    """How many rows each object has, and the sum over them of every array of `right`."""
+    names, ids = np.unique(groups, return_inverse=True)
+    sums = {name: np.round(np.bincount(ids, np.asarray(one, float)), 6).tolist() for name, one in right.items()}
+    return {"objects": dict(zip(names.tolist(), np.bincount(ids).tolist(), strict=True)), "right": sums}
+
+
+def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any]:
     table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
     rows = deepest_rows(table, table.rows_of("test"))
-    found = features(runs, seed, table, rows, "class")
+    found = features(encoders, seed, table, rows, "class")
     found |= {"pixels": background_difference(table, rows), "vector": contact_vector(table, rows)}
     scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(True,), metrics={"vector": "euclidean"})
-    return [one for one in scored if one.query_sensor == retrieval.ALL]
+    pooled = {one.name: one.found for one in scored if one.query_sensor == retrieval.ALL and one.found}
+    groups = pooled["stage 2"].groups
+    parts = {part: {name: getattr(one, part) for name, one in pooled.items()} for part in ("top1", "top5")}
+    return {"data": table.content_hash} | {part: by_object(groups, right) for part, right in parts.items()}
 
 
-def probes(grade: str, seed: int, runs: tuple[Path, Path]) -> dict[str, dict[str, results.ProbeResult]]:
+def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any]:
     """Linear probes on the sensor left out, universal tokens, objects never seen in the test split."""
     table = manifests.read(WORK / f"{LEFT_OUT}-{grade}" / "manifest.parquet")
     rows = np.concatenate([deepest_rows(table, table.rows_of(split)) for split in ("train", "val", "test")])
     split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
-    found = features(runs, seed, table, rows, "both")
+    found = features(encoders, seed, table, rows, "both")
     found["pixels"] = baseline.reduce(background_difference(table, rows), split == "train")
-    probed: dict[str, dict[str, results.ProbeResult]] = {}
+    probed: dict[str, Any] = {"data": table.content_hash}
     for label in (*NAMED, *UNNAMED):
-        values = [table.value(int(row), f"label.{label}") for row in rows]
+        values, right, tested = [table.value(int(row), f"label.{label}") for row in rows], {}, groups[:0]
         for name, x in found.items():
             scaling = "common" if name == "pixels" else "column"
-            one = probe.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
-            probed.setdefault(label, {})[name] = one
+            outcome = probe.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling).outcome
+            assert outcome is not None
+            right[name], tested = outcome.correct, outcome.groups
+        probed[label] = by_object(tested, right)
     return probed
 
 
-def averaged(several: list[results.ProbeResult]) -> results.ProbeResult:
-    """Probes of the same touches (other seeds, other labels) as one: the share of them that was right, by touch."""
-    tables = [one.outcome for one in several if one.outcome is not None]
-    outcome = replace(tables[0], correct=np.mean([table.correct for table in tables], axis=0))
-    return replace(several[0], accuracy=float(outcome.correct.mean()), outcome=outcome)
+# %% [markdown]
+# ## Grade by grade, seed by seed
+
+# %%
+SETTINGS = {"touches": TOUCHES, "more": MORE, "objects": OBJECTS, "steps": [STEPS1, STEPS2], "grades": GRADES}
+SETTINGS |= {"simulator": VERSION}
+
+
+def scored(grade: str, seed: int) -> dict[str, Any]:
+    """What the file of a grade and a seed says; it is made first where it is not there, or is of other encoders."""
+    file = OUT / "teaching" / f"{grade}-{seed}.json"
+    if TABLE:
+        if not file.exists():
+            raise SystemExit(f"there is no {file}: run this page without TABLE=1")
+        return json.loads(file.read_text())
+    encoders = {f"stage {stage}": load_encoder(run) for stage, run in zip((1, 2), prepare(seed), strict=True)}
+    about: dict[str, Any] = {"settings": SETTINGS, "encoders": {name: one.mark for name, one in encoders.items()}}
+    if file.exists() and (found := json.loads(file.read_text())) | about == found:
+        return found
+    found = about | {"machine": machine.describe().sentence(), "config": asdict(encoders["stage 2"].config)}
+    found |= {"retrieval": retrieve(encoders, grade, seed), "probes": probes(encoders, grade, seed)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(file, json.dumps(found) + "\n")
+    return found
+
+
+# %% [markdown]
+# ## Tables
 
 
 # %%
-def points(change: tuple[float, float | None, float | None]) -> str:
-    mean, low, high = change
-    return f"{100 * mean:+.1f}" + ("" if low is None or high is None else f" ({100 * low:+.1f} to {100 * high:+.1f})")
-
-
-def percent(values: list[float]) -> str:
-    return f"{100 * np.mean(values):.1f} %" + (f" +- {100 * np.std(values, ddof=1):.1f}" if len(values) > 1 else "")
-
-
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
 RIVALS = ("untrained", "pixels")  # of the probes
-SIZE = f"TOUCHES={TOUCHES} MORE={MORE} OBJECTS={OBJECTS} STEPS1={STEPS1} STEPS2={STEPS2} "
-SIZE += f"SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
-NETWORK = f"preset tiny with a touch tower of {STACK['width']} x {DEPTH['touch']} at 84 pixels"
+Right = dict[str, list[np.ndarray]]  # by name: for every seed, how many each object has right
 
 
-def retrieval_table(scored: dict[str, list[retrieval.Retrieval]], pooled: dict[str, retrieval.Retrieval]) -> str:
+def gathered(several: list[dict[str, Any]]) -> tuple[np.ndarray, Right]:
+    """Rows of each object, and what each set of features got right of them, seed by seed. Raises SystemExit when the
+    seeds were not scored on the same rows."""
+    counts = [one["objects"] for one in several]
+    if any(count != counts[0] for count in counts):
+        raise SystemExit("the files of teaching/ are of different data: make them anew, without TABLE=1")
+    right = {name: [np.array(one["right"][name]) for one in several] for name in several[0]["right"]}
+    return np.array(list(counts[0].values())), right
+
+
+def ahead(counts: np.ndarray, first: np.ndarray, second: np.ndarray, *, interval: bool = True) -> str:
+    """How many points `first` is above `second`, with the 95 % interval over objects."""
+    change = np.repeat((first - second) / counts, counts)
+    low, high = results.mean_interval(change, np.repeat(np.arange(len(counts)), counts)) if interval else (None, None)
+    return f"{100 * change.mean():+.1f}" + (
+        "" if low is None or high is None else f" ({100 * low:+.1f} to {100 * high:+.1f})"
+    )
+
+
+def retrieval_table(found: list[dict[str, Any]]) -> str:
     """Shares of the seeds together, and how far stage 2 is ahead: together, and seed by seed."""
-    rows = []
-    for name, one in pooled.items():
-        change = "-" if name == "stage 2" else points(retrieval.difference(pooled["stage 2"], one))
-        pairs = zip(scored["stage 2"], scored[name], strict=True)
-        each = "-" if name == "stage 2" else "; ".join(points(retrieval.difference(a, b)) for a, b in pairs)
-        rows.append((name, f"{100 * one.top1:.1f} %", f"{100 * one.top5:.1f} %", change, each))
+    (counts, first), (_, five) = (gathered([one["retrieval"][part] for one in found]) for part in ("top1", "top5"))
+    rows, best = [], first["stage 2"]
+    for name in NAMES:
+        shares = [f"{100 * np.mean(part[name], 0).sum() / counts.sum():.1f} %" for part in (first, five)]
+        change = each = "-"
+        if name != "stage 2":
+            change = ahead(counts, np.mean(best, 0), np.mean(first[name], 0))
+            each = "; ".join(ahead(counts, a, b) for a, b in zip(best, first[name], strict=True))
+        rows.append((name, *shares, change, each))
     return markdown(
         ("features", "top-1 of 50", "top-5", "stage 2 ahead by (points, 95 % over objects)", "seed by seed"), rows
     )
 
 
-def by_seed(several: list[results.ProbeResult], rivals: list[results.ProbeResult]) -> str:
-    """How far ahead in each seed: the interval over objects is of these encoders, not of others trained alike."""
-    return ", ".join(points((a.accuracy - b.accuracy, None, None)) for a, b in zip(several, rivals, strict=True))
+def percent(counts: np.ndarray, several: list[np.ndarray]) -> str:
+    shares = [100 * one.sum() / counts.sum() for one in several]
+    return f"{np.mean(shares):.1f} %" + (f" +- {np.std(shares, ddof=1):.1f}" if len(shares) > 1 else "")
 
 
-def probe_table(probed: list[dict[str, dict[str, results.ProbeResult]]]) -> str:
-    """Accuracies by label, and of all that captions name together; and how far stage 2 is ahead."""
+def probe_table(found: list[dict[str, Any]]) -> str:
+    """Accuracies by label, and of all that captions name together; and how far stage 2 is ahead, by seed too: the
+    interval over objects is of these encoders, not of others trained alike."""
     rows = []
-    for title, labels in [
-        *((one, (one,)) for one in NAMED),
-        ("these three", NAMED),
-        *((one, (one,)) for one in UNNAMED),
-    ]:
-        seeds = {name: [averaged([found[label][name] for label in labels]) for found in probed] for name in NAMES[:5]}
-        mean = {name: averaged(several) for name, several in seeds.items()}
-        changes = [
-            points(results.difference(mean["stage 2"], mean[name])) + "; " + by_seed(seeds["stage 2"], seeds[name])
-            for name in RIVALS
-        ]
-        rows.append((title, *(percent([one.accuracy for one in several]) for several in seeds.values()), *changes))
+    for title, labels in [*((x, (x,)) for x in NAMED), ("these three", NAMED), *((x, (x,)) for x in UNNAMED)]:
+        each = [gathered([one["probes"][label] for one in found]) for label in labels]
+        counts = each[0][0]
+        right = {name: [np.mean(s, 0) for s in zip(*(r[name] for _, r in each), strict=True)] for name in NAMES[:5]}
+        changes = []
+        for name in RIVALS:
+            apart = zip(right["stage 2"], right[name], strict=True)
+            seeds = ", ".join(ahead(counts, a, b, interval=False) for a, b in apart)
+            changes.append(ahead(counts, np.mean(right["stage 2"], 0), np.mean(right[name], 0)) + "; " + seeds)
+        rows.append((title, *(percent(counts, right[name]) for name in NAMES[:5]), *changes))
     head = ("label", *NAMES[:5], *(f"stage 2 ahead of {name} (points, 95 % over objects; by seed)" for name in RIVALS))
     return markdown(head, rows)
 
 
 # %%
-lines = ["# Simulated scenes as teachers", "", f"Made by `{SIZE} python experiments/teaching.py`, {NETWORK}.", ""]
-record: dict[str, Any] = {"touches": TOUCHES, "more": MORE, "objects": OBJECTS, "steps": [STEPS1, STEPS2]}
-record |= {"seeds": SEEDS, "simulator": VERSION}
-runs_of = {seed: prepare(seed) for seed in SEEDS}
-for grade in GRADES:
-    scored: dict[str, list[retrieval.Retrieval]] = {name: [] for name in NAMES}
-    for seed in SEEDS:
-        for one in retrieve(grade, seed, runs_of[seed]):
-            scored[one.name].append(one)
-    pooled = {name: retrieval.averaged(several, name) for name, several in scored.items()}
-    probed = [probes(grade, seed, runs_of[seed]) for seed in SEEDS]
-    accuracies = [{k: {n: one.accuracy for n, one in v.items()} for k, v in found.items()} for found in probed]
-    record[grade] = {"retrieval": retrieval.to_records(list(pooled.values())), "probes": accuracies}
+files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
+told = files[GRADES[0]][0]
+size = " ".join(f"{name.upper()}={told['settings'][name]}" for name in ("touches", "more", "objects"))
+size += " STEPS1={} STEPS2={}".format(*told["settings"]["steps"])
+size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
+tower = told["config"]["model"]["touch"]
+network = f"preset tiny with a touch tower of {tower['width']} x {tower['depth']}"
+network += f" at {told['config']['model']['image_size']} pixels"
+lines = ["# Simulated scenes as teachers", "", f"Made by `{size} python experiments/teaching.py`, {network}.", ""]
+for grade, found in files.items():
     lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
-    lines += [retrieval_table(scored, pooled), ""]
+    lines += [retrieval_table(found), ""]
     lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
-    lines += [probe_table(probed), ""]
-
-# %%
+    lines += [probe_table(found), ""]
 OUT.mkdir(parents=True, exist_ok=True)
-write_atomic(OUT / "teaching.json", json.dumps(record, indent=2) + "\n")
 write_atomic(OUT / "teaching.md", "\n".join(lines))
 print("\n".join(lines))

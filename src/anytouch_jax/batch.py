@@ -50,9 +50,9 @@ class MatchBatch(NamedTuple):
     sensor: Array
     positive: Array
     positive_sensor: Array
-    negative: Array | None = None
-    negative_sensor: Array | None = None
-    place: Array | None = None
+    negative: Array = None
+    negative_sensor: Array = None
+    place: Array = None
 
 
 class Stage2Batch(NamedTuple):

@@ -96,7 +96,7 @@ def _possible(config: Config) -> None:
         raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
     if model.attention == "cudnn" and model.dtype != "bfloat16":
         raise UserError("--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out")
-    if model.dtype == "float64" and not jax.config.jax_enable_x64:
+    if model.dtype == "float64" and not jax.config.read("jax_enable_x64"):
         raise UserError("--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32")
     if config.stage == 2 and objective.force:
         raise UserError("--objective.force is a loss of stage 1; leave it out in stage 2")

@@ -255,8 +255,9 @@ class Loader:
         assert pairs is not None
         self._shard.check(rows, "the rows of a matching batch")
         parts = [self._empty(rows, pairs.windows.shape[1]) for _ in range(2 if self._alone else 3)]
-        place = np.zeros(len(parts[0][1]), np.int32) if self._alone else None
-        batch = MatchBatch(*(array for part in parts for array in part), place=place)
+        batch = MatchBatch(*(array for part in parts for array in part))
+        if self._alone:
+            batch = batch._replace(place=np.zeros(len(batch.sensor), np.int32))
         jobs: list[Any] = []
         sensor = self._gallery_sensor(step, pairs)
         for slot, (index, epoch) in enumerate(pairs.anchors.take(rank * rows, rows)):

@@ -109,8 +109,8 @@ def _expected(key: str, source: str, files: Mapping[str, Arrays]) -> np.ndarray:
 
 def _stage_map(case: Case, name: str, sources: Mapping[str, str], model: Model, files: Mapping[str, Arrays]) -> None:
     fresh = nest(_values(param_shapes(model), 4))
-    before = "stage1" in name and not name.startswith("stage1")
-    stage1 = release.to_params(files["mae"], _two_layers()[0]) if before else None
+    begun = "stage1" in name and not name.startswith("stage1")
+    stage1 = release.to_params(files["mae"], _two_layers()[0]) if begun else None
     merged = release.first_params(fresh, model, stage1=stage1, clip=files["clip"])
     ours, before = release.to_release(merged, model), release.to_release(fresh, model)
     used = release.release_names(model)

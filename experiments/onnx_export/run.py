@@ -9,6 +9,7 @@ older Orbax), converts it and runs the result on the same touches. Nothing is wr
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from anytouch_jax.config import to_json
+from anytouch_jax.evaluate.export import call_of, describes
 from anytouch_jax.evaluate.features import check_frames, load_encoder
 from anytouch_jax.io.checkpoint import export_safetensors
 
@@ -53,7 +55,12 @@ def main() -> int:
         if done.returncode:
             print("the conversion failed: nothing is written", file=sys.stderr)
             return 1
+        about = call_of(encoder, frames=options.frames, width=cases[f"features{BATCHES[0]}"].shape[1])
+        about["input"] = about["input"].replace("frames:", "touches:", 1)
+        (folder / "about.json").write_text(json.dumps(about, indent=2) + "\n")
+        os.replace(folder / "about.json", describes(options.out))
         os.replace(folder / "model.onnx", options.out)
+    print(f"{describes(options.out)}: how to call it")
     print(f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
 

@@ -106,6 +106,9 @@ class Model:
         if name in FIELD_SENSORS:
             raise ConfigError(f"sensor {name!r} measures a force field and has no images; leave it out of training")
         if name not in self.sensors:
-            known = ", ".join(self.sensors)
-            raise ConfigError(f"unknown sensor {name!r}; known: {known}. Add it at the end of --model.sensors")
+            known, table = ", ".join(self.sensors), " ".join(self.sensors)
+            raise ConfigError(
+                f"unknown sensor {name!r}; known: {known}. A new one is named with the others: "
+                f"--model.sensors {name} {table}"
+            )
         return self.sensors.index(name)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from anytouch_jax.config import SENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
 CONVERTER = """\
@@ -48,5 +51,9 @@ def test_what_differs_from_the_live_model_is_not_written(tmp_path, tiny_run, fac
     env = os.environ | {"PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == (0 if same else 1), done.stderr
-    assert [file.name for file in out.parent.iterdir()] == ([out.name] if same else [])
+    assert sorted(file.name for file in out.parent.iterdir()) == ([out.name, f"{out.name}.json"] if same else [])
+    if same:
+        about = json.loads(out.with_name(f"{out.name}.json").read_text())
+        assert about["sensors"]["digit"] == SENSORS.index("digit") and about["frames"] == frames
+        assert about["input"].startswith("touches: uint8 RGB") and about["background"] == "keep"
     assert ("nothing is written" in done.stderr) is not same

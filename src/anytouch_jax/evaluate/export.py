@@ -104,32 +104,41 @@ def export(
     plain = replace(encoder, config=replace(encoder.config, model=replace(model, attention="xla")))
     data = _artefact(plain, frames, platforms, pooling, join)
     live = plain if model.attention == "cudnn" and _here() != "cuda" else encoder
-    side = model.image_size
-    less = ", less the untouched gel: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
     differs, width = _worst(live, data, frames, pooling, join)
     about = {
         "format": FORMAT,
         "file": path.name,
         "bytes": len(data),
         "sha256": hashlib.sha256(data).hexdigest(),
-        "source": encoder.source,
         "jax": jax.__version__,
         "platforms": list(platforms),
-        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){less}; sensor: int32 (B,)",
-        "output": f"features: float32 (B, {width}), not normalised",
-        "frames": frames,
-        "image_size": model.image_size,
-        "features": width,
-        "background": encoder.config.data.background,
-        "pooling": pooling,
-        "join": join,
-        "sensors": {name: row for row, name in enumerate(model.sensors)},
+        **call_of(encoder, frames=frames, width=width, pooling=pooling, join=join),
         "worst_difference": differs,
         "example": _EXAMPLE.format(name=path.name, frames=frames, size=model.image_size),
     }
     write_bytes(path, data)
     write_bytes(describes(path), (json.dumps(about, indent=2) + "\n").encode())
     return about
+
+
+def call_of(
+    encoder: Encoder, *, frames: int, width: int, pooling: Pooling = "class", join: Join = "mean"
+) -> dict[str, Any]:
+    """How an encoder in another form is called: what goes in, what comes out, which row is which sensor."""
+    model, side = encoder.config.model, encoder.config.model.image_size
+    less = ", less the untouched gel: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
+    return {
+        "source": encoder.source,
+        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){less}; sensor: int32 (B,)",
+        "output": f"features: float32 (B, {width}), not normalised",
+        "frames": frames,
+        "image_size": side,
+        "features": width,
+        "background": encoder.config.data.background,
+        "pooling": pooling,
+        "join": join,
+        "sensors": {name: row for row, name in enumerate(model.sensors)},
+    }
 
 
 def describes(path: Path) -> Path:

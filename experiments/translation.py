@@ -273,7 +273,7 @@ names = sorted({row_name(record) for record in records}, key=lambda name: ("pixe
 cells = [(name, *(spread([r["error"] for r in of(task, name)]) for task in TASKS)) for name in names]
 means = [spread([r["mean_target"] for r in of(task, name)][:1]) for task in TASKS for name in names[:1]]
 cells.append((MEAN, *means))
-encoders = dict.fromkeys([*known_objects, *(name.split(", ")[0] for name in names if "pixels" not in name)])
+told_of = dict.fromkeys([*known_objects, *(name.split(", ")[0] for name in names if "pixels" not in name)])
 
 
 def against(task: tuple[str, str], better: str, worse: str) -> str:
@@ -341,7 +341,7 @@ lines = [
     markdown(("", *head[1:]), physical),
     "",
     "Objects of the pairs that an encoder was trained on in its last stage: "
-    + ", ".join(f"{name} {known_objects.get(name, 'not counted')}" for name in encoders)
+    + ", ".join(f"{name} {known_objects.get(name, 'not counted')}" for name in told_of)
     + ".",
     "",
 ]

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from sklearn.decomposition import PCA
 
 from ..config import UserError
+from ..data.manifest import Manifest
+from ..data.samples import read_picture
 
 Array = npt.NDArray[Any]
+RAW_SIZE = (240, 320)  # rows and columns of a picture before it is averaged down
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R 601, on RGB
 
 
@@ -29,6 +34,28 @@ def raw_pixels(
     if has_background is not None:
         change[~np.asarray(has_background, bool)] = 0.0
     return np.concatenate([small, change], axis=1)
+
+
+def row_pixels(table: Manifest, row: int, grounds: dict[Path, Array]) -> Array:
+    """`raw_pixels` of a row of a manifest, f32 (2 * 768,); `grounds` keeps backgrounds that many rows share.
+
+    Raises SampleError, which names row and file.
+    """
+    frame = _same_size(read_picture(table, row))
+    has = table.value(row, "background_path") is not None
+    ground = np.zeros_like(frame)
+    if has:
+        file = table.file(row, "background_path")
+        if file not in grounds:
+            grounds[file] = _same_size(read_picture(table, row, "background_path"))
+        ground = grounds[file]
+    return raw_pixels(frame[None], ground[None], np.array([has]))[0]
+
+
+def _same_size(image: Array) -> Array:
+    if image.shape[:2] == RAW_SIZE:
+        return image
+    return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
 
 
 def reduce(features: Array, train: Array, components: int = 200) -> Array:

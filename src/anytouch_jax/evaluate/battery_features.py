@@ -12,14 +12,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from ..config import UserError
 from ..data.evaluation import evaluation
 from ..data.files import distinct_files
-from ..data.images import decode
 from ..data.manifest import Manifest
 from ..data.packed import read_file
 from ..io.tree import flatten
@@ -32,7 +30,6 @@ Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f
 
 VERSION = 2  # of what is computed; a change raises it
 BATCH = 64
-RAW_SIZE = (240, 320)
 
 
 class Store:
@@ -126,13 +123,15 @@ def encoded(
 
 def raw(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> Store:
     """Grey pixels (24 x 32) of the last frame beside the difference of every frame from the background, in 0..1."""
-    grounds: dict[str, Array] = {}
+    grounds: dict[Path, Array] = {}
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
         windows = ordered(clips[np.searchsorted(clips[:, -1], rows)], rows, order)
         single, places = np.unique(windows, return_inverse=True)
-        greys, changes = np.split(np.stack([_pixels(table, int(row), grounds) for row in single]), 2, axis=1)
+        greys, changes = np.split(
+            np.stack([baseline.row_pixels(table, int(row), grounds) for row in single]), 2, axis=1
+        )
         places = places.reshape(windows.shape)
         return np.concatenate([greys[places[:, -1]], changes[places].reshape(len(rows), -1)], axis=1)
 
@@ -191,22 +190,3 @@ def pictures(table: Manifest, count: int = 32) -> str:
         with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
             found.update(read_file(table.file(int(row))))
     return found.hexdigest()
-
-
-def _pixels(table: Manifest, row: int, grounds: dict[str, Array]) -> Array:
-    """Grey pixels of a frame and their difference from its background, f32 (2 * 768,)."""
-    frame = _small(decode(table.file(row)))
-    has = table.value(row, "background_path") is not None
-    ground = np.zeros_like(frame)
-    if has:
-        file = table.file(row, "background_path")
-        if str(file) not in grounds:
-            grounds[str(file)] = _small(decode(file))
-        ground = grounds[str(file)]
-    return baseline.raw_pixels(frame[None], ground[None], np.array([has]))[0]
-
-
-def _small(image: Array) -> Array:
-    if image.shape[:2] == RAW_SIZE:
-        return image
-    return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))

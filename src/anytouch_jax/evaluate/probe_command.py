@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,7 +12,6 @@ import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.samples import read_picture
 from anytouch_jax.evaluate import baseline, probe
 from anytouch_jax.evaluate.features import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 Say = Callable[[str], None]
 RAW = "raw pixels"
 GROUP = "grasp_group"  # the default of --group, which a manifest need not have
-_RAW_SIZE = (240, 320)
 
 
 @dataclass(frozen=True)
@@ -169,19 +168,7 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
 
 def raw_features(task: Task) -> np.ndarray:
     """Grey pixels and their difference from the background, reduced by a PCA fitted on train."""
-    pieces = []
-    for row in task.rows:
-        frame = _small(read_picture(task.manifest, int(row)))
-        has = task.manifest.value(int(row), "background_path") is not None
-        ground = _small(read_picture(task.manifest, int(row), "background_path")) if has else np.zeros_like(frame)
-        pieces.append(baseline.raw_pixels(frame[None], ground[None], np.array([has]))[0])
+    grounds: dict[Path, np.ndarray] = {}
+    pieces = [baseline.row_pixels(task.manifest, int(row), grounds) for row in task.rows]
     train = task.split == "train"
     return baseline.reduce(np.stack(pieces), train if train.any() else np.ones(len(pieces), bool))
-
-
-def _small(image: np.ndarray) -> np.ndarray:
-    import cv2
-
-    if image.shape[:2] == _RAW_SIZE:
-        return image
-    return np.asarray(cv2.resize(image, _RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))

@@ -16,6 +16,7 @@ from ..data.samples import read_picture
 
 Array = npt.NDArray[Any]
 RAW_SIZE = (240, 320)  # rows and columns of a picture before it is averaged down
+KEPT = 256  # backgrounds in memory, 230 kB each
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R 601, on RGB
 
 
@@ -37,7 +38,7 @@ def raw_pixels(
 
 
 def row_pixels(table: Manifest, row: int, grounds: dict[Path, Array]) -> Array:
-    """`raw_pixels` of a row of a manifest, f32 (2 * 768,); `grounds` keeps backgrounds that many rows share.
+    """`raw_pixels` of a row of a manifest, f32 (2 * 768,); `grounds` keeps some backgrounds, which many rows share.
 
     Raises SampleError, which names row and file.
     """
@@ -47,6 +48,8 @@ def row_pixels(table: Manifest, row: int, grounds: dict[Path, Array]) -> Array:
     if has:
         file = table.file(row, "background_path")
         if file not in grounds:
+            if len(grounds) >= KEPT:
+                grounds.clear()
             grounds[file] = _same_size(read_picture(table, row, "background_path"))
         ground = grounds[file]
     return raw_pixels(frame[None], ground[None], np.array([has]))[0]

@@ -49,7 +49,7 @@ def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch, rich):
     counts = {}
     for shard in ((0, 1), (0, 2), (1, 2)):
         read.clear()
-        loader = Loader(manifest, settings(2, batch_size=8), devices=4, shard=shard)
+        loader = Loader(manifest, settings(2, batch_size=8, cache=0), devices=4, shard=shard)
         for step in range(6):
             loader.batch(step)
         counts[shard] = len(read)

@@ -213,7 +213,10 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
     about: dict[str, Any] = {"settings": SETTINGS, "encoders": {name: one.mark for name, one in encoders.items()}}
     if file.exists() and (found := json.loads(file.read_text())) | about == found:
         return found
-    found = about | {"machine": machine.describe().sentence(), "config": asdict(encoders["stage 2"].config)}
+    config = encoders["stage 2"].config
+    names = tuple("/".join(Path(one).parts[-2:]) for one in config.data.manifests)
+    config = replace(config, data=replace(config.data, manifests=names))
+    found = about | {"machine": machine.describe().sentence(), "config": asdict(config)}
     found |= {"retrieval": retrieve(encoders, grade, seed), "probes": probes(encoders, grade, seed)}
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(file, json.dumps(found) + "\n")

@@ -273,7 +273,8 @@ names = sorted({row_name(record) for record in records}, key=lambda name: ("pixe
 cells = [(name, *(spread([r["error"] for r in of(task, name)]) for task in TASKS)) for name in names]
 means = [spread([r["mean_target"] for r in of(task, name)][:1]) for task in TASKS for name in names[:1]]
 cells.append((MEAN, *means))
-told_of = dict.fromkeys([*known_objects, *(name.split(", ")[0] for name in names if "pixels" not in name)])
+counted = [*known_objects, *(name.split(", ")[0] for name in names if "pixels" not in name)]
+told = ", ".join(f"{name} {known_objects.get(name, 'not counted')}" for name in dict.fromkeys(counted))
 
 
 def against(task: tuple[str, str], better: str, worse: str) -> str:
@@ -295,6 +296,7 @@ for ours in (name for name in names if name.startswith("anytouch")):  # and its 
     rivals = [name for name in names if name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
     rivals += [*(name for name in names if "pixels" in name), MEAN]
     claims += [(f"{ours} below {rival}", *(against(task, ours, rival) for task in TASKS)) for rival in rivals]
+QUESTION = "is the paper's order found? (and is it below both references?)"
 head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
 
 # %% [markdown]
@@ -327,11 +329,7 @@ lines = [
     "",
     markdown(head, cells),
     "",
-    *(
-        [markdown(("is the paper's order found? (and is it below both references?)", *head[1:]), claims), ""]
-        if claims
-        else []
-    ),
+    *([markdown((QUESTION, *head[1:]), claims), ""] if claims else []),
     "Images: normalised pixels (ImageNet's mean and deviation). Fields: each of the six channels in deviations over "
     "the training fields. The paper, on its own recordings (units not stated): T3 0.2261, 0.0167, 0.0155; AnyTouch "
     "0.2159, 0.0151, 0.0144.",
@@ -340,9 +338,7 @@ lines = [
     "",
     markdown(("", *head[1:]), physical),
     "",
-    "Objects of the pairs that an encoder was trained on in its last stage: "
-    + ", ".join(f"{name} {known_objects.get(name, 'not counted')}" for name in told_of)
-    + ".",
+    f"Objects of the pairs that an encoder was trained on in its last stage: {told}.",
     "",
 ]
 lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]

@@ -35,7 +35,7 @@ export-onnx: FRAMES ?= 1
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --loader.background subtract --loader.contact-only --loader.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps 400 --batch 48
-DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps 200 --batch 64 --model.match-head cosine --objective.match-weight 4
+DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps 200 --batch 64 --model.match-head cosine --objective.match-weight 8 --loader.negatives same_sensor
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile

@@ -43,7 +43,8 @@ class Size:
 
     Towers from scratch learn nothing in minutes from matching one pair against one other, as the paper does on CLIP's
     weights. So `match_head` is "cosine", each touch against all others of the batch, on a share `match_keep` of the
-    patches and weighed by `match_weight`; only frames in contact are drawn, those with a share `contact` of the
+    patches and weighed by `match_weight`, all of a step's touches to be found by one sensor (`negatives`), so that the
+    sensor tells nothing; only frames in contact are drawn, those with a share `contact` of the
     strongest of their recording (`anytouch contact`), as the paper's are contact frames (those of `real` are not
     marked, and all drawn); a row of question q2 has the paper's head. The softmax starts mild (`temperature`): a sharp
     one only punishes untrained towers. Touches are shown less the untouched gel (but for `real`, where one in ten has
@@ -70,6 +71,7 @@ class Size:
     match_head: str = "cosine"
     match_weight: float = 4.0
     match_keep: float = 0.5
+    negatives: Literal["any", "same_sensor"] = "same_sensor"
     contact: float = 0.6
     background: Literal["keep", "subtract"] = "subtract"
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -228,7 +230,7 @@ def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests
         objective = replace(objective, match_weight=size.match_weight, match_keep=size.match_keep)
     data = replace(
         config.data, manifests=manifests, batch_size=batch, background=size.background, jitter=(0, 0, 0, 0),
-        contact_only=True,
+        contact_only=True, negatives=size.negatives if stage == 2 else "any",
     )  # fmt: skip
     return replace(
         config,
@@ -290,7 +292,7 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
         yield "dynamics", "no_flips", own("anytouch", data={"flip": 0.0}), False
         for name in ("frame_differences", "force_heads"):
             yield "dynamics", name, own(name), False
-        paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0)  # as the paper has it
+        paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0, negatives="any")  # the paper's
         yield "q2", "matched_mlp", training(paired, "anytouch", seed), False
 
 

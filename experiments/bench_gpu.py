@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "src"))
 import jax
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate import machine, speed, speed_report
+from anytouch_jax.evaluate import machine, results, speed, speed_report
 from anytouch_jax.evaluate.variants import variants_of
 from anytouch_jax.evaluate.workloads import Workload, workloads
 
@@ -64,7 +64,7 @@ def main() -> None:
         heads = ("workload", "variant", "batch", "samples/s", "of its peak", "GiB")
         text = f"# Speed against error, preset {options.preset}\n\n{here.sentence()}\n\n{speed_report.NOTES}\n\n"
         text += speed_report.to_markdown(rows)
-        text += f"\n## Memory against batch size\n\n{speed_report.table(heads, swept)}" if swept else ""
+        text += f"\n## Memory against batch size\n\n{results.markdown(heads, swept)}\n" if swept else ""
         numbers = {"machine": dataclasses.asdict(here), "preset": options.preset, "sweep": swept}
         return speed_report.write(
             options.out, "gpu", text, numbers | {"rows": [speed_report.as_dict(row) for row in rows]}

@@ -36,8 +36,8 @@ from study import asked, page
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import machine, plots, probe, tasks
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder
-from anytouch_jax.evaluate.sections import markdown
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.evaluate.results import markdown
+from anytouch_jax.whole import write_whole
 
 RUN, DATA = asked.path("RUN", "runs/stage2"), asked.path("DATA", "data/scenes/manifest.parquet")
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
@@ -135,7 +135,7 @@ def make(name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         raise SystemExit(f"there is no {path}: run this page without TABLE=1")
     if found is None:
         found = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": SETTINGS} | measure()
-        write_atomic(path, json.dumps(found, indent=1) + "\n")
+        write_whole(path, json.dumps(found, indent=1) + "\n")
     return found
 
 
@@ -188,7 +188,7 @@ Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
 ![Slip against time](figures/{NAME}.png)
 """
-write_atomic(OUT / f"{NAME}.md", text)
+write_whole(OUT / f"{NAME}.md", text)
 points = {
     f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"]) for one in record
 }

@@ -44,7 +44,7 @@ from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
 from anytouch_jax.sim.pouring import VERSION, Task
 from anytouch_jax.train.mesh import enable_compilation_cache
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.whole import write_whole
 
 enable_compilation_cache()
 
@@ -136,7 +136,7 @@ def do_seed(seed: int) -> None:
 
     def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float, **about: float) -> None:
         path, about["seconds"] = path_of_row(name, mode, seed), round(time.time() - since, 1)
-        write_atomic(path, pouring_table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
+        write_whole(path, pouring_table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
         mean = pouring.error(trials.poured, TASK.target).mean
         print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {about['seconds']:.0f} s", flush=True)
 
@@ -225,7 +225,7 @@ flow and the load, {VERSION} now):
 
 Made by `make pouring`, from the JSON in `{FOLDER.name}/`.
 """
-write_atomic(PAGE, text)
+write_whole(PAGE, text)
 print(text)
 for name in (picture, "pouring_frames.png"):
     page.show(figures / name)

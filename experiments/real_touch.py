@@ -225,7 +225,7 @@ record["slip"] = json.loads(results.to_json(slips))
 # stages; it is too small to rank encoders.
 
 # %%
-from anytouch_jax.train.record import write_atomic  # noqa: E402
+from anytouch_jax.whole import write_whole  # noqa: E402
 
 OUT.mkdir(parents=True, exist_ok=True)
 head = (
@@ -233,5 +233,5 @@ head = (
     f"Made by `experiments/real_touch.py` from `{STAGE1}` ({config.run.steps} steps) and `{STAGE2}`; manifest "
     f"{manifest.content_hash[:12]}. Every number is in `real_touch.json`.\n\n"
 )
-write_atomic(OUT / "real_touch.md", head + "\n".join(lines) + "\n")
-write_atomic(OUT / "real_touch.json", json.dumps(record, indent=1) + "\n")
+write_whole(OUT / "real_touch.md", head + "\n".join(lines) + "\n")
+write_whole(OUT / "real_touch.json", json.dumps(record, indent=1) + "\n")

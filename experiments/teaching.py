@@ -42,9 +42,9 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import baseline, machine, probe, results, retrieval
 from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
-from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.sim.dataset import VERSION
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.whole import write_whole
 
 WORK, OUT, TABLE = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results"), asked.switch("TABLE")
 TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4000)
@@ -219,7 +219,7 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
     found = about | {"machine": machine.describe().sentence(), "config": asdict(config)}
     found |= {"retrieval": retrieve(encoders, grade, seed), "probes": probes(encoders, grade, seed)}
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(file, json.dumps(found) + "\n")
+    write_whole(file, json.dumps(found) + "\n")
     return found
 
 
@@ -307,5 +307,5 @@ for grade, found in files.items():
     lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
     lines += [probe_table(found), ""]
 OUT.mkdir(parents=True, exist_ok=True)
-write_atomic(OUT / "teaching.md", "\n".join(lines))
+write_whole(OUT / "teaching.md", "\n".join(lines))
 print("\n".join(lines))

@@ -45,13 +45,13 @@ from anytouch_jax.evaluate import generation, pairs
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
+from anytouch_jax.evaluate.results import markdown, verdict
 from anytouch_jax.evaluate.results import seed_interval as interval
-from anytouch_jax.evaluate.sections import markdown
 from anytouch_jax.nn.translation import Translation
 from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.whole import write_whole
 
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
 NAME = "translation_quick" if QUICK else "translation"
@@ -167,7 +167,7 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
     }
     if about["fit"]["seed"] == SEEDS[0]:
         picture_grid(file.with_suffix(".png"), made, test_x[shown], test_y[shown])
-    write_atomic(file, json.dumps(record, indent=2) + "\n")
+    write_whole(file, json.dumps(record, indent=2) + "\n")
     print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
 
@@ -201,7 +201,7 @@ def all_runs() -> None:
     known = encoders(table)
     counts = RUN_FILES / "overlap.json"
     before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
-    write_atomic(counts, json.dumps(before | {name: count for name, (_, count) in known.items()}) + "\n")
+    write_whole(counts, json.dumps(before | {name: count for name, (_, count) in known.items()}) + "\n")
     content = table.content_hash[:16]
     plain = max(seen_by(one) for one, _ in known.values())  # the references see what the encoders see
     plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]
@@ -287,8 +287,7 @@ def against(task: tuple[str, str], better: str, worse: str) -> str:
         return "-"
     low, high = interval(change)
     said = "" if low is None or high is None else f" ({low:+.4f} to {high:+.4f})"
-    word = "undecided" if low is None or high is None or low <= 0 <= high else "agrees" if high < 0 else "does not"
-    return f"{np.mean(change):+.4f}{said}, {word}"
+    return f"{np.mean(change):+.4f}{said}, {verdict(low, high, len(change), wanted=-1)}"
 
 
 claims = []
@@ -344,7 +343,7 @@ lines = [
 lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]
 lines += [f"![{path.stem}]({NAME}/{path.name})" for path in sorted(RUN_FILES.glob("*.png"))]
 lines.append("")
-write_atomic(OUT / f"{NAME}.md", "\n".join(lines))
+write_whole(OUT / f"{NAME}.md", "\n".join(lines))
 print("\n".join(lines))
 for picture in sorted(RUN_FILES.glob("*.png")):
     page.show(picture)

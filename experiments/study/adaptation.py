@@ -20,7 +20,7 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate.battery_features import digest
 from anytouch_jax.evaluate.features import load_encoder, text_column
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.whole import write_whole
 
 from . import cuts, plan
 from .plan import Leaf
@@ -73,7 +73,7 @@ def adapted(work: Work, run: Path, data: Path, frames: int, labels: str | None =
         words = ["adapt", "--run", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", frames, "--out", out]
         if main([str(word) for word in (*words, *(("--labels", labels) if labels else ()))]):
             raise UserError(f"anytouch adapt failed with {frames} frames of {plan.UNSEEN}; its message is above")
-        write_atomic(note, json.dumps(of) + "\n")
+        write_whole(note, json.dumps(of) + "\n")
     return out
 
 

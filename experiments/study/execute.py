@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from anytouch_jax.config import UserError
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.whole import write_whole
 
 from . import budget, plan
 from .plan import Leaf, Scenes, Size, Training
@@ -173,5 +173,5 @@ def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
     about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
     about |= {"identity": leaf.identity, "simulator": plan.simulator(), "scoring": plan.scoring(leaf.question)}
     out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
+    write_whole(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
     return True

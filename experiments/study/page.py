@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.evaluate.results import markdown
 
 from . import budget, pictures, plan, report, scores
 from .results import Run, differences, read

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.evaluate.results import markdown
 
 from . import adaptation, paper, plan
 from .results import Column, Run, spread

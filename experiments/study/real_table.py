@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from anytouch_jax.evaluate.results import markdown, verdict
 from anytouch_jax.evaluate.results import seed_interval as interval
-from anytouch_jax.evaluate.sections import markdown
 
 from .questions import Part
 from .real import OURS, PIXELS, UNTRAINED
-from .results import CLAIM, Change, Run
+from .results import Change, Run
 from .tables import Statement
 
 
@@ -54,17 +54,10 @@ def ahead(runs: Sequence[Run], task: str, name: str) -> Statement:
     means = [100 * row["mean"] for row in found]
     label = f"{task}: above {'raw pixels' if name == PIXELS else 'an untrained encoder'}"
     low, high = interval(means)
-    known = [row for row in found if row["low"] is not None]
     if not found:
         return Statement(label, Change("not run"), {})
-    if len(known) == len(found) and all(row["low"] > 0 for row in found):
-        word = "agrees"
-    elif len(known) == len(found) and all(row["high"] < 0 for row in found):
-        word = "disagrees"
-    else:
-        word = "undecided"
-    if len(found) < CLAIM:
-        word = f"{len(found)} seed{'s' if len(found) > 1 else ''}, no claim"
+    words = {verdict(row["low"], row["high"], len(found)) for row in found}
+    word = words.pop() if len(words) == 1 else "undecided"
     each = {f"seed {i}": Change("", *(None if row[k] is None else 100 * row[k] for k in ("mean", "low", "high")))
             for i, row in enumerate(found)}  # fmt: skip
     return Statement(label, Change(word, float(np.mean(means)), low, high, len(found)), each)

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate.sections import markdown
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.evaluate.results import markdown
+from anytouch_jax.whole import write_whole
 
 from . import pictures, questions, real_table
 from .plan import LABELS
@@ -144,7 +144,7 @@ def write(folder: Path, out: Path) -> Path:
     runs, page = read(folder), out / "README.md"
     figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
-    write_atomic(page, whole(runs, figures, out))
+    write_whole(page, whole(runs, figures, out))
     return page
 
 

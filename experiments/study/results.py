@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from anytouch_jax.config import UserError
+from anytouch_jax.evaluate.results import CLAIM, verdict
 from anytouch_jax.evaluate.results import seed_interval as interval
 
 from .plan import LABELS
 
-CLAIM = 3  # seeds from which a sign is claimed
 NO_SIGN = "no sign in the paper"
 Seeds = dict[int, float]
 
@@ -163,14 +163,7 @@ def change(first: Seeds, second: Seeds, expected: float | None, better: int = 1)
     mean, (low, high) = float(np.mean(several)), over_seeds(several)
     shown = [None if one is None else better * one for one in (mean, low, high)]
     sides = shown if better > 0 else [shown[0], shown[2], shown[1]]
-    if len(seeds) < CLAIM:
-        word = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}, no claim"
-    elif not expected:
-        word = NO_SIGN
-    elif low is None or high is None or low <= 0 <= high:
-        word = "undecided"
-    else:
-        word = "agrees" if np.sign(mean) == np.sign(expected) else "disagrees"
+    word = NO_SIGN if not expected and len(seeds) >= CLAIM else verdict(low, high, len(seeds), wanted=expected or 1.0)
     return Change(word, *sides, len(seeds))  # type: ignore[arg-type]
 
 

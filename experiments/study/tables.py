@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.evaluate.results import markdown
 
 from . import paper
 from .results import CLAIM, NO_SIGN, Change, Column, Run, Seeds, change, spread, together, values

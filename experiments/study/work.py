@@ -30,7 +30,7 @@ from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
 from anytouch_jax.sim.scene import cast
-from anytouch_jax.train.record import write_atomic
+from anytouch_jax.whole import write_whole
 
 from . import cuts, plan, scores
 from .cuts import content_hash
@@ -107,13 +107,13 @@ class Work:
             before = {}
         about = {"of": of, "parts": before.get("parts", 0) + 1, "seconds": before.get("seconds", 0.0)}
         run.mkdir(parents=True, exist_ok=True)
-        write_atomic(run / BEGUN, json.dumps(about) + "\n")
+        write_whole(run / BEGUN, json.dumps(about) + "\n")
         init = self.run_of(one.init) if one.init else None
         try:
             result = pretrain(self.resolved(one.config), run, init=init, say=lambda _: None)
         finally:  # the next part adds to this one's time; what a part that was killed took is lost
             about["seconds"] = round(about["seconds"] + time.perf_counter() - start, 1)
-            write_atomic(run / BEGUN, json.dumps(about) + "\n")
+            write_whole(run / BEGUN, json.dumps(about) + "\n")
         if result.interrupted is not None:
             raise KeyboardInterrupt
         self._finish(run, about | {"resumed_at_step": result.resumed})
@@ -152,7 +152,7 @@ class Work:
         return scores.encoder_of(leaf, self)
 
     def _finish(self, folder: Path, about: dict[str, Any]) -> None:
-        write_atomic(folder / DONE, json.dumps(about) + "\n")
+        write_whole(folder / DONE, json.dumps(about) + "\n")
         self.say(f"  {folder.name}: {about['seconds']:.0f} s")
 
     def _forget(self) -> None:

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from anytouch_jax import pages
-from anytouch_jax.evaluate import machine, plots, speed, speed_report, variants
+from anytouch_jax.evaluate import machine, plots, results, speed, speed_report, variants
 from anytouch_jax.evaluate.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
 from anytouch_jax.io import release
 from anytouch_jax.train.step import merge
@@ -259,7 +259,7 @@ def to_markdown(work: Workload, found: dict[str, Any], preset: str) -> str:
     line = f"torch {about['torch']} ({about['threads']} threads), transformers {about['transformers']}"
     title = f"## {work.name}, preset {preset}, batch {work.samples}"
     return (
-        f"{title}\n\n{speed_report.table(heads, rows)}{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
+        f"{title}\n\n{results.markdown(heads, rows)}\n{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
     )
 
 

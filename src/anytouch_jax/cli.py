@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -81,7 +82,8 @@ def _main(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:
         raise
     except OSError as error:  # a disk, a folder, a name: never a programming error
-        print(f"anytouch {args[0]}: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        advice = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        print(f"anytouch {args[0]}: {error.filename or 'a file'}: {error.strerror or error}{advice}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

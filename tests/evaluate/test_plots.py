@@ -181,14 +181,6 @@ def test_names_of_a_pareto_plot_lie_on_nothing(tmp_path: Path, drawn: list[Any])
             assert not inside.contains(x, y)
 
 
-def test_a_folder_that_is_a_file_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"cannot write .*a\.png: File exists; choose another folder"):
-        plots.write_bytes(tmp_path / "file" / "a.png", b"new")
-    with pytest.raises(UserError, match=r"cannot write .*a\.png"):
-        plots.write_bytes(tmp_path / "file" / "deep" / "a.png", b"new")
-
-
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         plots.bars(tmp_path / name, {"x": {"a": Bar(0.2)}})
@@ -199,7 +191,7 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> None:
     path = tmp_path / "a.png"
-    plots.write_bytes(path, b"old")
+    path.write_bytes(b"old")
 
     def full(self: Path, data: bytes) -> None:
         with open(self, "wb") as file:
@@ -207,7 +199,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> No
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(UserError, match=r"cannot write .*a\.png: No space left"):
+    with pytest.raises(OSError, match=r"No space left .*a\.png"):
         plots.bars(path, {"x": {"a": Bar(0.2)}})
     assert path.read_bytes() == b"old" and [one.name for one in tmp_path.iterdir()] == ["a.png"]
 

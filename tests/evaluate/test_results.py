@@ -20,6 +20,7 @@ from anytouch_jax.evaluate.results import (
     r2_interval,
     to_json,
     to_table,
+    verdict,
 )
 
 ONE = ProbeResult(
@@ -147,3 +148,21 @@ def test_json() -> None:
     assert one["parts"][1]["accuracy"] is None
     assert "outcome" not in one
     assert two["r2"] == 0.81
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "seeds", "wanted", "word"),
+    [
+        (0.1, 2.0, 3, 1, "agrees"),
+        (0.1, 2.0, 3, -1, "disagrees"),
+        (-2.0, -0.1, 3, -1, "agrees"),
+        (-2.0, -0.1, 5, 1, "disagrees"),
+        (-0.1, 2.0, 3, 1, "undecided"),
+        (0.0, 2.0, 3, 1, "undecided"),
+        (None, None, 3, 1, "undecided"),
+        (0.1, 2.0, 2, 1, "2 seeds, no claim"),
+        (0.1, 2.0, 1, 1, "1 seed, no claim"),
+    ],
+)
+def test_a_sign_is_told_of_an_interval_that_leaves_zero_out(low, high, seeds, wanted, word):
+    assert verdict(low, high, seeds, wanted=wanted) == word

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.config import UserError
+from anytouch_jax.whole import write_whole
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest import Manifest
@@ -79,8 +80,6 @@ def check_home(folder: Path, option: str = "--out") -> None:
 
 def write_text(text: str, path: Path) -> Path:
     """Write a report to `path`, whole or not at all; its folder is made."""
-    from anytouch_jax.data.files import write_whole
-
     target = path.expanduser().resolve()
     try:
         write_whole(target, text)

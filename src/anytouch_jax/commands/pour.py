@@ -12,6 +12,7 @@ from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Pour
 from anytouch_jax.strict_json import SEED, in_range
+from anytouch_jax.whole import write_whole
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.features import Encoder
@@ -67,8 +68,7 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
     """Learn from recorded runs, and compare with the hand on those of split test."""
     from anytouch_jax.evaluate import pouring_recordings
     from anytouch_jax.evaluate.features import load_encoder
-    from anytouch_jax.evaluate.plots import write_bytes
-    from anytouch_jax.evaluate.sections import markdown
+    from anytouch_jax.evaluate.results import markdown
     from anytouch_jax.sim.pouring import Task
 
     encoder = load_encoder(str(options.run))
@@ -91,7 +91,7 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
     about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
     about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "sensor": policy.sensor}
     found_text = json.dumps(about | {name: one._asdict() for name, one in rows.items()}, indent=2)
-    write_bytes(out / "pour.json", (found_text + "\n").encode())
+    write_whole(out / "pour.json", found_text + "\n")
     say(f"policy and results in {out}")
     return 0
 
@@ -99,8 +99,7 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
 def _simulated(options: Pour, out: Path) -> int:
     from anytouch_jax.evaluate import pouring, pouring_bounds, pouring_policy, pouring_recordings
     from anytouch_jax.evaluate.features import load_encoder
-    from anytouch_jax.evaluate.plots import write_bytes
-    from anytouch_jax.evaluate.sections import markdown
+    from anytouch_jax.evaluate.results import markdown
     from anytouch_jax.sim.pouring import Task
 
     encoder = load_encoder(str(options.run))
@@ -128,7 +127,7 @@ def _simulated(options: Pour, out: Path) -> int:
     found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
     about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
     about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
-    write_bytes(out / "pour.json", (json.dumps(about | {"poured": found}, indent=2) + "\n").encode())
+    write_whole(out / "pour.json", json.dumps(about | {"poured": found}, indent=2) + "\n")
     say(f"film, policy and results in {out}")
     return 0
 

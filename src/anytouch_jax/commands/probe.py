@@ -10,6 +10,7 @@ from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Probe
 from anytouch_jax.strict_json import COUNT, in_range
+from anytouch_jax.whole import write_whole
 
 _OF_LABEL = ("label", "group", "leave_out", "where", "sensor")
 _OF_SPLITS = ("group", "seeds", "protocol")  # of a label; --leave-out has folds instead
@@ -40,9 +41,7 @@ def run(options: Probe) -> int:
         table, record = results.to_table(found), results.to_json(found)
     Console().print(Markdown(table)) if Console().is_terminal else print(table)
     if options.out is not None:
-        from anytouch_jax.train.record import write_atomic
-
-        write_atomic(options.out, record)
+        write_whole(options.out, record)
     return 0
 
 

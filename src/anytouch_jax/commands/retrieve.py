@@ -16,6 +16,7 @@ from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Retrieve
 from anytouch_jax.strict_json import COUNT, Range, in_range
+from anytouch_jax.whole import write_whole
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.features import Encoder
@@ -27,7 +28,7 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate import features, retrieval
     from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
-    from anytouch_jax.evaluate.sections import markdown
+    from anytouch_jax.evaluate.results import markdown
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     least = Range(2, math.inf, "2 or more, the touch and at least one other")
@@ -71,10 +72,8 @@ def run(options: Retrieve) -> int:
     for note in dict.fromkeys(note for one in scored for note in one.notes):
         say(note)
     if options.out is not None:
-        from anytouch_jax.train.record import write_atomic
-
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
-        write_atomic(options.out, json.dumps(about | {"results": retrieval.to_records(scored)}, indent=2) + "\n")
+        write_whole(options.out, json.dumps(about | {"results": retrieval.to_records(scored)}, indent=2) + "\n")
     return 0
 
 

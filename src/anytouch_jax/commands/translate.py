@@ -15,6 +15,7 @@ from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_use import Translate
 from anytouch_jax.strict_json import SEED, in_range
+from anytouch_jax.whole import write_whole
 
 _OF_FIT = ("data", "steps", "batch", "learning_rate", "tune", "adversarial", "seed")
 
@@ -52,7 +53,6 @@ def _fit(options: Translate) -> int:
     from anytouch_jax.evaluate import generation, generator, pairs
     from anytouch_jax.evaluate.features import load_encoder
     from anytouch_jax.evaluate.generation_figures import picture_grid
-    from anytouch_jax.evaluate.plots import write_bytes
 
     home = _home(options, options.out or options.generator, "out")
     if options.run is None or not options.data:
@@ -84,7 +84,7 @@ def _fit(options: Translate) -> int:
     picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}
     report["critic"] = made.design.has_critic
-    write_bytes(home / "report.json", (json.dumps(report, indent=2) + "\n").encode())
+    write_whole(home / "report.json", json.dumps(report, indent=2) + "\n")
     generator.save(made, home)  # last: a folder that holds it is whole
     print(f"{home}: error {ours.mean():.4f} on objects never seen (copying the mean target: {mean.mean():.4f})")
     return 0
@@ -136,13 +136,12 @@ def _targets(options: Translate, suffix: str) -> list[Path]:
 
 
 def _write(path: Path, result: Any) -> None:
-    from anytouch_jax.evaluate.plots import write_bytes
 
     if result.dtype == np.uint8:
         import cv2
 
-        write_bytes(path, cv2.imencode(".png", result[..., ::-1])[1].tobytes())
+        write_whole(path, cv2.imencode(".png", result[..., ::-1])[1].tobytes())
         return
     data = io.BytesIO()
     np.save(data, result, allow_pickle=False)
-    write_bytes(path, data.getvalue())
+    write_whole(path, data.getvalue())

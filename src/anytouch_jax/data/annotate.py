@@ -21,10 +21,10 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.edit import replace_column
 from anytouch_jax.data.endpoint import AnswerError, Client, Endpoint, EndpointError
-from anytouch_jax.data.files import write_whole
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.prompts import Nonsense, caption_of
 from anytouch_jax.data.questions import PHRASE, Job, data_url, find_jobs, picture_bytes, small_jpeg
+from anytouch_jax.whole import write_whole
 
 _NONSENSE_TRIES = 3
 _STREAK = 25  # failures in a row after which the run stops instead of paying on

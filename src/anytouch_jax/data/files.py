@@ -1,11 +1,8 @@
-"""The distinct files that a manifest names, and files that are written whole or not at all."""
+"""The distinct files that a manifest names."""
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -45,19 +42,3 @@ def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
     first = known[first]
     code_of = {name: full[i * rows : (i + 1) * rows] for i, name in enumerate(columns)}
     return Files(code_of, first % rows, np.array(columns)[first // rows])
-
-
-def write_whole(path: Path, data: bytes | str) -> None:
-    """Replace the file in one move, so that neither a reader nor a crash ever leaves half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data.encode("utf-8") if isinstance(data, str) else data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp gives a file that only its owner may read
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

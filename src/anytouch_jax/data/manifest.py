@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +24,7 @@ from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model
 from anytouch_jax.data.paths import resolve
 from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, is_manifest, load_table, typed
 from anytouch_jax.data.windows import windows
+from anytouch_jax.whole import replacing
 
 KEYS = ("sequence", "touch", "grasp_group")  # what two manifests may call alike and is not the same
 __all__ = [
@@ -232,24 +232,14 @@ def write(manifest: Manifest, path: str | Path) -> None:
     """
     target, table = _placed(manifest, path)
     table = with_own_keys(manifest, table)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with replacing(target) as part, part.open("wb") as file:
             if target.suffix.lower() == ".csv":
                 pa.csv.write_csv(table, file, pa.csv.WriteOptions(quoting_style="needed"))
             else:
                 pa.parquet.write_table(table, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp gives a file that only its owner may read
-        os.replace(temporary, target)
     except pa.ArrowException as error:
-        Path(temporary).unlink(missing_ok=True)
         raise ManifestError(f"{target} cannot be written: {str(error).splitlines()[0]}") from None
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def check_target(manifest: Manifest, path: str | Path) -> None:

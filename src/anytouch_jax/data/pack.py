@@ -25,11 +25,12 @@ import pyarrow.parquet
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.bounded import bounded_map
-from anytouch_jax.data.files import Files, distinct_files, write_whole
+from anytouch_jax.data.files import Files, distinct_files
 from anytouch_jax.data.licences import licences
 from anytouch_jax.data.manifest import Manifest, with_own_keys
 from anytouch_jax.data.packed import INDEX, forget, read_file
 from anytouch_jax.data.table import PATHS
+from anytouch_jax.whole import replacing, write_whole
 
 _PICTURES = tuple(name for name in PATHS if name not in ("path", "field_path"))
 GROUPS = {"touch": ("path",), "shared": _PICTURES, "field": ("field_path",)}
@@ -95,7 +96,7 @@ def pack(
     forget()
     packed = _repoint(manifest, target, files, names, shard_of, row_of)
     manifests.write(packed, target)
-    write_whole(folder / "README.md", _card(packed, orders).encode())
+    write_whole(folder / "README.md", _card(packed, orders))
     return target
 
 
@@ -130,7 +131,7 @@ def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: b
     if folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
         raise PackError(f"{folder} is not an empty folder; choose another one")
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(mark, json.dumps(plan | {"files": stamp}).encode())
+    write_whole(mark, json.dumps(plan | {"files": stamp}))
 
 
 def _orders(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
@@ -207,17 +208,11 @@ class _Group:
     ) -> tuple[int, _Piece | None]:
         """One shard and then its index: (rows, the piece that begins the next shard)."""
         path = self.folder / self._name(number)
-        part = path.with_suffix(".part")
         left: list[_Piece] = []
-        try:
-            with part.open("w+b") as file:
-                index, digest = self._fill(file, _until(first, pieces, shard_bytes, left))
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        with replacing(path, part=path.with_suffix(".part")) as part, part.open("w+b") as file:
+            index, digest = self._fill(file, _until(first, pieces, shard_bytes, left))
         self.sums[self._name(number)] = digest
-        write_whole(self.folder / "SHA256SUMS", "".join(f"{d}  {n}\n" for n, d in sorted(self.sums.items())).encode())
+        write_whole(self.folder / "SHA256SUMS", "".join(f"{d}  {n}\n" for n, d in sorted(self.sums.items())))
         stream = io.BytesIO()
         np.save(stream, index)
         write_whole(path.with_suffix(".index"), stream.getvalue())

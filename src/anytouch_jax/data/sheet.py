@@ -10,9 +10,9 @@ import numpy as np
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data.annotate import Caption
-from anytouch_jax.data.files import write_whole
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.questions import picture_bytes, small_jpeg
+from anytouch_jax.whole import write_whole
 
 _SIDE = 256
 _STYLE = (

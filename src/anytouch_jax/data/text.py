@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import tokenizers
 from tokenizers import decoders, models, normalizers, pre_tokenizers, processors, trainers
 
 from anytouch_jax.config import UserError
+from anytouch_jax.whole import write_whole
 
 START, END = "<|startoftext|>", "<|endoftext|>"
 
@@ -64,16 +63,7 @@ class Tokenizer:
         """Write a tokenizer.json that `load` reads, whole or not at all; `path` is the file or its folder."""
         path = Path(path)
         target = path / "tokenizer.json" if path.suffix != ".json" else path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(self._inner.to_str())
-            os.chmod(temporary, 0o644)  # mkstemp gives a file that only its owner may read
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        write_whole(target, self._inner.to_str())
 
 
 def load(path: str | Path) -> Tokenizer:

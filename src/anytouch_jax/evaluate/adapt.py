@@ -24,7 +24,8 @@ from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses
-from anytouch_jax.train.record import Record, write_atomic
+from anytouch_jax.train.record import Record
+from anytouch_jax.whole import write_whole
 
 Params = dict[str, Any]
 Say = Callable[[str], None]
@@ -103,7 +104,7 @@ def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     check_empty(out)
     out.mkdir(parents=True, exist_ok=True)
     text = to_json(adapted.config)
-    write_atomic(out / "config.json", text + "\n")
+    write_whole(out / "config.json", text + "\n")
     tokenizer = Path(run) / "tokenizer.json"
     if tokenizer.exists():
         shutil.copyfile(tokenizer, out / "tokenizer.json")

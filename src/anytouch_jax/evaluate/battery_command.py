@@ -12,7 +12,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery
 from anytouch_jax.evaluate.benchmarks import benchmark_of
 from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
-from anytouch_jax.evaluate.sections import markdown
+from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.tasks import available
 
 if TYPE_CHECKING:

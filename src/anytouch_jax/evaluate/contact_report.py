@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data.contact import DEFAULT_THRESHOLD, THRESHOLDS, ContactScores, contact_scores
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.whole import write_whole
 
 # The columns that tell contact, in the order they are looked for, and the value above which they mean it.
 REFERENCES: Mapping[str, float] = {"label.force": 0.0, "label.contact": 0.5, "label.contact_score": 7.0}
@@ -133,12 +133,8 @@ def contact_picture(manifest: Manifest, scores: ContactScores, path: str | Path,
             else order
         )
         bands.append(_band(f"{title}: {len(side)} frames", manifest, chosen, scores.score, colour))
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.part")
-    temporary.write_bytes(cv2.imencode(".png", np.vstack(bands))[1].tobytes())
-    os.replace(temporary, target)
-    return target
+    write_whole(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
+    return Path(path)
 
 
 def _band(

@@ -20,7 +20,7 @@ import numpy as np
 from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL, UserError
-from anytouch_jax.evaluate.plots import write_bytes
+from anytouch_jax.whole import write_whole
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.features import Encoder, Join, Pooling
@@ -116,8 +116,8 @@ def export(
         "worst_difference": differs,
         "example": _EXAMPLE.format(name=path.name, frames=frames, size=model.image_size),
     }
-    write_bytes(path, data)
-    write_bytes(describes(path), (json.dumps(about, indent=2) + "\n").encode())
+    write_whole(path, data)
+    write_whole(describes(path), json.dumps(about, indent=2) + "\n")
     return about
 
 

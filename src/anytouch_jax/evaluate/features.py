@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import warnings
 import zlib
 from collections.abc import Callable
@@ -24,6 +22,7 @@ from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.whole import replacing
 
 Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
@@ -240,18 +239,9 @@ def text_column(manifest: Manifest, name: str) -> np.ndarray:
 
 
 def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:
-    """Write features, row numbers, keys and a description as one `.npz`, atomically. Raises UserError."""
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}")  # another process may write the same
-    try:
-        with open(part, "wb") as file:
-            described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
-            keys = {f"key/{k}": v for k, v in features.keys.items()}
-            arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **keys, **described}
-            np.savez(file, **arrays)
-        os.replace(part, path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
-    finally:
-        with contextlib.suppress(OSError):  # there may be no such folder
-            part.unlink(missing_ok=True)
+    """Write features, row numbers, keys and a description as one `.npz`, whole or not at all. Raises OSError."""
+    described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
+    keys = {f"key/{k}": v for k, v in features.keys.items()}
+    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **keys, **described}
+    with replacing(path) as part, open(part, "wb") as file:
+        np.savez(file, **arrays)

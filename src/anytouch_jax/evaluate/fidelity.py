@@ -24,6 +24,7 @@ from ..sim.scene import Scenes, cast, draw_recording, draw_touch
 from ..sim.sensors import SENSORS
 from ..sim.shear import Shear, shear_step
 from ..sim.units import identity_unit
+from .results import markdown
 
 Fields = npt.NDArray[Any]
 Surface = Callable[[Fields, Fields], Fields]
@@ -292,11 +293,11 @@ def to_markdown(rows: Sequence[Row]) -> str:
     heads = ["fidelity", "grid", "iterations", "press ms", "shear ms"]
     heads += [f"{name}: rms / max %" for name in names] + ["shear rms %", "force %", "converged"]
     heads += [f"{name}: picture" for name in names]
-    lines = [heads, ["---"] * len(heads)]
+    lines = []
     for row in rows:
         cells = [row.fidelity, str(row.grid), "own" if row.iterations is None else str(row.iterations)]
         cells += [f"{row.press_ms:.2f}", f"{row.shear_ms:.2f}"]
         cells += [f"{100 * row.rms[name]:.2f} / {100 * row.largest[name]:.2f}" for name in names]
         cells += [f"{100 * row.shear:.2f}", f"{100 * row.force:.2f}", f"{row.converged} of {len(row.rms)}"]
         lines.append(cells + [f"{row.image[name]:.2f}" for name in names])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return markdown(heads, lines) + "\n"

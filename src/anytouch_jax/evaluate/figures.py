@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config, UserError
+from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
+from anytouch_jax.whole import write_whole
 
 _GREY, _GAP = 128, 4
 
@@ -77,16 +77,8 @@ def _to_pixels(normalised: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an RGB image u8 (H, W, 3) atomically. Raises UserError when the disk does not take it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    good, data = cv2.imencode(".png", image[..., ::-1])
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_bytes(data.tobytes() if good else b"")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UserError(f"cannot write the figure {path}: {error.strerror}") from None
+    """Write an RGB image u8 (H, W, 3), whole or not at all. Raises OSError."""
+    write_whole(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
 
 def pixel_baselines(clip: np.ndarray, hidden: np.ndarray, *, patch: int, frames: int) -> dict[str, float]:

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 
 from anytouch_jax.config import UserError
-from anytouch_jax.evaluate.speed_report import table
+from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.workloads import Workload, abstract_state, make_batch, step_of, workloads
 from anytouch_jax.train.mesh import batch_sharding, make_mesh, replicated, state_sharding
 
@@ -220,4 +220,4 @@ def to_markdown(layouts: Sequence[Layout]) -> str:
         ]
         for x in layouts
     ]
-    return table(heads, rows)
+    return markdown(heads, rows) + "\n"

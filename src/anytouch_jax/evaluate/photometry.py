@@ -23,6 +23,7 @@ import numpy.typing as npt
 from ..config import UserError
 from ..sim import calibration, optics, sensors, units
 from ..sim.calibration import COARSE, INDENTERS, PITCH, Presses
+from .results import markdown
 
 Array = npt.NDArray[Any]
 SSIM_SIGMA, SSIM_C1, SSIM_C2 = 1.5, (0.01 * 255) ** 2, (0.03 * 255) ** 2  # Wang et al. 2004
@@ -127,15 +128,15 @@ def ssim_map(a: Array, b: Array) -> Array:
 def to_markdown(rows: Sequence[Score]) -> str:
     """A table of scores, with the ratio of Taxim's time to ours where both were timed."""
     head = ["sensor", "renderer", "presses", "MAE", "PSNR dB", "SSIM", "ring MAE", "ms/frame", "x ours"]
-    lines = ["| " + " | ".join(head) + " |", "|---|---|" + "---:|" * (len(head) - 2)]
+    lines = []
     for row in rows:
         ours = next((r.ms for r in rows if r.sensor == row.sensor and r.renderer == "ours"), None)
         ratio = f"{row.ms / ours:.1f}" if row.ms and ours else ""
         name = row.renderer + (" (in-sample)" if row.in_sample else "")
         ms = "" if row.ms is None else f"{row.ms:.1f}"
         figures = [f"{row.mae:.2f}", f"{row.psnr:.2f}", f"{row.ssim:.4f}", f"{row.ring_mae:.2f}", ms, ratio]
-        lines.append("| " + " | ".join([row.sensor, name, str(row.presses), *figures]) + " |")
-    return "\n".join(lines)
+        lines.append([row.sensor, name, str(row.presses), *figures])
+    return markdown(head, lines)
 
 
 def _constant(presses: Presses) -> Renderer:

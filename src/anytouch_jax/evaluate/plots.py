@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from anytouch_jax.whole import write_whole
 
 from ..config import UserError
 
@@ -46,27 +45,13 @@ class Bar(NamedTuple):
 
 
 def write_figure(path: Path, figure: Figure) -> None:
-    """Write a figure as PNG; the same figure gives the same bytes. Raises UserError when the disk does not take it."""
+    """Write a figure as PNG; the same figure gives the same bytes. Raises OSError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)  # drawn without pyplot: no global state, no display
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
-    write_bytes(path, data.getvalue())
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Replace a file in one move. Raises UserError when the disk does not take it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(data)
-        os.replace(part, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):  # there may be no such folder
-            part.unlink()
-        advice = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose another folder"
-        raise UserError(f"cannot write {path}: {error.strerror}; {advice}") from None
+    write_whole(path, data.getvalue())
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

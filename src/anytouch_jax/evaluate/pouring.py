@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.whole import write_whole
+
 from ..sim import pouring, pouring_render
 from ..sim.pouring import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
 from .results import mean_interval
@@ -235,8 +237,6 @@ def write_film(path: Path, trials: Trials, task: Task, number: int = 0, *, every
     """
     from PIL import Image  # matplotlib cannot be had without it
 
-    from .plots import write_bytes
-
     if trials.frames is None:
         raise ValueError("these trials kept no frames; run them with film=1")
     last = int(trials.steps[number])
@@ -246,7 +246,7 @@ def write_film(path: Path, trials: Trials, task: Task, number: int = 0, *, every
     ]
     data = io.BytesIO()
     pages[0].save(data, "gif", save_all=True, append_images=pages[1:], duration=round(1000 / rate), loop=0)
-    write_bytes(path, data.getvalue())
+    write_whole(path, data.getvalue())
 
 
 def _page(trials: Trials, task: Task, number: int, step: int) -> Array:

@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.whole import write_whole
+
 from ..config import UserError
 from ..data import manifest as manifests
 from ..data.images import decode
@@ -25,7 +27,6 @@ from ..data.manifest import Manifest
 from ..data.transforms import touch_evaluation
 from ..sim.pouring import ACTIONS, STAND, Task
 from .features import load_encoder, text_column
-from .plots import write_bytes
 from .pouring import SENSOR, START, Controller, Trials
 from .pouring_bounds import blind_inputs
 from .pouring_policy import Head, Learning, Touch, forward, imitate, moments
@@ -65,7 +66,7 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
         for moment in range(int(steps)):
             name = f"run_{run:04d}/{moment:04d}.png"
             png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[1]
-            write_bytes(folder / name, png.tobytes())
+            write_whole(folder / name, png.tobytes())
             action, choice = (ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices))
             rows.append(
                 {"path": name, "sensor": SENSOR, "sequence": f"run_{run:04d}", "frame_index": moment,
@@ -194,7 +195,7 @@ def save_policy(folder: Path, policy: Touch) -> None:
     data = io.BytesIO()
     arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
     np.savez(data, about=np.asarray(told), **arrays)
-    write_bytes(folder / POLICY, data.getvalue())
+    write_whole(folder / POLICY, data.getvalue())
 
 
 def load_policy(folder: Path | str) -> Touch:

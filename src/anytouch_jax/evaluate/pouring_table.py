@@ -13,8 +13,7 @@ import numpy.typing as npt
 from ..config import UserError
 from ..sim.pouring import Task
 from .pouring import Error, Trials, error
-from .results import seed_interval
-from .sections import markdown
+from .results import markdown, seed_interval, verdict
 
 Array = npt.NDArray[Any]
 MODES = ("fine-tuned", "frozen")
@@ -33,9 +32,6 @@ BLIND = ("blind", "count")
 SHOWN = "shown stills"  # of the run `anytouch` in place of one trained on stills: says nothing of such training
 DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the others see stills
 CLAIMS = (("anytouch", "static"), ("anytouch", "t3"), ("static", "none"), ("t3", "none"), ("anytouch", "none"))
-
-
-CLAIM = 3  # seeds below which no sign is claimed
 
 
 class Row(NamedTuple):
@@ -140,13 +136,6 @@ def difference(a: Row, b: Row) -> Difference:
     return Difference(float(change.mean()), *seed_interval(each), each)
 
 
-def verdict(change: Difference) -> str:
-    """What a difference says of a claim that it is below zero; nothing with fewer than CLAIM seeds."""
-    if change.low is None or change.high is None or len(change.each) < CLAIM:
-        return f"{len(change.each)} seed{'s' if len(change.each) > 1 else ''}, no claim"
-    return "agrees" if change.high < 0 else "reversed" if change.low > 0 else "not decided"
-
-
 def table(rows: Sequence[Row]) -> str:
     """Markdown: mean errors beside the paper's, then each of the paper's orders with its paired difference."""
     by = {(row.name, row.mode): row for row in rows}
@@ -181,7 +170,7 @@ def _claim(by: Mapping[tuple[str, str], Row], mode: str, better: str, worse: str
         return None
     change = difference(a, b)
     words = _words(Error(*change[:3]), "+.1f")
-    return TITLES[better], TITLES[worse], mode, words, verdict(change)
+    return TITLES[better], TITLES[worse], mode, words, verdict(change.low, change.high, len(change.each), wanted=-1)
 
 
 def _paper(name: str, mode: int) -> str:

@@ -17,16 +17,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.whole import write_whole
+
 from ..config import FIELD_SENSORS, UserError
 from ..data import manifest as manifests
 from ..data.manifest import Manifest
-from . import baseline, matching, plots, probe, results, retrieval, space
+from . import baseline, matching, probe, results, retrieval, space
 from .contacts import background_difference, contact_vector, deepest_rows
 from .features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from .sections import (
     Section,
     losses_section,
-    markdown,
     matching_section,
     probes_section,
     reconstructions_section,
@@ -64,8 +65,8 @@ def write_report(
             lines.append(f"![{section.title}](figures/{_placed(section.figure, folder / 'figures' / name)})")
         lines += [part.strip() for part in (section.table, section.notes) if part]
     if numbers is not None:
-        plots.write_bytes(folder / "report.json", (_json(numbers) + "\n").encode())
-    plots.write_bytes(folder / "report.md", ("\n\n".join(lines) + "\n").encode())
+        write_whole(folder / "report.json", _json(numbers) + "\n")
+    write_whole(folder / "report.md", "\n\n".join(lines) + "\n")
     return folder / "report.md"
 
 
@@ -74,7 +75,7 @@ def _placed(figure: Path, target: Path) -> str:
     if not figure.is_file():
         raise UserError(f"there is no figure {figure} for the report; draw it first or leave it out")
     if figure.resolve() != target.resolve():
-        plots.write_bytes(target, figure.read_bytes())
+        write_whole(target, figure.read_bytes())
     return target.name
 
 
@@ -191,7 +192,8 @@ def _facts(table: Manifest, first: Encoder, second: Encoder) -> Section:
         f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of {second.config.data.batch_size}, "
         f"recipe {second.config.recipe}, towers {second.config.towers}. All figures below are of split test."
     )
-    return Section("Data and runs", text, table=markdown(("split", "frames", "touches", "objects", "sensors"), rows))
+    counted = results.markdown(("split", "frames", "touches", "objects", "sensors"), rows)
+    return Section("Data and runs", text, counted)
 
 
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:

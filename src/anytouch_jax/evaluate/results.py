@@ -133,6 +133,21 @@ def seed_interval(several: Sequence[float]) -> tuple[float | None, float | None]
     return float(np.mean(several)) - half, float(np.mean(several)) + half
 
 
+CLAIM = 3  # seeds from which a sign is claimed
+
+
+def verdict(low: float | None, high: float | None, seeds: int, *, wanted: float = 1.0) -> str:
+    """What the interval of a difference says of a claim that it has the sign of `wanted`.
+
+    "agrees" or "disagrees" where zero lies outside, else "undecided"; below CLAIM seeds "1 seed, no claim".
+    """
+    if seeds < CLAIM:
+        return f"{seeds} seed{'s' if seeds > 1 else ''}, no claim"
+    if low is None or high is None or low <= 0 <= high:
+        return "undecided"
+    return "agrees" if (low > 0) == (wanted > 0) else "disagrees"
+
+
 def r2_interval(error: Array, truth: Array, groups: Array) -> tuple[float | None, float | None]:
     """95 % percentile interval of R2 under a bootstrap over `groups`; `error`, `truth` (n,) as `mean_interval`."""
     times, ids = group_draws(groups, 1000, 0)
@@ -198,10 +213,10 @@ def to_table(results: Sequence[Result]) -> str:
     regressed = [one for one in results if isinstance(one, RegressionResult)]
     if classified:
         head = ("probe", "protocol", "accuracy", "95 % over test groups", "balanced", "commonest class", "refits")
-        blocks.append(_markdown((*head, "train", "test (groups)", "classes", "penalty or k"), _class_rows(classified)))
+        blocks.append(markdown((*head, "train", "test (groups)", "classes", "penalty or k"), _class_rows(classified)))
     if regressed:
         head = ("probe", "protocol", "R2", "95 % over test groups", "MAE", "MAE 95 %", "MAE of the mean")
-        blocks.append(_markdown((*head, "train", "test (groups)", "penalty"), _regression_rows(regressed)))
+        blocks.append(markdown((*head, "train", "test (groups)", "penalty"), _regression_rows(regressed)))
     notes = dict.fromkeys(f"- {one.probe} ({one.protocol}): {note}" for one in results for note in one.notes)
     if notes:
         blocks.append("\n".join(notes))
@@ -241,6 +256,8 @@ def _interval(low: float | None, high: float | None, factor: float = 100.0, digi
     return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
 
 
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table of texts; bars and line breaks in a cell are made harmless."""
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    clean = [[" ".join(str(cell).split()).replace("|", "\\|") for cell in line] for line in lines]
+    return "\n".join("| " + " | ".join(line) + " |" for line in clean)

@@ -42,13 +42,6 @@ class Section:
     notes: str = ""
 
 
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table of texts; bars and line breaks in a cell are made harmless."""
-    lines = [head, ["---"] * len(head), *rows]
-    clean = [[" ".join(str(cell).split()).replace("|", "\\|") for cell in line] for line in lines]
-    return "\n".join("| " + " | ".join(line) + " |" for line in clean)
-
-
 def samples_section(manifest: Manifest, folder: Path, *, split: str = "test", seed: int = 0) -> list[Section]:
     """A picture for each grade of alignment: rows are touches, columns the sensors and the photograph; captions below.
 
@@ -123,7 +116,7 @@ def losses_section(runs: Mapping[str, Path], folder: Path) -> Section:
             if len(values):
                 smooth = plots.smoothed(values)
                 rows.append((title, name.replace("_", " "), str(len(lines)), f"{smooth[0]:.3f}", f"{smooth[-1]:.3f}"))
-    table = markdown(("run", "term", "steps", "at the start", "at the end"), rows)
+    table = results.markdown(("run", "term", "steps", "at the start", "at the end"), rows)
     return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
 
 
@@ -176,7 +169,7 @@ def space_section(
         "best). Uniformity: lower is more even. Silhouette (-1 to 1): a low one by sensor and a high one by object is "
         "what alignment is for."
     )
-    return Section("The space of touches", text, markdown(head, rows), path)
+    return Section("The space of touches", text, results.markdown(head, rows), path)
 
 
 def retrieval_section(
@@ -208,8 +201,8 @@ def retrieval_section(
         ahead += [(grade, name, _change(*change)) for name, change in changes[grade].items()]
     head = ("data", "features", "top-1 matched", "top-5 matched", "top-1 matched, centred", "top-1 by chance",
             "top-1 by chance, centred", "gallery", "queries")  # fmt: skip
-    table = markdown(head, rows) + f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
-    table += markdown(("data", "features", f"{best} minus these"), ahead)
+    table = results.markdown(head, rows) + f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
+    table += results.markdown(("data", "features", f"{best} minus these"), ahead)
     path = folder / "figures" / "retrieval.png"
     if panels:
         plots.bars(path, panels, label="top-1")
@@ -232,7 +225,8 @@ def matching_section(found: Sequence[matching.MatchScore], notes: Sequence[str])
         "where they give away nothing. In brackets: 95 % over objects drawn anew."
     )
     listed = "\n".join(f"- {note}" for note in notes)
-    return Section("Cross-sensor matching", text, markdown(*matching.table(found)) if found else "", notes=listed)
+    table = results.markdown(*matching.table(found)) if found else ""
+    return Section("Cross-sensor matching", text, table, notes=listed)
 
 
 _COLUMNS = (("matched", False), ("matched", True), ("by chance", False), ("by chance", True))

@@ -109,7 +109,7 @@ def _batches(loader: Loader, count: int) -> list[Any]:
 
 def to_markdown(rows: Sequence[Feed]) -> str:
     """A line a way to load."""
-    from anytouch_jax.evaluate.speed_report import table
+    from anytouch_jax.evaluate.results import markdown
 
     heads = (
         "batches of",
@@ -132,4 +132,4 @@ def to_markdown(rows: Sequence[Feed]) -> str:
         ]
         for row in rows
     ]
-    return table(heads, cells)
+    return markdown(heads, cells) + "\n"

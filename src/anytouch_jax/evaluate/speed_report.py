@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.evaluate.plots import write_bytes
+from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.speed import Row
+from anytouch_jax.whole import write_whole
 
 _HEADS = (
     "variant",
@@ -44,7 +45,7 @@ def to_markdown(rows: Sequence[Row]) -> str:
     parts, names = [], list(dict.fromkeys(row.workload for row in rows))
     for name in names:
         members = [_cells(row) for row in rows if row.workload == name]
-        parts.append((f"### {name}\n\n" if len(names) > 1 else "") + table(_HEADS, members))
+        parts.append((f"### {name}\n\n" if len(names) > 1 else "") + markdown(_HEADS, members) + "\n")
     single = [row for row in rows if row.samples == 1 and not row.note]
     if single:
         cells = [
@@ -52,7 +53,7 @@ def to_markdown(rows: Sequence[Row]) -> str:
             for r in single
         ]
         heads = ("latency of one sample", "variant", "p50 ms", "p99 ms", "calls", "error")
-        parts.append(table(heads, cells))
+        parts.append(markdown(heads, cells) + "\n")
     return "\n".join(parts)
 
 
@@ -82,12 +83,6 @@ def error(value: float | None) -> str:
     return "" if value is None else f"{value:.1e}"
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [list(heads), ["---"] * len(heads), *map(list, rows)]
-    return "\n".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |" for line in lines) + "\n"
-
-
 def points(rows: Sequence[Row]) -> dict[str, tuple[float, float]]:
     """(time ratio, error) of the rows that have both, for `plots.pareto`: of the gradient, or of the output."""
     found = {}
@@ -110,5 +105,5 @@ def write(folder: Path, name: str, text: str, numbers: Mapping[str, Any]) -> Pat
     """Write `name`.md and `name`.json in a folder, each in one move. Raises UserError when that cannot be done."""
     for suffix, content in ((".json", json.dumps(numbers, indent=2, allow_nan=False) + "\n"), (".md", text)):
         path = folder / f"{name}{suffix}"
-        write_bytes(path, content.encode())
+        write_whole(path, content)
     return path

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 import jax
 
 from anytouch_jax.evaluate.memory import ask
-from anytouch_jax.evaluate.speed_report import table
+from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.workloads import abstract_state, make_batch, step_of, workloads
 from anytouch_jax.train.mesh import donated, enable_compilation_cache
 
@@ -77,4 +77,4 @@ def to_markdown(found: Sequence[Start]) -> str:
         + [f"{x:.2f}" for x in (s.imports, s.trace, s.compile, s.total)]
         for s in found
     ]
-    return table(heads, rows)
+    return markdown(heads, rows) + "\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import UserError
+from anytouch_jax.whole import replacing
 
 
 class WeightsError(UserError):
@@ -25,18 +25,14 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
     wrong = [name for name, value in metadata.items() if not isinstance(value, str)]
     if wrong:
         raise WeightsError(f"metadata of {path} must be text; {', '.join(wrong)} is not")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # the library ignores strides: a transposed view would be written in the wrong order
-        save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, temporary, dict(metadata))
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # the library gives a file that only its owner may read
-        os.replace(temporary, path)
+        with replacing(path) as part:
+            # the library ignores strides: a transposed view would be written in the wrong order
+            save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, part, dict(metadata))
+            umask = os.umask(0)
+            os.umask(umask)
+            os.chmod(part, 0o666 & ~umask)  # the library gives a file that only its owner may read
     except Exception as error:  # the library wraps OSError in its own kind
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise WeightsError(f"could not write {path}: {error}") from error
 
 

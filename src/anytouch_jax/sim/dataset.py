@@ -7,8 +7,8 @@ there they become `manifest.parquet` in one rename: a folder without it is not f
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.whole import replacing, write_whole
 
 from . import captions, objects, photo, scene
 from .record import Recorder, Take
@@ -196,12 +197,8 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> 
 def _write_table(rows: list[Row], file: Path) -> None:
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: [row.get(name) for row in rows] for name in names})
-    temporary = file.with_suffix(".tmp")
-    with temporary.open("wb") as out:
-        pq.write_table(table, out)
-        out.flush()
-        os.fsync(out.fileno())
-    os.replace(temporary, file)
+    with replacing(file, part=file.with_suffix(".tmp")) as part:
+        pq.write_table(table, part)
 
 
 def _is_whole(part: Path) -> bool:
@@ -226,13 +223,11 @@ def _write_image(path: Path, image: np.ndarray) -> None:
 
 
 def _write_array(path: Path, array: np.ndarray) -> None:
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        np.save(file, array, allow_pickle=False)
-    os.replace(temporary, path)
+    data = io.BytesIO()
+    np.save(data, array, allow_pickle=False)
+    _write_bytes(path, data.getvalue())
 
 
 def _write_bytes(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    """Not waiting for the disk: a part's table, which is written last, vouches for its files."""
+    write_whole(path, data, sync=False, part=path.with_name(path.name + ".tmp"))

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 from anytouch_jax.config import Config, ConfigError, UserError, from_json, to_json
 from anytouch_jax.io.record import read_record, steps
+from anytouch_jax.whole import write_whole
 
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
 HARMLESS = {
@@ -43,19 +44,6 @@ def writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """Replace a file in one move, so that a reader or a crash never sees half of it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def begun_with(run_dir: Path) -> Config | None:
     """The settings that the run in a folder was begun with, None without a complete checkpoint: what lies in such a
     folder was left by a start that failed, or is not ours. Where config.json is lost the latest checkpoint tells them.
@@ -83,7 +71,7 @@ def open_run(run_dir: Path, config: Config) -> None:
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
         if not goes_on(run_dir, config) or not path.exists():
-            write_atomic(path, to_json(config) + "\n")
+            write_whole(path, to_json(config) + "\n")
 
 
 def goes_on(run_dir: Path, config: Config) -> bool:
@@ -190,7 +178,7 @@ def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
                 rows.append(row)
                 kept.append(line)
     if rewrite and len(kept) < len(lines):
-        write_atomic(path, "".join(kept))
+        write_whole(path, "".join(kept))
     return rows
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import pickletools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from anytouch_jax.data.images import natural
 from anytouch_jax.data.readers.common import DatasetError
+from anytouch_jax.whole import write_whole
 
 PARTS = ("train", "val", "test")
 PICTURES = {
@@ -82,9 +82,7 @@ def export(root: Path, names: Sequence[str]) -> int:
             raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(lines)
-    temporary = root / ".feel.csv.part"
-    temporary.write_text(text.getvalue(), encoding="utf-8")
-    os.replace(temporary, root / "feel.csv")
+    write_whole(root / "feel.csv", text.getvalue())
     return len(lines)
 
 
@@ -120,7 +118,5 @@ def _write_grasp(folder: Path, number: int, grasp: Any) -> None:
             continue
         pixels = np.asarray(grasp[key][()])
         path = folder / sub / f"{number}{ending}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        temporary.write_bytes(cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1].tobytes())
-        os.replace(temporary, path)
+        data = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
+        write_whole(path, data, sync=False)

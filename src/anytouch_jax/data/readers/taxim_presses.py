@@ -11,7 +11,6 @@ Every press is a sequence of its own, split by hash. The radius is that of the c
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import zipfile
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader, Rows, hash_split
+from anytouch_jax.whole import write_whole
 
 FOLDER = "taxim_presses"
 
@@ -70,12 +70,8 @@ def _installed() -> Path:
 
 def _save(path: Path, image: np.ndarray) -> None:
     """Write a BGR picture as PNG, whole or not at all, unless it is there."""
-    if path.is_file():
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".part.png")
-    temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-    os.replace(temporary, path)
+    if not path.is_file():
+        write_whole(path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
 
 
 READER = Reader(

@@ -1,0 +1,43 @@
+"""Files that are written whole or not at all: to a name beside their own, then moved over it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path, *, sync: bool = True, part: Path | None = None) -> Iterator[Path]:
+    """The path of a file to write, which takes the place of `path` in one move when the block ends.
+
+    On any error, and when the process is killed, `path` stays as it was. Its folder is made. The bytes are on the disk
+    before the name is (`sync`; not worth its time for thousands of files that another file vouches for). `part`: where
+    it is written, by one process alone: what a killed one leaves is written over by the next. Raises OSError, with the
+    file's name.
+    """
+    path = Path(path)
+    part = part or path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        if sync:
+            with open(part, "r+b") as file:
+                os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        if error.filename not in (None, str(part), part):
+            raise
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):  # there may be no such folder
+            part.unlink()
+
+
+def write_whole(path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None) -> None:
+    """Write a file whole or not at all, text as UTF-8. Raises OSError, with the file's name (see `replacing`)."""
+    with replacing(path, sync=sync, part=part) as target:
+        target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)

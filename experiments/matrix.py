@@ -18,7 +18,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import jax
 from study import budget, plan, report
@@ -50,6 +50,7 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
     """The sizes asked for. Raises UserError for a name or a number that is none."""
     size: Any = plan.QUICK if quick else plan.FULL
     fields = {field.name: getattr(size, field.name) for field in dataclasses.fields(size)}
+    kinds = get_type_hints(plan.Size)
     settable = [name for name in fields if name not in ("name", "stack", "decoder")]
     for change in changes:
         name, _, text = change.partition("=")
@@ -59,6 +60,13 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
             value = tuple(map(int, text.split(","))) if name == "seeds" else type(fields[name])(text)
         except ValueError:
             raise UserError(f"--set {change}: {text!r} is no number") from None
+        choices = get_args(kinds[name])
+        if isinstance(value, str) and value not in choices:
+            raise UserError(f"--set {change}: choose among {', '.join(choices)}")
+        if isinstance(value, int) and value < 1:
+            raise UserError(f"--set {change}: 1 or more")
+        if isinstance(value, tuple) and len(set(value)) < len(value):
+            raise UserError(f"--set {change}: each seed once")
         size = dataclasses.replace(size, **{name: value})
     same = quick or plan.settings(size) == plan.settings(plan.FULL)
     return size if same else dataclasses.replace(size, name="changed")
@@ -70,6 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if asked.jobs < 1:
             raise UserError(f"--jobs {asked.jobs}: 1 or more")
+        if asked.minutes is not None and not asked.minutes > 0:
+            raise UserError(f"--minutes {asked.minutes:g}: above 0")
         chosen = choose(asked)
         if asked.plan:
             return _print(chosen)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from anytouch_jax.cli import main
-from anytouch_jax.whole import replacing, write_whole
+from anytouch_jax.whole import alone, replacing, write_whole
 
 
 def test_a_file_is_replaced_in_one_move(tmp_path: Path) -> None:
@@ -70,3 +70,12 @@ def test_a_full_disk_is_one_sentence_of_the_command(tmp_path, monkeypatch, capsy
     picture.write_text("path,sensor,sequence,frame,split\nx.png,digit,0,0,train\n")
     assert main(["contact", str(picture), "--out", str(tmp_path / "b.csv")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_lock_is_had_once_and_ends_with_its_block(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text("kept")
+    with alone(path) as first, alone(path) as second:
+        assert first and not second
+    with alone(path) as again:
+        assert again and path.read_text() == "kept"

@@ -132,9 +132,14 @@ def execute(
             with work.claim(leaf.file) as mine:
                 try:
                     done = mine and (is_done(leaf, out) or _one(leaf, work, out, begin))
-                except UserError as error:
-                    say(f"{leaf.file} failed: {error}")
-                    result.failed[leaf.file] = str(error)
+                except (
+                    UserError,
+                    RuntimeError,
+                    MemoryError,
+                ) as error:  # XLA's errors are RuntimeErrors
+                    what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+                    say(f"{leaf.file} failed: {what}")
+                    result.failed[leaf.file] = what
                     done = None
             planned += expected - (0.0 if done else budget.cost(leaf, work.ready(leaf)))
             if done:

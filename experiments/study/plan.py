@@ -68,7 +68,7 @@ class Size:
     rate1: float = 1e-3
     rate2: float = 1e-3
     temperature: float = 0.2
-    match_head: str = "cosine"
+    match_head: Literal["mlp", "linear", "cosine", "none"] = "cosine"
     match_weight: float = 4.0
     match_keep: float = 0.5
     negatives: Literal["any", "same_sensor"] = "same_sensor"

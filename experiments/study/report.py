@@ -13,7 +13,7 @@ from anytouch_jax.whole import write_whole
 from . import pictures, questions, real_table
 from .plan import LABELS
 from .questions import Part
-from .results import CLAIM, Run, comparable, differences, drawn, read, simulated
+from .results import CLAIM, NOT_NOTED, Run, comparable, differences, drawn, read, simulated
 from .tables import by_chance, tally
 
 _INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
@@ -85,7 +85,7 @@ def recipes(runs: Sequence[Run]) -> str:
     differ = [name for name in names if len({one.get(name) for one in by_question.values()}) > 1]
     groups: dict[str, list[str]] = {}
     for question, one in by_question.items():
-        words = ", ".join(f"{name} {one[name]}" for name in differ if name in one)
+        words = ", ".join(f"{name} {one.get(name, NOT_NOTED)}" for name in differ)
         groups.setdefault(words, []).append(question)
     return "; ".join(f"{', '.join(of)}: {words}" for words, of in groups.items()) if len(groups) > 1 else ""
 

@@ -17,6 +17,7 @@ from anytouch_jax.evaluate.results import seed_interval as interval
 from .plan import LABELS
 
 NO_SIGN = "no sign in the paper"
+NOT_NOTED = "not noted"
 Seeds = dict[int, float]
 
 
@@ -88,13 +89,13 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
     that do not note their settings are told apart by the name of their size.
     """
     found: dict[str, set[str]] = {}
+    names = {name for about in records for name in about.get("settings") or {} if name not in LABELS}
     untold = any(not about.get("settings") for about in records)
     for about in records:
         found.setdefault("simulator version", set()).add(str(simulated(about)))
         found.setdefault("scoring version", set()).add(str(about.get("scoring", 1)))
-        for name, value in (about.get("settings") or {}).items():
-            if name not in LABELS:
-                found.setdefault(name, set()).add(str(value))
+        for name in names if about.get("settings") else ():  # a setting that one does not know is another value
+            found.setdefault(name, set()).add(str(about["settings"].get(name, NOT_NOTED)))
         for name, value in about.get("data", {}).items():
             found.setdefault(f"data set {name} of seed {about.get('seed')}", set()).add(value[:8])
         if untold:

@@ -7,14 +7,13 @@ a folder says that it is finished, and of what: one of other data is made again,
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import gc
 import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -30,7 +29,7 @@ from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
 from anytouch_jax.sim.scene import cast
-from anytouch_jax.whole import write_whole
+from anytouch_jax.whole import alone, write_whole
 
 from . import cuts, plan, scores
 from .cuts import content_hash
@@ -63,18 +62,11 @@ class Work:
         dataset, _, part = name.partition("/")
         return self.folder / dataset / (f"{part}.parquet" if part else cuts.WHOLE)
 
-    @contextmanager
-    def claim(self, name: str) -> Iterator[bool]:
+    def claim(self, name: str) -> AbstractContextManager[bool]:
         """A lock on `name` that dies with the process; whether it was free."""
         path = self.folder / "claims" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                yield False
-            else:
-                yield True
+        return alone(path)
 
     def make(self, one: Scenes, size: Size) -> None:
         check_objects(size)

@@ -224,7 +224,7 @@ class Simulate:
     fidelity: Literal["fast", "exact"] = "fast"
     """Contact solved in a few rounds, or to convergence."""
     frames: int = 10
-    """Frames of a recording, at 30 a second; one gesture fills them."""
+    """Frames of a recording; one gesture fills them (10: a third of a second at 30 Hz)."""
     objects: int = 200
     """Objects of the catalogue that take turns."""
     depth: tuple[float, float] = (0.3, 1.0)
@@ -240,7 +240,7 @@ class Simulate:
     fields: str = ""
     """Fields to write beside the images (.npy), with commas between: displacement, pressure, shear."""
     size: int = 224
-    """Pixels of an image's shorter side."""
+    """Pixels of an image's shorter side; 0 for the sensor's own resolution."""
     units: Literal["each", "one"] = "each"
     """each: every recording by a device of its own. one: one device of each sensor, mounted straight."""
     threads: int = 2

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: to a name beside their own, then moved over it."""
+"""Files that are written whole or not at all (to a name beside their own, then moved over it), and locks on them."""
 
 from __future__ import annotations
 
@@ -41,3 +41,25 @@ def write_whole(path: str | Path, data: bytes | str, *, sync: bool = True, part:
     """Write a file whole or not at all, text as UTF-8. Raises OSError, with the file's name (see `replacing`)."""
     with replacing(path, sync=sync, part=part) as target:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
+@contextlib.contextmanager
+def alone(path: str | Path) -> Iterator[bool]:
+    """A lock on a file, which is made if need be, that ends with the block or the process; whether it was free.
+
+    Where the system or the disk knows no locks it always is.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield True
+        return
+    free = True
+    with open(path, "ab") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            free = False
+        except OSError:  # a disk without locks
+            pass
+        yield free

@@ -54,6 +54,18 @@ def test_objects_left_out_are_dealt_within_the_test_rows():
         assert all(given.test[one].all() for cut in found for one in cut)
 
 
+@pytest.mark.parametrize("protocol", ["honest", "published"])
+def test_what_only_test_has_is_dealt_within_test(protocol):
+    """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its class has."""
+    given = rows()
+    given = given._replace(y=np.linspace(0, 1, N), measured=True, fits=given.test, tests=given.test)
+    how, used, why = scheme(given)
+    assert how == "folds" and "train has no row of what is fitted on" in why
+    np.testing.assert_array_equal(used, given.test)
+    found = cuts(given, 0, protocol)
+    assert len(found) == FOLDS and all(len(cut.fit) and given.test[one].all() for cut in found for one in cut)
+
+
 def test_every_class_is_learned_in_every_fold():
     given = rows("shared")
     for seed in range(5):

@@ -1,5 +1,7 @@
 """Streams: every frame of a video, the newest of a camera, and where the time went."""
 
+import os
+import signal
 import threading
 
 import cv2
@@ -320,6 +322,21 @@ def test_an_interrupt_keeps_what_there_is():
     assert not collect(some(2)).interrupted
 
 
+def test_sigterm_keeps_what_there_is_and_a_long_stream_only_its_last_times(monkeypatch):
+    def terminated():
+        yield from some(2)
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield from some(1)
+
+    result = collect(terminated())
+    assert result.interrupted and len(result.values) >= 2
+    monkeypatch.setattr("anytouch_jax.evaluate.stream.KEPT", 3)
+    result = collect(some(9), lambda one: None)
+    assert result.total == 9 and result.numbers.tolist() == [6, 7, 8]
+    assert budget(result)[-1].startswith("9 frames embedded; of the last 3: 0 dropped")
+    assert len(collect(some(9)).values) == 9, "features are all kept"
+
+
 def test_nothing_is_a_result_too():
     result = collect(some(0))
     assert result.values.shape == (0, 0) and result.seconds.shape == (0, 4)
@@ -331,7 +348,7 @@ def test_the_budget_names_each_part():
     seconds[:, 3] = np.arange(101) / 1000  # 0 .. 100 ms
     seconds[:, 1] = 0.002
     numbers = np.arange(101) * 2
-    result = Result(np.zeros((101, 3)), numbers, np.arange(101) / 25, seconds, np.full(101, 0.05), False)
+    result = Result(np.zeros((101, 3)), numbers, np.arange(101) / 25, seconds, np.full(101, 0.05), 101, False)
     lines = {line.rsplit(maxsplit=2)[0]: line.split()[-2:] for line in budget(result)[1:-1]}
     assert list(lines) == [*PARTS, "frame to features"]
     assert lines["encoder"] == ["50.00", "99.00"] and lines["resize"] == ["2.00", "2.00"]

@@ -96,8 +96,17 @@ def test_groups_fall_back_to_the_recording():
         row(sequence="v/3", label__object="a"),
     ]
     assert select(table(rows), TASKS["object"]).groups.tolist() == ["grasp_group g1", "touch t1", "sequence v/3"]
+    rows += [row(sequence="w/1", label__object="b")]
     video = Task("x", "label.object", groups=("recording",))
-    assert select(table(rows), video).groups.tolist() == ["recording v"] * 3
+    assert select(table(rows), video).groups.tolist() == ["recording v"] * 3 + ["recording w"]
+    one = [row(sequence=f"mine/{i}", label__object="b") for i in range(2)]
+    assert select(table(one), video).groups.tolist() == ["sequence mine/0", "sequence mine/1"]
+
+
+def test_without_objects_the_touches_of_a_video_are_one_group():
+    rows = [row(sequence=f"{video}/{first}", label__material="wood") for video in "vw" for first in (0, 40)]
+    found = select(table(rows), TASKS["material"])
+    assert found.groups.tolist() == ["recording v"] * 2 + ["recording w"] * 2
 
 
 def test_recordings_of_joined_files_are_never_one_group(tmp_path):

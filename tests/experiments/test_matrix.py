@@ -61,6 +61,10 @@ def test_sizes_can_be_changed():
     [
         (["--set", "depth=3"], "--set depth=3: choose among own, "),
         (["--set", "steps1=many"], "'many' is no number"),
+        (["--set", "own=0"], "--set own=0: 1 or more"),
+        (["--set", "match_head=foo"], "--set match_head=foo: choose among mlp, linear, cosine, none"),
+        (["--set", "seeds=0,0,1"], "--set seeds=0,0,1: each seed once"),
+        (["--minutes", "-1"], "--minutes -1: above 0"),
         (["--only", "q9"], "there is no question 'q9'; choose among q1"),
         (["--only", "real", "--real", "no.csv"], "needs real touch, and there is no "),
         (["--chunk", "3/2"], "--chunk 3/2: write it as 2/4"),
@@ -92,9 +96,12 @@ def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(t
     paths = synthetic.write(tmp_path / "matrix", plan.leaves(plan.QUICK, real=False)[:2])
     for change, sentence in (
         ({"simulator": 1}, "holds results of {question} of version 1 of the simulator, and these runs are of version"),
-        ({"settings": {"steps1": 999}}, "of other settings than these runs (steps1 6 and 999): give a new folder"),
+        ({"steps1": 999}, "of other settings than these runs (steps1 6 and 999): give a new folder"),
+        ({"negatives": None}, "than these runs (negatives not noted and same_sensor): give a new folder"),
     ):
-        text = json.dumps(json.loads(paths[1].read_text()) | change)
+        whole = json.loads(paths[1].read_text())
+        settings = {name: one for name, one in (whole["settings"] | change).items() if one is not None}
+        text = json.dumps(whole | (change if "simulator" in change else {"settings": settings}))
         paths[1].write_text(text)
         assert matrix.main([*words, "--jobs", "3"]) == 1
         out, error = capsys.readouterr()

@@ -187,7 +187,9 @@ def test_every_question_has_its_signs(rendered):
 def test_runs_of_other_data_or_settings_stand_in_no_table(change, words, tmp_path, rendered):
     text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"))
     path = tmp_path / "ablations-no_text-1.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    whole = json.loads(path.read_text())
+    change = change | ({"settings": whole["settings"] | change["settings"]} if change.get("settings") else {})
+    path.write_text(json.dumps(whole | change))
     after = report.text(read(tmp_path))
     lines = section(after, "Ablations (Table 6)")
     assert f"**No table: these runs differ in what they must share ({words}).**" in lines and "|" not in lines

@@ -1,6 +1,7 @@
 """A data set on disk: the same bytes for a seed, whole or not there, going on after an interruption."""
 
 import errno
+import fcntl
 import json
 import shutil
 from dataclasses import replace
@@ -71,8 +72,11 @@ def test_the_manifest_is_one_that_the_project_reads(made):
     assert len(clips) == 20 and all(len({rows[i]["unit"] for i in clip}) == 1 for clip in clips)
     pairs = {(row["touch"], row["sensor"]) for row in rows if row["touch"]}
     assert len(pairs) == 20
-    units = {split: {row["unit"] for row in rows if row["split"] == split} for split in ("train", "val", "test")}
-    assert not units["train"] & units["test"] and not units["val"] & units["test"]
+    _, splits = scene.cast(SCENES)
+    touches = [scene.draw_touch(SCENES, number, splits) for number in range(10)]
+    units = [scene.draw_recording(SCENES, touch, sensor).unit for touch in touches for sensor in SCENES.sensors]
+    tints = {tuple(unit.tint) for unit in units}
+    assert len(tints) == 20, "every recording has a unit of its own, so no test unit is met in training"
 
 
 def test_shares_and_labels_are_as_drawn(made):
@@ -205,17 +209,35 @@ def test_a_folder_of_something_else_is_left_alone(made, tmp_path):
     assert (tmp_path / "mine.txt").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
     with pytest.raises(UserError, match=r"holds a data set with seed 4, not 5; vision 0.5, not 0.25"):
         dataset.simulate(replace(SCENES, seed=5, vision=0.25), made)
-    (tmp_path / "dataset.json").write_text("[1]")
-    with pytest.raises(UserError, match="holds a data set with version None"):
-        dataset.simulate(SCENES, tmp_path)
+    for text in ("[1]", "", "{}"):
+        (tmp_path / "dataset.json").write_text(text)
+        with pytest.raises(UserError, match=r"dataset\.json does not hold the settings of a simulated data set"):
+            dataset.simulate(SCENES, tmp_path)
+
+
+def test_two_processes_do_not_simulate_into_one_folder(made):
+    before = tree(made)
+    with open(made / "dataset.json") as mark:
+        fcntl.flock(mark, fcntl.LOCK_EX)  # as another process holds it
+        with pytest.raises(UserError, match="another process simulates into"):
+            dataset.simulate(SCENES, made)
+    assert dataset.simulate(SCENES, made) == made / "manifest.parquet" and tree(made) == before
+
+
+def test_a_part_is_told_of_when_its_files_are_on_the_disk(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(dataset, "Recorder", Blank)
+    monkeypatch.setattr("os.sync", lambda: told.append(sorted(one.name for one in (tmp_path / "parts").iterdir())))
+    dataset.simulate(SCENES, tmp_path)
+    assert told == [[], ["00000.parquet"]]
 
 
 def test_settings_are_compared_by_value(made):
     file = made / "dataset.json"
     before = file.read_bytes()
     file.write_text(json.dumps(json.loads(before)))  # formatted otherwise
-    same = replace(SCENES, depth=(int(SCENES.depth[0]), SCENES.depth[1])) if SCENES.depth[0] == 0 else SCENES
-    assert dataset.simulate(same, made) == made / "manifest.parquet"
+    whole = replace(SCENES, depth=(SCENES.depth[0], int(SCENES.depth[1])))  # 1 for 1.0
+    assert SCENES.depth[1] == 1 and dataset.simulate(whole, made) == made / "manifest.parquet"
     file.write_bytes(before)
 
 
@@ -248,7 +270,7 @@ def test_the_command_makes_a_data_set(tmp_path, capsys):
     assert main(["simulate", "--out", str(out), *options]) == 0
     said = capsys.readouterr().err
     few, compiling, *_ = said.splitlines()
-    assert few == "of 6 objects none is held out: val and test take 12 objects or more"
+    assert few == "no touch is of split val and test: more touches or more objects (some 16) give some"
     assert compiling == "compiling the contact solver for digit: about a minute the first time"
     assert "2 touches by digit" in said
     assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
@@ -258,9 +280,33 @@ def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(tmp_path, capsy
     monkeypatch.setattr(dataset, "GROUP", 1)
     words = ["--sensors", "digit,tac3d", "--objects", "12", "--frames", "2", "--size", "32", "--vision", "0"]
     args = ["simulate", "--out", str(tmp_path / "scenes"), "--touches", "25", *words]
-    assert main(args) == 0
+    assert main([*args, "--held-out", "0"]) == 0
     first, *lines, last = capsys.readouterr().err.splitlines()
     assert "digit, tac3d" in first and "25 touches by" in last
     assert lines == [f"{done} of 25 touches" for done in (3, 5, 8, 10, 13, 15, 18, 20, 23, 25)]
-    assert main(args) == 0  # nothing is left to do, nothing is compiled
+    assert main([*args, "--held-out", "0"]) == 0  # nothing is left to do, nothing is compiled
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_frames_that_did_not_converge_are_counted(tmp_path, capsys, monkeypatch):
+    class Rough(Blank):
+        def take(self, recording):
+            take = super().take(recording)
+            return take._replace(labels=take.labels | {"converged": np.array([1.0, 0.0])})
+
+    monkeypatch.setattr(dataset, "Recorder", Rough)
+    words = ["--touches", "3", "--sensors", "digit", "--objects", "6", "--frames", "2", "--size", "32"]
+    assert main(["simulate", "--out", str(tmp_path), "--fidelity", "exact", *words]) == 0
+    assert "3 touches by digit; 3 of 6 frames did not converge (label.converged)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--sensors", "tac3d", "--fields", "pressure"], "none of the sensors has a camera"),
+        (["--size", "8"], "size must be at least 16, or 0 for each sensor's own resolution, not 8"),
+    ],
+)
+def test_what_would_do_nothing_is_refused(tmp_path, capsys, words, told):
+    assert main(["simulate", "--out", str(tmp_path / "x"), *words]) == 1
+    assert told in capsys.readouterr().err and not (tmp_path / "x").exists()

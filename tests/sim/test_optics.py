@@ -184,6 +184,7 @@ def test_a_backdrop_made_beforehand_gives_the_same_picture():
 def test_the_default_size_has_a_short_side_of_224():
     assert optics.picture_size(DIGIT) == (299, 224)
     assert optics.picture_size(SENSORS["gelsight"], 112) == (112, 149)
+    assert optics.picture_size(DIGIT, 0) == DIGIT.resolution == (320, 240)
 
 
 def test_a_field_sensor_has_no_picture():

@@ -224,3 +224,12 @@ def test_another_batch_gives_the_same_recording(takes, monkeypatch):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-4), other.labels, take.labels)
     with pytest.raises(ValueError, match="1 to 6 recordings of one sensor"):
         Recorder(scenes, things, batch=6).record([])
+
+
+def test_an_exact_recording_converges_and_says_so():
+    scenes = replace(SCENES, sensors=("digit",), fidelity="exact", frames=2, size=0, fields=())
+    objects, splits = scene.cast(scenes)
+    asked = scene.draw_recording(scenes, scene.draw_touch(scenes, 0, splits), "digit")
+    (take,) = Recorder(scenes, objects, 1).record([asked])
+    assert take.image.shape == (2, *DIGIT.resolution, 3), "size 0 is the sensor's own"
+    assert take.labels["converged"].tolist() == [1, 1] and take.labels["force"][-1] > 0

@@ -136,13 +136,13 @@ def test_units_stay_inside_the_field_and_carry_markers_by_share():
 def test_the_mounting_and_its_inverse():
     unit = units.draw_unit(DIGIT, np.random.default_rng(7))
     x, y = jnp.array([0.0, 3.0, -2.0]), jnp.array([0.0, 1.0, 5.0])
-    there = units.to_gel(unit, x, y)
-    back = units.from_gel(unit, *there)
-    np.testing.assert_allclose(back, np.stack([x, y]), atol=1e-5)
-    np.testing.assert_allclose([there[0][0], there[1][0]], unit.offset, atol=1e-6)
+    back = units.from_gel(unit, x, y)
+    there = np.stack(units.turned(*back, unit.rotation)) + unit.offset[:, None]
+    np.testing.assert_allclose(there, np.stack([x, y]), atol=1e-5)
+    np.testing.assert_allclose(units.from_gel(unit, *unit.offset), [0, 0], atol=1e-6)
     quarter = units.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
-    np.testing.assert_allclose(units.to_gel(quarter, jnp.array(1.0), jnp.array(0.0)), [0, 1], atol=1e-6)
-    np.testing.assert_array_equal(units.to_gel(units.identity_unit(DIGIT), x, y), [x, y])
+    np.testing.assert_allclose(units.from_gel(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
+    np.testing.assert_array_equal(units.from_gel(units.identity_unit(DIGIT), x, y), [x, y])
 
 
 def test_stacked_units_vmap():
@@ -150,8 +150,8 @@ def test_stacked_units_vmap():
     several = [units.draw_unit(DIGIT, rng) for _ in range(3)]
     stacked = units.stack(several)
     assert stacked.uneven.shape == (3, 5, 3)
-    moved = jax.vmap(lambda u: jnp.stack(units.to_gel(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
-    np.testing.assert_allclose(moved[2], units.to_gel(several[2], 1.0, 2.0), rtol=1e-6)
+    moved = jax.vmap(lambda u: jnp.stack(units.from_gel(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
+    np.testing.assert_allclose(moved[2], units.from_gel(several[2], 1.0, 2.0), rtol=1e-6)
 
 
 def test_the_side_of_a_dent_that_turns_away_from_a_light_is_in_its_shadow():

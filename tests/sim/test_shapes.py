@@ -10,6 +10,7 @@ from anytouch_jax.config import UserError
 from anytouch_jax.sim import primitives
 from anytouch_jax.sim.letters import STROKES
 from anytouch_jax.sim.objects import catalogue
+from anytouch_jax.sim.scene import Scenes, draw_touch
 from anytouch_jax.sim.shapes import (
     PRIMITIVES,
     TEXTURES,
@@ -18,7 +19,6 @@ from anytouch_jax.sim.shapes import (
     floor,
     height,
     layers,
-    reach,
     relief,
     sample,
     unroll,
@@ -192,14 +192,12 @@ def test_a_raster_of_a_tenth_of_a_millimetre_holds_the_surface(thing):
 
 
 @pytest.mark.parametrize("thing", catalogue(5, 48), ids=lambda thing: thing.name)
-def test_places_within_reach_meet_the_object(thing):
-    low_x, high_x, low_y, high_y = reach(thing.shape)
-    assert low_x < high_x and low_y < high_y
+def test_the_places_of_scenes_meet_the_object(thing):
     x, y = axes(60, 0.2)
-    for a in (low_x, high_x):
-        for b in (low_y, high_y):
-            z = base(thing.shape, x + a, y + b)
-            assert (z > -0.5).mean() > 0.004 and z.max() > -0.2
+    scenes = Scenes(touches=8, objects=1)
+    for a, b in (draw_touch(scenes, number, ("train",)).place for number in range(8)):
+        z = base(thing.shape, x + a, y + b)
+        assert (z > z.max() - 0.3).mean() > 0.004 and z.max() > -0.2
 
 
 def test_sample_gives_the_pixels_back():

@@ -185,6 +185,7 @@ def test_fast_is_near_exact_on_a_path():
     for right, quick in zip(walk(exact, path), walk(fast, path), strict=True):
         assert np.linalg.norm(quick.force - right.force) < 0.06 * MU * LOAD
         assert abs(quick.twist_torque - right.twist_torque) < 0.06 * MU * LOAD * A
+        assert abs(quick.slip_fraction - right.slip_fraction) < 0.2
         error = np.sqrt(np.mean((quick.displacement - right.displacement) ** 2))
         assert error < 0.05 * np.abs(right.displacement).max()
 

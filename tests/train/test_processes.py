@@ -28,6 +28,7 @@ URI = {"OMPI_MCA_orte_hnp_uri": "1531576320.0;tcp://10.96.0.1:34911"}
     ("environ", "place"),
     [
         ({}, None),
+        ({"JAX_NUM_PROCESSES": "1"}, None),
         ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, None),  # any pod, also one alone
         ({"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}, None),  # no srun
         (SLURM | {"SLURM_STEP_NUM_TASKS": "1", "SLURM_PROCID": "0"}, None),
@@ -50,6 +51,7 @@ def test_the_environment_tells_who_this_process_is(environ, place):
         (HERE, "JAX_NUM_PROCESSES must be a number, not ''"),
         (HERE | {"JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": "one"}, "JAX_PROCESS_ID must be a number, not 'one'"),
         (HAND | {"JAX_PROCESS_ID": "4"}, "JAX_PROCESS_ID must be below JAX_NUM_PROCESSES=4, not 4"),
+        ({"JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": "1"}, "JAX_NUM_PROCESSES needs JAX_COORDINATOR_ADDRESS"),
         (OMPI, "add -x JAX_COORDINATOR_ADDRESS=host:port"),
     ],
 )

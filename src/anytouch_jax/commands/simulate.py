@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.commands.words import say
@@ -11,6 +12,8 @@ from anytouch_jax.options import Simulate
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from anytouch_jax.sim.scene import Scenes
+
 
 def run(options: Simulate) -> int:
     """Simulate a data set, or finish one that was begun; 130 after Ctrl-C (what is finished is kept)."""
@@ -18,7 +21,7 @@ def run(options: Simulate) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from anytouch_jax.sim.dataset import simulate
-    from anytouch_jax.sim.scene import Scenes, cast
+    from anytouch_jax.sim.scene import Scenes
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
@@ -39,15 +42,36 @@ def run(options: Simulate) -> int:
         units=options.units,
         first=options.first,
     )
-    if scenes.held_out and set(cast(scenes)[1]) == {"train"}:
-        say(f"of {scenes.objects} objects none is held out: val and test take 12 objects or more")
+    if missing := _missing(scenes):
+        say(f"no touch is of split {' and '.join(missing)}: more touches or more objects (some 16) give some")
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         told = _teller(bar, scenes.sensors)
         path = simulate(scenes, options.out, threads=options.threads, progress=told)
-    say(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}")
+    say(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
     return 0
+
+
+def _missing(scenes: Scenes) -> list[str]:
+    """The splits that no touch is of, where objects are held out."""
+    from anytouch_jax.sim.scene import cast, draw_touch
+
+    splits = cast(scenes)[1]
+    numbers = range(scenes.first, scenes.first + min(scenes.touches, len(splits)))  # by then each object had its turn
+    there = {draw_touch(scenes, number, splits).split for number in numbers}
+    return [name for name in ("val", "test") if scenes.held_out and name not in there]
+
+
+def _unconverged(manifest: Path) -> str:
+    """How many frames of fidelity exact did not converge, in words; "" for none."""
+    import pyarrow.parquet as pq
+
+    if "label.converged" not in pq.read_schema(manifest).names:
+        return ""
+    column = pq.read_table(manifest, columns=["label.converged"])["label.converged"].drop_null().to_numpy()
+    few = int((column < 1).sum())
+    return f"; {few} of {len(column)} frames did not converge (label.converged)" if few else ""
 
 
 def _teller(bar: Progress, sensors: tuple[str, ...]) -> Callable[[int, int], None]:

@@ -48,6 +48,12 @@ def scheme(rows: Rows) -> tuple[Literal["split", "folds"], Array, str]:
     rows alone are cut in folds; where groups are on both sides, all rows are.
     """
     learned, tested = rows.pool & rows.fits, rows.test & rows.tests
+    if not learned.any():
+        return (
+            "folds",
+            rows.test,
+            "train has no row of what is fitted on: folds over the test rows, whole groups left out",
+        )
     if not rows.measured and not np.isin(rows.y[tested], rows.y[learned]).any():
         return "folds", rows.test, "no class of test is in train: folds over the test rows, whole groups left out"
     shared = np.intersect1d(rows.groups[learned], rows.groups[tested])

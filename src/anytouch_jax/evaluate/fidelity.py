@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +74,8 @@ class Row:
 
     `press_ms`, `shear_ms`: median milliseconds a frame of one step, a batch of all scenes at a time. `rms`, `largest`:
     scene -> error of the normal displacement, brought to the reference's grid by cubic interpolation. `shear`: the
-    root mean square of the tangential one. `force`: of the normal force, over the force. `converged`: of the scenes.
+    root mean square of the tangential one. `slip`: of the share of the contact that slips, in points. `force`: of the
+    normal force, over the force. `converged`: of the scenes.
     `image`: scene -> mean absolute error in grey levels (0..255) of the picture rendered from the variant's own grid,
     beside that of the reference, over the pixels that the touch changes.
     """
@@ -87,6 +88,7 @@ class Row:
     rms: dict[str, float]
     largest: dict[str, float]
     shear: float
+    slip: float
     force: float
     converged: int
     image: dict[str, float]
@@ -139,13 +141,21 @@ def speed_against_error(
     ]
 
 
+class Solution(NamedTuple):
+    """Displacement (H, W) and tangential displacement (H, W, 2) in mm, force in N, share of the contact that slips."""
+
+    displacement: Fields
+    tangential: Fields
+    force: float
+    slip: float
+
+
 def _heights(setting: Setting, surface: Surface, grid: int) -> Fields:
     axis = ((np.arange(grid) + 0.5) / grid - 0.5) * setting.size
     return surface(*np.meshgrid(axis, axis))
 
 
-def _references(setting: Setting, surfaces: Iterable[Surface], grid: int) -> list[tuple[Fields, Fields, float]]:
-    """For each surface displacement (H, W), tangential displacement (H, W, 2) in mm and force in N."""
+def _references(setting: Setting, surfaces: Iterable[Surface], grid: int) -> list[Solution]:
     pitch, gel, friction, found = setting.size / grid, setting.gel, setting.friction, []
 
     def solve(heights: Array) -> tuple[Contact, Shear]:
@@ -159,7 +169,8 @@ def _references(setting: Setting, surfaces: Iterable[Surface], grid: int) -> lis
             contact, slid = solved(jnp.asarray(_heights(setting, surface, grid)))
             if not (bool(contact.converged) and bool(slid.converged)):
                 raise UserError("the reference did not converge: take a coarser one, or a smoother scene")
-            found.append((np.asarray(contact.displacement), np.asarray(slid.displacement), float(contact.force)))
+            fields = np.asarray(contact.displacement), np.asarray(slid.displacement)
+            found.append(Solution(*fields, float(contact.force), float(slid.slip_fraction)))
     return found
 
 
@@ -191,17 +202,18 @@ def _row(
     names: list[str],
     contact: Contact,
     slid: Shear,
-    right: list[tuple[Fields, Fields, float]],
+    right: list[Solution],
 ) -> Row:
-    rms, largest, image, shear, force = {}, {}, {}, 0.0, 0.0
+    rms, largest, image, shear, slip, force = {}, {}, {}, 0.0, 0.0, 0.0
     bare = _picture(np.zeros_like(right[0][0]), np.zeros_like(right[0][1]), setting)
     for number, name in enumerate(names):
-        displacement, tangential, load = right[number]
+        displacement, tangential, load, slipping = right[number]
         moved = _resized(contact.displacement[number], displacement.shape)
         dragged = _resized(slid.displacement[number], tangential.shape)
         error, top = moved - displacement, displacement.max()
         rms[name], largest[name] = float(np.sqrt(np.mean(error**2)) / top), float(abs(error).max() / top)
         shear = max(shear, float(np.sqrt(np.mean((dragged - tangential) ** 2)) / abs(tangential).max()))
+        slip = max(slip, abs(float(slid.slip_fraction[number]) - slipping))
         force = max(force, abs(float(contact.force[number]) / load - 1))
         own = _picture(contact.displacement[number], slid.displacement[number], setting)
         image[name] = _picture_error(own, _picture(displacement, tangential, setting), bare)
@@ -214,6 +226,7 @@ def _row(
         rms=rms,
         largest=largest,
         shear=shear,
+        slip=slip,
         force=force,
         converged=converged,
         image=image,
@@ -282,8 +295,8 @@ def recording_speed(
 
 def recorded_markdown(rows: Sequence[Recorded]) -> str:
     """A table with a line a sensor."""
-    lines = ["| recordings by | frames/s |", "| --- | --- |"]
-    return "\n".join(lines + [f"| {row.sensor} | {row.frames_per_second:.0f} |" for row in rows]) + "\n"
+    cells = [(one.sensor, f"{one.frames_per_second:.0f}") for one in rows]
+    return markdown(("recordings by", "frames/s"), cells) + "\n"
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
@@ -291,13 +304,18 @@ def to_markdown(rows: Sequence[Row]) -> str:
     (see `Row.image`), times in milliseconds a frame."""
     names = list(rows[0].rms) if rows else []
     heads = ["fidelity", "grid", "iterations", "press ms", "shear ms"]
-    heads += [f"{name}: rms / max %" for name in names] + ["shear rms %", "force %", "converged"]
+    heads += [f"{name}: rms / max %" for name in names] + ["shear rms %", "slip points", "force %", "converged"]
     heads += [f"{name}: picture" for name in names]
     lines = []
     for row in rows:
         cells = [row.fidelity, str(row.grid), "own" if row.iterations is None else str(row.iterations)]
         cells += [f"{row.press_ms:.2f}", f"{row.shear_ms:.2f}"]
         cells += [f"{100 * row.rms[name]:.2f} / {100 * row.largest[name]:.2f}" for name in names]
-        cells += [f"{100 * row.shear:.2f}", f"{100 * row.force:.2f}", f"{row.converged} of {len(row.rms)}"]
+        cells += [
+            f"{100 * row.shear:.2f}",
+            f"{100 * row.slip:.1f}",
+            f"{100 * row.force:.2f}",
+            f"{row.converged} of {len(row.rms)}",
+        ]
         lines.append(cells + [f"{row.image[name]:.2f}" for name in names])
     return markdown(heads, lines) + "\n"

@@ -22,8 +22,10 @@ import numpy as np
 
 from anytouch_jax.config import UserError
 from anytouch_jax.evaluate.features import Encoder, Join, Pooling, Sight, check_frames, touch_features
+from anytouch_jax.train.watch import Terminated, terminating
 
 PARTS = ("decode", "resize", "copy", "encoder")
+KEPT = 100_000  # embedded frames whose times are kept where their features are not
 _PATIENCE = 2.0  # seconds that a camera is given to answer after the last frame that anybody wants
 
 
@@ -209,7 +211,8 @@ def _read(source: Source, live: bool, see: Sight, frames: int, stride: int, mail
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 
-    `interrupted`: Ctrl-C ended the stream.
+    `total`: how many were embedded, of which the arrays may hold only the last. `interrupted`: Ctrl-C or SIGTERM ended
+    the stream.
     """
 
     values: np.ndarray
@@ -217,21 +220,24 @@ class Result(NamedTuple):
     at: np.ndarray
     seconds: np.ndarray
     age: np.ndarray
+    total: int
     interrupted: bool
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
-    """All that a stream gives, up to its end or to Ctrl-C. With `on_each`, values go there and are not kept."""
-    found: list[Embedded] = []
-    interrupted = False
+    """All that a stream gives, up to its end, Ctrl-C or SIGTERM. With `on_each`, values go there and are not kept, nor
+    are the times of more than the last KEPT: a stream may run for weeks."""
+    found: deque[Embedded] = deque(maxlen=KEPT if on_each else None)
+    total, interrupted = 0, False
     try:
-        with closing(embedded):
+        with closing(embedded), terminating():
             for one in embedded:
+                total += 1
                 if on_each is not None:
                     on_each(one)
                     one = one._replace(values=np.zeros(0, np.float32))
                 found.append(one)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Terminated):
         interrupted = True
     return Result(
         np.stack([one.values for one in found]) if found else np.zeros((0, 0), np.float32),
@@ -239,6 +245,7 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         np.asarray([one.at for one in found]),
         np.asarray([one.seconds for one in found]).reshape(-1, len(PARTS)),
         np.asarray([one.age for one in found]),
+        total,
         interrupted,
     )
 
@@ -253,4 +260,5 @@ def budget(result: Result) -> list[str]:
     count = len(result.numbers)
     rate = (count - 1) / np.ptp(result.at + result.age) if count > 1 else np.nan
     dropped = int(np.ptp(result.numbers)) + 1 - count if count else 0
-    return [*lines, f"{count} frames embedded, {dropped} dropped, {rate:.1f} frames/s"]
+    last = "," if result.total == count else f"; of the last {count}:"
+    return [*lines, f"{result.total} frames embedded{last} {dropped} dropped, {rate:.1f} frames/s"]

@@ -35,7 +35,8 @@ class Task:
 
     `label`: a column of the manifest; `classes`: the only values that take part (all without it); `above`: the label is
     a number, and the class is whether it lies above. `groups`: columns of which the first with a value names what is
-    never on both sides of a split (then the sequence; "recording" is the sequence without its last part). `frames`: 1,
+    never on both sides of a split (then the sequence; "recording" is the sequence without its last part: several
+    touches of one video, and no group where all rows are of one). `frames`: 1,
     or 3 for a clip that ends at the row. `which` rows: press, the deepest frame of a recording; contact, all that
     touch; moving, the frame of a recording that slips most. `fingers`: the rows of a touch by two units, features
     concatenated; `phase` "after": the frames after the grasp (Feel) instead of those during it. `where`: (column,
@@ -46,7 +47,7 @@ class Task:
     name: str
     label: str
     kind: Literal["classification", "regression"] = "classification"
-    groups: tuple[str, ...] = ("object",)
+    groups: tuple[str, ...] = ("object", "recording")
     frames: int = 1
     which: Which = "press"
     classes: tuple[str, ...] = ()
@@ -240,7 +241,7 @@ def _groups(table: Manifest, columns: Sequence[str]) -> Array:
     for name in reversed(columns):
         if name == "recording":
             recordings = np.array([f"recording {one.rpartition('/')[0] or one}" for one in sequence])
-            found = np.char.add(recordings, file)
+            found = np.char.add(recordings, file) if len(set(recordings)) > 1 else found
         elif name in table.table.column_names:
             values = text_column(table, name)
             own = np.char.add(values, file) if name in KEYS else values

@@ -1,8 +1,9 @@
 """Sentences about how an object feels, in the manner of the annotations of AnyTouch (its appendix on GPT-4o).
 
 They tell hardness, roughness, texture, warmth and grip: what a hand knows. They never name the object or its material
-(though most words for warmth and grip go with one material), and they tell nothing of its form, the indenter, or of
-the touch itself (force, motion, direction), so that labels of these are not given away.
+(though most words for warmth and grip go with one material), and no word stands for its form, the indenter, or
+for the touch itself (force, motion, direction), so that labels of these are not given away. What they do tell of the
+form: cones, rings and letters carry finer textures than the others, so wide spacing is seldom said of them.
 """
 
 from __future__ import annotations

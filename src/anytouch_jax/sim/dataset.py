@@ -9,8 +9,9 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ import pyarrow.parquet as pq
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.whole import replacing, write_whole
+from anytouch_jax.whole import alone, replacing, write_whole
 
 from . import captions, objects, photo, scene
 from .record import Recorder, Take
@@ -52,8 +53,13 @@ def simulate(
     out = Path(out)
     if threads < 1:
         raise UserError(f"threads must be at least 1, not {threads}")
+    things, splits = scene.cast(scenes)  # before the folder is taken: what cannot be simulated leaves nothing
     try:
-        return _simulate(scenes, out, threads, progress)
+        _claim(scenes, out)
+        with alone(out / SETTINGS) as mine:
+            if not mine:
+                raise UserError(f"another process simulates into {out}: wait for it, or give another folder")
+            return _simulate(scenes, things, splits, out, threads, progress)
     except (FileExistsError, NotADirectoryError) as error:
         raise UserError(f"{error.filename or out} is a file; give a folder") from None
     except OSError as error:
@@ -62,9 +68,9 @@ def simulate(
         ) from None
 
 
-def _simulate(scenes: Scenes, out: Path, threads: int, progress: Callable[[int, int], None]) -> Path:
-    things, splits = scene.cast(scenes)  # before the folder is taken: what cannot be simulated leaves nothing
-    _claim(scenes, out)
+def _simulate(
+    scenes: Scenes, things: Any, splits: Sequence[str], out: Path, threads: int, progress: Callable[[int, int], None]
+) -> Path:
     target = out / MANIFEST
     if target.exists():
         shutil.rmtree(out / PARTS, ignore_errors=True)  # left by a kill in the last moment
@@ -100,11 +106,7 @@ def _claim(scenes: Scenes, out: Path) -> None:
             del settings[name]
     text, file = json.dumps(settings, indent=2) + "\n", out / SETTINGS
     if file.exists():
-        try:
-            held = json.loads(file.read_text())
-        except ValueError:
-            held = {}
-        held, now = held if isinstance(held, dict) else {}, json.loads(text)
+        held, now = _read_settings(file), json.loads(text)
         pairs = {name: (held.get(name), now.get(name)) for name in (*now, *held)}
         other = [f"{name} {one!r}, not {two!r}" for name, (one, two) in pairs.items() if one != two]
         if not other:
@@ -113,7 +115,18 @@ def _claim(scenes: Scenes, out: Path) -> None:
     if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")
     out.mkdir(parents=True, exist_ok=True)
-    _write_bytes(file, text.encode())
+    write_whole(file, text, part=out / f"{SETTINGS}.tmp")
+
+
+def _read_settings(file: Path) -> dict[str, Any]:
+    """Raises UserError where they are not those of a data set."""
+    try:
+        held = json.loads(file.read_text())
+    except ValueError:
+        held = None
+    if not isinstance(held, dict) or "version" not in held:
+        raise UserError(f"{file} does not hold the settings of a simulated data set: give another folder")
+    return held
 
 
 def _write_group(
@@ -141,7 +154,7 @@ def _write_recording(scenes: Scenes, thing: objects.Object, recording: Recording
     picture = caption = None
     if recording.has_photo:
         picture = folder / "photo.jpg"
-        image = photo.photograph(thing, touch.place, scene.photo_rng(scenes, recording), scenes.size)
+        image = photo.photograph(thing, touch.place, scene.photo_rng(scenes, recording), scenes.size or 224)
         _write_image(out / picture, image)
     if recording.has_text:
         caption = captions.caption(thing, scene.caption_rng(scenes, recording))
@@ -197,6 +210,7 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> 
 def _write_table(rows: list[Row], file: Path) -> None:
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: [row.get(name) for row in rows] for name in names})
+    os.sync()  # the files that it vouches for, once a part instead of once a picture
     with replacing(file, part=file.with_suffix(".tmp")) as part:
         pq.write_table(table, part)
 
@@ -229,5 +243,5 @@ def _write_array(path: Path, array: np.ndarray) -> None:
 
 
 def _write_bytes(path: Path, data: bytes) -> None:
-    """Not waiting for the disk: a part's table, which is written last, vouches for its files."""
+    """Not waiting for the disk: that is done once a part (`_write_table`)."""
     write_whole(path, data, sync=False, part=path.with_name(path.name + ".tmp"))

@@ -17,7 +17,7 @@ import numpy as np
 from ..config import UserError
 from . import markers, shading, splines
 from .sensors import Markers, Sensor, look
-from .units import Unit
+from .units import Unit, turned
 
 Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope
@@ -34,7 +34,10 @@ class View(NamedTuple):
 
 
 def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
-    """(height, width) of a picture of the whole field with square pixels and a short side of `short` pixels."""
+    """(height, width) of a picture of the whole field with square pixels: a short side of `short` pixels, 0 for the
+    sensor's own resolution."""
+    if not short:
+        return sensor.resolution
     scale = short / min(sensor.field)
     return round(sensor.field[0] * scale), round(sensor.field[1] * scale)
 
@@ -93,7 +96,7 @@ def render(
         halo = _halo(displacement, matrices, pitch, sensor)
     glow: tuple[Array, ...] | None = None
     if shadow and halo is not None:
-        lit = (*_turned(halo[0], halo[1], unit), halo[2])
+        lit = (*turned(halo[0], halo[1], unit.light_angle), halo[2])
         glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
     ink = None
     if sensor.markers is not None and halo is not None:
@@ -162,13 +165,7 @@ def _slopes(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor,
     if sensor.skin:
         by, bx = (splines.blur(n, sensor.skin / pitch) for n in displacement.shape)
         displacement = by @ displacement @ bx.T
-    return _turned(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit)
-
-
-def _turned(x: Array, y: Array, unit: Unit) -> tuple[Array, Array]:
-    """Slopes along x and y as the unit's lights meet them."""
-    c, s = jnp.cos(unit.light_angle), jnp.sin(unit.light_angle)
-    return c * x - s * y, s * x + c * y
+    return turned(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit.light_angle)
 
 
 def _halo(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor) -> tuple[Array, ...]:

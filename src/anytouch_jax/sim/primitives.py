@@ -119,21 +119,3 @@ def floor(form: Form) -> float:
     """The height of the table in mm below the highest place."""
     drop = {"sphere": form.size, "cylinder": form.size, "screw": form.size, "ring": 0.3 * form.size, "cone": 4.0}
     return -drop.get(form.primitive, PLATE)
-
-
-def reach(form: Form) -> tuple[float, float, float, float]:
-    """Places worth touching: lowest x, highest x, lowest y, highest y in mm; 12 mm around one meet the top."""
-    s = form.size
-    if form.primitive in ("flat", "letters"):
-        r = 0.7 * s if form.primitive == "flat" else 0.5 * s
-        return -r, r, -r, r
-    if form.primitive in ("cylinder", "screw"):
-        return -0.15 * s, 0.15 * s, -8.0, 8.0
-    if form.primitive == "edge":
-        return -4.0 - s, 0.5 - s, -8.0, 8.0
-    if form.primitive == "corner":
-        return -4.0 - s, 0.5 - s, -4.0 - s, 0.5 - s
-    if form.primitive == "ring":
-        return 0.2 * s, s, -0.4 * s, 0.4 * s
-    r = {"sphere": 0.15, "cone": 0.1}[form.primitive] * s
-    return -r, r, -r, r

@@ -21,7 +21,7 @@ from .mechanics import Contact, Fidelity, Gel
 from .objects import Object
 from .scene import Recording, Scenes
 from .sensors import SENSORS, Sensor, look
-from .units import from_gel, stack
+from .units import from_gel, stack, turned
 
 SPACING = 0.1  # mm a pixel of a relief
 RELIEF = 400  # pixels of a relief: 40 mm, more than any field turned by any angle, and its motion
@@ -79,8 +79,8 @@ def surfaces(clip: Clip, x: Array, y: Array) -> Array:
     x, y = from_gel(clip.unit, x, y)
 
     def under(motion: Array) -> Array:
-        u, v = _turned(x - motion[0], y - motion[1], -motion[2])
-        u, v = _turned(u - clip.start[0], v - clip.start[1], -clip.start[2])
+        u, v = turned(x - motion[0], y - motion[1], -motion[2])
+        u, v = turned(u - clip.start[0], v - clip.start[1], -clip.start[2])
         z = shapes.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
         return z + clip.tilt[0] * x + clip.tilt[1] * y
 
@@ -92,8 +92,7 @@ def surfaces(clip: Clip, x: Array, y: Array) -> Array:
 def gel_motion(clip: Clip) -> Array:
     """Motion (T, 3) mm, mm, rad of the object from frame to frame in the gel's own frame; 0 in the first."""
     steps = jnp.diff(clip.motion, axis=0, prepend=clip.motion[:1])
-    c, s = jnp.cos(clip.unit.rotation), jnp.sin(clip.unit.rotation)
-    return jnp.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1], steps[:, 2]], 1)
+    return jnp.stack([*turned(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
 
 
 def record(
@@ -193,11 +192,6 @@ def _fields(
     return jnp.concatenate([known[name]() for name in names], -1) if names else None
 
 
-def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return c * x - s * y, s * x + c * y
-
-
 AT_ONCE = 24_000_000  # pixels that are computed at a time; some dozen float32 planes of them are in memory
 
 
@@ -209,7 +203,8 @@ class Recorder:
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
         self._scenes, self._objects, self._batch = scenes, objects, batch
-        pixels = 2 * scenes.frames * scenes.size**2  # of a recording; a picture is at most twice as long as wide
+        # Of a recording: a picture is at most twice as long as wide, and a sensor's own at most 480 pixels high.
+        pixels = 2 * scenes.frames * (scenes.size or 480) ** 2
         self._at_once = max(1, min(batch, AT_ONCE // pixels))
         self._relief = lru_cache(64)(lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING))
         self._programs: dict[str, Any] = {}
@@ -226,9 +221,9 @@ class Recorder:
         clips = [self._clip(recording) for recording in recordings[first : first + self._at_once]]
         count = len(clips)
         clips += clips[-1:] * (self._at_once - count)  # one shape, one compilation
-        units = stack([clip.unit for clip in clips])
+        several = stack([clip.unit for clip in clips])
         batch = Clip(*(np.stack(values) for values in zip(*(c._replace(unit=0) for c in clips), strict=True)))
-        takes = jax.device_get(self._program(recordings[0].sensor)(batch._replace(unit=units)))
+        takes = jax.device_get(self._program(recordings[0].sensor)(batch._replace(unit=several)))
         return [jax.tree.map(lambda x, i=i: x[i], takes) for i in range(count)]
 
     def _program(self, name: str) -> Any:

@@ -1,6 +1,7 @@
 """Which touches are made: objects, places, motions and sensor units, drawn from a seed (numpy; nothing is computed).
 
-A touch is a place on an object; a recording is one sensor's clip of it: press, hold, slide or twist, release, at 30 Hz.
+A touch is a place on an object; a recording is one sensor's clip of it: press, hold, slide or twist, release.
+One gesture fills a clip, whatever its number of frames: ten, at the 30 Hz of the sensors, are a third of a second.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ Array = np.ndarray
 Grade = Literal["fine", "coarse"]
 Motion = Literal["hold", "slide", "twist"]
 
-RATE = 30.0  # frames a second
 FIELDS = ("displacement", "pressure", "shear")
 # Tags that keep the random streams of a seed apart.
 _OBJECTS, _TOUCH, _RECORDING, _PHOTO, _CAPTION, _UNIT = 1, 2, 3, 4, 5, 6
@@ -71,9 +71,13 @@ class Scenes:
         for name in self.fields:
             if name not in FIELDS:
                 raise UserError(f"there is no field {name!r}; choose among {', '.join(FIELDS)}")
-        for name, least in (("touches", 1), ("frames", 1), ("objects", 1), ("size", 16)):
+        for name, least in (("touches", 1), ("frames", 1), ("objects", 1)):
             if getattr(self, name) < least:
                 raise UserError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        if self.size < 16 and self.size:
+            raise UserError(f"size must be at least 16, or 0 for each sensor's own resolution, not {self.size}")
+        if self.fields and all(SENSORS[name].kind == "field" for name in self.sensors):
+            raise UserError("fields are written beside pictures, and none of the sensors has a camera: leave them away")
         if not (0 <= self.depth[0] <= self.depth[1] < math.inf):
             raise UserError(
                 f"depth is a range of mm from 0 on, lowest first, not {self.depth[0]:g} to {self.depth[1]:g}"

@@ -13,12 +13,12 @@ import numpy as np
 from anytouch_jax.config import UserError
 
 from .letters import STROKES
-from .primitives import PRIMITIVES, floor, reach
+from .primitives import PRIMITIVES, floor
 from .textures import GRAINS, TEXTURES, Array, namespace, warped
 
 __all__ = [
     "GRAINS", "PRIMITIVES", "TEXTURES", "Shape",
-    "base", "floor", "height", "layers", "reach", "relief", "sample", "unroll",
+    "base", "floor", "height", "layers", "relief", "sample", "unroll",
 ]  # fmt: skip
 
 

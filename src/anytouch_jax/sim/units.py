@@ -1,7 +1,7 @@
 """One unit of a sensor: what differs between two devices of the same family, as arrays that vmap over recordings.
 
-`rotation` and `offset` move the *object*: `to_gel` and `from_gel` turn places of the object's frame into places on the
-gel and back, and the scene applies them before contact. `mirror`, `zoom` and `window` move the *picture*: they choose
+`rotation` and `offset` move the *object*: `from_gel` turns places on the gel into places of the object's frame, before
+contact. `mirror`, `zoom` and `window` move the *picture*: they choose
 which part of the gel the camera shows and from which side, and only the renderer knows them.
 """
 
@@ -88,17 +88,15 @@ def draw_unit(sensor: Sensor, rng: np.random.Generator) -> Unit:
     )
 
 
-def to_gel(unit: Unit, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Places on the gel (mm) of places `x`, `y` of the nominal mounting: turned by `rotation`, moved by `offset`."""
-    c, s = jnp.cos(unit.rotation), jnp.sin(unit.rotation)
-    return c * x - s * y + unit.offset[0], s * x + c * y + unit.offset[1]
+def turned(x: jax.Array, y: jax.Array, angle: Any) -> tuple[jax.Array, jax.Array]:
+    """Vectors turned by `angle` rad, from x towards y."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * x - s * y, s * x + c * y
 
 
 def from_gel(unit: Unit, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The inverse of `to_gel`: where on the nominally mounted object the gel's places `x`, `y` (mm) lie."""
-    c, s = jnp.cos(unit.rotation), jnp.sin(unit.rotation)
-    x, y = x - unit.offset[0], y - unit.offset[1]
-    return c * x + s * y, -s * x + c * y
+    """Where on the nominally mounted object the gel's places `x`, `y` (mm) lie: moved and turned back."""
+    return turned(x - unit.offset[0], y - unit.offset[1], -unit.rotation)
 
 
 def stack(units: list[Unit]) -> Unit:

@@ -32,6 +32,7 @@ from anytouch_jax.train.processes import Ballot, check_shared, told_by_first, wh
 from anytouch_jax.train.record import Record, goes_on, open_run, writing
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
+from anytouch_jax.whole import alone
 
 Tree = Any
 _SIGNAL, _SKIPPED = "signal", "skipped_samples"  # beside the metrics of a step: what its ballot says
@@ -99,6 +100,8 @@ def fit(
     check_shared(run_dir / "figures")
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
+        if lead and not stack.enter_context(alone(run_dir / "config.json")):
+            raise UserError(f"another process trains {run_dir}: wait for it, or name another folder with --run")
         with writing(run_dir / "checkpoints"):
             checkpoints = Checkpoints(
                 run_dir / "checkpoints",

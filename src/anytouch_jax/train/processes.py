@@ -68,6 +68,8 @@ def find_place(environ: Mapping[str, str] = os.environ) -> Place | None:
     elif launcher:
         count, index, local = (_number(environ, name) for name in _LAUNCHERS[launcher])
         place = Place(count, index, local, coordinator, launcher)
+    elif environ.get("JAX_NUM_PROCESSES", "1") != "1":  # else each of them would train alone, in one folder
+        raise ConfigError("JAX_NUM_PROCESSES needs JAX_COORDINATOR_ADDRESS=host:port too, of the process of number 0")
     else:
         return None
     if not index < max(count, 1):

@@ -18,6 +18,7 @@ STEPS      ?=
 STOP_AFTER ?=
 SAVE       ?=
 BATCH      ?=
+ARGS       ?=
 LABEL      ?= material
 GOLDEN     ?= tests/parity/golden
 WORKERS    ?= 2
@@ -58,6 +59,7 @@ help: ## list the targets
 	@echo "  INIT=path        what stage 2 starts from: a stage-1 run or a weights file ($(INIT))"
 	@echo "  PRESET=name      tiny, small, base or large ($(PRESET))"
 	@echo "  STEPS=n  STOP_AFTER=n  SAVE=n  BATCH=n   whole schedule; end early; steps between checkpoints; samples a step"
+	@echo "  ARGS=\"--recipe release\"                 any other option of anytouch train"
 	@echo "  LABEL=name       label column of probe ($(LABEL));  GOLDEN=folder  vectors of parity ($(GOLDEN))"
 
 setup: $(STAMP) ## make .venv with the pinned versions
@@ -72,11 +74,11 @@ demo: $(STAMP) ## simulate, train both stages, probe and report, in eleven to tw
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
 	$(ANYTOUCH) simulate --out $(SCENES)
 
-train-stage1: $(STAMP) $(scenes) ## masked and next-frame pre-training: [DATA= RUN= PRESET= STEPS= STOP_AFTER= SAVE=]
-	$(ANYTOUCH) train --stage 1 --data $(DATA) $(OPTIONS)
+train-stage1: $(STAMP) $(scenes) ## masked and next-frame pre-training: [DATA= RUN= PRESET= STEPS= STOP_AFTER= SAVE= ARGS=]
+	$(ANYTOUCH) train --stage 1 --data $(DATA) $(OPTIONS) $(ARGS)
 
 train-stage2: $(STAMP) $(scenes) ## alignment and matching on top of INIT: [DATA= INIT= RUN= PRESET= STEPS= ...]
-	$(ANYTOUCH) train --stage 2 --data $(DATA) $(OPTIONS) --init $(INIT)
+	$(ANYTOUCH) train --stage 2 --data $(DATA) $(OPTIONS) --init $(INIT) $(ARGS)
 
 probe: $(STAMP) $(scenes) ## linear and kNN probes of a run on a label column: [DATA= LABEL= RUN=]
 	$(ANYTOUCH) probe --run $(RUN) --data $(DATA) --label $(LABEL)

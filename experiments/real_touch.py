@@ -47,10 +47,11 @@ from anytouch_jax.objectives import normalise_touch, stage1_terms
 from anytouch_jax.ops import masking
 from anytouch_jax.options import Probe
 from anytouch_jax.train.loop import fit
+from anytouch_jax.whole import write_whole
 
 DATA, OUT = asked.path("DATA", "../shared/real_touch/manifest.csv"), asked.path("OUT", "experiments/results")
 STAGE1, STAGE2 = asked.path("STAGE1", "runs/stage1"), asked.path("STAGE2", "runs/stage2")
-LABELLED, LABELLED_STEPS = asked.path("LABELLED", "runs/labelled"), asked.number("LABELLED_STEPS", 200)
+LABELLED, LABELLED_STEPS = asked.path("LABELLED", "runs/labelled"), asked.number("LABELLED_STEPS", 600)
 
 manifest = manifests.read(DATA)
 params, text, about = checkpoint.load_params(STAGE1)
@@ -143,7 +144,8 @@ def train_with_labels() -> Encoder:
     fresh = {"touch": net.init(jax.random.key(1))["touch"]}
     kernel = np.random.default_rng(1).standard_normal((config.model.embed, len(names))) * 0.02
     fresh["head"] = {"kernel": jnp.asarray(kernel, jnp.float32), "bias": jnp.zeros(len(names))}
-    recipe = replace(config, run=replace(config.run, steps=LABELLED_STEPS, figure_every=0))
+    run, optim = replace(config.run, steps=LABELLED_STEPS, figure_every=0), replace(config.optim, warmup=None)
+    recipe = replace(config, run=run, optim=optim)
     fit(recipe, params=fresh, loss_fn=labelled_loss, batches=labelled_batches, run_dir=LABELLED)
     return load_encoder(LABELLED)
 
@@ -171,6 +173,10 @@ found.append(probe_command.probe.majority(task.labels, task.groups, task.split, 
 write("## Object, test recordings, contact frames\n")
 write(results.to_table(found))
 record["object"] = json.loads(results.to_json(found))
+
+metrics = [json.loads(line) for line in (LABELLED / "metrics.jsonl").read_text().splitlines()]
+record["labelled_train"] = learned = float(np.mean([row["accuracy"] for row in metrics[-50:]]))
+write(f"Trained with labels: {100 * learned:.1f} % of its own frames in the last 50 of {len(metrics)} steps.\n")
 
 # %% [markdown]
 # Differences are paired by test frame, intervals over test recordings.
@@ -225,9 +231,6 @@ record["slip"] = json.loads(results.to_json(slips))
 # stages; it is too small to rank encoders.
 
 # %%
-from anytouch_jax.whole import write_whole  # noqa: E402
-
-OUT.mkdir(parents=True, exist_ok=True)
 head = (
     "# Real touch: what a tiny encoder learns from 210 clips\n\n"
     f"Made by `experiments/real_touch.py` from `{STAGE1}` ({config.run.steps} steps) and `{STAGE2}`; manifest "

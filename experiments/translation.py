@@ -340,6 +340,8 @@ lines = [
     f"Objects of the pairs that an encoder was trained on in its last stage: {told}.",
     "",
 ]
+if not any(record["critic"] for record in records):
+    lines += ["No critic judged the images: these encoders see touches less the untouched gel, no whole picture.", ""]
 lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]
 lines += [f"![{path.stem}]({NAME}/{path.name})" for path in sorted(RUN_FILES.glob("*.png"))]
 lines.append("")

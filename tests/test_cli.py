@@ -417,6 +417,15 @@ def test_convert_to_the_authors_names_and_back(tmp_path, tiny_run, capsys):
         np.testing.assert_array_equal(load_encoder(path).embed(clip, "digit"), expected)
 
 
+def test_what_the_authors_files_cannot_hold_is_one_sentence(tmp_path, capsys):
+    model = touch_model()
+    params = build(model).init(jax.random.key(0))
+    export_safetensors(tmp_path / "own.safetensors", {"touch": params["touch"]}, {release.MODEL_KEY: to_json(model)})
+    told = mistake(capsys, "convert", tmp_path / "own.safetensors", tmp_path / "theirs.safetensors")
+    assert "lacks a touch encoder or a decoder" in told and "--names own" in told
+    assert not (tmp_path / "theirs.safetensors").exists()
+
+
 def test_convert_brings_the_universal_tokens_to_the_last_row(tmp_path):
     # A sensor added at the end of the table stands behind them; the authors' code reads the last row.
     model = touch_model(sensors=(*SENSORS, "mine"))

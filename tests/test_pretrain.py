@@ -10,11 +10,12 @@ import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 from touch_world import make_touches
 
-from anytouch_jax.config import SENSORS, UserError, from_json
+from anytouch_jax.config import SENSORS, UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import text as texts
 from anytouch_jax.data.loader import Loader
 from anytouch_jax.io import checkpoint, release
+from anytouch_jax.io.resize import resize_position
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import build
 
@@ -120,6 +121,7 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == vocabulary < 2048
     assert first.params["text"]["token"].shape == (vocabulary, 16)
 
+    whole = train(config, tmp_path / "whole", said, init=init)
     shutil.rmtree(init)  # what goes on needs it no more, whether or not it is named
     assert train(config, tmp_path / "r", said, init=init, stop_after=2).step == 2
     assert not any("is not read" in line for line in said)
@@ -127,6 +129,10 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert f"was begun from {init}: {run} is not read" in said[-1] + "".join(said)
     last = train(config, tmp_path / "r", said)
     assert (last.resumed, last.step, last.traces) == (2, 4, 1)
+    wanted, found = arrays_of(whole), arrays_of(last)
+    assert found.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in found)
+    for name, array in wanted.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
     assert not any("without a stage-1 run" in line for line in said)
     assert (tmp_path / "r" / "tokenizer.json").read_bytes() == tokenizer
     lines = read_metrics(tmp_path / "r")
@@ -275,6 +281,29 @@ def test_settings_that_would_do_nothing_are_one_sentence(world, tmp_path):
         config = run_config(world, stage, model=model)
         config = replace(config, objective=replace(config.objective, **objective))
         assert told in refused(config, tmp_path / "r") and not (tmp_path / "r").exists()
+    config = run_config(world, 2)
+    config = replace(config, optim=replace(config.optim, accumulate=2))
+    assert "--optim.accumulate must be 1 in stage 2" in refused(config, tmp_path / "r")
+    both = refused(run_config(world), tmp_path / "r", init="a.pth", clip="b.safetensors")
+    assert "--clip is not read beside --init" in both and not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("form", ["run", "file"])
+def test_weights_for_another_image_size_have_their_positions_resized(straight, world, tmp_path, form):
+    run, result = straight
+    init, before = run, as_used(run, result)
+    if form == "file":
+        model = from_json((run / "config.json").read_text()).model
+        init = tmp_path / "w.safetensors"
+        release.write_safetensors(init, release.to_release(before, model), {release.MODEL_KEY: to_json(model)})
+    said: list[str] = []
+    params = train(run_config(world, model={"image_size": 56}), tmp_path / "r", said, init=init, stop_after=0).params
+    for part in ("touch", "decoder"):
+        table = np.asarray(before[part]["position"])
+        rows = len(params[part]["position"])
+        assert rows == 1 + 4 * (len(table) - 1)
+        np.testing.assert_allclose(params[part]["position"], resize_position(table, rows), atol=1e-6)
+    assert f"the positions of {init} are resized for pictures of 56 pixels" in said
 
 
 def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):
@@ -319,8 +348,9 @@ def test_a_run_is_not_gone_on_with_on_other_rows(world, tmp_path):
     write_manifest(file, rows)
     message = refused(run_config(file), tmp_path / "r")
     assert "have changed since" in message and "--init" in message
-    write_manifest(file, rows[:-1])
-    assert train(run_config(file), tmp_path / "r", stop_after=2).step == 2
+    moved = shutil.copytree(world.parent, tmp_path / "moved")
+    write_manifest(moved / "other.csv", rows[:-1])  # the same rows and files at another place
+    assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2
 
 
 def test_a_start_that_failed_leaves_no_tokenizer_behind_that_counts(straight, world, tmp_path):

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from anytouch_jax.config import to_json
+from anytouch_jax.config import UserError, to_json
 from anytouch_jax.evaluate.export import call_of, describes
 from anytouch_jax.evaluate.features import check_frames, load_encoder
 from anytouch_jax.io.checkpoint import export_safetensors
@@ -66,4 +66,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except UserError as error:
+        sys.exit(f"onnx_export: {error}")

@@ -134,15 +134,15 @@ def q3(runs: Sequence[Run]) -> Part:
     names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
     static = Table("q3", names, SIX, paper.TABLES23, SIX_PAPER)
     rivals = [pair for pair in against(static, "anytouch", None) if pair.second in paper.TABLES23]
-    one = judge(runs, "q3", SIX, rivals)
+    one = judge(runs, "q3", SIX, [*rivals, *_controls(len(SIX))])
     shape = [pair._replace(label=f"form: {pair.label}", expected=_of_form(pair)) for pair in rivals]
-    form = judge(runs, "q3", FORM, shape)
+    form = judge(runs, "q3", FORM, [*shape, *_controls(len(FORM), "form: ")])
     moving = Table("q3", names, dynamic("clips"), paper.TABLE4, ("pouring, fine-tuned (g)", "frozen (g)"))
     ahead = [
         Pair(f"AnyTouch against {title(name)}", "anytouch", name, (1, 1, 1, 1), (0, 2, 3))  # R2 is no accuracy
         for name in paper.TABLE4 if name != "anytouch"
     ]  # fmt: skip
-    two = judge(runs, "q3", moving.columns, ahead)
+    two = judge(runs, "q3", moving.columns, [*ahead, *_controls(len(moving.columns), "dynamic tasks: ", (0, 2, 3))])
     text = (
         f"Static tasks (Tables 2 and 3):\n\n{block(runs, static, one)}\n\n"
         "The form of the indenter, which no caption names (signs as of the materials):\n\n"
@@ -151,6 +151,14 @@ def q3(runs: Sequence[Run]) -> Part:
         f"less is better):\n\n{block(runs, moving, two)}"
     )
     return Part("Q3: static and dynamic perception (Tables 2, 3, 4)", text, (*one, *form, *two))
+
+
+def _controls(columns: int, label: str = "", whole: Sequence[int] | None = None) -> list[Pair]:
+    """What the paper has no row for: AnyTouch above what was never trained, and above raw pixels."""
+    return [
+        Pair(f"{label}our control: AnyTouch above {title(name)}", "anytouch", name, (1,) * columns, whole)
+        for name in ("untrained", "pixels")
+    ]
 
 
 def _of_form(pair: Pair) -> tuple[float | None, ...]:

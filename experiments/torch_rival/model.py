@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from keys import renamed
 from torch import Tensor, nn
 from torch.nn import functional as F
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModel, ViTConfig
@@ -189,24 +190,6 @@ def both_ways(a: Tensor, b: Tensor, scale: Tensor) -> Tensor:
     logits = scale * a @ b.T
     own = torch.arange(len(a), device=a.device)
     return F.cross_entropy(logits.float(), own) + F.cross_entropy(logits.T.float(), own)
-
-
-_DECODER = {
-    "attention.attention.query": "attention.q_proj",
-    "attention.attention.key": "attention.k_proj",
-    "attention.attention.value": "attention.v_proj",
-    "attention.output.dense": "attention.o_proj",
-    "intermediate.dense": "mlp.fc1",
-    "output.dense": "mlp.fc2",
-}
-
-
-def renamed(key: str) -> str:
-    """A key of the authors' files as this version of transformers names it."""
-    if "touch_decoder_blocks" in key:
-        for old, new in _DECODER.items():
-            key = key.replace(f".{old}.", f".{new}.") if f".{old}." in key else key
-    return key
 
 
 def load(model: nn.Module, weights: dict[str, Tensor]) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from keys import renamed
 
 from anytouch_jax import pages
 from anytouch_jax.evaluate import machine, plots, results, speed, speed_report, variants
@@ -106,7 +108,7 @@ def reference(work: Workload, params: Any) -> dict[str, Any]:
     }
 
 
-def rival_errors(loss: float, file: Path, exact: dict[str, Any], renamed: Any) -> dict[str, float]:
+def rival_errors(loss: float, file: Path, exact: dict[str, Any]) -> dict[str, float]:
     """Relative errors of a rival, as `speed.errors` has them for ours."""
     found = release.read_weights(file)
     errors = {"output": speed.relative([found.pop("output")], [exact["output"]])}
@@ -140,7 +142,6 @@ def compare(
 ) -> dict[str, Any]:
     """Rows of ours and of PyTorch for a workload. Raises SystemExit where the losses differ."""
     sys.path.insert(0, str(Path(__file__).parent))
-    renamed = _renamed()
     state = first_state(work.config)
     params = jax.device_get(merge(state.trainable, state.frozen))
     with TemporaryDirectory() as name:
@@ -161,7 +162,7 @@ def compare(
                     notes[rival] = str(error)
                     continue
                 first = time.perf_counter() - start
-                errors[rival] = rival_errors(answer["loss"], folder / "values.safetensors", exact, renamed)
+                errors[rival] = rival_errors(answer["loss"], folder / "values.safetensors", exact)
                 errors[rival]["first"] = first
                 print(f"{work.name}: PyTorch {rival}: {errors[rival]}", file=sys.stderr)
                 if "float32" in rival:
@@ -228,15 +229,6 @@ def timed(
     return rows
 
 
-def _renamed() -> Any:
-    """`model.renamed`, without importing torch here."""
-    source = Path(__file__).with_name("model.py").read_text()
-    cut = source[source.index("_DECODER = {") : source.index("def load(")]
-    space: dict[str, Any] = {}
-    exec(cut, space)
-    return space["renamed"]
-
-
 def to_markdown(work: Workload, found: dict[str, Any], preset: str) -> str:
     heads = ("", "time / ours float32 (IQR)", "best / best", "ms", "samples/s", "GFLOP/s", "of float32 peak")
     heads += ("error: output", "loss", "gradient", "p99 ms")
@@ -276,6 +268,8 @@ def main() -> None:
     options = parser.parse_args()
     if unknown := set(options.what) - {*WHAT}:
         parser.error(f"{', '.join(sorted(unknown))}: choose among {', '.join(WHAT)}")
+    if shutil.which(options.torch) is None:
+        parser.error(f"--torch {options.torch}: no such program; make bench-torch makes one")
     here = machine.describe()
     if here.load > 0.3 * here.cores:
         print(f"load {here.load:.1f}: PyTorch's threads suffer more than ours from other work; wait", file=sys.stderr)

@@ -189,7 +189,7 @@ class Parity:
 
 @dataclass(frozen=True)
 class Convert:
-    """Convert weights: authors' .pth, CLIP (.safetensors, .bin) or a run -> .safetensors with the authors' key names.
+    """Convert weights: the authors' .pth, CLIP's (with --names own) or a run -> .safetensors.
 
     Example: anytouch convert runs/stage2 weights.safetensors
     """
@@ -317,7 +317,7 @@ class Bench:
     batch: int | None = None
     """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; a device for memory)."""
     out: Path = Path("runs/bench")
-    """Folder for speed.md, speed.json and figures/."""
+    """Folder for speed.md, or speed_WHAT_PRESET.md, its numbers (.json) and figures/."""
     rounds: int = 9
     """Rounds in which all variants take turns; figures are medians."""
     quick: bool = False

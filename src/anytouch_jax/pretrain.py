@@ -59,6 +59,10 @@ def pretrain(
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     say = say if jax.process_index() == 0 else silent
     _possible(config)
+    if config.stage == 1 and init is not None and clip is not None:
+        raise UserError(
+            "--clip is not read beside --init in stage 1, where each gives the touch encoder: leave one out"
+        )
     _same_stage(run, config)
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _with_tokenizer(config, run, manifest, clip)
@@ -98,6 +102,11 @@ def _possible(config: Config) -> None:
         raise UserError("--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out")
     if model.dtype == "float64" and not jax.config.read("jax_enable_x64"):
         raise UserError("--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32")
+    if config.stage == 2 and config.optim.accumulate > 1 and (model.image or model.text):
+        raise UserError(
+            "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
+            "whole batch; lower --batch instead"
+        )
     if config.stage == 2 and objective.force:
         raise UserError("--objective.force is a loss of stage 1; leave it out in stage 2")
     if config.stage == 2 and objective.differences and not objective.reconstruct:
@@ -279,6 +288,9 @@ def _load(path: Path, config: Config, say: Say) -> Params:
         params, stored = release.to_params(weights, detected), detected.sensors
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
+    if params["touch"]["position"].shape[0] != config.model.patches + 1:
+        say(f"the positions of {path} are resized for pictures of {config.model.image_size} pixels")
+        params = release.resized(params, config.model.patches)
     touch, wanted = params["touch"], config.model.sensors
     touch = touch | {"sensor_tokens": release.match_sensors(np.asarray(touch["sensor_tokens"]), stored, wanted)}
     if config.model.patch_encoder == "sensor" and touch["patch"]["kernel"].ndim == 4:

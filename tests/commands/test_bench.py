@@ -32,9 +32,20 @@ def run(*args):
         return int(stop.code or 0)
 
 
+def numbers_of(folder, name):
+    return json.loads((folder / f"speed_{name}.json").read_text())
+
+
+def test_no_page_is_written_over_by_another(tiny, tmp_path, capsys):
+    (tmp_path / "speed_embed_tiny.md").write_text("by hand")
+    assert run("embed", "--quick", "--out", tmp_path) == 1
+    assert "was not made by bench" in capsys.readouterr().err
+    assert (tmp_path / "speed_embed_tiny.md").read_text() == "by hand" and len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_table_of_numbers_of_words_and_a_figure(tiny, tmp_path, capsys):
     assert run("embed", "--quick", "--out", tmp_path) == 0
-    text, numbers = (tmp_path / "speed.md").read_text(), json.loads((tmp_path / "speed.json").read_text())
+    text, numbers = (tmp_path / "speed_embed_tiny.md").read_text(), numbers_of(tmp_path, "embed_tiny")
     (rows,) = numbers["results"].values()
     assert [row["variant"] for row in rows] == ["float32", "bfloat16"] and numbers["rounds"] == 2
     assert rows[0]["ratio"] == 1 and 0 < rows[0]["error_output"] < 1e-5 < rows[1]["error_output"]
@@ -52,17 +63,17 @@ def test_what_was_measured_outlives_what_fails_later(tiny, tmp_path, capsys, mon
     monkeypatch.setattr(speed, "errors", fail)
     assert run("embed", "--quick", "--out", tmp_path) == 0
     assert "no errors, the float64 reference failed: RESOURCE_EXHAUSTED" in capsys.readouterr().err
-    (rows,) = json.loads((tmp_path / "speed.json").read_text())["results"].values()
+    (rows,) = numbers_of(tmp_path, "embed_tiny")["results"].values()
     assert all(row["ratio"] > 0 and row["error_output"] is None for row in rows)
     monkeypatch.setitem(bench._SECTIONS, "loader", fail)
     with pytest.raises(RuntimeError):
         main(["bench", "embed", "loader", "--quick", "--out", str(tmp_path / "second")])
-    assert "embed one still" in (tmp_path / "second" / "speed.md").read_text()
+    assert "embed one still" in (tmp_path / "second" / "speed_embed_loader_tiny.md").read_text()
 
 
 def test_loader_and_simulator(tmp_path):
     assert run("loader", "simulator", "--quick", "--out", tmp_path) == 0
-    numbers = json.loads((tmp_path / "speed.json").read_text())["results"]
+    numbers = numbers_of(tmp_path, "loader_simulator_tiny")["results"]
     loads = numbers["Loader, preset tiny"]
     assert {(row["kind"], row["threads"]) for row in loads} >= {("clip", 1), ("still", 1), ("clip", 2)}
     assert all(row["difference"] == 0 and row["frames_per_second"] > 0 for row in loads)
@@ -92,7 +103,8 @@ def test_memory_and_compile_are_asked_of_other_processes(monkeypatch, tmp_path, 
     assert asked == [("large", 1, 1, 2), ("large", 2, 1, 2), ("large", 2, 2, 2)]
     printed = capsys.readouterr().out
     assert "| 2 | 1 x 2 | 4 | 1.0 | 2.0 | 4.0 | 7 all-reduce (4.0) |" in printed and "| 6.00 |" in printed
-    assert "simulated CPU devices" in (tmp_path / "speed.md").read_text()  # how it was measured stands beside it
+    page = (tmp_path / "speed_memory_compile_large.md").read_text()
+    assert "simulated CPU devices" in page  # how it was measured stands beside it
 
 
 def test_mistakes(tiny, tmp_path, capsys):
@@ -111,7 +123,7 @@ def rival(monkeypatch):
     import run as module
 
     yield module
-    del sys.modules["run"]
+    del sys.modules["run"], sys.modules["keys"]
 
 
 def test_the_rival_gets_the_same_numbers_under_the_authors_names(rival, tmp_path):
@@ -129,8 +141,8 @@ def test_the_rival_gets_the_same_numbers_under_the_authors_names(rival, tmp_path
         release.to_release(build(work.config.model).init(rival.jax.random.key(0)), work.config.model)
     ) - rival.UNUSED | ({k for k in named if k in rival.UNUSED})
     old = "touch_mae_model.touch_decoder_blocks.0.attention.output.dense.weight"
-    assert rival._renamed()(old) == "touch_mae_model.touch_decoder_blocks.0.attention.o_proj.weight"
-    assert rival._renamed()("a.output.dense.bias") == "a.output.dense.bias"  # of the decoder's blocks only
+    assert rival.renamed(old) == "touch_mae_model.touch_decoder_blocks.0.attention.o_proj.weight"
+    assert rival.renamed("a.output.dense.bias") == "a.output.dense.bias"  # of the decoder's blocks only
 
 
 def test_what_differs_is_not_timed(rival):
@@ -148,7 +160,7 @@ def test_a_gradient_that_the_rival_lacks_is_noticed(rival, tmp_path):
     file = tmp_path / "values.safetensors"
     release.write_safetensors(file, {"output": np.ones(2, np.float32), "grad/a": np.full(2, 1.5, np.float32)}, {})
     with pytest.raises(SystemExit, match="no gradient for"):
-        rival.rival_errors(2.0, file, exact, str)
+        rival.rival_errors(2.0, file, exact)
     exact["gradient"]["b"] = np.zeros(2)
-    errors = rival.rival_errors(2.2, file, exact, str)
+    errors = rival.rival_errors(2.2, file, exact)
     assert errors["output"] == 0 and errors["loss"] == pytest.approx(0.1) and errors["gradient"] == pytest.approx(0.5)

@@ -56,6 +56,27 @@ def test_what_cannot_be_is_told_before_the_work(mistake, tiny_run, world, tmp_pa
     assert "--gallery must be 2 or more" in mistake("retrieve", "--data", world, "--run", tiny_run, "--gallery", 1)
 
 
+def test_numbers_and_names_that_cannot_be_are_one_sentence(mistake, tiny_run, world, tmp_path):
+    adapt = ("adapt", "--run", tiny_run, "--data", world, "--sensor", "new", "--out", tmp_path / "a")
+    for seed in (-1, 10**20):
+        assert "--seed must be" in mistake(*adapt, "--seed", seed)
+    assert "--steps must be 1 or more" in mistake(*adapt, "--steps", 0)
+    probe = ("probe", "--run", tiny_run, "--data", world, "--label", "object")
+    assert "--seeds must be 0 or more" in mistake(*probe, "--seeds", -3)
+    assert "'nothing'" in mistake(*probe, "--where", "nothing", 1)
+    assert "no row is of sensor 'xyz'; the manifest has digit, gelsight_mini" in mistake(*probe, "--sensor", "xyz")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_batch_larger_than_a_folder_costs_nothing(anytouch, tiny_run, world, tmp_path):
+    (tmp_path / "frames").mkdir()
+    for name in ("a0", "a1"):
+        (tmp_path / "frames" / f"{name}.png").write_bytes((world.parent / f"{name}.png").read_bytes())
+    words = ("--run", tiny_run, "--input", tmp_path / "frames", "--sensor", "digit", "--out", tmp_path / "f.npz")
+    said = anytouch("embed", *words, "--batch", 10**7)
+    assert said.status == 0 and "2 features of 12 values" in said.out, said.err
+
+
 def test_an_absolute_path_is_called_so(mistake, tiny_run, tmp_path):
     picture, manifest = tmp_path / "a.png", tmp_path / "m.csv"
     cv2.imwrite(str(picture), np.zeros((32, 32, 3), np.uint8))

@@ -218,6 +218,19 @@ def test_a_killed_pack_goes_on_behind_the_last_whole_shard(make, tmp_path, monke
     assert len(read) == 28 - (first if stop_at > 3 else 0)
 
 
+def test_a_pack_that_failed_before_its_first_shard_takes_its_folder_again(make, tmp_path):
+    loose = make(_rows())
+    gone = loose.file(3).read_bytes()
+    loose.file(3).unlink()
+    with pytest.raises(PackError, match="run anytouch verify with --repair first"):
+        pack(loose, tmp_path / "out")
+    mended = select(loose, np.delete(np.arange(len(loose)), 3))  # as --repair leaves it
+    assert pack(mended, tmp_path / "out").is_file()
+    loose.file(3).write_bytes(gone)
+    with pytest.raises(PackError, match="another manifest or shard size"):
+        pack(loose, tmp_path / "out")
+
+
 def test_a_finished_pack_is_left_alone(make, tmp_path, monkeypatch):
     loose = make(_rows())
     target = pack(loose, tmp_path / "out")

@@ -9,36 +9,37 @@ import pytest
 from anytouch_jax.config import UserError
 from anytouch_jax.evaluate.baseline import raw_pixels, reduce
 
+HALF = 24 * 32 * 3
+
 
 def pictures(count: int, height: int = 48, width: int = 64, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (count, height, width, 3), np.uint8)
 
 
-def test_pixels_are_block_means_of_grey() -> None:
+def test_pixels_are_block_means_in_colour() -> None:
     frames, backgrounds = pictures(3), pictures(3, seed=1)
     features = raw_pixels(frames, backgrounds)
-    assert features.shape == (3, 2 * 24 * 32)
-    grey = (frames / 255) @ [0.299, 0.587, 0.114]
-    blocks = grey.reshape(3, 24, 2, 32, 2).mean((2, 4)).reshape(3, -1)
-    np.testing.assert_allclose(features[:, :768], blocks, atol=1e-6)
-    behind = (backgrounds / 255) @ [0.299, 0.587, 0.114]
-    np.testing.assert_allclose(
-        features[:, 768:], blocks - behind.reshape(3, 24, 2, 32, 2).mean((2, 4)).reshape(3, -1), atol=1e-6
+    assert features.shape == (3, 2 * 24 * 32 * 3)
+    seen, behind = (
+        (one / 255).reshape(3, 24, 2, 32, 2, 3).mean((2, 4)).reshape(3, -1) for one in (frames, backgrounds)
     )
+    np.testing.assert_allclose(features[:, :HALF], seen, atol=1e-6)
+    np.testing.assert_allclose(features[:, HALF:], seen - behind, atol=1e-6)
+    turned = raw_pixels(frames[..., ::-1], backgrounds)
+    assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, "a colour tells a slope: it is not lost"
 
 
 @pytest.mark.parametrize("shape", [(320, 240), (50, 77), (30, 33)])
 def test_any_size_is_averaged_by_area(shape: tuple[int, int]) -> None:
     frame = pictures(1, *shape)
-    grey = ((frame[0] / 255) @ [0.299, 0.587, 0.114]).astype(np.float32)
-    expected = cv2.resize(grey, (32, 24), interpolation=cv2.INTER_AREA)
-    np.testing.assert_allclose(raw_pixels(frame, frame)[0, :768], expected.ravel(), atol=2e-3)
+    expected = cv2.resize((frame[0] / 255).astype(np.float32), (32, 24), interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(raw_pixels(frame, frame)[0, :HALF], expected.ravel(), atol=2e-3)
 
 
 def test_a_frame_like_its_background_has_no_difference() -> None:
     frames = pictures(4)
-    assert not raw_pixels(frames, frames)[:, 768:].any()
-    other = raw_pixels(frames, pictures(4, seed=2), np.array([True, False, True, False]))[:, 768:]
+    assert not raw_pixels(frames, frames)[:, HALF:].any()
+    other = raw_pixels(frames, pictures(4, seed=2), np.array([True, False, True, False]))[:, HALF:]
     np.testing.assert_array_equal(other.any(axis=1), [True, False, True, False])
 
 

@@ -342,7 +342,7 @@ def test_raw_pixels_see_the_force_and_their_own_cache(pictures, tmp_path):
     (still,) = battery.run(None, pictures, ["force"], seeds=1, frames=1)
     assert (still["frames"], still["test"]) == (1, one["test"])
     store = battery_features.raw(pictures)
-    assert store.get(np.array([[2]]), 1).shape == (1, 2 * 768) and store.get(np.array([[2]]), 3).shape == (1, 4 * 768)
+    assert store.get(np.array([[2]]), 1).shape == (1, 2 * 2304) and store.get(np.array([[2]]), 3).shape == (1, 4 * 2304)
 
 
 # The public benchmarks, on trees laid out like the originals.

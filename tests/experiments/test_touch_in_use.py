@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import runpy
+import shutil
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,13 @@ def visit(name, monkeypatch, **environment):
     for key, value in environment.items():
         monkeypatch.setenv(key, str(value))
     return runpy.run_path(str(SCRIPTS / f"{name}.py"))
+
+
+@pytest.mark.parametrize("name", ["pouring", "translation"])
+def test_the_committed_page_is_what_its_files_give(name, tmp_path, monkeypatch, capsys):
+    shutil.copytree(SCRIPTS / "results" / name, tmp_path / name)
+    visit(name, monkeypatch, TABLE=1, OUT=tmp_path)
+    assert (tmp_path / f"{name}.md").read_text() == (SCRIPTS / "results" / f"{name}.md").read_text()
 
 
 @pytest.mark.slow

@@ -126,6 +126,13 @@ def test_unknown_and_broken_cases_are_failures_not_tracebacks(tmp_path):
     assert all("understand" in row.note or "understood" in row.note for row in rows)
 
 
+def test_a_case_in_which_nothing_is_compared_has_failed(tmp_path):
+    (tmp_path / "I_pos.json").write_text("{}")
+    np.savez(tmp_path / "I_pos.npz", unknown=np.zeros(3))
+    (row,) = parity.run(tmp_path)
+    assert not row.good and row.note == "nothing was compared"
+
+
 def test_a_broken_checkpoint_is_a_failed_case(tmp_path):
     folder = copied(tmp_path, "I_pos_embed")
     (folder / "stage1_tiny.pth").write_bytes(b"x" * 100)

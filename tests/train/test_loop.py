@@ -282,7 +282,7 @@ def test_nothing_but_the_late_fetch_looks_at_a_result(tmp_path, monkeypatch):
 
     monkeypatch.setattr(jax, "device_get", lambda tree: fetch(show(tree)))
     monkeypatch.setattr(loop._Loop, "compile", hidden)
-    monkeypatch.setattr(loop._Loop, "save", lambda self, done, state: self.log() or done)
+    monkeypatch.setattr(loop._Loop, "save", lambda self, done, state, since: self.log() or done)
     result = run(tmp_path, toy_config(save_every=0), stop_after=4)
     assert [row["step"] for row in rows(tmp_path)] == [0, 1, 2, 3]
     with pytest.raises(TypeError):
@@ -310,7 +310,7 @@ def test_no_step_compiles_after_the_first_of_its_kind(tmp_path, caplog, fsdp):
             assert all(kinds[:2] if stop == 6 else kinds[:1]) and not any(kinds[2:]), seen
 
 
-def test_nothing_is_transferred_unasked(tmp_path):
+def test_nothing_is_transferred_to_the_device_unasked(tmp_path):
     with jax.transfer_guard("disallow"):
         run(tmp_path, toy_config(save_every=0), stop_after=4)
 
@@ -330,11 +330,12 @@ def test_reports_come_every_so_often_and_at_the_end_and_cannot_end_the_run(tmp_p
 
 
 def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, monkeypatch):
-    saved = {}
+    saved, partial = {}, []
 
     class Watched(loop.Checkpoints):
         def save(self, step, state, metrics):
             saved[step] = metrics["loss"]
+            partial.append(bool(metrics.get("partial")))
             super().save(step, state, metrics)
 
     monkeypatch.setattr(loop, "Checkpoints", Watched)
@@ -345,6 +346,7 @@ def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, mon
         6: pytest.approx(np.mean(losses[3:6])),
         8: pytest.approx(np.mean(losses[6:])),
     }
+    assert partial == [False, False, True], "two steps against three: never the best"
 
 
 def test_a_saved_state_is_not_touched_by_the_steps_after_it(undisturbed, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_use import Adapt
+from anytouch_jax.strict_json import COUNT, NOT_NEGATIVE, SEED, in_range
 
 
 def run(options: Adapt) -> int:
@@ -13,6 +14,7 @@ def run(options: Adapt) -> int:
     from anytouch_jax.evaluate.adapt import adapt, check_empty, save
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    in_range("--", options, seed=SEED, steps=COUNT, frames=NOT_NEGATIVE)
     check_empty(options.out)
     check_home(options.out)
     enable_compilation_cache()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.words import say
+from anytouch_jax.config import UserError
 from anytouch_jax.options import Bench
 
 if TYPE_CHECKING:
@@ -20,10 +21,17 @@ Section = tuple[str, str, list[Any]]  # title, Markdown, records
 
 
 def run(options: Bench) -> int:
-    """Measure what was asked for, write speed.md, speed.json and a figure a workload, and print the tables."""
+    """Measure what was asked for, write a page, its numbers and a figure a workload, and print the tables.
+
+    The page is speed.md, or speed_WHAT_PRESET.md where only some was asked for: no measurement is written over by
+    another. Raises UserError for a page that somebody wrote.
+    """
     from anytouch_jax.evaluate import machine
 
-    check_folder(options.out / "speed.md")
+    page = options.out / f"{_stem(options)}.md"
+    check_folder(page)
+    if page.exists() and not page.with_suffix(".json").exists():
+        raise UserError(f"{page} was not made by bench, it has no numbers beside it: choose another --out")
     here = machine.describe()
     say(here.sentence())
     wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)
@@ -33,8 +41,12 @@ def run(options: Bench) -> int:
             sections.append(section)
             path = _write(options, here, sections)  # after each: what was measured is not lost with what fails later
             print(section[1])
-    say(f"{path}, speed.json and figures/ beside it")
+    say(f"{path}, its numbers in {path.stem}.json, and figures/ beside it")
     return 0
+
+
+def _stem(options: Bench) -> str:
+    return "_".join(("speed", *dict.fromkeys(options.what), options.preset)) if options.what else "speed"
 
 
 def _write(options: Bench, here: Any, sections: list[Section]) -> Path:
@@ -50,7 +62,7 @@ def _write(options: Bench, here: Any, sections: list[Section]) -> Path:
         "quick": options.quick,
         "results": {title: [speed_report.as_dict(row) for row in rows] for title, _, rows in sections},
     }
-    return speed_report.write(options.out, "speed", text, numbers)
+    return speed_report.write(options.out, _stem(options), text, numbers)
 
 
 def _rounds(options: Bench) -> int:

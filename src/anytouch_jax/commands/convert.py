@@ -38,6 +38,8 @@ def run(options: Convert) -> int:
         weights = release.read_weights(source)
         model = release.model_of(source, weights)
         params = release.to_params(weights, model)
+    if options.names == "release" and not {"touch", "decoder"} <= params.keys():
+        raise UserError(f"{source} lacks a touch encoder or a decoder, which the authors' files hold: add --names own")
     if options.names == "release" and model.sensors[-1] != UNIVERSAL:
         params, model = _universal_last(params, model)
     about |= {release.MODEL_KEY: to_json(model)}

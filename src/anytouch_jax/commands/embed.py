@@ -148,7 +148,8 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
 
     def flush() -> None:
         if waiting:
-            full = np.stack(waiting + waiting[-1:] * (options.batch - len(waiting)))  # one shape, one compilation
+            missing = options.batch - len(waiting) if values else 0  # one shape, one compilation
+            full = np.stack(waiting + waiting[-1:] * missing)
             z = encoder.embed(full, np.full(len(full), row), pooling=options.pooling, join=options.join)
             values.append(z[: len(waiting)])
             waiting.clear()

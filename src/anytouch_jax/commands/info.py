@@ -65,6 +65,8 @@ def _run(path: Path) -> list[str]:
     about = checkpoint.read_metadata(path)
     config: Config = from_json(about["config"])
     kept = checkpoint.steps(path / "checkpoints")
+    lowest = checkpoint.best_of(path / "checkpoints")
+    best = "" if lowest is None else f" (lowest loss at {lowest})"
     source = about.get("source") or {}
     began = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
     loss = about.get("metrics", {}).get("loss")
@@ -76,7 +78,7 @@ def _run(path: Path) -> list[str]:
         ]
     return [
         f"{path}: a run of stage {config.stage}, step {about['step']} of {config.run.steps}"
-        + (f"; checkpoints at {', '.join(map(str, kept))}" if kept else ""),
+        + (f"; checkpoints at {', '.join(map(str, kept))}{best}" if kept else ""),
         f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
         _model(config.model),
         _sensors(config.model, about.get("seen")),

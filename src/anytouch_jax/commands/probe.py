@@ -9,7 +9,7 @@ from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Probe
-from anytouch_jax.strict_json import COUNT, in_range
+from anytouch_jax.strict_json import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.whole import write_whole
 
 _OF_LABEL = ("label", "group", "leave_out", "where", "sensor")
@@ -47,7 +47,7 @@ def run(options: Probe) -> int:
 
 def check_options(options: Probe) -> None:
     """Refuse what differs from its default and would do nothing. Raises UserError that names it and says why."""
-    in_range("--", options, frames=COUNT, max_rows=COUNT)
+    in_range("--", options, frames=COUNT, max_rows=COUNT, seeds=NOT_NEGATIVE)
     if options.tasks or options.benchmark:
         refuse(options, _OF_LABEL, "beside --tasks or --benchmark, which have labels and groups of their own")
         if options.benchmark and not options.tasks:

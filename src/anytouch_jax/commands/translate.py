@@ -84,7 +84,7 @@ def _fit(options: Translate) -> int:
     picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}
     report["critic"] = made.design.has_critic
-    write_whole(home / "report.json", json.dumps(report, indent=2) + "\n")
+    write_whole(home / "report.json", json.dumps(report, indent=2, allow_nan=False) + "\n")
     generator.save(made, home)  # last: a folder that holds it is whole
     print(f"{home}: error {ours.mean():.4f} on objects never seen (copying the mean target: {mean.mean():.4f})")
     return 0
@@ -109,6 +109,8 @@ def _translate(options: Translate) -> int:
         if options.background is None:
             raise UserError("this encoder sees touches less the untouched gel: name its picture by --background")
         images = [subtract_background([one], decode(options.background))[0] for one in images]
+    elif options.background is not None:
+        raise UserError("this encoder sees touches as the camera gives them: leave --background away")
     seen = np.concatenate([touch_evaluation([one], size) for one in images])
     for target, result in zip(targets, made(seen), strict=True):
         _write(target, result)

@@ -84,10 +84,26 @@ class Loader:
     def steps_per_epoch(self) -> int:
         """Batches that hold every still and every clip once (and every anchor, where matching has its own steps)."""
         size = self.config.data.batch_size
-        steps = sum(-(-pool.draws // size) for pool in self._pools)
+        steps = sum(-(-pool.draws // size) for pool in self._drawn)
         if self.config.data.split_steps:
-            steps += sum(-(-pairs.anchors.size // self._match_size) for pairs in self._pairs if pairs)
+            steps += sum(-(-pairs.anchors.size // self._match_size) for pairs in self._drawn_pairs)
         return steps
+
+    @property
+    def _no_stills(self) -> bool:
+        return len(self._pools) > 1 and self.config.data.clip_share == 1
+
+    @property
+    def _drawn(self) -> tuple[Pool, ...]:
+        """Those of stills and clips that batches are drawn from."""
+        return self._pools[1:] if self._no_stills else self._pools
+
+    @property
+    def _drawn_pairs(self) -> list[Pairs]:
+        """Those of stills and clips that matching draws from (`_match_kinds`)."""
+        still, clip = self._pairs
+        chosen = (clip,) if clip is not None and self._no_stills else (still, clip)
+        return [pairs for pairs in chosen if pairs is not None]
 
     @property
     def sensors_seen(self) -> list[str]:
@@ -142,10 +158,10 @@ class Loader:
 
     def _share_of_align(self) -> float:
         """Share of the steps that align: all, or as many as align batches there are to match batches (release)."""
-        pairs = [pair for pair in self._pairs if pair is not None]
+        pairs = self._drawn_pairs
         if not self.config.data.split_steps or not pairs:
             return 1.0
-        align = sum(pool.draws for pool in self._pools) / self.config.data.batch_size
+        align = sum(pool.draws for pool in self._drawn) / self.config.data.batch_size
         return align / (align + sum(pair.anchors.size for pair in pairs) / self._match_size)
 
     @property

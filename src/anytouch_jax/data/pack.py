@@ -115,7 +115,10 @@ def _stamp(manifest: Manifest, files: Files) -> str | None:
 
 
 def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: bool) -> None:
-    """Take the folder for this plan, or find that it is its own from an earlier run."""
+    """Take the folder for this plan, or find that it is its own from an earlier run.
+
+    One in which another plan failed before its first shard, as for a missing file, is taken over.
+    """
     mark = folder / "pack.json"
     if mark.is_file():
         try:
@@ -123,12 +126,13 @@ def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: b
         except (ValueError, TypeError):
             raise PackError(f"{mark} is not of a pack; choose another folder") from None
         files = old.pop("files", None)
-        if old != plan:
-            raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")
-        if files != stamp and files is not None and not (finished and stamp is None):
+        if old == plan and (files in (stamp, None) or (finished and stamp is None)):
+            return
+        if any(folder.rglob("*.parquet")):
+            if old != plan:
+                raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")
             raise PackError(f"the files of the manifest are others than when {folder} was begun; choose another folder")
-        return
-    if folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
+    elif folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
         raise PackError(f"{folder} is not an empty folder; choose another one")
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(mark, json.dumps(plan | {"files": stamp}))

@@ -17,15 +17,14 @@ from ..data.samples import read_picture
 Array = npt.NDArray[Any]
 RAW_SIZE = (240, 320)  # rows and columns of a picture before it is averaged down
 KEPT = 256  # backgrounds in memory, 230 kB each
-GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R 601, on RGB
 
 
 def raw_pixels(
     frames: Array, backgrounds: Array, has_background: Array | None = None, *, size: tuple[int, int] = (24, 32)
 ) -> Array:
-    """Grey pixels and their difference from the background, both averaged down to `size` (rows, columns).
+    """Pixels, in colour, and their difference from the background, both averaged down to `size` (rows, columns).
 
-    `frames`, `backgrounds`: u8 RGB (n, h, w, 3) -> f32 (n, 2 * rows * columns), pixels in 0..1. The difference is 0
+    `frames`, `backgrounds`: u8 RGB (n, h, w, 3) -> f32 (n, 2 * rows * columns * 3), in 0..1. The difference is 0
     where `has_background` (n,) is false. It may be called in pieces. Raises UserError when shapes do not match.
     """
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.shape != backgrounds.shape:
@@ -38,7 +37,7 @@ def raw_pixels(
 
 
 def row_pixels(table: Manifest, row: int, grounds: dict[Path, Array]) -> Array:
-    """`raw_pixels` of a row of a manifest, f32 (2 * 768,); `grounds` keeps some backgrounds, which many rows share.
+    """`raw_pixels` of a row of a manifest, f32 (2 * 2304,); `grounds` keeps some backgrounds, which many rows share.
 
     Raises SampleError, which names row and file.
     """
@@ -75,10 +74,12 @@ def reduce(features: Array, train: Array, components: int = 200) -> Array:
 
 
 def _shrink(images: Array, size: tuple[int, int]) -> Array:
-    """Grey area averages (n, rows * columns) in 0..1 of u8 images (n, h, w, 3)."""
-    rows, columns = _area(images.shape[1], size[0]), _area(images.shape[2], size[1])
-    grey = [rows @ (image.astype(np.float32) @ GREY) @ columns.T for image in images]
-    return np.stack(grey).reshape(len(images), -1) / 255.0 if grey else np.zeros((0, size[0] * size[1]), np.float32)
+    """Area averages (n, rows * columns * 3) in 0..1 of u8 images (n, h, w, 3)."""
+    count, height, width, colours = images.shape
+    rows, columns = _area(height, size[0]), _area(width, size[1])
+    lower = rows @ images.reshape(count, height, -1).astype(np.float32)
+    small = columns @ lower.reshape(count, size[0], width, colours)
+    return np.asarray(small / 255.0, np.float32).reshape(count, -1)
 
 
 def _area(fine: int, coarse: int) -> Array:

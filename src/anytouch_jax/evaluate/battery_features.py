@@ -122,22 +122,22 @@ def encoded(
 
 
 def raw(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> Store:
-    """Grey pixels (24 x 32) of the last frame beside the difference of every frame from the background, in 0..1."""
+    """Pixels (24 x 32 x 3) of the last frame beside the difference of every frame from the background, in 0..1."""
     grounds: dict[Path, Array] = {}
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
         windows = ordered(clips[np.searchsorted(clips[:, -1], rows)], rows, order)
         single, places = np.unique(windows, return_inverse=True)
-        greys, changes = np.split(
+        plain, changes = np.split(
             np.stack([baseline.row_pixels(table, int(row), grounds) for row in single]), 2, axis=1
         )
         places = places.reshape(windows.shape)
-        return np.concatenate([greys[places[:, -1]], changes[places].reshape(len(rows), -1)], axis=1)
+        return np.concatenate([plain[places[:, -1]], changes[places].reshape(len(rows), -1)], axis=1)
 
     about = {
         "version": VERSION,
-        "parameters": "raw pixels",
+        "parameters": "raw pixels in colour",
         "manifest": table.content_hash,
         "pictures": pictures(table),
         "order": order,

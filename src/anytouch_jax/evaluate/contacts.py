@@ -42,8 +42,10 @@ def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = 
     """
     rows = np.unique(manifest.rows_of(split) if rows is None else np.asarray(rows))
     rows = rows[manifest.present("touch")[rows]]
-    if frames > 1:
+    if frames > 1 and len(rows):
         rows = np.intersect1d(rows, manifest.clips(frames)[:, -1])
+        if not len(rows):
+            raise UserError(f"no touch ends a clip of {frames} frames; take fewer, or 1")
     if not len(rows):
         raise UserError("no row has a touch; cross-sensor tasks need the column 'touch' (the place, whoever feels it)")
     codes = np.stack([manifest.codes("touch", own=True), manifest.codes("sensor"), manifest.codes("unit", own=True)], 1)

@@ -75,7 +75,7 @@ def draw_galleries(
         if len(rest) < gallery_size - 1:
             raise UserError(
                 f"a gallery of {gallery_size} needs {gallery_size - 1} other touches than "
-                f"{str(query.touch[rank])!r}, and there are {len(rest)}; give more touches or a smaller gallery_size"
+                f"{str(query.touch[rank])!r}, and there are {len(rest)}; give more touches or a smaller --gallery"
             )
         ranks.append(rank)
         several = [_draw(own, rest, covariates, gallery_size, np.random.default_rng([s, rank])) for s in range(draws)]

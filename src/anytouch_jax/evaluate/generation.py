@@ -120,6 +120,8 @@ def fit(
             if val is not None:
                 guess = now.normalised(val[0]) if seen is None else now.from_features(seen)
                 losses[-1]["val"] = float(_errors(now, guess, val[1]).mean())
+                if not np.isfinite(losses[-1]["val"]):
+                    raise UserError(f"the error on val is not finite at step {step + 1}; lower the learning rate")
             if val is None or losses[-1]["val"] < best:
                 best, made = losses[-1].get("val", np.inf), state.made
             if say is not None:

@@ -65,6 +65,8 @@ def _tried(runner: Callable[[Case], None], case: Case) -> list[Row]:
         with jax.default_matmul_precision("highest"):
             runner(case)
         case.finish()
+        if not case.rows:
+            case.fail("-", "nothing was compared")
     except Exception as error:  # a folder of another make: any array or key may be absent or of another shape
         reason = (str(error).splitlines() or [""])[0]
         case.fail("-", f"not understood: {type(error).__name__}: {reason}")

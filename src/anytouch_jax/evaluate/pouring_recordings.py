@@ -61,12 +61,14 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
     rows: list[dict[str, Any]] = []
-    first_test = len(trials.steps) - round(held_out * len(trials.steps))
+    if len(trials.steps) < 2:
+        raise UserError("one run is too few: of two or more, some are kept for the test")
+    first_test = len(trials.steps) - max(1, round(held_out * len(trials.steps)))
     for run, steps in enumerate(trials.steps):
         for moment in range(int(steps)):
             name = f"run_{run:04d}/{moment:04d}.png"
             png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[1]
-            write_whole(folder / name, png.tobytes())
+            write_whole(folder / name, png.tobytes(), sync=False)
             action, choice = (ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices))
             rows.append(
                 {"path": name, "sensor": SENSOR, "sequence": f"run_{run:04d}", "frame_index": moment,

@@ -91,13 +91,16 @@ def read_task(options: Probe, say: Say) -> Task:
     kept = np.array([value not in (None, "") for value in label])
     if options.where is not None:
         name, least = options.where
+        values = _column(table, name)
         try:
-            number = np.array([np.nan if v in (None, "") else float(v) for v in _column(table, name)])
+            number = np.array([np.nan if v in (None, "") else float(v) for v in values])
         except ValueError:
             raise UserError(f"--where {name}: that column holds words, not numbers") from None
         kept &= number > least
     if options.sensor is not None:
         kept &= text_column(manifest, "sensor") == options.sensor
+        if options.sensor not in (there := sorted(set(text_column(manifest, "sensor")))):
+            raise UserError(f"no row is of sensor {options.sensor!r}; the manifest has {', '.join(there)}")
     fields = kept & np.isin(text_column(manifest, "sensor"), FIELD_SENSORS)
     if fields.any():
         say(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")

@@ -122,7 +122,7 @@ def _text(value: Any) -> str:
         if np.isnan(value):
             return ""
         if not np.isfinite(value) or value != int(value):
-            raise UserError(f"the label holds {value:g}, a measured quantity and no class; use the regression probe")
+            raise UserError(f"the label holds {value:g}, a measured quantity and no class; --tasks force measures one")
         return str(int(value))
     return str(value)
 

@@ -243,7 +243,7 @@ def _usable(
     if match is not None:
         if not covariates:
             raise UserError(
-                f"the manifest has none of {', '.join(match)} to match the gallery in; add one, or give match=None"
+                f"the manifest has none of {', '.join(match)} to match the gallery in; add one, or draw --by-chance"
             )
         whole = np.isfinite(numbers(manifest, covariates, kept)).all(axis=1)
         if not whole.all():

@@ -66,6 +66,7 @@ def _without_echoes(hook: Callable[..., Any]) -> Callable[..., Any]:
     return told
 
 
+PARTIAL = "partial"  # among a checkpoint's metrics: its loss is of fewer steps than those of others
 sys.excepthook = _without_echoes(sys.excepthook)
 
 
@@ -319,9 +320,17 @@ def _description(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _loss(folder: Path) -> float:
-    """The loss a checkpoint was saved with; infinite when unknown, so that it is never the best."""
+    """The loss a checkpoint was saved with; infinite when unknown or of few steps, so that it is never the best."""
     try:
-        loss = read_record(folder)["metrics"].get("loss")
+        metrics = read_record(folder)["metrics"]
     except CheckpointError:  # a damaged one is left for `restore` to report
         return math.inf
-    return math.inf if loss is None else loss
+    loss = metrics.get("loss")
+    return math.inf if loss is None or metrics.get(PARTIAL) else loss
+
+
+def best_of(folder: Path) -> int | None:
+    """The step of the checkpoint of lowest loss in a folder of them; None where none is known."""
+    losses = {step: _loss(folder / f"{step:08d}") for step in steps(folder)}
+    best = min(losses, key=lambda step: (losses[step], -step), default=None)
+    return best if best is not None and math.isfinite(losses[best]) else None

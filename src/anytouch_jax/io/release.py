@@ -231,6 +231,15 @@ def served(params: Params, config: Config, told: Mapping[str, Any]) -> Params:
     return params | {"touch": serve_unseen(params["touch"], config.model, told["seen"], universal_drawn=drawn)}
 
 
+def resized(params: Params, patches: int) -> Params:
+    """The parameters for pictures of another number of patches: bicubic resize of all tables of positions."""
+
+    def fitted(part: Params) -> Params:
+        return part | {"position": resize_position(np.asarray(part["position"]), patches + 1)}
+
+    return {name: fitted(part) if "position" in part and name != "text" else part for name, part in params.items()}
+
+
 def _by_key(wanted: Sequence[Entry]) -> dict[str, Entry]:
     return {entry.key: entry for entry in wanted}
 

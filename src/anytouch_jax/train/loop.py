@@ -16,7 +16,7 @@ import jax
 from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, UserError, to_json
-from anytouch_jax.io.checkpoint import Checkpoints
+from anytouch_jax.io.checkpoint import PARTIAL, Checkpoints
 from anytouch_jax.train.mesh import (
     batch_sharding,
     donated,
@@ -174,13 +174,13 @@ class _Loop:
                 self.pending = (step, metrics, {"samples": _rows(batch)} | dict(info))
                 done = step + 1
                 if every > 0 and done % every == 0:
-                    saved = self.save(done, state)
+                    saved = self.save(done, state, done - saved)
                 if figures > 0 and done % figures == 0:
                     reported = self.report(done, state, placed)
                 if self.signalled(interrupt):
                     break
         if saved < done:
-            self.save(done, state)
+            self.save(done, state, done - saved)
         with writing(self.record.path.parent / "checkpoints"):
             self.checkpoints.wait()
         signalled = self.signalled(interrupt)
@@ -248,13 +248,18 @@ class _Loop:
                 "skipped; lower optim.learning_rate, set optim.clip_norm, or look for NaN in the data"
             )
 
-    def save(self, done: int, state: TrainState) -> int:
-        """Write a checkpoint in the background, after the metrics of all its steps."""
+    def save(self, done: int, state: TrainState, since: int) -> int:
+        """Write a checkpoint in the background, after the metrics of all its steps, `since` the one before.
+
+        Its loss is their mean. That of fewer steps than others' is `partial`: it would be the best by chance.
+        """
         self.log()
         self.record.sync()
         metrics = {name: value for name, value in self.row.items() if isinstance(value, int | float)}
         if self.losses:
             metrics["loss"] = sum(self.losses) / len(self.losses)
+        if since < self.config.run.save_every:
+            metrics[PARTIAL] = 1
         with writing(self.record.path.parent / "checkpoints"):
             self.checkpoints.save(done, state, metrics)
         self.losses = []

@@ -18,9 +18,11 @@ from anytouch_jax.whole import write_whole
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
 HARMLESS = {
     "data.cache",
+    "data.manifests",  # their content is compared (`pretrain`): a data set may have moved
     "data.on_bad_sample",
     "data.prefetch",
     "data.threads",
+    "data.tokenizer",  # a run has its own copy
     "run.figure_every",
     "run.fsdp",
     "run.keep",

@@ -478,3 +478,12 @@ def test_tasks_from_the_command_line(pictures, tiny_run, tmp_path, capsys):
     assert "not both" in capsys.readouterr().err
     assert main(["probe", "--tasks", "taste", "--data", data]) == 1
     assert "no task 'taste'" in capsys.readouterr().err
+
+
+def test_a_fit_that_does_not_converge_is_told_of(monkeypatch):
+    planted(monkeypatch, telling(MANY, "material", noise=1.0))
+    (one,) = battery.run(NOBODY, MANY, ["material"], seeds=2)
+    assert not any("converge" in note for note in one["notes"])
+    monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 1)
+    (one,) = battery.run(NOBODY, MANY, ["material"], seeds=2)
+    assert one["notes"][-1].endswith("fits did not converge")

@@ -143,8 +143,9 @@ def _probe(
         for head in head_names:
             for protocol in protocols:
                 about = {"task": task.name, "head": head, "protocol": protocol}
-                rest = {"frames": length, "order": setting.order, "notes": notes}
-                found.append(about | _result(case, head, protocol) | rest)
+                result = _result(case, head, protocol)
+                rest = {"frames": length, "order": setting.order, "notes": notes + result["notes"]}
+                found.append(about | result | rest)
     return found
 
 
@@ -222,7 +223,7 @@ def _components(x: Array, rows: deals.Rows) -> Array:
 
 
 def _result(case: Case, head: HeadName, protocol: Protocol) -> dict[str, Any]:
-    rows, chosen, sizes = case.rows, list[float](), list[int]()
+    rows, chosen, sizes, unfinished = case.rows, list[float](), list[int](), 0
     tested, chances = list[deals.Sums](), list[deals.Sums]()
     for seed in range(case.setting.seeds):
         cuts = deals.cuts(rows, seed, protocol)
@@ -231,7 +232,8 @@ def _result(case: Case, head: HeadName, protocol: Protocol) -> dict[str, Any]:
             continue
         said, base = [], []
         for cut in cuts:
-            option, predicted = _predicted(case, cut, head, protocol, seed)
+            option, predicted, finished = _predicted(case, cut, head, protocol, seed)
+            unfinished += not finished
             said.append(_tested(rows, cut, predicted))
             base.append(_tested(rows, cut, _constant(rows, cut)))
             chosen.append(option)
@@ -249,7 +251,8 @@ def _result(case: Case, head: HeadName, protocol: Protocol) -> dict[str, Any]:
         low, high = deals.interval(tested, deals.mae_of)
         mae, chance = (float(np.mean(_values(deals.mae_of, several))) for several in (tested, chances))
         result |= {"mae": mae, "mae_low": low, "mae_high": high, "chance_mae": chance, "unit": case.task.unit}
-    return result | {"groups": len(np.unique(tested[0].groups)), "chosen": chosen}
+    notes = [f"{unfinished} of {len(chosen)} fits did not converge"] * bool(unfinished)
+    return result | {"groups": len(np.unique(tested[0].groups)), "chosen": chosen, "notes": notes}
 
 
 def _values(value: Callable[[Array], Array], tested: Sequence[deals.Sums]) -> list[float]:
@@ -260,14 +263,14 @@ def _joined(parts: Sequence[deals.Sums]) -> deals.Sums:
     return deals.Sums(np.concatenate([one.groups for one in parts]), np.concatenate([one.sums for one in parts]))
 
 
-def _predicted(case: Case, cut: deals.Cut, head: HeadName, protocol: Protocol, seed: int) -> tuple[float, Array]:
-    """The option chosen and what its head says of the test rows."""
+def _predicted(case: Case, cut: deals.Cut, head: HeadName, protocol: Protocol, seed: int) -> tuple[float, Array, bool]:
+    """The option chosen, what its head says of the test rows, and whether its fit converged."""
     x, y, classes, setting = case.x, case.rows.y, len(case.names), case.setting
     problem = Problem(x[cut.fit], y[cut.fit], x[cut.val], x[cut.test], classes, setting.scaling, seed)
     path = heads.fit(head, problem, setting.recipe)
     on_test = protocol == "published"
     option = heads.choose(path.test if on_test else path.val, y[cut.test if on_test else cut.val], classes)
-    return path.options[option], path.final(option)
+    return path.options[option], path.final(option), all(path.finished[option : option + 1])
 
 
 def _constant(rows: deals.Rows, cut: deals.Cut) -> Array:

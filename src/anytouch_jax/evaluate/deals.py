@@ -48,7 +48,7 @@ def scheme(rows: Rows) -> tuple[Literal["split", "folds"], Array, str]:
     rows alone are cut in folds; where groups are on both sides, all rows are.
     """
     learned, tested = rows.pool & rows.fits, rows.test & rows.tests
-    if not learned.any():
+    if rows.measured and not learned.any():
         return (
             "folds",
             rows.test,

@@ -44,12 +44,14 @@ class Problem(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Predictions for each option: class numbers, or numbers. `final(i)`: those for test of option i, fitted on all."""
+    """Predictions for each option: class numbers, or numbers. `final(i)`: those for test of option i, fitted on all.
+    `finished`: whether each fit converged (empty: nothing that has to)."""
 
     options: tuple[float, ...]
     val: list[Array]
     test: list[Array]
     final: Callable[[int], Array]
+    finished: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,8 @@ def _linear(problem: Problem, penalties: Sequence[float]) -> Path:
         whole = logistic.path(x, problem.y, problem.classes, penalties[option : option + 1], models[option])
         return next(whole)(test)
 
-    return Path(tuple(penalties), [one(val) for one in models], [one(test) for one in models], final)
+    on_val, on_test = ([one(rows) for one in models] for rows in (val, test))
+    return Path(tuple(penalties), on_val, on_test, final, tuple(one.finished for one in models))
 
 
 def _thinned(count: int) -> Array:

@@ -106,8 +106,20 @@ def test_a_penalty_means_the_same_for_any_number_of_rows() -> None:
     once = probe_models.Linear(features, y, 0.1)
     thrice = probe_models.Linear(np.tile(features, (3, 1)), np.tile(y, 3), 0.1)
     weighted = probe_models.Linear(features, y, 0.1, weights=np.full(len(y), 3.0, np.float32))
-    np.testing.assert_allclose(thrice.coef, once.coef, atol=2e-3)
-    np.testing.assert_allclose(weighted.coef, once.coef, atol=2e-3)
+    assert once.fit and thrice.fit and weighted.fit
+    np.testing.assert_allclose(thrice.fit.weights, once.fit.weights, atol=2e-3)
+    np.testing.assert_allclose(weighted.fit.weights, once.fit.weights, atol=2e-3)
+
+
+def test_a_row_that_counts_twice_is_a_row_given_twice() -> None:
+    features, labels, _, _ = table(apart=1.0)
+    y = np.unique(labels, return_inverse=True)[1]
+    for names in (y, y % 2):  # many classes, and two
+        times = np.random.default_rng(0).integers(0, 4, len(names))
+        counted = probe_models.Linear(features, names, 0.1, weights=times.astype(np.float32)).fit
+        given = probe_models.Linear(np.repeat(features, times, 0), np.repeat(names, times), 0.1).fit
+        assert counted and given and counted.loss == pytest.approx(given.loss, abs=1e-5)
+        np.testing.assert_allclose(counted.weights, given.weights, atol=5e-3)
 
 
 def test_logistic_regression_is_at_its_optimum() -> None:
@@ -115,10 +127,11 @@ def test_logistic_regression_is_at_its_optimum() -> None:
     y = np.unique(labels, return_inverse=True)[1]
     model = probe_models.Linear(features, y, 0.1)
     x = (features - features.mean(0)) / features.std(0)
-    logits = x @ model.coef.T + model.intercept
+    assert model.fit
+    logits = x @ model.fit.weights + model.fit.bias
     share = np.exp(logits - logits.max(1, keepdims=True))
     share /= share.sum(1, keepdims=True)
-    gradient = (share - np.eye(3)[y]).T @ x / len(y) + 0.1 * model.coef
+    gradient = (share - np.eye(3)[y]).T @ x / len(y) + 0.1 * model.fit.weights.T
     assert np.abs(gradient).max() < 5e-3
 
 
@@ -372,7 +385,7 @@ def test_labels_only_outside_of_test() -> None:
 
 def test_a_measured_label_is_sent_to_regression() -> None:
     features, _, groups, split = table()
-    with pytest.raises(UserError, match=r"0\.5, a measured quantity .* use the regression probe"):
+    with pytest.raises(UserError, match=r"0\.5, a measured quantity .* --tasks force"):
         linear_probe(features, groups + 0.5, groups, split)
     with pytest.raises(UserError, match=r"not a number .*'ball'.* use the linear probe"):
         regression_probe(features, np.full(len(groups), "ball"), groups, split)
@@ -411,12 +424,7 @@ def test_lengths_must_agree() -> None:
 
 def test_an_unfinished_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     features, labels, groups, split = table(apart=1.0)
-    original = probe_models.LogisticRegression
-
-    def short(**settings: Any) -> Any:
-        return original(**{**settings, "max_iter": 2})
-
-    monkeypatch.setattr(probe_models, "LogisticRegression", short)
+    monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 2)
     assert "the fit stopped at its limit of iterations" in linear_probe(features, labels, groups, split).notes
 
 

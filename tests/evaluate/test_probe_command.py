@@ -73,8 +73,10 @@ def test_recordings_of_joined_files_are_never_one_group(manifest, tmp_path):
 
 
 def test_no_row_is_left(manifest):
-    with pytest.raises(UserError, match="no row has a label in 'slip' after the filters"):
+    with pytest.raises(UserError, match="no row is of sensor 'gelslim'; the manifest has digit"):
         read(manifest, label="slip", sensor="gelslim")
+    with pytest.raises(UserError, match="no row has a label in 'slip' after the filters"):
+        read(manifest, label="slip", where=("score", 1e9))
 
 
 def test_groups_are_found_with_or_without_label(manifest):

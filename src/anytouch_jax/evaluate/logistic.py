@@ -41,23 +41,28 @@ class Logistic(NamedTuple):
 
 
 def path(
-    x: Array, y: Array, classes: int, penalties: Sequence[float], start: Logistic | None = None
-) -> Iterator[Logistic]:
+    x: Array, y: Array, classes: int, penalties: Sequence[float], start: Logistic | None = None,
+    weights: Array | None = None,
+) -> Iterator[Logistic]:  # fmt: skip
     """Fits of class numbers `y` (n,) below `classes` on features `x` f32 (n, d), a penalty each, from the one before.
 
     A penalty is the factor of half the squared weights beside the mean log loss; the bias is free. Give standardised
-    features, and the strongest penalty first.
+    features, and the strongest penalty first. `weights` (n,): how much each row counts in that mean.
     """
     x = np.ascontiguousarray(x, np.float32)
     columns = 1 if classes == 2 else classes
+    counts = np.ones(len(x)) if weights is None else weights
+    shares = (counts / np.sum(counts, dtype=np.float64)).astype(np.float32)[:, None]
     with threads(x.size * columns):
-        covariance = (x.T @ x).astype(np.float64) / len(x)
+        covariance = (x.T @ (x * shares)).astype(np.float64)
         for penalty in penalties:
-            start = _fit(x, y, columns, penalty, covariance, start)
+            start = _fit(x, y, shares, columns, penalty, covariance, start)
             yield start
 
 
-def _fit(x: Array, y: Array, columns: int, penalty: float, covariance: Array, start: Logistic | None) -> Logistic:
+def _fit(
+    x: Array, y: Array, shares: Array, columns: int, penalty: float, covariance: Array, start: Logistic | None
+) -> Logistic:
     d, share = x.shape[1], 0.25 if columns == 1 else 1 / columns
     # A touch of the diagonal keeps the factor when there are fewer rows than features.
     diagonal = penalty + 1e-6 * share * np.trace(covariance) / d
@@ -71,7 +76,7 @@ def _fit(x: Array, y: Array, columns: int, penalty: float, covariance: Array, st
 
     def value(v: Array) -> tuple[float, Array]:
         weights, bias = unpacked(v)
-        loss, slope = _log_loss(x @ weights.astype(np.float32) + bias.astype(np.float32), y)
+        loss, slope = _log_loss(x @ weights.astype(np.float32) + bias.astype(np.float32), y, shares)
         loss += penalty / 2 * float(np.sum(weights**2))
         by_weights = (x.T @ slope).astype(np.float64) + penalty * weights
         by_bias = slope.sum(0, dtype=np.float64)
@@ -86,22 +91,21 @@ def _fit(x: Array, y: Array, columns: int, penalty: float, covariance: Array, st
     return Logistic(weights.astype(np.float32), bias.astype(np.float32), float(found.fun), found.nit < STEPS)
 
 
-def _log_loss(logits: Array, y: Array) -> tuple[float, Array]:
-    """Mean log loss and its gradient by the logits (n, columns), which it overwrites."""
-    n = np.float32(len(y))
+def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
+    """Log loss, the mean by the rows' `shares` (n, 1), and its gradient by the logits (n, columns), overwritten."""
     if logits.shape[1] == 1:
         signed = np.where(y == 1, logits[:, 0], -logits[:, 0])
-        loss = float(np.mean(np.logaddexp(0, -signed), dtype=np.float64))
-        slope = np.where(y == 1, -1, 1) / (1 + np.exp(np.minimum(signed, 80))) / n
-        return loss, slope[:, None].astype(np.float32)
+        loss = float(np.sum(shares[:, 0] * np.logaddexp(0, -signed), dtype=np.float64))
+        slope = np.where(y == 1, -1, 1) / (1 + np.exp(np.minimum(signed, 80)))
+        return loss, (slope[:, None] * shares).astype(np.float32)
     rows = np.arange(len(y))
     logits -= logits.max(1, keepdims=True)
     right = logits[rows, y]
     np.exp(logits, out=logits)
     total = logits.sum(1, keepdims=True)
-    loss = float(np.mean(np.log(total[:, 0]) - right, dtype=np.float64))
-    logits /= total * n
-    logits[rows, y] -= 1 / n
+    loss = float(np.sum(shares[:, 0] * (np.log(total[:, 0]) - right), dtype=np.float64))
+    logits *= shares / total
+    logits[rows, y] -= shares[:, 0]
     return loss, logits
 
 

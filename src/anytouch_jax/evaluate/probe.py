@@ -55,7 +55,7 @@ def linear_probe(
     for fit, weights in bootstraps(rows, seeds):
         model = Linear(rows.x[fit], rows.y[fit], penalty, weights=weights, start=best, scaling=scaling)
         refits.append(float(np.mean(model(rows.x[rows.test]) == rows.y[rows.test])))
-    if best.unfinished:
+    if not best.finished:
         notes += ("the fit stopped at its limit of iterations",)
     return _result(name, protocol, rows, correct, refits, penalty, chosen_on, notes, subsets)
 

@@ -7,7 +7,8 @@ import pytest
 
 from anytouch_jax.config import UserError
 from anytouch_jax.evaluate import deals
-from anytouch_jax.evaluate.deals import FOLDS, Rows, Sums, cuts, interval, scheme
+from anytouch_jax.evaluate.choices import FOLDS
+from anytouch_jax.evaluate.deals import Rows, Sums, cuts, interval, scheme
 
 N = 240
 

@@ -112,7 +112,7 @@ def test_many_rows_choose_on_some_and_report_a_fit_on_all(monkeypatch):
     x, y = blobs(900, apart=0.3)
     hard = problem()._replace(x=x[:500], y=y[:500], val=x[500:700], test=x[700:])
     whole = fit("linear", hard)
-    monkeypatch.setattr(heads, "SELECT_ROWS", 100)
+    monkeypatch.setattr("anytouch_jax.evaluate.choices.SELECT_ROWS", 100)
     few, option = fit("linear", hard), 3
     assert np.mean(few.test[option] == whole.test[option]) < 1.0  # chosen by a fit on 100 rows
     assert np.mean(few.final(option) == whole.test[option]) > 0.99  # reported by one on all

@@ -401,7 +401,7 @@ def test_a_constant_measured_label() -> None:
 
 def test_one_group_cannot_choose_a_penalty() -> None:
     features, labels, _, split = table(val=False)
-    with pytest.raises(UserError, match="train has one group only"):
+    with pytest.raises(UserError, match="all rows to learn from are of one group"):
         linear_probe(features, labels, np.where(split == "train", 0, 1), split)
     assert linear_probe(features, labels, np.where(split == "train", 0, 1), split, penalties=[0.1]).low is None
 

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..config import UserError
+from .choices import dealt
 from .results import Protocol
 
 Array = npt.NDArray[Any]
 
-FOLDS = 5
 DRAWS = 1000
 
 
@@ -78,7 +78,7 @@ def cuts(rows: Rows, seed: int, protocol: Protocol) -> list[Cut]:
         learned, tested = np.flatnonzero(rows.pool & rows.fits), np.flatnonzero(rows.test & rows.tests)
         return [_parted(rows, learned, tested, rng, protocol)]
     numbers = np.flatnonzero(used & (rows.fits | rows.tests))
-    fold, found = dealt(rows, numbers, rng), []
+    fold, found = _dealt(rows, numbers, rng), []
     for one in range(int(fold.max()) + 1):
         learned, tested = numbers[(fold != one) & rows.fits[numbers]], numbers[(fold == one) & rows.tests[numbers]]
         if len(learned) and len(tested):
@@ -89,21 +89,12 @@ def cuts(rows: Rows, seed: int, protocol: Protocol) -> list[Cut]:
 def _parted(rows: Rows, pool: Array, test: Array, rng: np.random.Generator, protocol: Protocol) -> Cut:
     if protocol == "published":
         return Cut(pool, pool[:0], test)
-    fold = dealt(rows, pool, rng)
+    fold = _dealt(rows, pool, rng)
     return Cut(pool[fold != 0], pool[fold == 0], test)
 
 
-def dealt(rows: Rows, numbers: Array, rng: np.random.Generator, count: int = FOLDS) -> Array:
-    """The fold i64 of each of the rows `numbers`: groups are dealt in turn, class by class. Raises UserError."""
-    names, first, ids = np.unique(rows.groups[numbers], return_index=True, return_inverse=True)
-    if len(names) < 2:
-        raise UserError(f"all rows to learn from are of one group, {str(names[0])!r}; two are the least to choose on")
-    count = min(count, len(names))
-    by_class = np.zeros(len(names)) if rows.measured else rows.y[numbers][first]
-    order = np.lexsort((rng.permutation(len(names)), by_class))
-    fold = np.empty(len(names), np.int64)
-    fold[order] = (np.arange(len(names)) + rng.integers(count)) % count
-    return fold[ids]
+def _dealt(rows: Rows, numbers: Array, rng: np.random.Generator) -> Array:
+    return dealt(rows.groups[numbers], None if rows.measured else rows.y[numbers], rng)
 
 
 class Sums(NamedTuple):

@@ -17,15 +17,11 @@ import numpy.typing as npt
 
 from ..config import UserError
 from . import logistic
+from .choices import NEIGHBOURS, PENALTIES, RIDGE, best_of, thinned
 from .probe_models import Scaling, nearest, ridge, standard, vote
 
 Array = npt.NDArray[Any]
 HeadName = Literal["linear", "knn", "gradient"]
-
-PENALTIES = (1.0, 0.1, 0.01, 0.001, 0.0001)
-RIDGE = (100.0, 10.0, *PENALTIES)
-NEIGHBOURS = (20, 10, 5, 1)
-SELECT_ROWS = 20_000  # on so many rows a penalty is chosen; the head that is reported has all
 
 
 class Problem(NamedTuple):
@@ -89,16 +85,14 @@ def score(predicted: Array, truth: Array, classes: int) -> float:
 
 
 def choose(found: Sequence[Array], truth: Array, classes: int) -> int:
-    """The option that scores best, the middle one of equals: the ends of a plateau are one step from falling off."""
-    scores = np.array([score(one, truth, classes) for one in found])
-    equals = np.flatnonzero(scores == scores.max())
-    return int(equals[len(equals) // 2])
+    """The option that scores best (see `choices.best_of`)."""
+    return best_of([score(one, truth, classes) for one in found])
 
 
 def _linear(problem: Problem, penalties: Sequence[float]) -> Path:
     mean, scale = standard(problem.x, scaling=problem.scaling)
     x, val, test = ((rows - mean) / scale for rows in (problem.x, problem.val, problem.test))
-    kept = _thinned(len(x))
+    kept = thinned(np.arange(len(x)))
     models = list(logistic.path(x[kept], problem.y[kept], problem.classes, penalties))
 
     def final(option: int) -> Array:
@@ -109,12 +103,6 @@ def _linear(problem: Problem, penalties: Sequence[float]) -> Path:
 
     on_val, on_test = ([one(rows) for one in models] for rows in (val, test))
     return Path(tuple(penalties), on_val, on_test, final, tuple(one.finished for one in models))
-
-
-def _thinned(count: int) -> Array:
-    if count <= SELECT_ROWS:
-        return np.arange(count)
-    return np.sort(np.random.default_rng(0).choice(count, SELECT_ROWS, replace=False))
 
 
 def _ridge(problem: Problem, penalties: Sequence[float]) -> Path:

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .choices import NEIGHBOURS, PENALTIES, RIDGE
 from .probe_models import Linear, Scaling, commonest, nearest, path, ridge, vote
 from .probe_rows import Rows, Scores, bootstraps, choose, folded, prepare
 from .results import Outcome, ProbeResult, Protocol, RegressionResult, mean_interval, parts_of, r2_interval
 
 Array = npt.NDArray[Any]
-
-PENALTIES = (1.0, 0.1, 0.01, 0.001, 0.0001)
-NEIGHBOURS = (20, 10, 5, 1)
 
 
 def linear_probe(
@@ -146,7 +144,7 @@ def regression_probe(
     split: Any,
     *,
     protocol: Protocol = "honest",
-    penalties: Sequence[float] = (100.0, 10.0, *PENALTIES),
+    penalties: Sequence[float] = RIDGE,
     name: str = "ridge",
 ) -> RegressionResult:
     """Ridge regression of a measured label (floats; NaN or None: no label) on features standardised by train.

@@ -10,13 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..config import UserError
+from .choices import FOLDS, best_of, dealt, thinned
 from .results import Protocol, group_draws
 
 Array = npt.NDArray[Any]
 Scores = Callable[[Array, Array, Sequence[float]], list[float]]  # (fit rows, scored rows, options) -> higher is better
-
-FOLDS = 5
-SELECT_ROWS = 10_000  # rows on which a penalty is chosen; the reported fit has all
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,7 @@ def choose(
     if protocol == "published":
         values, how = scores(rows.train, rows.test, options), "test"
     elif protocol == "honest":
-        fit = _thinned(rows.train)
+        fit = thinned(rows.train)
         if len(rows.val):
             values, how = scores(fit, rows.val, options), "val"
         else:
@@ -153,36 +151,21 @@ def choose(
             values, how = list(np.sum(table, axis=0)), "cross-validation"
     else:
         raise UserError(f"unknown protocol {protocol!r}; choose honest or published")
-    equals = np.flatnonzero(np.asarray(values) == np.max(values))
-    best = int(equals[len(equals) // 2])  # the ends of a plateau are one step from falling off
+    best = best_of(values)
     notes: tuple[str, ...] = ()
     if how == "test":
         notes += ("chosen on test, as the authors' code does: an upper estimate",)
-    if edges and len(equals) == 1 and best in (0, len(options) - 1):
+    alone = np.count_nonzero(np.asarray(values) == np.max(values)) == 1
+    if edges and alone and best in (0, len(options) - 1):
         notes += (f"the chosen penalty {options[best]:g} lies at the edge of those tried",)
     return options[best], how, notes
 
 
-def _thinned(rows: Array) -> Array:
-    """At most SELECT_ROWS of `rows`, evenly by chance and always the same."""
-    if len(rows) <= SELECT_ROWS:
-        return rows
-    return np.sort(np.random.default_rng(0).choice(rows, SELECT_ROWS, replace=False))
-
-
 def folded(rows: Rows, used: Array, count: int) -> Iterator[tuple[Array, Array]]:
     """(rows to fit, rows left out) with whole groups on one side and each class spread over the folds."""
-    names, ids = np.unique(rows.groups[used], return_inverse=True)
-    if len(names) < 2:
-        raise UserError(
-            f"train has one group only, {str(names[0])!r}; a penalty needs a val split or at least two groups"
-        )
-    first = rows.y[used][np.unique(ids, return_index=True)[1]]  # a label of each group
-    order = np.lexsort((np.random.default_rng(0).permutation(len(names)), first))
-    fold = np.empty(len(names), np.int64)
-    fold[order] = np.arange(len(names)) % min(count, len(names))  # dealt in turn, class by class
-    for number in range(min(count, len(names))):
-        out = fold[ids] == number
+    fold = dealt(rows.groups[used], rows.y[used], np.random.default_rng(0), count)
+    for number in range(int(fold.max()) + 1):
+        out = fold == number
         yield used[~out], used[out]
 
 

@@ -79,6 +79,15 @@ def filled(folder: Path, *losses: float, keep: int = 3) -> Checkpoints:
     return saver
 
 
+def test_a_loss_of_few_steps_is_never_the_best(tmp_path):
+    saver = opened(tmp_path, keep=1)
+    given = ({"loss": 0.1, checkpoint.PARTIAL: 1}, {"loss": 3.0}, {"loss": 2.0}, {"loss": 9.0})
+    for step, metrics in enumerate(given, 1):
+        saver.save(step, state_of(step), metrics)
+    saver.wait()
+    assert checkpoint.steps(tmp_path) == [3, 4] and checkpoint.best_of(tmp_path) == 3
+
+
 def test_every_type_comes_back_bit_equal(tmp_path):
     with_nan = state_of(3)
     odd = jnp.array([0x7FC00001, 0x80000000, 1], jnp.uint32).view(jnp.float32)  # a NaN with payload, -0, a denormal

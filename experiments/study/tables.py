@@ -189,7 +189,8 @@ def sentence(one: Statement) -> str:
     if len(one.columns) == 1:
         return f"- {one.label}: **{word}**, {_signed(row)}."
     wrong = [name for name, part in one.columns.items() if part.word == "disagrees" and row.word != "disagrees"]
-    columns += f". **Against the paper's sign: {', '.join(wrong)}**" if wrong else ""
+    against = "Below it" if "our control" in one.label else "Against the paper's sign"
+    columns += f". **{against}: {', '.join(wrong)}**" if wrong else ""
     over = "all columns together" if len(one.over) == len(one.columns) else " and ".join(one.over)
     return f"- {one.label}: **{word}**, {over} {_signed(row)}. By column: {columns}."
 
@@ -208,8 +209,8 @@ def by_chance(statements: Sequence[Statement]) -> str:
     rows = sum(one.row.word in told for one in statements)
     few = f"about {columns / 20:.0f}" if columns >= 20 else "less than one"
     return (
-        f"Of {columns} columns the paper has a sign and these results an interval; {few} of so many leave zero out by\n"
-        f"chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected for that number."
+        f"Of {columns} columns a sign is expected (the paper's, or that of a control of ours) and there is an interval;\n"
+        f"{few} of so many leave zero out by chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected for that number."
     )
 
 

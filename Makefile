@@ -24,6 +24,7 @@ GOLDEN     ?= tests/parity/golden
 WORKERS    ?= 2
 
 DEMO       ?= runs/demo
+DEMO_STEPS ?= 200
 PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets pouring translation
 
 train-stage1: RUN ?= runs/stage1
@@ -36,7 +37,7 @@ export-onnx: FRAMES ?= 1
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --loader.background subtract --loader.contact-only --loader.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps 400 --batch 48
-DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps 200 --batch 64 --model.match-head cosine --objective.match-weight 8 --loader.negatives same_sensor
+DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --loader.negatives same_sensor
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
@@ -64,7 +65,7 @@ help: ## list the targets
 
 setup: $(STAMP) ## make .venv with the pinned versions
 
-demo: $(STAMP) ## simulate, train both stages, probe and report, in eleven to twelve minutes: [DEMO=]
+demo: $(STAMP) ## simulate, train both stages, probe and report, in 5 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2]
 	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
 	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1 $(DEMO1)

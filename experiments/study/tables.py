@@ -209,8 +209,9 @@ def by_chance(statements: Sequence[Statement]) -> str:
     rows = sum(one.row.word in told for one in statements)
     few = f"about {columns / 20:.0f}" if columns >= 20 else "less than one"
     return (
-        f"Of {columns} columns a sign is expected (the paper's, or that of a control of ours) and there is an interval;\n"
-        f"{few} of so many leave zero out by chance alone. So a sign is told of a whole row, {rows} times, and nothing is corrected for that number."
+        f"Of {columns} columns a sign is expected (the paper's, or that of a control of ours) and there is an\n"
+        f"interval; {few} of so many leave zero out by chance alone. So a sign is told of a whole row, {rows} times,\n"
+        "and nothing is corrected for that number."
     )
 
 

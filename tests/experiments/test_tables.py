@@ -108,7 +108,7 @@ def test_ablations_that_hurt_agree(rendered):
     assert stage1.endswith("**Against the paper's sign: unseen sensor, other data**.")
     # Q1 2 x 5 x 4, Q2 4 + 5 x 2, Q3 2 + 4 + 6 static, 2 + 2 + 4 of forms and 3 x 4 dynamic, ablations 2 x 8 x 4,
     # grasp 1, dynamics 4, and two controls of Q3 on 6 + 4 + 4
-    assert "Of 183 columns a sign is expected" in text and "\nabout 9 of so many leave zero out by chance" in text
+    assert "Of 183 columns a sign is expected" in text and "about 9 of so many leave zero out by chance" in text
     assert "| Ablations (Table 6) | 16 | 0 | 0 | 0 | 0 |" in text
 
 

@@ -20,7 +20,7 @@ def picture_grid(
     """A grid of `rows` pairs spread over those given: a PNG, four columns.
 
     Images: the difference is twice enlarged about grey. Fields: indentation, on one scale a row; the difference from
-    blue (too little) through white to red. Raises UserError when the disk does not take it.
+    blue (too little) through white to red. Raises OSError.
     """
     chosen = np.linspace(0, len(images) - 1, min(rows, len(images))).round().astype(int)
     given, truth = images[chosen], targets[chosen]

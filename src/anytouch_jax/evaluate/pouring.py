@@ -233,7 +233,7 @@ def error(poured: Array, target: float) -> Error:
 def write_film(path: Path, trials: Trials, task: Task, number: int = 0, *, every: int = 4, rate: float = 10.0) -> None:
     """Write run `number` as a GIF: the frame, beside it the mass left over time and the action. Whole or not at all.
 
-    Every `every`-th moment is shown, `rate` a second. Raises UserError when the disk does not take it.
+    Every `every`-th moment is shown, `rate` a second. Raises OSError.
     """
     from PIL import Image  # matplotlib cannot be had without it
 

@@ -51,7 +51,7 @@ def write_report(
     """Write `folder`/report.md, report.json (`numbers`) and figures/; gives back the path of report.md.
 
     A figure from elsewhere is copied in. The pictures come first and report.md last, each in one move, so that a
-    report that is there is whole. Raises UserError for a figure that is not there and for a full disk.
+    report that is there is whole. Raises UserError for a figure that is not there, OSError for a full disk.
     """
     lines = [f"# {title}"]
     drawn = [section.figure.name for section in sections if section.figure is not None]

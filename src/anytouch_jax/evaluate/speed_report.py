@@ -102,7 +102,7 @@ def as_dict(row: Any) -> dict[str, Any]:
 
 
 def write(folder: Path, name: str, text: str, numbers: Mapping[str, Any]) -> Path:
-    """Write `name`.md and `name`.json in a folder, each in one move. Raises UserError when that cannot be done."""
+    """Write `name`.md and `name`.json in a folder, each in one move. Raises OSError."""
     for suffix, content in ((".json", json.dumps(numbers, indent=2, allow_nan=False) + "\n"), (".md", text)):
         path = folder / f"{name}{suffix}"
         write_whole(path, content)

@@ -55,7 +55,7 @@ def alone(path: str | Path) -> Iterator[bool]:
         yield True
         return
     free = True
-    with open(path, "ab") as file:
+    with open(path, "rb" if os.path.exists(path) else "ab") as file:  # one that may only be read can be locked too
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -45,8 +45,7 @@ from anytouch_jax.evaluate import generation, pairs
 from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
-from anytouch_jax.evaluate.results import markdown, verdict
-from anytouch_jax.evaluate.results import seed_interval as interval
+from anytouch_jax.evaluate.results import markdown, seed_interval, verdict
 from anytouch_jax.nn.translation import Translation
 from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
@@ -285,7 +284,7 @@ def against(task: tuple[str, str], better: str, worse: str) -> str:
     change = [several[0][seed] - several[1][seed] for seed in sorted(several[0].keys() & several[1].keys())]
     if not change:
         return "-"
-    low, high = interval(change)
+    low, high = seed_interval(change)
     said = "" if low is None or high is None else f" ({low:+.4f} to {high:+.4f})"
     return f"{np.mean(change):+.4f}{said}, {verdict(low, high, len(change), wanted=-1)}"
 

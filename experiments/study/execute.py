@@ -132,11 +132,7 @@ def execute(
             with work.claim(leaf.file) as mine:
                 try:
                     done = mine and (is_done(leaf, out) or _one(leaf, work, out, begin))
-                except (
-                    UserError,
-                    RuntimeError,
-                    MemoryError,
-                ) as error:  # XLA's errors are RuntimeErrors
+                except (UserError, RuntimeError, MemoryError) as error:  # XLA's are RuntimeErrors
                     what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
                     say(f"{leaf.file} failed: {what}")
                     result.failed[leaf.file] = what

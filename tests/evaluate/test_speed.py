@@ -231,7 +231,7 @@ def test_all_take_turns_and_each_round_begins_with_another():
         speed.interleaved([print], 0)
 
 
-CUDNN = {"attention": "cudnn", "dtype": "bfloat16"}
+NOWHERE = {"dtype": "float7"}
 
 
 def test_a_variant_that_fails_when_it_is_run_is_a_row_with_a_note(monkeypatch):
@@ -253,13 +253,13 @@ def test_a_variant_that_fails_when_it_is_run_is_a_row_with_a_note(monkeypatch):
 
 
 def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
-    tried = (*FAST[:1], variants.Variant("donated", donate=True), variants.Variant("cuDNN", CUDNN))
+    tried = (*FAST[:1], variants.Variant("donated", donate=True), variants.Variant("seven bits", NOWHERE))
     rows = speed.measure(STAGE1, tried, rounds=2, with_errors=False, peak_size=64)
     base, donated, absent = rows
     assert base.ratio == 1 and base.ratio_iqr == 0 and base.calls == 2 and base.error_loss is None
     assert base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
     assert donated.peak_bytes > donated.temp_bytes > 0 and donated.ratio > 0 and donated.copies >= base.copies > 0
-    assert absent.note and np.isnan(absent.ratio) and absent.variant == "cuDNN"
+    assert absent.note and np.isnan(absent.ratio) and absent.variant == "seven bits"
     text = speed_report.to_markdown(rows)
     assert absent.note.replace("|", "/") in text and "| donated | 4 |" in text
     assert speed_report.as_dict(absent)["seconds"] is None

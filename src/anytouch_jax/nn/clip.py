@@ -8,6 +8,7 @@ from jax import Array
 
 from anytouch_jax.config import Model, Stack, TextTower
 from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.product import stored
 from anytouch_jax.ops import tokens
 
 
@@ -50,7 +51,7 @@ class TextEncoder(nnx.Module):
         self.blocks = stacked_blocks(tower.stack, model, model.norm_eps, activation(model.activation))
         self.final_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
-        self.end_token, self.dtype, self.remat = tower.end_token, jnp.dtype(model.dtype), model.remat
+        self.end_token, self.dtype, self.remat = tower.end_token, stored(model.dtype), model.remat
 
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
         """Normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""

@@ -12,6 +12,7 @@ from jax.typing import DTypeLike
 
 from anytouch_jax.config import Model, Stack
 from anytouch_jax.nn.attention import attention
+from anytouch_jax.nn.product import product, products_saveable, stored
 
 Activation = Callable[[Array], Array]
 
@@ -73,8 +74,8 @@ class Dense(nnx.Module):
     def __call__(self, x: Array, outputs: int | None = None) -> Array:
         """All outputs, or the first `outputs` of them: what nobody reads is not computed."""
         # As a matrix: of two contracted axes XLA's CPU back end writes a transposed copy before the gradient's product.
-        y = x.astype(self.dtype).reshape(-1, x.shape[-1]) @ self.kernel[...][:, :outputs].astype(self.dtype)
-        y = y if self.bias is None else y + self.bias[...][None, :outputs].astype(self.dtype)
+        y = product(x.reshape(-1, x.shape[-1]), self.kernel[...][:, :outputs], self.dtype)
+        y = y if self.bias is None else y + self.bias[...][None, :outputs].astype(y.dtype)
         return y.reshape(*x.shape[:-1], y.shape[-1])
 
 
@@ -84,7 +85,7 @@ class LayerNorm(nnx.Module):
     def __init__(self, width: int, eps: float, dtype: DTypeLike) -> None:
         self.scale = table(width)
         self.bias = table(width)
-        self.eps, self.dtype = eps, jnp.dtype(dtype)
+        self.eps, self.dtype = eps, stored(dtype)
 
     def __call__(self, x: Array) -> Array:
         wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
@@ -124,7 +125,7 @@ class Mlp(nnx.Module):
 
 # A method whose backward pass keeps the products of its matrices and does the rest anew (norms, activations, sums):
 # on two CPU cores less to write and read back is 15 to 25 % off a step and two fifths off its memory.
-lean = nnx.remat(prevent_cse=False, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
+lean = nnx.remat(prevent_cse=False, policy=products_saveable)
 
 
 class Block(nnx.Module):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import Model
 from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.product import product, stored
 from anytouch_jax.ops import masking, tokens
 
 
@@ -26,11 +29,13 @@ class TouchPatch(nnx.Module):
         """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
         kernel = self.kernel[...]
         if patches.shape[2] == 1:
-            kernel = jnp.sum(kernel, axis=-3, keepdims=True)
+            kernel = reduce(jnp.add, jnp.moveaxis(kernel, -3, 0))[..., None, :, :]
         if not self.own:
-            return jnp.einsum("bktc,tcd->bkd", patches.astype(self.dtype), kernel.astype(self.dtype))
-        each = rows_of(kernel.astype(self.dtype), sensor)
-        return jnp.einsum("bktc,btcd->bkd", patches.astype(self.dtype), each)
+            matrix = kernel.reshape(-1, kernel.shape[-1])
+            x = product(patches.reshape(-1, len(matrix)), matrix, self.dtype)
+            return x.reshape(*patches.shape[:2], kernel.shape[-1])
+        each, own = rows_of(kernel, sensor), stored(self.dtype)
+        return jnp.einsum("bktc,btcd->bkd", patches.astype(own), each.astype(own))
 
 
 class TouchEncoder(nnx.Module):

@@ -14,6 +14,7 @@ from jax import Array
 
 from anytouch_jax.config import Model, Stack
 from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.product import stored
 from anytouch_jax.ops import tokens
 
 DECODER = Stack(128, 2, 4, 512)
@@ -107,7 +108,7 @@ class Conv(nnx.Module):
 
     def __init__(self, inputs: int, outputs: int, model: Model) -> None:
         self.kernel, self.bias = table(9 * inputs, outputs), table(outputs)
-        self.dtype = jnp.dtype(model.dtype)
+        self.dtype = stored(model.dtype)
 
     def __call__(self, x: Array) -> Array:
         kernel = self.kernel[...].reshape(3, 3, x.shape[-1], -1).astype(self.dtype)

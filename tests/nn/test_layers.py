@@ -3,12 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 from tiny_models import STACK, touch_model
 
-from anytouch_jax.config import Stack
 from anytouch_jax.nn.functional import build
-from anytouch_jax.nn.layers import Block, gelu, quick_gelu
+from anytouch_jax.nn.layers import gelu, quick_gelu
 from anytouch_jax.nn.product import stored
 
 X = jnp.linspace(-6, 6, 241)

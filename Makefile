@@ -37,6 +37,7 @@ export-onnx: FRAMES ?= 1
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --loader.background subtract --loader.contact-only --loader.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps 400 --batch 48
+DEMO_LONGER := $(if $(filter-out 200,$(DEMO_STEPS)),-$(DEMO_STEPS))
 DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --loader.negatives same_sensor
 
 ANYTOUCH := $(PY) -m anytouch_jax
@@ -69,8 +70,8 @@ demo: $(STAMP) ## simulate, train both stages, probe and report, in 5 to 12 minu
 	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
 	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1 $(DEMO1)
-	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2 --init $(DEMO)/stage1 $(DEMO2)
-	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1 --stage2 $(DEMO)/stage2 --out $(DEMO)/report
+	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2$(DEMO_LONGER) --init $(DEMO)/stage1 $(DEMO2)
+	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1 --stage2 $(DEMO)/stage2$(DEMO_LONGER) --out $(DEMO)/report$(DEMO_LONGER)
 
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
 	$(ANYTOUCH) simulate --out $(SCENES)

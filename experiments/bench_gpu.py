@@ -54,6 +54,8 @@ def main() -> None:
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     options = parser.parse_args()
+    if unknown := set(options.what) - {"stage1", "stage2", "embed"}:
+        parser.error(f"{', '.join(sorted(unknown))}: choose among stage1, stage2, embed")
     here = machine.describe()
     print(here.sentence(), file=sys.stderr)
     rows: list[speed.Row] = []

@@ -294,6 +294,8 @@ def probe_table(found: list[dict[str, Any]]) -> str:
 # %%
 files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
 told = files[GRADES[0]][0]
+if any(one["settings"] != told["settings"] for found in files.values() for one in found):
+    raise SystemExit("the files of teaching/ were made by different settings: make them anew, without TABLE=1")
 size = " ".join(f"{name.upper()}={told['settings'][name]}" for name in ("touches", "more", "objects"))
 size += " STEPS1={} STEPS2={}".format(*told["settings"]["steps"])
 size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"

@@ -32,7 +32,9 @@ import json
 import os
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -172,15 +174,28 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
 
 def encoders(table: manifests.Manifest) -> dict[str, tuple[Encoder, str]]:
     """Every encoder of RUNS by the name that it has in the table, with the objects that it knows of the pairs."""
-    found = {}
+    found: dict[str, tuple[Encoder, str]] = {}
+    trained = [load_encoder(path).config for path in RUNS.values() if Path(path).exists()]
     for number, (name, path) in enumerate(RUNS.items()):
         if Path(path).exists():
             encoder = load_encoder(path)
             found[name] = (encoder, overlap(encoder, table))
         else:
             print(f"there is no run {path}: {name} is replaced by a random encoder")
-            found[f"{name} (random encoder)"] = (random_encoder(preset("tiny"), number), "0")
+            found[f"{name} (random encoder)"] = (random_encoder((trained or [preset("tiny")])[0], number), "0")
     return found
+
+
+def one_table(several: Sequence[dict[str, Any]]) -> None:
+    """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
+    (errors of pictures of another size are no rivals), two encoders of one name."""
+    ways = {(one["touches"], one["pairs"], one["fit"]["steps"], one["size"], one["subtracts"]) for one in several}
+    known = {(one["name"], one["encoder"]) for one in several}
+    if len(ways) > 1 or len(known) > len({name for name, _ in known}):
+        raise UserError(
+            f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name, "
+            f"make no table together ({sorted(map(str, ways))}; {sorted(map(str, known))}): choose another OUT"
+        )
 
 
 def is_done(file: Path, about: dict[str, Any]) -> bool:
@@ -204,15 +219,16 @@ def all_runs() -> None:
     content = table.content_hash[:16]
     plain = max(seen_by(one) for one, _ in known.values())  # the references see what the encoders see
     plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]
+    every = {}
+    for (task, seed), (name, encoder, tune) in product(product(TASKS, SEEDS), plans):
+        about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content)
+        stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
+        every[RUN_FILES / f"{stem}.json"] = (about, encoder)
+    there = [file for file in RUN_FILES.glob("*-*.json") if file not in every]
+    one_table([*(about for about, _ in every.values()), *(json.loads(f.read_text())["settings"] for f in there)])
     for source, target in TASKS:
-        todo = []
-        for seed in SEEDS:
-            for name, encoder, tune in plans:
-                seen = seen_by(encoder) if encoder else plain
-                about = settings((source, target), name, encoder, seen, tune, seed, content)
-                stem = re.sub(r"[^a-z0-9_]+", "-", f"{source}-{target}-{name}-{tune}-{seed}".lower())
-                if not is_done(RUN_FILES / f"{stem}.json", about):
-                    todo.append((about, encoder, RUN_FILES / f"{stem}.json"))
+        mine = [(*one, file) for file, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
+        todo = [one for one in mine if not is_done(one[2], one[0])]
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
@@ -239,11 +255,7 @@ records = [json.loads(file.read_text()) for file in sorted(RUN_FILES.glob("*-*.j
 if not records:
     raise UserError(f"{RUN_FILES} holds no results; run this page without TABLE=1")
 known_objects = json.loads((RUN_FILES / "overlap.json").read_text())
-sizes = {(r["settings"]["touches"], r["settings"].get("pairs"), r["settings"]["fit"]["steps"]) for r in records}
-if len(sizes) > 1:
-    raise UserError(
-        f"{RUN_FILES} holds runs on other pairs or of other steps, {sorted(map(str, sizes))}: remove the old"
-    )
+one_table([record["settings"] for record in records])
 
 
 def row_name(record: dict[str, Any]) -> str:
@@ -263,11 +275,6 @@ def spread(values: list[float]) -> str:
     return f"{np.mean(values):.4f}" + (f" +- {np.std(values, ddof=1):.4f}" if len(values) > 1 else "")
 
 
-for name in {row_name(record) for record in records}:
-    if len(several := {r["settings"]["encoder"] for r in records if row_name(r) == name}) > 1:
-        raise UserError(
-            f"{RUN_FILES}: the runs of {name} are of several encoders, {sorted(several)}: remove the old ones"
-        )
 names = sorted({row_name(record) for record in records}, key=lambda name: ("pixels" in name, name))
 cells = [(name, *(spread([r["error"] for r in of(task, name)]) for task in TASKS)) for name in names]
 means = [spread([r["mean_target"] for r in of(task, name)][:1]) for task in TASKS for name in names[:1]]

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import warnings
 import zlib
 from pathlib import Path
 
@@ -282,7 +283,7 @@ def test_a_termination_before_the_first_step_is_polite(tmp_path, world, capsys, 
     told = capsys.readouterr().err.strip()
     assert told.splitlines()[-1].startswith("stopped by SIGTERM before a step of") and "Traceback" not in told
     assert signal.getsignal(signal.SIGTERM) is before
-    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {"config.json"}
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {"config.json", ".lock"}
     assert run(*args, "--stop-after", 0) == 0
 
 
@@ -311,6 +312,10 @@ def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
     assert "'new_sensor'" in (error := capsys.readouterr().err) and "universal tokens" in error
     with np.load(out) as file:
         assert np.abs(file["features"] - from_manifest).max() > 1e-4
+    assert run(*args, "--sensor", "digit", "--dtype", "bfloat16") == 0
+    with np.load(out) as file:
+        assert str(file["about/dtype"]) == "bfloat16"
+        assert 1e-5 < np.abs(file["features"] - from_manifest).max() / np.abs(from_manifest).max() < 0.05
 
 
 def test_embed_leaves_a_bad_picture_of_a_folder_out(tmp_path, world, tiny_run, capsys):
@@ -443,6 +448,20 @@ def test_a_reader_that_goes_away_is_no_traceback():
         f"{sys.executable} -m anytouch_jax --help | true", shell=True, capture_output=True, text=True, check=False
     )
     assert "Traceback" not in ended.stderr
+
+
+def test_a_warning_of_the_library_is_a_sentence(monkeypatch, capsys, tmp_path):
+    def warn(_):
+        warnings.warn("sensor 'x' is not known", stacklevel=2)
+        warnings.warn("jax will change", FutureWarning, stacklevel=2)
+        return 0
+
+    monkeypatch.setattr("anytouch_jax.commands.info.run", warn)
+    with warnings.catch_warnings(record=True) as others:
+        warnings.simplefilter("always")
+        assert main(["info", str(tmp_path)]) == 0
+    assert capsys.readouterr().err == "sensor 'x' is not known\n"
+    assert [one.category for one in others] == [FutureWarning]  # somebody else's, as Python shows it
 
 
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys, tmp_path):

@@ -1,5 +1,6 @@
 """Whole runs on a small world on disk: stage 1, then stage 2 from it, resumed, refused, started from other weights."""
 
+import fcntl
 import json
 import shutil
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 from touch_world import make_touches
 
+from anytouch_jax.cli import main
 from anytouch_jax.config import SENSORS, UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import text as texts
@@ -331,6 +333,33 @@ def test_touches_shown_otherwise_than_to_stage_one_are_told_of(tmp_path):
         train(one, tmp_path / name, said, init=tmp_path / "one", stop_after=0)
         assert any("trained with --loader.background keep, this run with subtract" in line for line in said) == told
 
+    release_file = tmp_path / "one.safetensors"  # the same is told of weights that say how they saw touches
+    assert main(["convert", str(tmp_path / "one"), str(release_file)]) == 0
+    said = []
+    train(other, tmp_path / "third", said, init=release_file, stop_after=0)
+    assert any("trained with --loader.background keep, this run with subtract" in line for line in said)
+
+
+def test_what_starts_anew_is_told_of(straight, world, tmp_path):
+    train(run_config(world, 2), tmp_path / "two", init=straight[0], stop_after=1)
+    for name, init, told in (("a", straight[0], False), ("b", tmp_path / "two", True)):
+        said: list[str] = []
+        train(run_config(world, 2), tmp_path / name, said, init=init, stop_after=0)
+        assert any("the touch encoder and the decoder are taken; " in line for line in said) == told
+    assert any("image, " in line and line.endswith("start anew") for line in said)
+
+
+def test_two_processes_never_train_one_run(straight, world, tmp_path):
+    run = tmp_path / "r"
+    for begun in (False, True):
+        run.mkdir(exist_ok=True)
+        with (run / ".lock").open("ab") as held:
+            fcntl.flock(held, fcntl.LOCK_EX)  # as another process holds it, from before its first checkpoint
+            before = sorted(path.name for path in run.iterdir())
+            assert f"another process trains {run}" in refused(run_config(world, 2), run, init=straight[0])
+            assert sorted(path.name for path in run.iterdir()) == before  # not even a tokenizer
+        assert begun or train(run_config(world, 2), run, init=straight[0], stop_after=1).step == 1
+
 
 def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
     epoch = Loader(manifests.read(world), run_config(world)).steps_per_epoch
@@ -356,6 +385,8 @@ def test_a_run_is_not_gone_on_with_on_other_rows(world, tmp_path):
 def test_a_start_that_failed_leaves_no_tokenizer_behind_that_counts(straight, world, tmp_path):
     run = tmp_path / "r"
     refused(run_config(world, 2), run, init=tmp_path / "mistyped")
+    assert not run.exists()
+    run.mkdir()
     (run / "tokenizer.json").write_text("{}")  # of other data
     train(run_config(world, 2), run, init=straight[0], stop_after=0)
     assert texts.load(run / "tokenizer.json").vocab_size > 2

@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from anytouch_jax.commands.output import check_folder
 from anytouch_jax.config import UserError, to_json
 from anytouch_jax.evaluate.export import call_of, describes
 from anytouch_jax.evaluate.features import check_frames, load_encoder
@@ -33,11 +34,11 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=1, help="frames of a touch: 1 (stills) or 3")
     parser.add_argument("--python", type=Path, required=True, help="python of the environment with jax2onnx")
     options = parser.parse_args()
-    encoder = load_encoder(options.run)
+    check_folder(options.out, read=(options.run,))
+    encoder = load_encoder(options.run).computed_in("float32")
     model = encoder.config.model
     check_frames(model, options.frames)
     rng, size = np.random.default_rng(0), model.image_size
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=options.out.parent, prefix=f".{options.out.name}.") as name:
         folder = Path(name)
         export_safetensors(folder / "params.safetensors", encoder.params, {"model": to_json(model)})
@@ -58,8 +59,8 @@ def main() -> int:
         about = call_of(encoder, frames=options.frames, width=cases[f"features{BATCHES[0]}"].shape[1])
         about["input"] = about["input"].replace("frames:", "touches:", 1)
         (folder / "about.json").write_text(json.dumps(about, indent=2) + "\n")
-        os.replace(folder / "about.json", describes(options.out))
         os.replace(folder / "model.onnx", options.out)
+        os.replace(folder / "about.json", describes(options.out))
     print(f"{describes(options.out)}: how to call it")
     print(f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB")
     return 0

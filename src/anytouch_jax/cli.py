@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass, make_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -75,7 +77,9 @@ def _main(argv: Sequence[str] | None) -> int:
         print(f"anytouch: no command {args[0]!r}{hint} See anytouch --help", file=sys.stderr)
         return 2
     try:
-        return _run(args[0], args[1:])
+        with warnings.catch_warnings():
+            warnings.showwarning = partial(_tell, warnings.showwarning)
+            return _run(args[0], args[1:])
     except UserError as error:
         print(f"anytouch {args[0]}: {error}", file=sys.stderr)
         return 1
@@ -88,6 +92,14 @@ def _main(argv: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def _tell(otherwise: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any) -> None:
+    """What the library warns of is a sentence for the user, without the line of code that Python shows."""
+    if category is UserWarning:
+        print(message, file=sys.stderr)
+    else:
+        otherwise(message, category, *where)
 
 
 def _usage() -> str:

@@ -97,6 +97,8 @@ class Embed:
     """Class token (what alignment trains), mean of patch tokens, or both."""
     join: Literal["mean", "sum", "concat"] = "mean"
     """How the segments of a long clip are joined."""
+    dtype: Literal["trained", "float32", "bfloat16"] = "trained"
+    """Arithmetic: as in training, or another; bfloat16 is for GPUs and CPUs with AMX."""
     batch: int = 64
     """Frames at a time (not with --stream)."""
     stream: bool = False
@@ -125,9 +127,9 @@ class Probe:
     """Run folders or weights files to compare."""
     label: str = "object"
     """Label column, with or without "label."."""
-    group: str = "grasp_group"
-    """Column, with or without "label.", whose values never stand on both sides of a split (default: grasp_group where
-    the manifest has it, else sequence)."""
+    group: str = ""
+    """Column, with or without "label.", whose values never stand on both sides of a split (default: the first of
+    grasp_group, object, touch, sequence that the manifest has and that is not the label)."""
     leave_out: str | None = None
     """Leave whole values of this column out in turn (for slip: object), instead of the splits."""
     where: tuple[str, float] | None = None

@@ -41,6 +41,8 @@ class Export:
     """Class token (what alignment trains), mean of patch tokens, or both."""
     join: Literal["mean", "sum", "concat"] = "mean"
     """How the segments of a long clip are joined."""
+    dtype: Literal["trained", "float32", "bfloat16"] = "trained"
+    """Arithmetic: as in training, or another; bfloat16 is for GPUs and CPUs with AMX."""
 
 
 @dataclass(frozen=True)

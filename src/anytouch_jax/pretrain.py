@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
@@ -28,12 +28,12 @@ from anytouch_jax.model import Model
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
-from anytouch_jax.train.record import begun_with
+from anytouch_jax.train.record import alone_in, begun_with
 from anytouch_jax.train.watch import silent
 
 Params = dict[str, Any]
 Say = Callable[[str], None]
-SCRATCH_VOCABULARY = 2048
+SCRATCH_VOCABULARY, TOKENIZER = 2048, "tokenizer.json"
 RELEASED = SENSORS[:5]  # what the authors' weights were trained on
 _NO_CLIP = "towers=pretrained needs CLIP weights: --clip <folder or file>, with tokenizer.json beside them"
 
@@ -79,18 +79,21 @@ def pretrain(
         say(note)
     config = _warmed(config, run, loader)
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
-    return fit(
-        config,
-        params=params,
-        loss_fn=partial(loss, net=net, config=config),
-        batches=loader.stream,
-        run_dir=run,
-        stop_after=stop_after,
-        on_report=partial(_report, run=run, net=net, config=config),
-        metadata=_describe(config, run, init, clip, manifest, loader),
-        say=say,
-        mesh=mesh,
-    )
+    with alone_in(run) if jax.process_index() == 0 else nullcontext():
+        if jax.process_index() == 0 and tokenizer is not None and not steps(run / "checkpoints"):
+            tokenizer.save(run / TOKENIZER)
+        return fit(
+            config,
+            params=params,
+            loss_fn=partial(loss, net=net, config=config),
+            batches=loader.stream,
+            run_dir=run,
+            stop_after=stop_after,
+            on_report=partial(_report, run=run, net=net, config=config),
+            metadata=_describe(config, run, init, clip, manifest, loader),
+            say=say,
+            mesh=mesh,
+        )
 
 
 def _possible(config: Config) -> None:
@@ -137,7 +140,7 @@ def _same_data(run: Path, manifest: manifests.Manifest) -> None:
         if before not in (None, manifest.content_hash):
             raise UserError(
                 f"the rows of the manifests have changed since {run} was begun; restore them, or begin another run "
-                f"with --init {run}"
+                f"with --init {run}, whose touch encoder and decoder it starts from"
             )
 
 
@@ -189,22 +192,19 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
     """The tokenizer of stage 2: the run's own, the one asked for, CLIP's, or one trained on the captions."""
     if config.model.text is None:
         return config, None
-    own, begun = run / "tokenizer.json", bool(steps(run / "checkpoints"))
-    if own.exists() and begun:  # else it is left from a start that failed
+    own = run / TOKENIZER
+    if own.exists() and steps(run / "checkpoints"):  # else it is left from a start that failed
         tokenizer = texts.load(own)
     elif config.data.tokenizer is not None:
         tokenizer = texts.load(config.data.tokenizer)
     elif config.towers == "pretrained":
-        tokenizer = texts.load(_beside(clip, "tokenizer.json"))
+        tokenizer = texts.load(_beside(clip, TOKENIZER))
     else:
         rows = manifest.rows_of(config.data.split)
         captions = sources.captions(manifest, rows, aligned_text=config.data.aligned_text)
         if not captions:
             return config, None
         tokenizer = texts.train(captions, SCRATCH_VOCABULARY)
-    if not begun:
-        run.mkdir(parents=True, exist_ok=True)
-        tokenizer.save(own)
     if config.towers == "pretrained":
         return config, tokenizer
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
@@ -233,7 +233,9 @@ def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say
     """Fresh `params`, with CLIP's and those of `init` in their places (golden K_weight_loading_map)."""
     if config.towers == "pretrained" and clip is None:
         raise UserError(_NO_CLIP)
-    first = None if init is None else _load(Path(init), config, say)
+    first = (
+        None if init is None else _load(Path(init), config, say, set(params) - ({"image", "text"} if clip else set()))
+    )
     weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
     if config.stage == 2 and init is None:
         say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
@@ -262,8 +264,11 @@ def _same_form(path: Path, before: Model, config: Config) -> None:
             raise UserError(f"{path} was trained with {name} {theirs}, this run would use {ours}: add {option}")
 
 
-def _load(path: Path, config: Config, say: Say) -> Params:
-    """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of the model's."""
+def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
+    """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of the model's.
+
+    Tells of other `parts` of the new model that it has too: they start anew.
+    """
     if not path.exists():
         raise UserError(f"no run folder or weights file at {path}; train stage 1 first, or give another --init")
     if path.is_dir() and not any(path.glob("*.pth")):
@@ -273,21 +278,25 @@ def _load(path: Path, config: Config, say: Say) -> Params:
         _same_form(path, before.model, config)
         params = release.served(params, before, told)
         stored, shown = before.model.sensors, before.data.background
-        if shown != config.data.background:
-            say(
-                f"{path} was trained with --loader.background {shown}, this run with {config.data.background}: its "
-                "encoder has never seen touches like these"
-            )
     else:
         file = _weights_file(path)
         _same_activation(file, release.told_activation(file), config)
         weights = release.read_weights(file)
         detected = release.model_of(file, weights)
-        if release.MODEL_KEY in release.read_metadata(file):  # else its heads are a guess
+        about = release.read_metadata(file)
+        shown = about.get(release.BACKGROUND_KEY, "keep")
+        if release.MODEL_KEY in about:  # else its heads are a guess
             _same_form(file, detected, config)
         params, stored = release.to_params(weights, detected), detected.sensors
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
+    if shown != config.data.background:
+        say(
+            f"{path} was trained with --loader.background {shown}, this run with {config.data.background}: its "
+            "encoder has never seen touches like these"
+        )
+    if anew := sorted((parts & set(params)) - {"touch", "decoder"}):
+        say(f"of {path} the touch encoder and the decoder are taken; {', '.join(anew)} start anew")
     if params["touch"]["position"].shape[0] != config.model.patches + 1:
         say(f"the positions of {path} are resized for pictures of {config.model.image_size} pixels")
         params = release.resized(params, config.model.patches)

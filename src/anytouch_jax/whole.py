@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 
 @contextlib.contextmanager
@@ -43,11 +44,20 @@ def write_whole(path: str | Path, data: bytes | str, *, sync: bool = True, part:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
+def _opened(path: str | Path) -> IO[bytes]:
+    """A file to be locked: to be written, since a network disk locks no other; else, where that may not be, read."""
+    try:
+        return open(path, "ab" if not os.path.exists(path) else "r+b")
+    except OSError:
+        return open(path, "rb")
+
+
 @contextlib.contextmanager
 def alone(path: str | Path) -> Iterator[bool]:
     """A lock on a file, which is made if need be, that ends with the block or the process; whether it was free.
 
-    Where the system or the disk knows no locks it always is.
+    The lock is of the file, not of its name: one that takes its place is another. Where the system or the disk knows
+    no locks it always is free.
     """
     try:
         import fcntl
@@ -55,7 +65,7 @@ def alone(path: str | Path) -> Iterator[bool]:
         yield True
         return
     free = True
-    with open(path, "rb" if os.path.exists(path) else "ab") as file:  # one that may only be read can be locked too
+    with _opened(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

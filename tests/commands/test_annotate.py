@@ -82,6 +82,13 @@ def test_captions_come_after_an_estimate_and_are_never_paid_twice(anytouch, touc
         assert f"gpt-4o at {server.url}: 3 questions (0 answered before), about " in said.out
         assert ": about 0.0" in said.out
         assert "3 questions asked, 300 tokens in, 60 tokens out" in said.out
+        captions = tmp_path / "touch_captions.parquet"
+        before = captions.read_bytes()
+        estimate = anytouch(*words, "--estimate")  # writes nothing, though all is answered
+        assert estimate.status == 0 and "0 questions (3 answered before)" in estimate.out
+        captions.write_bytes(b"corrected by hand")
+        assert anytouch(*words, "--estimate").status == 0 and captions.read_bytes() == b"corrected by hand"
+        captions.write_bytes(before)
         again = anytouch(*words)
         assert again.status == 0 and len(server.heads) == 3 and "0 questions asked" in again.out
     assert manifests.read(tmp_path / "touch_captions.parquet").column("text").to_pylist() == [GOOD["caption"]] * 6
@@ -108,6 +115,8 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
             (["--timeout", "-1"], "timeout -1.0 must be above 0"), (["--tries", "0"], "tries 0"),
             (["--limit", "0"], "limit 0 must be at least 1"), (["--out", "captions.txt"], "ends in .csv or .parquet"),
             (["--url", "http://127.0.0.1:9/\u00e9/v1"], "is not an http or https address"),
+            (["--url", "https://api..example.org/v1"], "is not an http or https address"),
+            (["--second-image", "image_2_path"], "there is no column 'image_2_path'"),
         ):  # fmt: skip
             assert told in mistake(*words, *wrong)
         assert server.heads == [] and not (tmp_path / "touch_captions.parquet").exists()

@@ -109,8 +109,16 @@ def test_memory_and_compile_are_asked_of_other_processes(monkeypatch, tmp_path, 
 
 def test_mistakes(tiny, tmp_path, capsys):
     assert run("speed") == 2
-    assert run("embed", "--rounds", 0, "--out", tmp_path) == 1
-    assert "at least one round" in capsys.readouterr().err
+    for words in (("--rounds", 0), ("--batch", 0), ("--batch", -2)):
+        assert run("embed", *words, "--out", tmp_path) == 1
+        assert f"{words[0]} must be 1 or more, not {words[1]}" in capsys.readouterr().err
+    for words, told in (
+        (("simulator", "--preset", "large", "--batch", 4), "--preset, --batch do nothing for the simulator alone"),
+        (("compile", "memory", "--rounds", 3), "--rounds does nothing for compilation and memory"),
+        (("embed", "--quick", "--rounds", 3), "--rounds does nothing with --quick, which takes 2"),
+    ):
+        assert run(*words, "--out", tmp_path) == 1 and told in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
 
 
 # The comparison with PyTorch ------------------------------------------------------------------------------------------

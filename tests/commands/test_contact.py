@@ -63,6 +63,7 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
         (["--drop", "--threshold", "digit", "999"], "every frame is without contact"),
         (["--check", "--reference", "label.depth"], "no column label.depth"),
         (["--reference", "label.force"], "--reference does nothing without --check"),
+        (["--check", "--reference", "label.force", "--above", "nan"], "--above must be a number, not nan"),
         (["--check", "--drop"], "--drop does nothing with --check alone"),
         (["--share", "60"], "--share is a part of the highest score"),
         (["--threshold", "gelsigth", "5"], "a threshold is given for the sensor 'gelsigth'"),

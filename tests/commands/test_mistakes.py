@@ -61,10 +61,18 @@ def test_numbers_and_names_that_cannot_be_are_one_sentence(mistake, tiny_run, wo
     for seed in (-1, 10**20):
         assert "--seed must be" in mistake(*adapt, "--seed", seed)
     assert "--steps must be 1 or more" in mistake(*adapt, "--steps", 0)
+    nothing = "--labels, --steps do nothing with --frames 0, which fits nothing"
+    assert nothing in mistake(*adapt, "--frames", 0, "--labels", "material", "--steps", 5)
+    towers = mistake("train", "--stage", 1, "--data", world, "--towers", "pretrained", "--run", tmp_path / "a")
+    assert "--towers pretrained needs CLIP weights" in towers
     probe = ("probe", "--run", tiny_run, "--data", world, "--label", "object")
     assert "--seeds must be 0 or more" in mistake(*probe, "--seeds", -3)
     assert "'nothing'" in mistake(*probe, "--where", "nothing", 1)
     assert "no row is of sensor 'xyz'; the manifest has digit, gelsight_mini" in mistake(*probe, "--sensor", "xyz")
+    tasks = ("probe", "--run", tiny_run, "--data", world, "--tasks", "object")
+    for heads in ("gradien", ","):
+        assert "choose among linear, knn, gradient, with commas between" in mistake(*tasks, "--heads", heads)
+    assert "--join does nothing for clips of 3 frames" in mistake(*tasks, "--frames", 3, "--join", "concat")
     assert not (tmp_path / "a").exists()
 
 

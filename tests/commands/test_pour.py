@@ -62,3 +62,7 @@ def test_demonstrations_are_recorded_and_learned_from(anytouch, tiny_run, tmp_pa
     assert "3 runs of gelsight_mini to learn from, 1 of split test" in said.err
     assert {"touch", "blind"} <= json.loads((out / "pour.json").read_text()).keys()
     assert {path.name for path in out.iterdir()} == {"policy.npz", "encoder.safetensors", "pour.json"}
+    for path in (out, out / "policy.npz"):
+        told = anytouch("info", path)
+        assert f"{out}: a policy of `anytouch pour` over clips of gelsight_mini" in told.out and told.status == 0
+        assert "the last of them the actions" in told.out and " - 3 numbers" in told.out

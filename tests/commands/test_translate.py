@@ -106,6 +106,10 @@ def test_mistakes(run, world_of_pairs, mistake, tmp_path):
         ((image, "--run", run, "--out", image), "an image that is read"),
         ((image, "--fit", *data, "--run", run), "--fit takes its images"),
         (("--fit", "--run", run), "the pairs of --data"),
+        (
+            ("--fit", *data, "--run", run, "--from", "digit", "--to", "tac3d", "--adversarial", 0.5),
+            "--adversarial does nothing to tac3d, whose fields have no critic",
+        ),
         ((image, "--run", run, "--steps", 9, "--tune", "fine"), "--steps, --tune do nothing without --fit"),
         (("--fit", *data, "--run", run, "--background", image), "--background does nothing with --fit"),
         (("--fit", *data, "--run", run, "--to", "allsight"), "no rows of sensor 'allsight'"),

@@ -185,6 +185,12 @@ def test_the_sensors_seen_are_those_drawn_from(make, settings):
     assert Loader(make(rows), settings(2, require=("text",))).sensors_seen == ["digit", "gelslim"]
 
 
+def test_a_sensor_without_a_clip_is_not_seen_where_clips_alone_are_drawn(make, settings):
+    rows = [*world(), {"sensor": "duragel"}]
+    assert "duragel" in Loader(make(rows), settings(1)).sensors_seen
+    assert "duragel" not in Loader(make(rows), settings(1, clip_share=1.0)).sensors_seen
+
+
 # Force ---------------------------------------------------------------------------------------------------------------
 
 

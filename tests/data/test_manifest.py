@@ -251,6 +251,16 @@ def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
     assert len(np.unique(one.codes("touch"))) == 6 and len(np.unique(one.codes("grasp_group"))) == 2
 
 
+def test_keys_may_be_numbers_in_joined_manifests(tmp_path):
+    head = {"sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1], "split": ["train"] * 2}
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        columns = {"path": ["0.png", "1.png"], **head, "grasp_group": [7, 8]}
+        m.write(m.from_columns(columns, tmp_path / name / "m.parquet"), tmp_path / name / "m.parquet")
+    m.write(m.read([tmp_path / "a/m.parquet", tmp_path / "b/m.parquet"]), tmp_path / "both.parquet")
+    assert len(np.unique(m.read(tmp_path / "both.parquet").codes("grasp_group"))) == 4
+
+
 def test_columns_of_any_kind_are_carried_along(tmp_path):
     columns = {"path": ["a.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
     one, two = (m.from_columns(columns | {"box": [[1, k]], "bytes": [b"\xff"]}, tmp_path / "m.csv") for k in (2, 3))

@@ -62,6 +62,19 @@ def test_what_is_written_is_read(shown, manifest):
     assert pq.read_table(manifest)["label.mass"].to_pylist()[0] == pytest.approx(float(shown.mass[0, 0]))
 
 
+def test_runs_of_the_test_come_last_and_parts_are_no_copies(shown, manifest):
+    first = int(shown.steps[0])  # the first run is the test's, not the last
+    path = changed(manifest, "turned", split=lambda x: ["test"] * first + ["train"] * (len(x) - first))
+    found = pouring_recordings.read(path, SIDE)
+    assert found.test.tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(found.trials.steps, [*shown.steps[1:], shown.steps[0]])
+    learned, unseen = found.part(False), found.part(True)
+    assert len(learned.steps) == COUNT - 1 and unseen.steps.tolist() == [first]
+    np.testing.assert_array_equal(unseen.frames[:first, 0], shown.frames[:first, 0])
+    for part in (learned, unseen):
+        assert np.shares_memory(part.frames, found.trials.frames)
+
+
 def test_what_is_unused_teaches_nobody_and_an_empty_choice_is_the_action(shown, manifest):
     first = int(shown.steps[0])
     path = changed(manifest, "part", **{
@@ -95,6 +108,13 @@ def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder,
         said.append(np.stack([one.act(frames) for frames in shown.frames]))
     np.testing.assert_array_equal(*said)
     assert again.stills == stills and again.sensor == "gelsight_mini" and again.encoder.subtracts
+    assert again.encoder.seen is None  # as before: nobody told
+
+
+def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_path):
+    policy = pouring_policy.learn_frozen(replace(encoder, seen=("digit", "gelsight_mini")), shown, FAST, stills=True)
+    pouring_recordings.save_policy(tmp_path, policy)
+    assert pouring_recordings.load_policy(tmp_path).encoder.seen == ("digit", "gelsight_mini")
 
 
 def test_a_policy_takes_frames_of_the_camera(shown, encoder):

@@ -86,6 +86,18 @@ def test_groups_are_found_with_or_without_label(manifest):
     assert set(read(manifest, label="slip", group="object").groups) == {f"object {n}" for n in range(6)}
 
 
+def test_groups_are_objects_then_touches_then_recordings_unless_they_are_the_label(manifest):
+    assert set(read(manifest, label="slip").groups) == {f"object {n}" for n in range(6)}
+    assert set(read(manifest, label="label.slip").groups) == set(read(manifest, label="slip").groups)
+    assert set(read(manifest, label="object").groups) == {f"s{n}" for n in range(COUNT // 2)}
+    table = manifests.read(manifest).table.to_pydict()
+    for name, values in (("touch", 3), ("grasp_group", 2)):
+        table[name] = [None if n % 5 == 4 else str(n % values) for n in range(COUNT)]
+        manifests.write(manifests.from_columns(table, manifest), manifest)
+        found = set(read(manifest, label="object").groups)
+        assert {str(n) for n in range(values)} < found and any(one.startswith("sequence s") for one in found - {"0"})
+
+
 def test_a_group_that_is_not_there_is_no_recording(manifest):
     with pytest.raises(UserError, match=r"no column 'taste' or 'label\.taste'; it has path"):
         read(manifest, label="object", group="taste")
@@ -95,7 +107,7 @@ def test_labels_never_stand_for_the_columns_of_a_manifest(manifest):
     table = manifests.read(manifest)
     odd = table.table.to_pydict() | {"label.sensor": ["gelslim"] * COUNT, "label.split": ["train"] * COUNT}
     manifests.write(manifests.from_columns(odd | {"label.sequence": ["one"] * COUNT}, manifest), manifest)
-    task = read(manifest, label="slip", sensor="digit")
+    task = read(manifest, label="object", sensor="digit")
     assert set(task.split) == {"train", "test"} and len(np.unique(task.groups)) == COUNT // 2
 
 

@@ -57,3 +57,9 @@ def test_what_differs_from_the_live_model_is_not_written(tmp_path, tiny_run, fac
         assert about["sensors"]["digit"] == SENSORS.index("digit") and about["frames"] == frames
         assert about["input"].startswith("touches: uint8 RGB") and about["background"] == "keep"
     assert ("nothing is written" in done.stderr) is not same
+    if same:  # a place that cannot be written is named before the work
+        command[command.index("--out") + 1] = str(out.parent)
+        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
+        assert (
+            done.returncode == 1 and done.stderr == f"onnx_export: {out.parent} is a folder; name a file with --out\n"
+        )

@@ -25,6 +25,9 @@ def test_the_committed_page_is_what_its_files_give(tmp_path, monkeypatch, capsys
     assert (tmp_path / "teaching.md").read_text() == (RESULTS / "teaching.md").read_text()
     file = tmp_path / "teaching" / "fine-1.json"
     found = json.loads(file.read_text())
+    file.write_text(json.dumps(found | {"settings": found["settings"] | {"steps": [600, 1000]}}))
+    with pytest.raises(SystemExit, match="made by different settings"):
+        run(monkeypatch, TABLE=1, OUT=tmp_path)
     found["retrieval"]["top1"]["objects"]["an object of other data"] = 1
     file.write_text(json.dumps(found))
     with pytest.raises(SystemExit, match="are of different data"):

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from anytouch_jax.config import UserError
+
 SCRIPTS = Path(__file__).resolve().parents[2] / "experiments"
 
 
@@ -23,6 +25,18 @@ def test_the_committed_page_is_what_its_files_give(name, tmp_path, monkeypatch, 
     shutil.copytree(SCRIPTS / "results" / name, tmp_path / name)
     visit(name, monkeypatch, TABLE=1, OUT=tmp_path)
     assert (tmp_path / f"{name}.md").read_text() == (SCRIPTS / "results" / f"{name}.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "changed", [{"size": 112}, {"subtracts": False}, {"pairs": "others"}, {"encoder": "runs/stage2 (weights 0)"}]
+)
+def test_runs_that_are_no_rivals_make_no_table(changed, tmp_path, monkeypatch):
+    shutil.copytree(SCRIPTS / "results" / "translation", tmp_path / "translation")
+    file = next((tmp_path / "translation").glob("*-anytouch-frozen-*.json"))
+    found = json.loads(file.read_text())
+    file.write_text(json.dumps(found | {"settings": found["settings"] | changed}))
+    with pytest.raises(UserError, match="make no table together"):
+        visit("translation", monkeypatch, TABLE=1, OUT=tmp_path)
 
 
 @pytest.mark.slow

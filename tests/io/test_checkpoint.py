@@ -246,12 +246,14 @@ def test_leftovers_of_a_killed_run_are_swept(tmp_path):
     filled(tmp_path, 1)
     for name in ("00000002.writing", "00000002.writing.orbax-checkpoint-tmp", "00000000.deleted"):
         (tmp_path / name / "state").mkdir(parents=True)
-    (tmp_path / "notes").mkdir()
+    users = ["00000001.bak", "00000002.broken", "notes"]
+    for name in users:
+        (tmp_path / name).mkdir()
     assert steps(tmp_path) == [1]
     load_params(tmp_path)  # a reader leaves them alone: a run may be writing
-    assert len(list(tmp_path.iterdir())) == 5
+    assert len(list(tmp_path.iterdir())) == 7
     saver = opened(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000001", "notes"] and saver.latest() == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000001", *users] and saver.latest() == 1
 
 
 def test_a_step_is_saved_once_and_replaced_by_a_later_run(tmp_path):

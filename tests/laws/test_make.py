@@ -123,6 +123,14 @@ def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
         assert "--data d/scenes/contact.parquet" in step and "--loader.contact-only" in step
 
 
+def test_a_longer_demo_goes_on_from_the_scenes_and_stage_1_of_the_plain_one() -> None:
+    plain, longer = (make("-n", "demo", "DEMO=d", *words).stdout.splitlines() for words in ((), ("DEMO_STEPS=600",)))
+    assert plain[:-2] == longer[:-2]
+    assert "--run d/stage2-600 --init d/stage1 " in longer[-2] and "--steps 600" in longer[-2]
+    assert longer[-1].endswith("--stage2 d/stage2-600 --out d/report-600")
+    assert plain[-1].endswith("--stage2 d/stage2 --out d/report")
+
+
 def test_notebooks_run_in_their_own_folder_and_find_their_helpers() -> None:
     done = make("-n", "notebooks", "PAGES=q2_space")
     assert done.returncode == 0 and f"PYTHONPATH={ROOT}/experiments " in done.stdout

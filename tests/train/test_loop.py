@@ -56,7 +56,9 @@ def undisturbed(tmp_path_factory):
 
 def test_a_run_leaves_its_folder_and_a_line_a_step(undisturbed):
     run_dir, result = undisturbed
-    assert {entry.name for entry in run_dir.iterdir()} == {"config.json", "metrics.jsonl", "checkpoints", "figures"}
+    assert {entry.name for entry in run_dir.iterdir()} == {
+        ".lock", "config.json", "metrics.jsonl", "checkpoints", "figures",
+    }  # fmt: skip
     found = rows(run_dir)
     assert [row["step"] for row in found] == list(range(8))
     wanted = {"loss", "reconstruction", "grad_norm", "param_norm", "update_norm", "learning_rate", "p_u"}

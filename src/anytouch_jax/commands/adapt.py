@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from anytouch_jax.commands.output import check_home
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_use import Adapt
 from anytouch_jax.strict_json import COUNT, NOT_NEGATIVE, SEED, in_range
@@ -15,6 +16,8 @@ def run(options: Adapt) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     in_range("--", options, seed=SEED, steps=COUNT, frames=NOT_NEGATIVE)
+    if not options.frames:
+        refuse(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
     check_empty(options.out)
     check_home(options.out)
     enable_compilation_cache()

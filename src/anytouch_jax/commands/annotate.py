@@ -93,7 +93,7 @@ def _consent(options: Annotate, estimate: Estimate) -> bool:
     print(f"{options.model} at {options.url}: {estimate}", flush=True)
     if options.estimate:
         raise _OnlyAnEstimate
-    if options.yes:
+    if options.yes or not estimate.questions:
         return True
     if not sys.stdin.isatty():
         raise UserError("nobody is there to confirm this; add --yes, or --estimate to see the estimate only")

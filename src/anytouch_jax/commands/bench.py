@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options import Bench
+from anytouch_jax.strict_json import COUNT, in_range
 
 if TYPE_CHECKING:
     from anytouch_jax.evaluate.speed import Row
@@ -28,6 +30,8 @@ def run(options: Bench) -> int:
     """
     from anytouch_jax.evaluate import machine
 
+    in_range("--", options, batch=COUNT, rounds=COUNT)
+    _refuse_unused(options)
     page = options.out / f"{_stem(options)}.md"
     check_folder(page)
     if page.exists() and not page.with_suffix(".json").exists():
@@ -43,6 +47,16 @@ def run(options: Bench) -> int:
             print(section[1])
     say(f"{path}, its numbers in {path.stem}.json, and figures/ beside it")
     return 0
+
+
+def _refuse_unused(options: Bench) -> None:
+    asked: set[str] = {*(options.what or _SECTIONS)}
+    if asked == {"simulator"}:
+        refuse(options, ("preset", "batch"), "for the simulator alone, which has no network")
+    if asked <= {"compile", "memory"}:
+        refuse(options, ("rounds",), "for compilation and memory, which are measured once")
+    if options.quick:
+        refuse(options, ("rounds",), f"with --quick, which takes {_QUICK_ROUNDS}")
 
 
 def _stem(options: Bench) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options_data import Contact
+from anytouch_jax.strict_json import Range, in_range
 
 
 def run(options: Contact) -> int:
@@ -20,6 +23,7 @@ def run(options: Contact) -> int:
         refuse(options, ("reference", "above"), "without --check, which compares with a column")
     elif options.out is None:
         refuse(options, ("drop",), "with --check alone, which writes no manifest", "; or name one with --out")
+    in_range("--", options, above=Range(-math.inf, math.inf, "a number"))
     manifest = manifests.read(options.manifest)
     target = options.out or (None if options.check else beside(options.manifest, "contact"))
     if target is not None:

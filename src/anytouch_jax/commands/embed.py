@@ -31,7 +31,7 @@ def run(options: Embed) -> int:
         # before what takes long: what is embedded must have a place
         check_folder(options.out, read=(options.run, options.input))
     enable_compilation_cache()
-    encoder = features.load_encoder(options.run)
+    encoder = features.load_encoder(options.run).computed_in(options.dtype)
     features.check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
     if options.batch < 1:
@@ -57,6 +57,7 @@ def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
         "pooling": options.pooling,
         "frames": str(options.frames),
         "join": options.join,
+        "dtype": encoder.config.model.dtype,
     }
 
 

@@ -14,7 +14,7 @@ def run(options: Export) -> int:
 
     check_folder(options.out, read=(options.run,))
     enable_compilation_cache()
-    encoder = features.load_encoder(options.run)
+    encoder = features.load_encoder(options.run).computed_in(options.dtype)
     refuse_join(options, encoder.config.model.frames)
     platforms = [name.strip() for name in options.platforms.split(",") if name.strip()]
     about = export.export(

@@ -1,4 +1,4 @@
-"""`anytouch info`: what a run, a weights file, a manifest, features or a translation is."""
+"""`anytouch info`: what a run, a weights file, a manifest, features, a translation or a policy is."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ def run(options: Info) -> int:
 
 def _lines(path: Path) -> list[str]:
     from anytouch_jax.evaluate import export, generator
+    from anytouch_jax.evaluate.pouring_recordings import POLICY
 
     if not path.exists():
         raise UserError(f"there is no {path}")
@@ -31,6 +32,8 @@ def _lines(path: Path) -> list[str]:
         return _folder(path)
     if path.name == generator.FILE:
         return _translation(path)
+    if path.name == POLICY:
+        return _policy(path.parent)
     if export.describes(path).is_file():
         return [f"{path}: an exported encoder; how to call it", export.describes(path).read_text("utf-8").strip()]
     if path.suffix.lower() in _TABLES:
@@ -43,13 +46,17 @@ def _lines(path: Path) -> list[str]:
 
 
 def _folder(path: Path) -> list[str]:
-    """A run, else a translation, else the manifest that is meant: by its name, or the only one."""
+    """A run, else a translation or a policy, else the manifest that is meant: by its name, or the only one."""
     from anytouch_jax.data.table import is_manifest
     from anytouch_jax.evaluate import generator
+    from anytouch_jax.evaluate.pouring_recordings import POLICY
     from anytouch_jax.io.record import steps
 
-    if not steps(path / "checkpoints") and (path / generator.FILE).is_file():
-        return _translation(path)
+    if not steps(path / "checkpoints"):
+        if (path / generator.FILE).is_file():
+            return _translation(path)
+        if (path / POLICY).is_file():
+            return _policy(path)
     found = [one for one in sorted(path.iterdir()) if one.suffix.lower() in _TABLES and is_manifest(one)]
     named = [one for one in found if one.stem == "manifest"] or found
     if steps(path / "checkpoints") or not named:
@@ -171,4 +178,17 @@ def _translation(path: Path) -> list[str]:
         f"{path}: a translation of {design.source} into {what} of {design.target}",
         f"encoder {design.encoder or 'none'} ({design.fit.tune}), {design.fit.steps} steps on {design.pairs} pairs",
         _model(design.shape.model),
+    ]
+
+
+def _policy(path: Path) -> list[str]:
+    from anytouch_jax.evaluate.pouring_recordings import load_policy
+
+    policy = load_policy(path)
+    sizes = [len(policy.head.mean), *(len(bias) for _, bias in policy.head.layers)]
+    return [
+        f"{path}: a policy of `anytouch pour` over {'stills' if policy.stills else 'clips'} of {policy.sensor}",
+        f"an MLP of {' - '.join(map(str, sizes))} numbers, the last of them the actions",
+        _model(policy.encoder.config.model),
+        _sensors(policy.encoder.config.model, None if policy.encoder.seen is None else list(policy.encoder.seen)),
     ]

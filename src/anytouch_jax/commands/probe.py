@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markdown import Markdown
 
-from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.output import check_folder, check_home
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Probe
@@ -27,6 +27,8 @@ def run(options: Probe) -> int:
     check_options(options)
     if options.out is not None:
         check_folder(options.out, read=(*options.data, *options.run))
+    if options.cache is not None:
+        check_home(options.cache, "--cache")
     enable_compilation_cache()
     if options.tasks or options.benchmark:
         from anytouch_jax.evaluate import battery_command
@@ -50,6 +52,8 @@ def check_options(options: Probe) -> None:
     in_range("--", options, frames=COUNT, max_rows=COUNT, seeds=NOT_NEGATIVE)
     if options.tasks or options.benchmark:
         refuse(options, _OF_LABEL, "beside --tasks or --benchmark, which have labels and groups of their own")
+        if options.frames == 1 or (options.benchmark and not options.tasks):
+            refuse(options, ("order",), "for stills")
         if options.benchmark and not options.tasks:
             refuse(options, _OF_TASKS, "beside --benchmark, which has the authors' settings")
         elif options.frames is None:

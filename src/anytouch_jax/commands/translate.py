@@ -12,7 +12,7 @@ import numpy as np
 from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import UserError
+from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options_use import Translate
 from anytouch_jax.strict_json import SEED, in_range
 from anytouch_jax.whole import write_whole
@@ -57,6 +57,8 @@ def _fit(options: Translate) -> int:
     home = _home(options, options.out or options.generator, "out")
     if options.run is None or not options.data:
         raise UserError("--fit needs the encoder of --run and the pairs of --data")
+    if options.to in FIELD_SENSORS:
+        refuse(options, ("adversarial",), f"to {options.to}, whose fields have no critic")
     check_home(home)
     if (home / generator.FILE).exists():
         raise UserError(f"{home} holds a translation already; remove it, or choose another folder with --out")
@@ -78,7 +80,7 @@ def _fit(options: Translate) -> int:
     made, losses = generation.fit(
         encoder, x, y, source=options.source, target=options.to, val=val, options=how, say=say
     )
-    if how.adversarial and not made.design.has_critic and not made.design.shape.field:
+    if how.adversarial and not made.design.has_critic and not made.design.shape.field:  # a field never has one
         say("no critic took part: the encoder knows touches less the untouched gel, and the targets are whole pictures")
     ours, mean = generation.errors(made, test_x, test_y), generation.mean_errors(made, test_y)
     picture_grid(home / "pairs.png", made, test_x, test_y)

@@ -23,7 +23,7 @@ from anytouch_jax.data.edit import replace_column
 from anytouch_jax.data.endpoint import AnswerError, Client, Endpoint, EndpointError
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.prompts import Nonsense, caption_of
-from anytouch_jax.data.questions import PHRASE, Job, data_url, find_jobs, picture_bytes, small_jpeg
+from anytouch_jax.data.questions import PHRASE, SECOND_IMAGE, Job, data_url, find_jobs, picture_bytes, small_jpeg
 from anytouch_jax.whole import write_whole
 
 _NONSENSE_TRIES = 3
@@ -95,11 +95,12 @@ def annotate(
     split: str | None = None,
     families: Mapping[str, str] | None = None,
     overwrite: bool = False,
-    second_image: str = "image2_path",
+    second_image: str = SECOND_IMAGE,
     limit: int | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Annotated:
-    """Ask `endpoint` for every caption that is lacking, after `confirm(estimate)`; answers and failures in `folder`.
+    """Ask `endpoint` for every caption that is lacking, after `confirm(estimate)`, which is also told where nothing is
+    lacking; answers and failures in `folder`.
 
     One question for each touch (else each sequence), `threads` at a time; pictures are sent with no side longer than
     `side`. Prices are for a million tokens. `limit`: only the first so many captions (to look at a sample first).
@@ -125,7 +126,7 @@ def annotate(
         say(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
     estimate = _estimate([job for job, _ in lacking], cached, side, price_in, price_out)
-    if lacking and not confirm(estimate):
+    if not confirm(estimate):
         raise AnnotateError("not confirmed: nothing was asked")
     lacking.sort(key=lambda one: one[1] in store.failed)  # what failed the last time bars no other question
     try:

@@ -74,6 +74,7 @@ class Endpoint:
         try:
             parts = urllib.parse.urlsplit(url)
             good = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and url.isascii()
+            (parts.hostname or "").encode("idna")  # as the resolver will: no empty and no endless part
         except ValueError:
             good = False
         if not good:

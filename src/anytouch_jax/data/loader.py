@@ -108,7 +108,8 @@ class Loader:
     @property
     def sensors_seen(self) -> list[str]:
         """Names of the sensors that batches are drawn from, in the order of the table."""
-        rows = np.unique(np.concatenate([self._sensor[pool.windows[:, -1]] for pool in self._pools]))
+        drawn = [pool.windows[:, -1] for pool in self._drawn] + [pair.windows[:, -1] for pair in self._drawn_pairs]
+        rows = np.unique(self._sensor[np.concatenate(drawn)])
         return [self.config.model.sensors[row] for row in rows]
 
     def batch(self, step: int) -> Batch:

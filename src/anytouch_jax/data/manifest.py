@@ -269,7 +269,7 @@ def own_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
     if len(pairs) == len(np.unique(pairs[:, 0])):
         return column
     prefix = pa.array([f"{number}/" for number in range(len(manifest.files))]).take(pa.array(manifest.source))
-    return pa.chunked_array([pc.binary_join_element_wise(prefix, column.combine_chunks(), "")])
+    return pa.chunked_array([pc.binary_join_element_wise(prefix, column.combine_chunks().cast(pa.string()), "")])
 
 
 def with_own_keys(manifest: Manifest, table: pa.Table) -> pa.Table:

@@ -18,6 +18,7 @@ from anytouch_jax.data.prompts import FAMILIES, Family, Question, family_of, que
 from anytouch_jax.data.table import SPLITS
 
 PHRASE = "phrase"  # the column that keeps the words that were expanded
+SECOND_IMAGE = "image2_path"  # a manifest need not have it
 _SKIPPED = ("background",)
 
 
@@ -43,13 +44,17 @@ def find_jobs(
     split: str | None = None,
     families: Mapping[str, str] | None = None,
     overwrite: bool = False,
-    second_image: str = "image2_path",
+    second_image: str = SECOND_IMAGE,
 ) -> Jobs:
     """Groups of rows of one touch (else of one sequence) that lack a caption, or whose phrase is to be expanded.
 
     The picture of a group is that of its middle frame. Rows of other datasets than those of `families` and FAMILIES
     are left out, as are backgrounds. Raises UserError when no caption is lacking.
     """
+    if second_image not in (SECOND_IMAGE, *manifest.table.column_names):
+        raise UserError(
+            f"there is no column {second_image!r}; the manifest has {', '.join(manifest.table.column_names)}"
+        )
     asked, family, left = _asked(manifest, split, families, overwrite)
     jobs: list[Job] = []
     for rows in _groups(manifest, asked, family):

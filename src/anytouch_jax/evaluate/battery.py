@@ -144,7 +144,11 @@ def _probe(
             for protocol in protocols:
                 about = {"task": task.name, "head": head, "protocol": protocol}
                 result = _result(case, head, protocol)
-                rest = {"frames": length, "order": setting.order, "notes": notes + result["notes"]}
+                rest = {
+                    "frames": length,
+                    "order": setting.order if length > 1 else "right",
+                    "notes": notes + result["notes"],
+                }
                 found.append(about | result | rest)
     return found
 

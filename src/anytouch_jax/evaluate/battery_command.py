@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery
 from anytouch_jax.evaluate.benchmarks import benchmark_of
 from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
+from anytouch_jax.evaluate.heads import HeadName
 from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.tasks import available
 
@@ -31,6 +32,8 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
     encoders = {str(path): load_encoder(path) for path in options.run}
     for encoder in encoders.values():
         check_frames(encoder.config.model, options.frames or 1)
+        if options.join != "mean" and options.frames and options.frames <= encoder.config.model.frames:
+            raise UserError(f"--join does nothing for clips of {options.frames} frames, which have one segment")
     if options.controls:
         first = next(iter(encoders.values()), None)
         encoders["random encoder"] = random_encoder(first.config if first else preset("tiny"))
@@ -61,8 +64,10 @@ def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], f
         return [one.task], one.settings(), one.paper
     names = available(table) if options.tasks == "all" else _names(options.tasks)
     protocols = ("honest", "published") if options.protocol == "published" else ("honest",)
-    settings = {"pooling": options.pooling, "join": options.join, "protocols": protocols,
-                "head_names": tuple(_names(options.heads) or ())}  # fmt: skip
+    asked, known = _names(options.heads) or (), get_args(HeadName)
+    if not asked or not set(asked) <= set(known):
+        raise UserError(f"--heads {options.heads!r}: choose among {', '.join(known)}, with commas between")
+    settings = {"pooling": options.pooling, "join": options.join, "protocols": protocols, "head_names": asked}
     if not names:
         raise UserError("the manifest has no label of any task; `anytouch probe --label COLUMN` takes any column")
     return names, settings | ({} if options.frames is None else {"frames": options.frames}), None

@@ -65,6 +65,12 @@ class Encoder:
         say(f"sensor {name!r} {why}: using {instead}")
         return model.sensors.index(name) if known else model.universal_row
 
+    def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
+        """The same encoder with other arithmetic: "float32", "bfloat16", or "trained" for that of its training."""
+        if dtype == "trained":
+            return self
+        return replace(self, config=replace(self.config, model=replace(self.config.model, dtype=dtype)))
+
     @property
     def subtracts(self) -> bool:
         """Whether it was trained on touches less the untouched gel (`data.background`), and wants those."""

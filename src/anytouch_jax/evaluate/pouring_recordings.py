@@ -37,15 +37,16 @@ POLICY, WEIGHTS = "policy.npz", "encoder.safetensors"
 
 
 class Recordings(NamedTuple):
-    """Runs as trials of B (masses are unknown: NaN), whether each is of the test split (B,), and their sensor."""
+    """Runs as trials of B (masses are unknown: NaN), those of the test split last: `test` (B,); and their sensor."""
 
     trials: Trials
     test: Array
     sensor: str
 
     def part(self, test: bool) -> Trials:
-        """The runs of test, or those to learn from."""
-        keep = self.test == test
+        """The runs of test, or those to learn from; no copy."""
+        first = len(self.test) - int(self.test.sum())
+        keep = slice(first, None) if test else slice(first)
         over_time = {name: getattr(self.trials, name) for name in Trials._fields[2:]}
         cut: dict[str, Any] = {name: None if x is None else x[:, keep] for name, x in over_time.items()}
         return Trials(self.trials.poured[keep], self.trials.steps[keep], **cut)
@@ -88,7 +89,8 @@ def read(path: Path, side: int) -> Recordings:
     sensors = np.unique(text_column(table, "sensor"))
     if len(sensors) > 1:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
-    runs, split = _runs(table, path), text_column(table, "split")
+    split = text_column(table, "split")
+    runs = sorted(_runs(table, path), key=lambda rows: split[rows[0]] == "test")
     steps = np.array([len(rows) for rows in runs])
     padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
     order = np.stack(padded, 1)  # (S, B) row numbers
@@ -190,6 +192,8 @@ def save_policy(folder: Path, policy: Touch) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     encoder, head = policy.encoder, policy.head
     about = {release.MODEL_KEY: to_json(encoder.config.model), release.BACKGROUND_KEY: encoder.config.data.background}
+    if encoder.seen is not None:
+        about[release.SEEN_KEY] = ",".join(encoder.seen)
     checkpoint.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}

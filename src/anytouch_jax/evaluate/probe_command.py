@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 RAW = "raw pixels"
-GROUP = "grasp_group"  # the default of --group, which a manifest need not have
+GROUPS = ("grasp_group", "object", "touch", "sequence")  # what --group is by default: the first that there is
 
 
 @dataclass(frozen=True)
@@ -131,12 +131,19 @@ def _column(table: Any, name: str) -> list[Any]:
     raise UserError(f"the manifest has no column {name!r} or 'label.{name}'; it has {', '.join(table.column_names)}")
 
 
+def _has_values(table: Any, name: str) -> bool:
+    named = {name, f"label.{name}"} & set(table.column_names)
+    return any(value not in (None, "") for one in named for value in table[one].to_pylist())
+
+
 def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
-    """The column left out or asked for, the sequence where it is empty, or where there is no default column."""
+    """The column left out or asked for, else the first of `GROUPS` with a value; the sequence where it is empty."""
     table = manifests.with_own_keys(manifest, manifest.table)  # recordings of two files are never one
     sequence = table["sequence"].to_pylist()
-    name = options.leave_out or options.group
-    if name == GROUP and not {name, f"label.{name}"} & set(table.column_names):
+    usual = (one for one in GROUPS if one != options.label.removeprefix("label.") and _has_values(table, one))
+    asked = options.leave_out or options.group
+    name = asked or next(usual)
+    if name == "sequence" and not asked:
         return np.array([sequence[r] for r in rows])
     column = _column(table, name)
     return np.array([str(column[r]) if column[r] not in (None, "") else f"sequence {sequence[r]}" for r in rows])

@@ -41,7 +41,7 @@ __all__ = [
 
 Tree = Any
 
-_UNFINISHED = re.compile(r"\d{8,}\..+")  # being written or removed, by us or by Orbax
+_UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")  # being written or removed, by us or by Orbax
 _AVERAGE = "opt_state/ema/"
 _SHOWN = 5  # names listed in one error message
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost

@@ -29,10 +29,9 @@ from anytouch_jax.train.mesh import (
 )
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.processes import Ballot, check_shared, told_by_first, whole
-from anytouch_jax.train.record import Record, goes_on, open_run, writing
+from anytouch_jax.train.record import Record, alone_in, goes_on, open_run, writing
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
-from anytouch_jax.whole import alone
 
 Tree = Any
 _SIGNAL, _SKIPPED = "signal", "skipped_samples"  # beside the metrics of a step: what its ballot says
@@ -92,16 +91,15 @@ def fit(
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
     say = say or to_stderr
     lead = jax.process_index() == 0
-    if lead:
-        open_run(run_dir, config)
-    else:
-        goes_on(run_dir, config)  # so that each process finds a mistake by itself
-        say = silent
-    check_shared(run_dir / "figures")
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
-        if lead and not stack.enter_context(alone(run_dir / "config.json")):
-            raise UserError(f"another process trains {run_dir}: wait for it, or name another folder with --run")
+        if lead:
+            stack.enter_context(alone_in(run_dir))
+            open_run(run_dir, config)
+        else:
+            goes_on(run_dir, config)  # so that each process finds a mistake by itself
+            say = silent
+        check_shared(run_dir / "figures")
         with writing(run_dir / "checkpoints"):
             checkpoints = Checkpoints(
                 run_dir / "checkpoints",

@@ -7,13 +7,14 @@ import dataclasses
 import json
 import math
 import os
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
 from anytouch_jax.config import Config, ConfigError, UserError, from_json, to_json
 from anytouch_jax.io.record import read_record, steps
-from anytouch_jax.whole import write_whole
+from anytouch_jax.whole import alone, write_whole
 
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
 HARMLESS = {
@@ -44,6 +45,31 @@ def writing(path: Path) -> Iterator[None]:
             f"cannot write {path}: {reason}; free some space or mend the folder, then run the same command again: "
             "it goes on from the last complete checkpoint"
         ) from error
+
+
+_held: set[tuple[int, Path]] = set()
+
+
+@contextlib.contextmanager
+def alone_in(run_dir: Path) -> Iterator[None]:
+    """Keep other processes from training in a run folder, which is made; a thread may ask for it again inside.
+
+    Raises UserError where another one trains there, and for a folder that cannot be written.
+    """
+    mine = (threading.get_ident(), run_dir.resolve())
+    if mine in _held:
+        yield
+        return
+    with writing(run_dir):
+        run_dir.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        with writing(run_dir):
+            free = stack.enter_context(alone(run_dir / ".lock"))
+        if not free:
+            raise UserError(f"another process trains {run_dir}: wait for it, or name another folder with --run")
+        _held.add(mine)
+        stack.callback(_held.discard, mine)
+        yield
 
 
 def begun_with(run_dir: Path) -> Config | None:

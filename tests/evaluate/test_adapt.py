@@ -216,5 +216,6 @@ def test_the_command(run, data, tmp_path, capsys, compiled_once):
     assert cli.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 1
     assert "is not empty" in capsys.readouterr().err
     args[args.index("--frames") + 1] = 0
+    del args[args.index("--steps") : args.index("--steps") + 2]
     assert cli.main([str(arg) for arg in [*args, tmp_path / "none"]]) == 0
     assert "gelslim has the universal tokens" in capsys.readouterr().out

@@ -233,9 +233,8 @@ def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say
     """Fresh `params`, with CLIP's and those of `init` in their places (golden K_weight_loading_map)."""
     if config.towers == "pretrained" and clip is None:
         raise UserError(_NO_CLIP)
-    first = (
-        None if init is None else _load(Path(init), config, say, set(params) - ({"image", "text"} if clip else set()))
-    )
+    fresh = set(params) - ({"image", "text"} if clip else set())
+    first = None if init is None else _load(Path(init), config, say, fresh)
     weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
     if config.stage == 2 and init is None:
         say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")

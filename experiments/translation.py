@@ -193,13 +193,13 @@ def one_table(several: Sequence[dict[str, Any]]) -> None:
     known = {(one["name"], one["encoder"]) for one in several}
     if len(ways) > 1 or len(known) > len({name for name, _ in known}):
         raise UserError(
-            f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name, "
-            f"make no table together ({sorted(map(str, ways))}; {sorted(map(str, known))}): choose another OUT"
+            f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
+            f"make no table together ({sorted(map(str, ways | known))}): choose another OUT"
         )
 
 
-def is_done(file: Path, about: dict[str, Any]) -> bool:
-    return file.exists() and json.loads(file.read_text())["settings"] == about
+def _settings_of(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text())["settings"]
 
 
 # %%
@@ -211,13 +211,9 @@ def all_runs() -> None:
         for word in os.environ["REMAINING"].split():
             write_remaining(Path(word))
         raise SystemExit(0)
-    RUN_FILES.mkdir(parents=True, exist_ok=True)
     known = encoders(table)
-    counts = RUN_FILES / "overlap.json"
-    before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
-    write_whole(counts, json.dumps(before | {name: count for name, (_, count) in known.items()}) + "\n")
     content = table.content_hash[:16]
-    plain = max(seen_by(one) for one, _ in known.values())  # the references see what the encoders see
+    plain = seen_by(next(iter(known.values()))[0])  # one view for all, the references too
     plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]
     every = {}
     for (task, seed), (name, encoder, tune) in product(product(TASKS, SEEDS), plans):
@@ -225,21 +221,21 @@ def all_runs() -> None:
         stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
         every[RUN_FILES / f"{stem}.json"] = (about, encoder)
     there = [file for file in RUN_FILES.glob("*-*.json") if file not in every]
-    one_table([*(about for about, _ in every.values()), *(json.loads(f.read_text())["settings"] for f in there)])
+    one_table([*(about for about, _ in every.values()), *map(_settings_of, there)])
+    counts = RUN_FILES / "overlap.json"
+    before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
+    write_whole(counts, json.dumps(before | {name: count for name, (_, count) in known.items()}) + "\n")
     for source, target in TASKS:
         mine = [(*one, file) for file, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
-        todo = [one for one in mine if not is_done(one[2], one[0])]
+        todo = [one for one in mine if not (one[2].exists() and _settings_of(one[2]) == one[0])]
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
-        data = {
-            seen: [pairs.read_pairs(table, part, seen[0], subtract=seen[1]) for part in split]
-            for seen in {(about["size"], about["subtracts"]) for about, _, _ in todo}
-        }
+        data = [pairs.read_pairs(table, part, plain[0], subtract=plain[1]) for part in split]
         force = [table.value(int(row), "label.force") for row in split.test.source]
         shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
         for about, encoder, file in todo:
-            one_run(about, encoder, (*data[about["size"], about["subtracts"]], shown), file)
+            one_run(about, encoder, (*data, shown), file)
 
 
 if not TABLE:

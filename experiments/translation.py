@@ -128,18 +128,12 @@ def mark(encoder: Encoder | None) -> str:
 
 
 def settings(
-    task: tuple[str, str],
-    name: str,
-    encoder: Encoder | None,
-    seen: tuple[int, bool],
-    tune: str,
-    seed: int,
-    content: str,
+    task: tuple[str, str], name: str, encoder: Encoder | None, seen: tuple[int, bool], tune: str, seed: int, data: str
 ) -> dict[str, Any]:
     return {
         "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
-        "pairs": content,
+        "pairs": data,
     }  # fmt: skip
 
 

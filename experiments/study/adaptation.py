@@ -37,7 +37,10 @@ Probes = Callable[..., list[dict[str, Any]]]
 def rows(leaf: Leaf, work: Work, probes: Probes) -> list[dict[str, Any]]:
     """Probes of the new sensor: views `<tokens>, <n> unlabelled` and `<tokens>, <n> labelled`; `seen` where it was."""
     run, own = work.run_of(leaf.model), work.folder / "own"  # type: ignore[arg-type]
-    plain, options = load_encoder(run), {"test_sensors": (plan.UNSEEN,), "max_rows": None}
+    plain, options = (
+        load_encoder(run),
+        {"test_sensors": (plan.UNSEEN,), "max_rows": None, "protocols": ("honest", "published")},
+    )
     if leaf.name == "seen":
         return probes(leaf, work, f"own/{cuts.STATIC}", TASKS, "seen", plain, **options)
     name = labelled(own, 0)

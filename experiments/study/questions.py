@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from anytouch_jax.evaluate.results import markdown
 
-from . import adaptation, paper, plan
+from . import adaptation, paper, plan, scores
 from .results import Column, Run, spread
-from .tables import Pair, Statement, Table, against, block, judge, sentence, title
+from .tables import Pair, Statement, Table, against, block, cell, judge, published, sentence, title
 
 
 def four(task: str) -> tuple[Column, ...]:
@@ -144,13 +145,30 @@ def q3(runs: Sequence[Run]) -> Part:
     ]  # fmt: skip
     two = judge(runs, "q3", moving.columns, [*ahead, *_controls(len(moving.columns), "dynamic tasks: ", (0, 2, 3))])
     text = (
-        f"Static tasks (Tables 2 and 3):\n\n{block(runs, static, one)}\n\n"
+        f"Static tasks (Tables 2 and 3):\n\n{block(runs, static, one)}\n\n{_read(runs)}"
         "The form of the indenter, which no caption names (signs as of the materials):\n\n"
         f"{block(runs, Table('q3', names, FORM), form)}\n\n"
         "Dynamic tasks, probes on clips; beside them the paper's pouring with a robot (Table 4,\n"
         f"less is better):\n\n{block(runs, moving, two)}"
     )
     return Part("Q3: static and dynamic perception (Tables 2, 3, 4)", text, (*one, *form, *two))
+
+
+def _read(runs: Sequence[Run]) -> str:
+    """The same features by other heads and poolings than the tables'; nothing where no run was read so."""
+    columns = (*(Column(task, ANY, task) for task in scores.STATIC), Column("form", ANY, scores.FORM))
+    ways = {"seen": "linear, class token and mean of patches"}
+    ways |= {f"read: {way}": way if "pooling" in options else f"{way}, class token and mean of patches"
+             for way, options in scores.WAYS.items()}  # fmt: skip
+    parts = []
+    for name in scores.READ:
+        several = [run for run in runs if run.name == name and any(r["view"] in [*ways][1:] for r in run.about["rows"])]
+        if several:
+            found = [replace(run, name=ways[run.name]) for run in by_view(several, "q3", name, [*ways])]
+            parts.append(
+                f"{title(name)}, by head and pooling:\n\n{block(found, Table('q3', [*ways.values()], columns), ())}\n\n"
+            )
+    return "".join(parts)
 
 
 def _controls(columns: int, label: str = "", whole: Sequence[int] | None = None) -> list[Pair]:
@@ -212,34 +230,36 @@ def by_view(runs: Sequence[Run], question: str, name: str, views: Sequence[str])
 
 def new_sensor(runs: Sequence[Run]) -> Part:
     """How much of the gap to a seen sensor a few frames close."""
-    lines, views = [], ["universal, 0 unlabelled"]
+    views = [NOTHING]
     for frames in adaptation.FRAMES:
         views += [f"fitted, {frames} unlabelled", f"universal, {frames} labelled", f"fitted, {frames} labelled"]
-    for view in views:
-        cells = []
-        for task in adaptation.TASKS:
-            found = spread(runs, "new_sensor", "left_out", Column(task, view, task))
-            cells.append("not run" if found is None else f"{found[0]:.1f}{_closed(runs, task, found[0])}")
-        lines.append((view, *cells))
-    top = [spread(runs, "new_sensor", "seen", Column(task, "seen", task)) for task in adaptation.TASKS]
-    lines.append(("trained on, all labelled", *("not run" if one is None else f"{one[0]:.1f}" for one in top)))
+    several = [*by_view(runs, "new_sensor", "left_out", views), *by_view(runs, "new_sensor", "seen", ("seen",))]
+    columns = [Column(task, ANY, task) for task in adaptation.TASKS]
+    lines = []
+    for name in (*views, "seen"):
+        cells = [cell(several, "new_sensor", name, one) + _closed(several, name, one) for one in columns]
+        lines.append((title(name), str(len({run.seed for run in several if run.name == name})), *cells))
+    said = published(several, Table("new_sensor", (*views, "seen"), columns))
     text = (
         f"{plan.UNSEEN} is left out of training. Tokens: the universal ones as they are, or fitted with all else\n"
         "frozen, by reconstruction of unlabelled frames or by the material that labelled ones show. Labelled frames\n"
         "also stand among the training rows of the probe; without them it has learned from the other sensors alone.\n"
-        "In brackets: share of the gap to a model trained on the sensor that is closed (- below 3 points of gap).\n"
-        "One seed: no claim. Reconstruction goes through the decoder of stage 1, which stage 2 has left behind.\n\n"
+        "In brackets at the end: share of the gap to a model trained on the sensor that is closed (- below 3 points).\n"
+        "No sign is claimed. Reconstruction goes through the decoder of stage 1, which stage 2 has left behind.\n\n"
     )
-    return Part("A new sensor", text + markdown(("tokens, frames", *adaptation.TASKS), lines), ())
+    table = markdown(("tokens, frames", "seeds", *adaptation.TASKS), lines)
+    return Part("A new sensor", f"{text}{table}\n\n{said}".rstrip(), ())
 
 
-def _closed(runs: Sequence[Run], task: str, value: float) -> str:
-    start = spread(runs, "new_sensor", "left_out", Column(task, "universal, 0 unlabelled", task))
-    goal = spread(runs, "new_sensor", "seen", Column(task, "seen", task))
-    if start is None or goal is None:
+NOTHING = "universal, 0 unlabelled"
+
+
+def _closed(runs: Sequence[Run], name: str, column: Column) -> str:
+    start, here, goal = (spread(runs, "new_sensor", one, column) for one in (NOTHING, name, "seen"))
+    if start is None or here is None or goal is None or name == "seen":
         return ""
     gap = goal[0] - start[0]
-    return " (-)" if gap < 3 else f" ({100 * (value - start[0]) / gap:.0f} %)"
+    return " (-)" if gap < 3 else f" ({100 * (here[0] - start[0]) / gap:.0f} %)"
 
 
 def dynamics(runs: Sequence[Run]) -> Part:

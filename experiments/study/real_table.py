@@ -30,8 +30,9 @@ def real(runs: Sequence[Run]) -> Part:
         statements += [ahead(several, task, name) for name in (PIXELS, UNTRAINED)]
     text = (
         "Stages 1 and 2 on the simulated data and the training split of the pack; GelSight Mini with markers, frames\n"
-        "in contact. Object: test recordings. Slip and fingers: recordings of all splits, so the encoder (not the\n"
-        "probe) has seen most of them in pre-training: without labels, but with captions and photographs of some.\n"
+        "in contact. Object: test recordings. Every recording tested (ten folds), slip and fingers: recordings of all\n"
+        "splits, so the encoder (not the probe) has seen most of them in pre-training: without labels, but with\n"
+        "captions and photographs of some.\n"
         "The paper has no such probe: tested is that ours is above the controls by more than the interval, in every\n"
         "seed. Each number is of one fit (for slip one a fold), not the mean of five deals as in the tables above.\n"
         "Fingers: trained on the units of one camera, tested on those of the other; the two fingers of a grasp are on\n"

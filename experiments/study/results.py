@@ -137,16 +137,16 @@ def over_seeds(several: list[float]) -> tuple[float | None, float | None]:
 
 
 def spread(
-    runs: Sequence[Run], question: str, name: str, column: Column
+    runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest"
 ) -> tuple[float, float | None, float | None] | None:
     """Mean of a cell and its interval: over seeds, with one seed that of the run itself (over test objects)."""
-    found = values(runs, question, name, column)
+    found = values(runs, question, name, column, protocol)
     if not found:
         return None
     mean, (low, high) = float(np.mean(list(found.values()))), over_seeds(list(found.values()))
     if len(found) == 1:
         run = next(one for one in runs if (one.question, one.name, one.seed) == (question, name, *found))
-        row = run.row(column) or {}
+        row = run.row(column, protocol) or {}
         low, high = (None if row.get(side) is None else column.factor * row[side] for side in ("low", "high"))
     return mean, low, high
 

@@ -93,8 +93,28 @@ def _q1(leaf: Leaf, work: Work) -> dict[str, Any]:
 
 
 def _q3(leaf: Leaf, work: Work) -> dict[str, Any]:
-    rows = _four_columns(leaf, work, plan.SENSORS, STATIC)
-    return {"rows": rows + _dynamic(leaf, work, ("clips",)), "data": ["own", "other"]}
+    rows = _four_columns(leaf, work, plan.SENSORS, STATIC) + _dynamic(leaf, work, ("clips",))
+    return {"rows": rows + (_read(leaf, work) if leaf.name in READ else []), "data": ["own", "other"]}
+
+
+READ = ("anytouch", "untrained")  # the models whose features are read in every way
+WAYS: Mapping[str, dict[str, Any]] = {
+    "kNN": {"head_names": ("knn",)},
+    "gradient": {"head_names": ("gradient",)},
+    "class token": {"pooling": "class"},
+    "mean of patches": {"pooling": "mean"},
+}
+
+
+def _read(leaf: Leaf, work: Work) -> list[Row]:
+    """The static tasks and the form by other heads and poolings than the tables': views `read: <way>`."""
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    encoder, labels = encoder_of(leaf, work), (*STATIC, FORM)
+    return [
+        row
+        for way, options in WAYS.items()
+        for row in _probes(leaf, work, f"own/{cuts.WHOLE}", labels, f"read: {way}", encoder, **sensors, **options)
+    ]
 
 
 def _ablations(leaf: Leaf, work: Work) -> dict[str, Any]:
@@ -115,7 +135,7 @@ _VIEWS: Mapping[str, dict[str, Any]] = {
 
 def _dynamic(leaf: Leaf, work: Work, views: Sequence[str]) -> list[Row]:
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS}
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
     return [
         row
         for view in views
@@ -125,7 +145,7 @@ def _dynamic(leaf: Leaf, work: Work, views: Sequence[str]) -> list[Row]:
 
 def _dynamics(leaf: Leaf, work: Work) -> dict[str, Any]:
     """Dynamic tasks under every view, and what the same training makes of static ones."""
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS}
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
     static = _probes(leaf, work, f"own/{cuts.WHOLE}", STATIC, "static", encoder_of(leaf, work), **sensors)
     return {"rows": _dynamic(leaf, work, tuple(_VIEWS)) + static, "data": ["own"]}
 
@@ -193,7 +213,7 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
 def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
     """Held or slipped, from the frame in which the press is done and from the last frame."""
     encoder, found = encoder_of(leaf, work), []
-    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None}
+    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocols": BOTH}
     for view in ("during", "after"):
         task = Task("grasp", "label.held", which="all", where=("label.moment", view))
         found += _probes(leaf, work, f"own/{cuts.GRASP}", (task,), view, encoder, **options)

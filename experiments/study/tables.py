@@ -117,9 +117,7 @@ def title(name: str) -> str:
 def block(runs: Sequence[Run], table: Table, statements: Sequence[Statement]) -> str:
     """The table, the published protocol beside it, and the statements, as Markdown."""
     parts = [_ours(runs, table)]
-    published = _published(runs, table)
-    if published:
-        parts.append(published)
+    parts += [said] if (said := published(runs, table)) else []
     if statements:
         parts.append("\n".join(map(sentence, statements)))
     return "\n\n".join(parts)
@@ -152,7 +150,7 @@ def commonest(runs: Sequence[Run], question: str, column: Column) -> float | Non
     return column.factor * float(np.mean(found)) if found and column.metric == "accuracy" else None
 
 
-def _published(runs: Sequence[Run], table: Table) -> str:
+def published(runs: Sequence[Run], table: Table) -> str:
     """Means under the published protocol; nothing where no run has it."""
     lines = []
     for name in table.names:
@@ -160,10 +158,10 @@ def _published(runs: Sequence[Run], table: Table) -> str:
         if any(found):
             pairs = zip(found, table.columns, strict=True)
             cells = [f"{np.mean(list(one.values())):.{column.digits}f}" if one else "-" for one, column in pairs]
-            lines.append((title(name), *cells))
+            lines.append((title(name), str(max(map(len, found))), *cells))
     if not lines:
         return ""
-    head = ("published protocol (chosen on test)", *(column.title for column in table.columns))
+    head = ("published protocol (chosen on test)", "seeds", *(column.title for column in table.columns))
     return markdown(head, lines)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import adaptation, plan, real
+from study import adaptation, plan, real, scores
 from study.questions import FORM, FOUR, GRASP, SIX, SPACE, STATIC, VIEWS, dynamic
 from study.results import Column
 
@@ -47,6 +47,9 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
         "dynamics": (*(one for view in VIEWS for one in dynamic(view)), *STATIC),
     }.get(leaf.question, ())  # fmt: skip
     found = [(one.view, one.task, one.metric) for one in columns]
+    if leaf.question == "q3" and leaf.name in scores.READ:
+        tasks = (*scores.STATIC, scores.FORM)
+        found += [(f"read: {way}", task, "accuracy") for way in scores.WAYS for task in tasks]
     if leaf.question == "new_sensor":
         views = ["seen"] if leaf.name == "seen" else ["universal, 0 unlabelled"]
         for count in adaptation.FRAMES if leaf.name != "seen" else ():
@@ -67,7 +70,7 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
 def _rows(leaf: plan.Leaf, view: str, task: str, metric: str, mean: Mean) -> list[dict[str, Any]]:
     value = mean(leaf.question, leaf.name, leaf.seed, view, task)
     shared = {"view": view, "task": task, "metric": metric, "test": 100}
-    both = ("honest", "published") if leaf.question in ("q1", "q3", "ablations") else ("honest",)
+    both = ("honest",) if leaf.question in ("q2", "real") else ("honest", "published")
     return [shared | {"protocol": one, "mean": value, "low": value - 0.05, "high": value + 0.05} for one in both]
 
 

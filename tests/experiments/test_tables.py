@@ -235,10 +235,30 @@ def test_shares_of_the_gap(tmp_path):
 
     leaves = [leaf for leaf in LEAVES if leaf.question == "new_sensor"]
     synthetic.write(tmp_path, leaves, mean)
-    text = report.parts(read(tmp_path))["new_sensor"].text
+    text, _, published = report.parts(read(tmp_path))["new_sensor"].text.partition("| published protocol")
     rows = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
-    assert "70.0 (50 %)" in rows["fitted, 18 labelled"] and "82.0 (110 %)" in rows["fitted, 100 labelled"]
-    assert "60.0 (0 %)" in rows["universal, 0 unlabelled"] and "80.0" in rows["trained on, all labelled"]
+    assert "70.0 (65.0 to 75.0) (50 %)" in rows["fitted, 18 labelled"] and "(110 %)" in rows["fitted, 100 labelled"]
+    assert "(0 %)" in rows["universal, 0 unlabelled"] and "80.0" in rows["trained on"]
+    assert "| fitted, 18 labelled | 1 | 70.0 | 70.0 | 70.0 |" in published
+
+
+def test_other_ways_to_read_features_stand_beside_the_tables(tmp_path):
+    def mean(question, name, seed, view, task):
+        return {"read: kNN": 0.2, "read: gradient": 0.3}.get(view, 0.6)
+
+    leaves = [leaf for leaf in LEAVES if leaf.question == "q3" and leaf.name in ("anytouch", "t3")]
+    files = synthetic.write(tmp_path, leaves, mean)
+    text = report.parts(read(tmp_path))["q3"].text
+    assert "AnyTouch, by head and pooling" in text and "T3-style, by head" not in text
+    assert "| kNN, class token and mean of patches | 3 | 20.0" in text and "| class token | 3 | 60.0" in text
+    for path in (
+        one for one in files if one.name != "q3-anytouch-0.json"
+    ):  # one seed was read in every way: the tables' own way is of that seed too
+        about = json.loads(path.read_text())
+        kept = [row for row in about["rows"] if not row["view"].startswith("read: ")]
+        path.write_text(json.dumps(about | {"rows": kept}))
+    text = report.parts(read(tmp_path))["q3"].text
+    assert "| linear, class token and mean of patches | 1 | " in text and "| gradient, class token and mean" in text
 
 
 def test_real_touch_is_above_only_when_every_interval_is(tmp_path):

@@ -177,7 +177,7 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
 
 
 def raw_features(task: Task) -> np.ndarray:
-    """Grey pixels and their difference from the background, reduced by a PCA fitted on train."""
+    """Pixels and their difference from the background, reduced by a PCA fitted on train."""
     grounds: dict[Path, np.ndarray] = {}
     pieces = [baseline.row_pixels(task.manifest, int(row), grounds) for row in task.rows]
     train = task.split == "train"

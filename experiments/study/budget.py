@@ -5,9 +5,10 @@ with a load of 2 to 8; alone on a quiet machine a training takes about two third
 1 1.15 s a step of 64; stage 2 4.7 s a step of 32, of which the touch to align 1.2 s, photographs 0.3 s, text 0.2 s and
 the three touches of a match 3.0 s; in proportion to the tokens for smaller pictures, to the weights for smaller towers
 (but seven tenths of stage 1, its decoder and pixels, are the same for all); 100 simulated frames a second and 10 s for
-the program of a sensor; about 25 s to start and end a training; a run's scores 6 to 350 s (of real touch, since its recordings are tested in folds, 220 s reckoned). `matrix.py --plan` prints
-the sum for any size; eight chunks, each of which makes its data again, stay below 75 minutes. Two processes side by
-side (`--jobs 2`) do `JOBS` times as much an hour.
+the program of a sensor; about 25 s to start and end a training; a run's scores 6 to 350 s (220 s for those of real
+touch are reckoned: its recordings are tested in ten folds). `matrix.py --plan` prints the sum for any size; eight
+chunks, each of which makes its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do `JOBS`
+times as much an hour.
 """
 
 from __future__ import annotations

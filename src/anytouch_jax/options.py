@@ -317,9 +317,9 @@ class Bench:
     preset: PresetName = "tiny"
     """Sizes of the network."""
     batch: int | None = None
-    """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; a device for memory)."""
+    """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; 4 a device for memory)."""
     out: Path = Path("runs/bench")
-    """Folder for speed.md, or speed_WHAT_PRESET.md, its numbers (.json) and figures/."""
+    """Folder for speed.md (speed_WHAT_PRESET.md where not everything at preset tiny), its numbers and figures/."""
     rounds: int = 9
     """Rounds in which all variants take turns; figures are medians."""
     quick: bool = False

@@ -71,7 +71,7 @@ def pretrain(
     if not steps(run / "checkpoints"):  # else only their shapes matter
         params = _first_params(params, config, init, clip, say)
     else:
-        _same_init(run, init, say)
+        _same_start(run, say, init=init, clip=clip)
     _same_data(run, manifest)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
@@ -144,12 +144,15 @@ def _same_data(run: Path, manifest: manifests.Manifest) -> None:
             )
 
 
-def _same_init(run: Path, init: str | Path | None, say: Say) -> None:
-    """Say so where a run that goes on is given another start than it had: it is not read again."""
+def _same_start(run: Path, say: Say, **given: str | Path | None) -> None:
+    """Say so where a run that goes on is given another `init` or `clip` than it had: they are not read again."""
     with suppress(checkpoint.CheckpointError):
-        before = (checkpoint.read_metadata(run).get("source") or {}).get("init")
-        if init is not None and (before is None or Path(before).resolve() != Path(init).resolve()):
-            say(f"{run} goes on and was begun {f'from {before}' if before else 'without --init'}: {init} is not read")
+        source = checkpoint.read_metadata(run).get("source") or {}
+        for name, path in given.items():
+            before = source.get(name)
+            if path is not None and (before is None or Path(before).resolve() != Path(path).resolve()):
+                told = f"from {before}" if before else f"without --{name}"
+                say(f"{run} goes on and was begun {told}: {path} is not read")
 
 
 def _describe(
@@ -254,6 +257,16 @@ def _same_activation(path: Path, told: str | None, config: Config) -> None:
         raise UserError(f"{path} was trained with {told}, this run would use {ours}: add --model.activation {told}")
 
 
+def _same_size(path: Path, before: Config, config: Config) -> None:
+    """Raise UserError where a run is of another preset than this one, and of towers of another size."""
+    theirs, ours = ((model.touch.width, model.touch.depth) for model in (before.model, config.model))
+    if theirs != ours and before.preset not in (config.preset, "custom"):
+        raise UserError(
+            f"{path} is of preset {before.preset} and this run would be of preset {config.preset}: add --preset "
+            f"{before.preset}"
+        )
+
+
 def _same_form(path: Path, before: Model, config: Config) -> None:
     """Raise UserError where weights fit by their shapes, but were trained with other heads or epsilons."""
     for name in ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps"):
@@ -273,6 +286,7 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
     if path.is_dir() and not any(path.glob("*.pth")):
         params, text, told = checkpoint.load_params(path)
         before = from_json(text)
+        _same_size(path, before, config)
         _same_activation(path, before.model.activation, config)
         _same_form(path, before.model, config)
         params = release.served(params, before, told)

@@ -59,7 +59,7 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
     [
         (["--out", "touch.parquet"], "is the manifest that was read"),
         (["--out", "m.json"], "ends in .csv or .parquet"),
-        (["--threads", "0"], "workers must be at least 1"),
+        (["--threads", "0"], "--threads (workers) must be at least 1"),
         (["--drop", "--threshold", "digit", "999"], "every frame is without contact"),
         (["--check", "--reference", "label.depth"], "no column label.depth"),
         (["--reference", "label.force"], "--reference does nothing without --check"),

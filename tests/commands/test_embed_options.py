@@ -13,6 +13,7 @@ import pytest
         (["frames", "--split", "test"], "--split does nothing with a folder or a video: only a manifest has splits"),
         (["touch.mp4", "--stride", "5"], "--stride does nothing without --stream"),
         (["0", "--stream", "--on-bad-sample", "skip"], "--on-bad-sample does nothing with --stream"),
+        (["0", "--stream", "--stride", "5"], "--stride does nothing for single frames"),
         (["0", "--stream", "--split", "test", "--batch", "8"], "--split, --batch do nothing with --stream"),
     ],
 )
@@ -20,12 +21,17 @@ def test_what_would_do_nothing_is_refused(mistake, words, told):
     assert told in mistake("embed", "--run", "nowhere", "--out", "f.npz", "--input", *words)
 
 
+def test_features_are_written_as_npz(mistake):
+    assert "features are written as .npz" in mistake("embed", "--run", "r", "--input", "m.csv", "--out", "f.csv")
+    assert "features are written as .npz" in mistake("embed", "--run", "r", "--input", "m.csv", "--out", "-")
+
+
 @pytest.mark.parametrize(
     "words",
     [
         ["m.csv", "--split", "test", "--frames", "3", "--batch", "8"],
         ["frames", "--sensor", "digit", "--batch", "8"],
-        ["0", "--stream", "--stride", "2", "--sensor", "digit"],
+        ["0", "--stream", "--stride", "2", "--frames", "3", "--sensor", "digit"],
     ],
 )
 def test_what_is_used_is_not_refused(mistake, words):

@@ -82,6 +82,31 @@ def test_nor_is_one_in_the_decoder(outside):
     assert np.isfinite(pred[0]).all() and np.isnan(pred[1]).all()
 
 
+@pytest.mark.parametrize("frames", [1, 3])
+def test_both_poolings_are_of_one_pass(frames):
+    clip = clips(frames)
+    token, patches = NET.apply(PARAMS, "encode_both", clip, SENSOR)
+    np.testing.assert_allclose(token, encode(PARAMS, clip, SENSOR), atol=1e-5)
+    every = NET.apply(PARAMS, "encode_tokens", clip, SENSOR)  # class token, five sensor tokens, sixteen patches
+    np.testing.assert_allclose(patches, every[:, 6:].mean(axis=1), atol=1e-5)
+    assert every.shape[1] == 22
+    cost = {
+        method: jax.jit(lambda p, c, m=method: NET.apply(p, m, c, SENSOR)).lower(PARAMS, clip).cost_analysis()["flops"]
+        for method in ("encode", "encode_both")
+    }
+    assert cost["encode_both"] < 1.05 * cost["encode"]
+
+
+@pytest.mark.parametrize("head", ["mlp", "linear"])
+def test_matching_logits_have_all_their_digits(head):
+    nets = [build(touch_model(match_head=head, dtype=dtype)) for dtype in ("float32", "bfloat16")]
+    params = nets[0].init(jax.random.key(0))
+    z = jax.random.normal(jax.random.key(1), (2, 5, 12))
+    first, second = (net.apply(params, "match", *z) for net in nets)
+    assert second.dtype == jnp.float32
+    np.testing.assert_array_equal(first, second)
+
+
 @pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
 def test_long_clips_are_segments_of_three(join, width):
     clip = clips(8)

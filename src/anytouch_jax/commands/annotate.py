@@ -11,6 +11,7 @@ from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Annotate
+from anytouch_jax.strict_json import COUNT, NOT_NEGATIVE, in_range
 
 if TYPE_CHECKING:
     from anytouch_jax.data.annotate import Annotated, Estimate
@@ -41,13 +42,16 @@ def run(options: Annotate) -> int:
         refuse(options, ("key",), "without --captions, the table that it is a column of")
     if options.sheet is None:
         refuse(options, ("sheet_count",), "without --sheet")
+    if (options.price_in is None) != (options.price_out is None):
+        raise UserError("--price-in and --price-out go together: a question costs by what is sent and what comes back")
+    in_range("--", options, price_in=NOT_NEGATIVE, price_out=NOT_NEGATIVE, sheet_count=COUNT)
     manifest = manifests.read(options.manifest)
     target = options.out or beside(options.manifest, "captions")
     if not options.estimate:
         check_new(manifest, target)
         check_folder(target, read=() if options.captions is None else (options.captions,))
     if options.sheet is not None:
-        check_folder(options.sheet, "--sheet")
+        check_folder(options.sheet, "--sheet", read=manifest.files)
     if options.captions is not None:
         return _attach(options, manifest, target)
     try:
@@ -90,10 +94,15 @@ def _endpoint(options: Annotate) -> Endpoint:
 
 
 def _consent(options: Annotate, estimate: Estimate) -> bool:
+    from anytouch_jax.data.endpoint import Client
+
     print(f"{options.model} at {options.url}: {estimate}", flush=True)
     if options.estimate:
         raise _OnlyAnEstimate
-    if options.yes or not estimate.questions:
+    if not estimate.questions:
+        return True
+    Client(_endpoint(options))  # a key that is not there is told before anybody is asked
+    if options.yes:
         return True
     if not sys.stdin.isatty():
         raise UserError("nobody is there to confirm this; add --yes, or --estimate to see the estimate only")

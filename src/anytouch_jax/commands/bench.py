@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -25,8 +26,9 @@ Section = tuple[str, str, list[Any]]  # title, Markdown, records
 def run(options: Bench) -> int:
     """Measure what was asked for, write a page, its numbers and a figure a workload, and print the tables.
 
-    The page is speed.md, or speed_WHAT_PRESET.md where only some was asked for: no measurement is written over by
-    another. Raises UserError for a page that somebody wrote.
+    The page is speed.md, with WHAT and the preset in its name where only some or another preset was asked for: no
+    measurement is written over by one of something else. Raises UserError for a page that somebody wrote, and for a
+    quick run in the place of a measurement.
     """
     from anytouch_jax.evaluate import machine
 
@@ -36,6 +38,8 @@ def run(options: Bench) -> int:
     check_folder(page)
     if page.exists() and not page.with_suffix(".json").exists():
         raise UserError(f"{page} was not made by bench, it has no numbers beside it: choose another --out")
+    if options.quick and page.exists() and not _made_quickly(page):
+        raise UserError(f"{page} holds a measurement, which a quick run would replace: choose another --out")
     here = machine.describe()
     say(here.sentence())
     wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)
@@ -60,7 +64,16 @@ def _refuse_unused(options: Bench) -> None:
 
 
 def _stem(options: Bench) -> str:
-    return "_".join(("speed", *dict.fromkeys(options.what), options.preset)) if options.what else "speed"
+    plain = not options.what and options.preset == Bench.preset
+    return "_".join(("speed", *dict.fromkeys(options.what), *(() if plain else (options.preset,))))
+
+
+def _made_quickly(page: Path) -> bool:
+    """Whether the numbers beside a page are of a quick run, or none that can be read."""
+    try:
+        return bool(json.loads(page.with_suffix(".json").read_text(encoding="utf-8")).get("quick", True))
+    except (OSError, ValueError, AttributeError):
+        return True
 
 
 def _write(options: Bench, here: Any, sections: list[Section]) -> Path:

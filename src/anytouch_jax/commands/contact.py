@@ -17,7 +17,7 @@ def run(options: Contact) -> int:
     """Score every frame; write the marked manifest, the picture of both sides, or compare with what is known."""
     from anytouch_jax.data import contact
     from anytouch_jax.data import manifest as manifests
-    from anytouch_jax.evaluate.contact_report import contact_picture, contact_quality
+    from anytouch_jax.evaluate.contact_report import contact_picture, contact_quality, known_contact_by
 
     if not options.check:
         refuse(options, ("reference", "above"), "without --check, which compares with a column")
@@ -32,6 +32,8 @@ def run(options: Contact) -> int:
         check_folder(options.picture, "--picture", read=manifest.files)
     limits = dict(options.threshold)
     contact.limits_of(manifest, limits, options.share)  # mistakes are told before the work
+    if options.check:
+        known_contact_by(manifest, options.reference)
     if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
         refuse(options, ("threshold", "share"), "where every row has a label.contact, which is kept")
     scores = contact.contact_scores(manifest, workers=options.threads)

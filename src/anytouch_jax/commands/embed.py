@@ -30,6 +30,8 @@ def run(options: Embed) -> int:
     if not (options.stream and str(options.out) == "-"):
         # before what takes long: what is embedded must have a place
         check_folder(options.out, read=(options.run, options.input))
+        if options.out.suffix.lower() != ".npz":
+            raise UserError(f"{options.out}: features are written as .npz; name such a file with --out")
     enable_compilation_cache()
     encoder = features.load_encoder(options.run).computed_in(options.dtype)
     features.check_frames(encoder.config.model, options.frames)
@@ -199,6 +201,8 @@ def _refuse_unused(options: Embed) -> None:
     if options.stream:
         refuse(options, ("split", "batch"), "with --stream, which embeds every frame by itself")
         refuse(options, ("on_bad_sample",), "with --stream: a frame that cannot be had ends it")
+        if options.frames == 1:
+            refuse(options, ("stride",), "for single frames", "; or ask for clips with --frames")
     elif options.input.suffix.lower() in _MANIFESTS:
         refuse(options, ("sensor", "stride"), "with a manifest, whose rows name their sensor and stride")
     else:

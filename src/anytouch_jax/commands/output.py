@@ -72,6 +72,8 @@ def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path
 def check_home(folder: Path, option: str = "--out") -> None:
     """As `check_folder`, for a folder that will be filled after long work: its parents are made, it is not."""
     if folder.is_dir():
+        if not os.access(folder, os.W_OK):
+            raise UserError(f"the folder {folder} cannot be written to; choose another {option}")
         return
     if folder.exists():
         raise UserError(f"{folder} is a file, not a folder; choose another {option}")

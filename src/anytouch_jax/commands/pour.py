@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse
@@ -40,6 +41,20 @@ def _home(options: Pour) -> Path:
     return options.out or (run if run.is_dir() else run.parent) / "pour"
 
 
+def _claim(out: Path, about: Mapping[str, Any]) -> None:
+    """Make the folder of the results. Raises UserError where it holds those of other settings: a policy would go."""
+    check_folder(out / "pour.json")
+    try:
+        before = dict(json.loads((out / "pour.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return  # nothing there, or nothing of ours
+    other = sorted(name for name in ("recordings", *about) if before.get(name) != about.get(name))
+    if other:
+        raise UserError(
+            f"{out} holds a policy of other settings ({', '.join(other)}); choose another folder with --out"
+        )
+
+
 def _record(options: Pour, folder: Path) -> int:
     from anytouch_jax.evaluate import pouring_policy, pouring_recordings
     from anytouch_jax.sim.pouring import Task
@@ -72,7 +87,9 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
     from anytouch_jax.sim.pouring import Task
 
     encoder = load_encoder(str(options.run))
-    check_folder(out / "pour.json")
+    about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
+    about |= {"stills": options.stills, "fine_tuned": options.fine_tune}
+    _claim(out, about)
     found = pouring_recordings.read(path, encoder.config.model.image_size)
     shown, unseen = found.part(False), found.part(True)
     say(f"{len(shown.steps)} runs of {found.sensor} to learn from, {len(unseen.steps)} of split test")
@@ -88,9 +105,9 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
     ]
     print(markdown(head, lines))
     pouring_recordings.save_policy(out, policy)
-    about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
-    about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "sensor": policy.sensor}
-    found_text = json.dumps(about | {name: one._asdict() for name, one in rows.items()}, indent=2)
+    found_text = json.dumps(
+        about | {"sensor": policy.sensor} | {name: one._asdict() for name, one in rows.items()}, indent=2
+    )
     write_whole(out / "pour.json", found_text + "\n")
     say(f"policy and results in {out}")
     return 0
@@ -103,9 +120,11 @@ def _simulated(options: Pour, out: Path) -> int:
     from anytouch_jax.sim.pouring import Task
 
     encoder = load_encoder(str(options.run))
-    check_folder(out / "pour.json")
     side = encoder.config.model.image_size
     task = Task(markers=options.markers)
+    about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
+    about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
+    _claim(out, about)
     say(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=side)
     policy, learning = _policy(options, encoder, shown, pouring.SENSOR)
@@ -125,8 +144,6 @@ def _simulated(options: Pour, out: Path) -> int:
     pouring.write_film(out / "pour.gif", trials, task)
     pouring_recordings.save_policy(out, policy)
     found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
-    about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
-    about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
     write_whole(out / "pour.json", json.dumps(about | {"poured": found}, indent=2) + "\n")
     say(f"film, policy and results in {out}")
     return 0
@@ -149,6 +166,8 @@ def _check(options: Pour) -> None:
     for name in ("trials", "demos"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, not {getattr(options, name)}")
+    if options.record is not None and options.demos < 2:
+        raise UserError("--demos 1 is too few to record: of two or more, some are kept for the test")
     if options.record is not None:
         learning = ("run", "recordings", "out", "trials", "stills", "fine_tune", "steps")
         refuse(options, learning, "with --record, which only writes demonstrations")

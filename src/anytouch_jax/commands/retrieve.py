@@ -45,6 +45,11 @@ def run(options: Retrieve) -> int:
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]
     rows = deepest_rows(table, rows, frames=options.frames)
+    asked: dict[str, Any] = {
+        "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
+        "seeds": options.seeds,
+    }  # fmt: skip
+    retrieval.cross_sensor_retrieval(table, {}, rows, **asked)  # a gallery that cannot be is told before the work
     found: dict[str, Any] = {}
     for name, encoder in encoders.items():
         kept, found[name] = features.embed_rows(encoder, table, rows, options.frames, options.pooling, say=say)
@@ -56,16 +61,7 @@ def run(options: Retrieve) -> int:
                 found[name] = make(table, rows)
             except UserError as error:
                 say(f"no control by {name}: {error}")
-    match = None if options.by_chance else retrieval.COVARIATES
-    scored = retrieval.cross_sensor_retrieval(
-        table,
-        found,
-        rows,
-        gallery_size=options.gallery,
-        match=match,
-        seeds=options.seeds,
-        metrics={VECTOR: "euclidean"},
-    )
+    scored = retrieval.cross_sensor_retrieval(table, found, rows, metrics={VECTOR: "euclidean"}, **asked)
     head = ("features", "query", "gallery", "centred", "top-1", "95 %", "top-5", "chance", "of", "queries")
     text = markdown(head, [_row(one) for one in scored])
     Console().print(Markdown(text)) if Console().is_terminal else print(text)

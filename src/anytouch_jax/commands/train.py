@@ -18,6 +18,8 @@ def run(options: Train, config: Config) -> int:
         raise UserError(f"baseline {baseline.name} has no stage 1: leave out --init")
     if options.stage == 1 and options.towers == "pretrained" and not options.clip:
         raise UserError("--towers pretrained needs CLIP weights: stage 1 starts its touch encoder from those of --clip")
+    if options.stage == 2 and options.clip and options.towers != "pretrained":
+        raise UserError("--clip gives stage 2 the towers of CLIP: add --towers pretrained, or leave --clip out")
     if options.stop_after is not None and options.stop_after < 0:
         raise UserError(f"--stop-after must be 0 or more, not {options.stop_after}")
     try:

@@ -30,8 +30,12 @@ def run(options: Translate) -> int:
         raise UserError("--fit takes its images from --data; translate in a second call")
     if options.fit:
         refuse(options, ("background",), "with --fit: the pairs of --data name their backgrounds")
+        if options.out is not None:
+            refuse(options, ("generator",), "beside --fit --out, which names the folder of what is trained")
     else:
         refuse(options, _OF_FIT, "without --fit, which trains a translation")
+        if options.generator is not None:
+            refuse(options, ("run",), "beside --generator, which holds its encoder")
     return _fit(options) if options.fit else _translate(options)
 
 
@@ -133,7 +137,7 @@ def _targets(options: Translate, suffix: str) -> list[Path]:
         targets = [(out or path.parent) / f"{path.stem}_{options.to}{suffix}" for path in images]
     if len(set(targets)) < len(targets):
         raise UserError("two images have the same name: translate them into different folders")
-    for path in images:
+    for path in (*images, *((options.background,) if options.background else ())):
         if path.resolve() in {target.resolve() for target in targets}:
             raise UserError(f"{path} is an image that is read; name another file")
     return targets

@@ -18,6 +18,7 @@ def run(options: Verify) -> int:
     """Print the report; 1 when there are errors that no repair took away."""
     from anytouch_jax.data import manifest as manifests
     from anytouch_jax.data import verify
+    from anytouch_jax.data.licences import commercial_only
     from anytouch_jax.data.repair import check_swap
 
     if options.swap and options.repair is None:
@@ -29,6 +30,8 @@ def run(options: Verify) -> int:
     for target in (options.repair, options.commercial_only):
         if target is not None:
             check_new(manifest, target)
+    if options.commercial_only is not None:
+        commercial_only(manifest)  # a manifest without such rows is told before the work
     if options.out is not None:
         check_folder(options.out, read=(*manifest.files, *(path for path in (options.repair,) if path)))
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)

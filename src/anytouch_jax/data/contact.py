@@ -104,7 +104,7 @@ def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, worker
     A frame or background that cannot be read gives NaN and its reason; nothing is raised for one file.
     """
     if workers < 1:
-        raise UserError(f"workers must be at least 1, is {workers}")
+        raise UserError(f"--threads (workers) must be at least 1, not {workers}")
     asked = np.arange(len(manifest)) if rows is None else np.asarray(rows)
     score = np.full(len(manifest), np.nan, np.float32)
     reasons = np.full(len(manifest), "not asked for", dtype=object)

@@ -28,7 +28,7 @@ from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.files import Files, distinct_files
 from anytouch_jax.data.licences import licences
 from anytouch_jax.data.manifest import Manifest, with_own_keys
-from anytouch_jax.data.packed import INDEX, forget, read_file
+from anytouch_jax.data.packed import INDEX, forget, read_file, split_packed
 from anytouch_jax.data.table import PATHS
 from anytouch_jax.whole import replacing, write_whole
 
@@ -74,7 +74,10 @@ def pack(
     files = distinct_files(manifest)
     finished = target.is_file() and (folder / "README.md").is_file()
     plan = {"version": _VERSION, "manifest": manifest.content_hash, "shard_bytes": shard_bytes}
-    _claim(folder, plan, _stamp(manifest, files), finished)
+    stamp = _stamp(manifest, files)
+    if isinstance(stamp, PackError) and not finished:
+        raise stamp
+    _claim(folder, plan, None if isinstance(stamp, PackError) else stamp, finished)
     if finished:
         if say:
             say(f"{folder} was finished before: left as it is")
@@ -100,18 +103,27 @@ def pack(
     return target
 
 
-def _stamp(manifest: Manifest, files: Files) -> str | None:
-    """A digest of where the files are, their sizes and times: equal manifests may show other pictures. None when one
-    of them is not there."""
+def _stamp(manifest: Manifest, files: Files) -> str | PackError:
+    """A digest of where the files are, their sizes and times: equal manifests may show other pictures. The error of
+    the first that is not there, which must be told before hours of packing the others."""
     digest = hashlib.sha256()
     for row, column in zip(files.row, files.column, strict=True):
         try:
             path = manifest.file(row, column)
-            about = os.stat(path)
-        except (OSError, UserError):  # named when it is to be packed
-            return None
+            about = os.stat((split_packed(path) or (path,))[0])
+        except FileNotFoundError:
+            return _cannot(manifest, int(row), str(column), "the file is missing")
+        except (OSError, UserError) as error:
+            return _cannot(manifest, int(row), str(column), str(error))
         digest.update(f"{path}\0{about.st_size}\0{about.st_mtime_ns}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
+
+
+def _cannot(manifest: Manifest, row: int, column: str, reason: str) -> PackError:
+    return PackError(
+        f"{manifest.where(row)}, column {column!r}: {manifest.value(row, column)!r} cannot be packed: {reason}; "
+        "run anytouch verify with --repair first"
+    )
 
 
 def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: bool) -> None:
@@ -201,11 +213,7 @@ class _Group:
             if data:
                 return _Piece(file, data)
             reason = "the file is empty"
-        cell = self.manifest.value(row, name)
-        raise PackError(
-            f"{self.manifest.where(row)}, column {name!r}: {cell!r} cannot be packed: {reason}; "
-            "run anytouch verify with --repair first"
-        )
+        raise _cannot(self.manifest, row, name, reason)
 
     def _write(
         self, number: int, first: _Piece, pieces: Iterator[_Piece], shard_bytes: int

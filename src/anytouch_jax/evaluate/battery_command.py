@@ -14,7 +14,7 @@ from anytouch_jax.evaluate.benchmarks import benchmark_of
 from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
 from anytouch_jax.evaluate.heads import HeadName
 from anytouch_jax.evaluate.results import markdown
-from anytouch_jax.evaluate.tasks import available
+from anytouch_jax.evaluate.tasks import available, task_of
 
 if TYPE_CHECKING:
     from anytouch_jax.options import Probe
@@ -67,6 +67,8 @@ def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], f
     asked, known = _names(options.heads) or (), get_args(HeadName)
     if not asked or not set(asked) <= set(known):
         raise UserError(f"--heads {options.heads!r}: choose among {', '.join(known)}, with commas between")
+    if options.order != "right" and options.frames is None and names and all(task_of(one).frames == 1 for one in names):
+        raise UserError("--order does nothing for stills, which these tasks are of; give --frames, or leave it out")
     settings = {"pooling": options.pooling, "join": options.join, "protocols": protocols, "head_names": asked}
     if not names:
         raise UserError("the manifest has no label of any task; `anytouch probe --label COLUMN` takes any column")

@@ -22,7 +22,7 @@ from ..data.manifest import Manifest
 from ..data.packed import read_file
 from ..io.tree import flatten
 from . import baseline
-from .features import Encoder, Features, Join, Pooling, save_npz
+from .features import Encoder, Features, Join, Pooling, check_backgrounds, save_npz
 
 Array = npt.NDArray[Any]
 Order = Literal["right", "shuffled", "repeated"]
@@ -105,6 +105,7 @@ def encoded(
     }
 
     def compute(rows: Array, frames: int) -> Array:
+        check_backgrounds(encoder, table, rows)
         config = replace(encoder.config, data=replace(encoder.config.data, batch_size=BATCH))
         kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
         found, read, row = [], 0, encoder.config.model.universal_row

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data.contact import DEFAULT_THRESHOLD, THRESHOLDS, ContactScores, contact_scores
@@ -58,6 +59,22 @@ class ContactQuality:
         ]  # fmt: skip
 
 
+def known_contact_by(manifest: Manifest, reference: str | None = None) -> tuple[str, npt.NDArray[np.float64]]:
+    """The column that tells of contact (default: the first of REFERENCES that is there) and its numbers, NaN for none.
+
+    Raises UserError when there is none, or none of numbers.
+    """
+    name = reference or next((one for one in REFERENCES if one in manifest.table.column_names), None)
+    if name is None or name not in manifest.table.column_names:
+        raise UserError(
+            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with"
+        )
+    try:
+        return name, np.array([np.nan if one is None else float(one) for one in manifest.table[name].to_pylist()])
+    except (TypeError, ValueError):
+        raise UserError(f"column {name} holds something that is no number; contact is told by a number") from None
+
+
 def contact_quality(
     manifest: Manifest,
     *,
@@ -73,17 +90,8 @@ def contact_quality(
     Only rows of `split` (default: all but `background`) that have a value and a score are compared. `thresholds`
     replaces entries of THRESHOLDS. Raises UserError when no such column or row is there.
     """
-    name = reference or next((one for one in REFERENCES if one in manifest.table.column_names), None)
-    if name is None or name not in manifest.table.column_names:
-        raise UserError(
-            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with"
-        )
+    name, truth = known_contact_by(manifest, reference)
     limit = REFERENCES.get(name, 0.0) if above is None else above
-    try:
-        values = [np.nan if one is None else float(one) for one in manifest.table[name].to_pylist()]
-    except (TypeError, ValueError):
-        raise UserError(f"column {name} holds something that is no number; contact is told by a number") from None
-    truth = np.array(values)
     splits = np.asarray(manifest.table["split"].to_pylist(), object)
     rows = np.flatnonzero(splits == split if split else splits != "background")
     known = rows[~np.isnan(truth[rows])]

@@ -108,13 +108,18 @@ class Encoder:
         count, run = len(clips), self._run(pooling, join)
         if not count:  # the network has no shape for nothing: embed one and give none
             clips, rows = np.zeros((1, *clips.shape[1:]), np.uint8), np.zeros(1, np.int32)
-        return np.asarray(run(self.params, clips, rows.astype(np.int32)))[:count]
+        return np.asarray(run(self._placed, clips, rows.astype(np.int32)))[:count]
 
     def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
         key = (pooling, join)
         if key not in self._compiled:
             self._compiled[key] = jax.jit(partial(touch_features, net=self.net, pooling=pooling, join=join))
         return self._compiled[key]
+
+    @cached_property
+    def _placed(self) -> dict[str, Any]:
+        """The parameters on the device, where they stay."""
+        return jax.device_put(self.params)
 
     @cached_property
     def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
@@ -147,12 +152,10 @@ def touch_features(
 ) -> jax.Array:
     """Features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,), to be traced: see `Encoder.embed`."""
     clips = normalise_touch(clips)
-    parts = []
-    if pooling in ("class", "both"):
-        parts.append(net.apply(params, "encode", clips, sensor, join))
-    if pooling in ("mean", "both"):
-        parts.append(net.apply(params, "encode_patches", clips, sensor, join))
-    return jnp.concatenate([part.astype(jnp.float32) for part in parts], axis=-1)
+    if pooling == "class":
+        return net.apply(params, "encode", clips, sensor, join).astype(jnp.float32)
+    parts = net.apply(params, "encode_both", clips, sensor, join)  # what is not read is not computed
+    return jnp.concatenate(parts if pooling == "both" else parts[1:], axis=-1).astype(jnp.float32)
 
 
 def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
@@ -227,6 +230,8 @@ def embed_rows(
         raise UserError("no rows are left to embed; check the split and the filters")
     for name in sorted(set(text_column(manifest, "sensor")[rows])):
         encoder.sensor_row(name, say)
+    if on_bad_sample == "error":
+        check_backgrounds(encoder, manifest, rows)
     data = replace(encoder.config.data, batch_size=min(batch, len(rows)), on_bad_sample=on_bad_sample)
     config = replace(encoder.config, data=data)
     kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
@@ -237,6 +242,16 @@ def embed_rows(
     if not ids:
         raise UserError(f"none of the {len(rows)} rows can be read; `anytouch verify` says what is wrong with them")
     return np.concatenate(ids), np.concatenate(values)
+
+
+def check_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray) -> None:
+    """Raise UserError where the encoder takes the untouched gel off and some of `rows` name no picture of it."""
+    bare = rows[~manifest.present("background_path")[rows]]
+    if encoder.subtracts and len(bare):
+        raise UserError(
+            f"{manifest.where(int(bare[0]))} and {len(bare) - 1} other rows have no background_path, which "
+            f"{encoder.source} takes off every touch; name one, or leave such rows out (embed: --on-bad-sample skip)"
+        )
 
 
 def text_column(manifest: Manifest, name: str) -> np.ndarray:

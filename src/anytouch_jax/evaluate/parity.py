@@ -95,7 +95,9 @@ def _probe(case: Case) -> None:
             case.compare(f"out/{name}/projected", out[:, : case.arrays[f"out/{name}/projected"].shape[1]])
             if feel:  # the reference interleaves the two images' tokens by a plain reshape (golden Q13)
                 out = out.reshape(len(images), out.shape[1], -1)
-            head_input = jnp.mean(out[:, 1 + net.model.sensor_tokens :], axis=1)
+                head_input = jnp.mean(out[:, 1 + net.model.sensor_tokens :], axis=1)
+            else:
+                head_input = encode(params, flat, sensor, net=net, method="encode_both")[1]
         case.compare(f"out/{name}/head_input", head_input)
         _probe_head(case, name, head_input)
 

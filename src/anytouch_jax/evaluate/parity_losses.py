@@ -273,7 +273,7 @@ def align_edge(case: Case) -> None:
 
 
 @partial(jax.jit, static_argnames=("net", "method"))
-def encode(params: Params, clip: Any, sensor: Any, *, net: Net, method: str = "encode") -> jax.Array:
+def encode(params: Params, clip: Any, sensor: Any, *, net: Net, method: str = "encode") -> Any:
     """A method of the touch encoder, compiled once for all cases of equal shapes."""
     return net.apply(params, method, clip, sensor)
 

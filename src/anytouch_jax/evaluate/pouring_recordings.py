@@ -91,6 +91,9 @@ def read(path: Path, side: int) -> Recordings:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
     split = text_column(table, "split")
     runs = sorted(_runs(table, path), key=lambda rows: split[rows[0]] == "test")
+    test = np.array([split[rows[0]] == "test" for rows in runs])
+    if not test.any() or test.all():
+        raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
     steps = np.array([len(rows) for rows in runs])
     padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
     order = np.stack(padded, 1)  # (S, B) row numbers
@@ -102,9 +105,6 @@ def read(path: Path, side: int) -> Recordings:
     frames = np.stack([np.stack([frame(int(row)) for row in rows]) for rows in order])
     unknown = np.full(order.shape, np.nan)
     trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
-    test = np.array([split[rows[0]] == "test" for rows in runs])
-    if not test.any() or test.all():
-        raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
     return Recordings(trials, test, str(sensors[0]))
 
 

@@ -14,6 +14,7 @@ from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import baseline, probe
 from anytouch_jax.evaluate.features import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate.probe_rows import prepare
 
 if TYPE_CHECKING:
     from anytouch_jax.options import Probe
@@ -47,6 +48,7 @@ class Task:
 def run_probes(options: Probe, say: Say) -> list[Any]:
     """All results: for each encoder (and the controls) a linear probe and kNN, or the groups left out."""
     task = read_task(options, say)
+    _check(options, task)  # mistakes are told before the work
     found: list[Any] = []
     for name, values in _features(options, task, say):
         # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.
@@ -57,6 +59,15 @@ def run_probes(options: Probe, say: Say) -> list[Any]:
     if options.leave_out is None:
         found.append(probe.majority(task.labels, task.groups, task.split, subsets=task.subsets))
     return found
+
+
+def _check(options: Probe, task: Task) -> None:
+    """Raise UserError for labels, splits or groups that no probe could use, whatever the features are."""
+    nothing, left_out = np.zeros((len(task.rows), 1), np.float32), options.leave_out is not None
+    split = np.full(len(task.rows), "train") if left_out else task.split
+    prepare(nothing, task.labels, task.groups, split, tested=not left_out)
+    if left_out and len(np.unique(task.groups)) == 1:
+        raise UserError(f"all rows are of one {options.leave_out} ({task.groups[0]}): nothing is left to learn from")
 
 
 def probe_features(
@@ -142,7 +153,7 @@ def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
     sequence = table["sequence"].to_pylist()
     usual = (one for one in GROUPS if one != options.label.removeprefix("label.") and _has_values(table, one))
     asked = options.leave_out or options.group
-    name = asked or next(usual)
+    name = asked or next(usual, "sequence")
     if name == "sequence" and not asked:
         return np.array([sequence[r] for r in rows])
     column = _column(table, name)

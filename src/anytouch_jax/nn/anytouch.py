@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 from jax import Array
@@ -14,7 +17,7 @@ from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
 from anytouch_jax.ops import tokens
 
-Features = Callable[[Array, Array], Array]
+Found = TypeVar("Found")  # features, or several of them
 
 
 class Lora(nnx.Module):
@@ -25,7 +28,9 @@ class Lora(nnx.Module):
 
 
 def _matcher(model: Model) -> Mlp | Dense | None:
-    """The matching head of Eq. 5: an MLP (paper), one linear layer (release), or none (as for cosines)."""
+    """The matching head of Eq. 5: an MLP (paper), one linear layer (release), or none (as for cosines). Its logits
+    are float32 at least, as those of every contrast."""
+    model = replace(model, dtype="float32") if model.dtype == "bfloat16" else model
     if model.match_head == "mlp":
         return Mlp(model.embed, model.embed, model, gelu, outputs=1)
     return Dense(model.embed, 1, model) if model.match_head == "linear" else None
@@ -63,19 +68,24 @@ class AnyTouch(nnx.Module):
         """As `encode`, of stills and clips of three frames, from the patches `keep_ids` (B, K) alone."""
         return self.touch.features(clip, sensor, keep_ids)
 
-    def encode_patches(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
-        """As `encode`, from the mean over the projected patch tokens (the release's "global" pooling)."""
+    def encode_both(self, clip: Array, sensor: Array, join: str = "mean") -> tuple[Array, Array]:
+        """In one pass `encode`, and the mean over the projected patch tokens (the release's "global" pooling)."""
         special = 1 + self.touch.sensor_tokens[...].shape[1]
-        mean = lambda c, s: jnp.mean(self.encode_tokens(c, s)[:, special:], axis=1)  # noqa: E731
-        return self._over_segments(mean, clip, sensor, join)
 
-    def _over_segments(self, features: Features, clip: Array, sensor: Array, join: str) -> Array:
+        def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
+            hidden = self.touch.hidden(clip, sensor)
+            return self.touch.embedding(hidden), jnp.mean(self.touch.projection(hidden[:, special:]), axis=1)
+
+        return self._over_segments(both, clip, sensor, join)
+
+    def _over_segments(self, features: Callable[[Array, Array], Found], clip: Array, sensor: Array, join: str) -> Found:
         if clip.shape[1] in (1, self.frames):
             return features(clip, sensor)
         parts = tokens.segments(clip, self.frames)
         b, s = parts.shape[:2]
-        z = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s)).reshape(b, s, -1)
-        return {"mean": lambda: z.mean(1), "sum": lambda: z.sum(1), "concat": lambda: z.reshape(b, -1)}[join]()
+        ways = {"mean": lambda z: z.mean(1), "sum": lambda z: z.sum(1), "concat": lambda z: z.reshape(b, -1)}
+        found = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s))
+        return jax.tree.map(lambda z: ways[join](z.reshape(b, s, -1)), found)
 
     def encode_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """The projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches]: the decoder's input."""
@@ -107,7 +117,7 @@ class AnyTouch(nnx.Module):
         hidden = self.touch.hidden(clip, sensor, keep_ids)
         own = sensor if decoder_sensor is None else decoder_sensor
         pixels = self._paint(self.touch.projection(hidden), restore_ids, frames, own)
-        return pixels, self.force(self.touch.projection(self.touch.post_norm(hidden[:, 0])))
+        return pixels, self.force(self.touch.embedding(hidden))
 
     def _paint(self, latent: Array, restore_ids: Array, frames: int, sensor: Array) -> Array:
         own = rows_of(self.touch.sensor_tokens[...], sensor) if hasattr(self.decoder, "sensor_projection") else None

@@ -73,7 +73,11 @@ class TouchEncoder(nnx.Module):
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Touch embedding (B, E) from the class token, of all patches or those to keep (B, K); not normalised."""
-        return self.projection(self.post_norm(self.hidden(clip, sensor, keep_ids)[:, 0]))
+        return self.embedding(self.hidden(clip, sensor, keep_ids))
+
+    def embedding(self, hidden: Array) -> Array:
+        """Touch embedding (B, E) from the class token of the last hidden states (B, 1 + S + K, D)."""
+        return self.projection(self.post_norm(hidden[:, 0]))
 
 
 class TouchDecoder(nnx.Module):

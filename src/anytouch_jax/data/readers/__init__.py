@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from anytouch_jax.config import UserError
@@ -110,6 +111,10 @@ def index(name: str, root: str | Path, out: str | Path | None = None, *, options
     if not base.is_dir():
         raise UserError(f"there is no folder {base}; ROOT is the folder that holds the dataset {name}")
     _refuse_unused(one, options)
+    if options.lists is not None:
+        options = replace(options, lists=(lists := options.lists.expanduser()))
+        if not lists.is_dir():
+            raise UserError(f"there is no folder {lists}; --lists is the folder that holds the dataset's lists")
     target = _target(base, name, out)
     notes = Notes()
     columns = one.read(base, options, notes)
@@ -163,6 +168,11 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
         raise UserError(f"{target} is the pack's own manifest; name another file with --out")
     if target.exists() and not manifests.is_manifest(target):
         raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
+    if not os.access(target.parent, os.W_OK):
+        raise UserError(
+            f"the manifest {target} cannot be written: {target.parent} is read-only; name another file with --out, in "
+            "a folder that contains the data"
+        )
     return target
 
 

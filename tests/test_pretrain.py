@@ -127,7 +127,8 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     shutil.rmtree(init)  # what goes on needs it no more, whether or not it is named
     assert train(config, tmp_path / "r", said, init=init, stop_after=2).step == 2
     assert not any("is not read" in line for line in said)
-    assert train(config, tmp_path / "r", said, init=run, stop_after=2).step == 2
+    assert train(config, tmp_path / "r", said, init=run, clip="other.bin", stop_after=2).step == 2
+    assert "was begun without --clip: other.bin is not read" in "".join(said)
     assert f"was begun from {init}: {run} is not read" in said[-1] + "".join(said)
     last = train(config, tmp_path / "r", said)
     assert (last.resumed, last.step, last.traces) == (2, 4, 1)
@@ -242,6 +243,9 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     stack = replace(other.model.touch, heads=other.model.touch.heads // 2)
     other = replace(other, model=replace(other.model, touch=stack))
     assert f"this run would use {stack.heads}: add --model.touch.heads" in refused(other, tmp_path / "b", init=run)
+    narrow = replace(stage2.model.touch, width=8)
+    other = replace(stage2, preset="small", model=replace(stage2.model, touch=narrow))
+    assert "would be of preset small: add --preset tiny" in refused(other, tmp_path / "b", init=run)
     pretrained = run_config(world, 2, towers="pretrained")
     assert "--clip" in refused(pretrained, tmp_path / "c")
     assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")

@@ -113,6 +113,9 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
         assert "not confirmed" in mistake(*words)
         for wrong, told in (
             (["--timeout", "-1"], "timeout -1.0 must be above 0"), (["--tries", "0"], "tries 0"),
+            (["--price-in", "2.5"], "--price-in and --price-out go together"),
+            (["--sheet", str(tmp_path / "s.png"), "--sheet-count", "-1"], "--sheet-count must be 1 or more"),
+            (["--sheet", str(touches)], "is a file that is read"),
             (["--limit", "0"], "limit 0 must be at least 1"), (["--out", "captions.txt"], "ends in .csv or .parquet"),
             (["--url", "http://127.0.0.1:9/\u00e9/v1"], "is not an http or https address"),
             (["--url", "https://api..example.org/v1"], "is not an http or https address"),
@@ -131,6 +134,9 @@ def test_an_estimate_needs_no_key(anytouch, mistake, touches, monkeypatch):
     assert said.status == 0 and "3 questions" in said.out and "OPENAI_API_KEY" not in said.err
     assert "is not an http or https address" in mistake(*words[:2], "--url", "example", "--estimate")
     assert "set the environment variable OPENAI_API_KEY" in mistake(*words, "--yes")
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda _: pytest.fail("asked before the key was looked for"))
+    assert "set the environment variable OPENAI_API_KEY" in mistake(*words)
 
 
 def test_failures_are_told_counted_and_the_rest_is_kept(anytouch, touches, tmp_path):

@@ -43,6 +43,14 @@ def test_no_page_is_written_over_by_another(tiny, tmp_path, capsys):
     assert (tmp_path / "speed_embed_tiny.md").read_text() == "by hand" and len(list(tmp_path.iterdir())) == 1
 
 
+def test_a_quick_run_is_not_put_in_the_place_of_a_measurement(tiny, tmp_path, capsys):
+    (tmp_path / "speed_embed_tiny.md").write_text("measured")
+    (tmp_path / "speed_embed_tiny.json").write_text('{"quick": false}')
+    assert run("embed", "--quick", "--out", tmp_path) == 1
+    assert "holds a measurement, which a quick run would replace" in capsys.readouterr().err
+    assert (tmp_path / "speed_embed_tiny.md").read_text() == "measured"
+
+
 def test_a_table_of_numbers_of_words_and_a_figure(tiny, tmp_path, capsys):
     assert run("embed", "--quick", "--out", tmp_path) == 0
     text, numbers = (tmp_path / "speed_embed_tiny.md").read_text(), numbers_of(tmp_path, "embed_tiny")

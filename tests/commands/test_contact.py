@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import pytest
 
+from anytouch_jax.data import contact
 from anytouch_jax.data import manifest as manifests
 
 
@@ -101,6 +102,12 @@ def test_marks_that_are_kept_are_told_of_and_cannot_be_moved(anytouch, mistake, 
     monkeypatch.undo()
     said = anytouch("contact", marked)
     assert said.status == 0 and "10 rows keep the label.contact that they had" in said.out
+
+
+def test_what_is_compared_with_is_looked_for_before_the_work(mistake, pressed, monkeypatch):
+    monkeypatch.setattr(contact, "contact_scores", lambda *_, **__: pytest.fail("the work was begun"))
+    assert "no column label.depth" in mistake("contact", pressed, "--check", "--reference", "label.depth")
+    assert "something that is no number" in mistake("contact", pressed, "--check", "--reference", "license")
 
 
 def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):

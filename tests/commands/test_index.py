@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -38,13 +39,16 @@ def test_without_out_it_lies_in_the_folder(anytouch, slides):
     assert len(manifests.read(slides / "ycb_slide.parquet")) == 20
 
 
-def test_mistakes_are_one_sentence(mistake, slides, tmp_path):
+def test_mistakes_are_one_sentence(mistake, slides, tmp_path, monkeypatch):
     assert "did you mean ycb_slide?" in mistake("index", "ycb-slides", slides)
     assert "there is no folder" in mistake("index", "ycb_slide", tmp_path / "nowhere")
     assert "does not use the option fold" in mistake("index", "ycb_slide", slides, "--fold", 2)
     assert "must lie in" in mistake("index", "ycb_slide", slides, "--out", tmp_path / "else" / "m.parquet")
+    assert "nowhere; --lists is the folder" in mistake("index", "objectfolder", slides, "--lists", "nowhere")
     assert "both at least 0" in mistake("index", "ycb_slide", slides, "--val", 2)
     assert "ends in .csv or .parquet" in mistake("index", "ycb_slide", slides, "--out", slides / "m.txt")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of somebody else
+    assert "is read-only; name another file with --out" in mistake("index", "ycb_slide", slides)
 
 
 def test_what_is_left_out_is_counted_with_its_first_file(anytouch, slides):

@@ -34,6 +34,7 @@ def test_a_run_pours(anytouch, tiny_run, tmp_path):
         (["--run", "x", "--record", "y"], "--run does nothing with --record, which only writes demonstrations"),
         (["--record", "y", "--trials", "3", "--stills"], "--trials, --stills do nothing with --record"),
         (["--run", "x", "--recordings", "y", "--demos", "9"], "--demos does nothing with --recordings"),
+        (["--record", "y", "--demos", "1"], "--demos 1 is too few to record"),
         (["--run", "x", "--size", "56"], "--size does nothing without --record"),
     ],
 )
@@ -46,6 +47,14 @@ def test_what_was_recorded_is_not_mixed_with_new_pictures(anytouch, tmp_path):
     (tmp_path / "manifest.parquet").write_bytes(b"of an earlier recording")
     said = anytouch("pour", "--record", tmp_path, "--demos", 2)
     assert said.status == 1 and "is there already" in said.err and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_policy_of_other_settings_is_not_written_over(anytouch, tiny_run, tmp_path):
+    kept = '{"run": "%s", "target": 60.0, "demonstrations": 2, "seed": 0, "stills": false, "fine_tuned": %s}'
+    (tmp_path / "pour.json").write_text(kept % (tiny_run, "true"))
+    said = anytouch("pour", "--run", tiny_run, "--demos", 2, "--out", tmp_path)
+    assert said.status == 1 and "holds a policy of other settings (fine_tuned, markers)" in said.err
+    assert "choose another folder with --out" in said.err and len(list(tmp_path.iterdir())) == 1
 
 
 def test_without_a_run_one_is_asked_for(anytouch):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from touch_world import make_touches
+
+from anytouch_jax.evaluate import probe_command
 
 BATTERY = "nothing without --tasks or --benchmark"
 LABEL = "nothing beside --tasks or --benchmark"
@@ -41,6 +44,26 @@ BENCHMARK = "nothing beside --benchmark, which has the authors' settings"
 )
 def test_what_would_do_nothing_is_refused(mistake, words, told):
     assert told in mistake("probe", "--data", "nowhere.csv", *words)
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory):
+    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 4, "val": 4, "test": 4}, each=1)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--label", "object"], "no class of test is in train: whole ones are held out there"),
+        (["--label", "force"], "a measured quantity and no class"),
+        (["--label", "split"], "the label has one class only"),
+        (["--tasks", "material", "--order", "shuffled"], "--order does nothing for stills, which these tasks are of"),
+    ],
+)
+def test_a_label_that_cannot_be_probed_is_told_before_the_work(anytouch, touches, monkeypatch, words, told):
+    monkeypatch.setattr(probe_command, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
+    said = anytouch("probe", "--data", touches, *words)
+    assert said.status == 1 and told in said.err.splitlines()[-1] and "Traceback" not in said.err
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 from touch_world import make_touches
 
 from anytouch_jax.cli import main
+from anytouch_jax.evaluate import features
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,8 @@ def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
         (["--seeds", "2"], "--seeds does nothing without --by-chance"),
     ],
 )
-def test_a_mistake_is_one_sentence(touches, capsys, words, sentence):
+def test_a_mistake_is_one_sentence(touches, capsys, monkeypatch, words, sentence):
+    monkeypatch.setattr(features, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
     assert main(["retrieve", "--data", str(touches), *words]) == 1
     said = capsys.readouterr().err.strip()
     assert said.startswith("anytouch retrieve: ") and sentence in said and said.count("\n") == 0

@@ -10,6 +10,7 @@ import pytest
 from gel_pictures import press
 
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data import verify
 
 
 def edit(path, **columns):
@@ -96,11 +97,12 @@ def test_several_manifests_are_looked_at_together(anytouch, distinct, tmp_path):
     assert said.status == 1 and "leak_file" in said.out  # the same pictures in train and test
 
 
-def test_mistakes_are_one_sentence(mistake, distinct, tmp_path):
+def test_mistakes_are_one_sentence(mistake, distinct, tmp_path, monkeypatch):
     assert "--repair OUT" in mistake("verify", distinct, "--swap", "mine")
     assert "no dataset 'x' to swap" in mistake("verify", distinct, "--swap", "x", "--repair", tmp_path / "o.csv")
     assert "is the manifest that was read" in mistake("verify", distinct, "--repair", distinct)
     assert "is not inside" in mistake("verify", distinct, "--repair", tmp_path / "below" / "o.csv")
     edit(distinct, license=[None] * 10)
+    monkeypatch.setattr(verify, "verify", lambda *_, **__: pytest.fail("the work was begun"))
     assert "no row may certainly be used" in mistake("verify", distinct, "--commercial-only", tmp_path / "c.csv")
     assert not (tmp_path / "c.csv").exists()

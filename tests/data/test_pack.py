@@ -273,6 +273,7 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
     with pytest.raises(PackError, match=words) as error:
         pack(loose, tmp_path / "out")
     assert "\n" not in str(error.value)
+    assert not list((tmp_path / "out").rglob("*.parquet")) or harm in ("empty", "folder")  # told before the packing
     assert not list((tmp_path / "out").rglob("*.part")) and not list((tmp_path / "out").rglob(".*"))
 
 

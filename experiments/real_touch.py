@@ -58,6 +58,7 @@ params, text, about = checkpoint.load_params(STAGE1)
 config: Config = from_json(text)
 lines: list[str] = []
 record: dict[str, Any] = {"data": manifest.content_hash, "config": json.loads(text)}
+record["config"]["data"]["manifests"] = [file.name for file in manifest.files]  # the hash says which rows
 
 
 def write(line: str = "") -> None:
@@ -225,10 +226,11 @@ record["slip"] = json.loads(results.to_json(slips))
 # Stage 1 paints hidden patches with little more than half of the error of the plain guess. It predicts the next frame
 # far worse than a copy of the last one: the copy has all pixels, the encoder a quarter of them, and neighbouring
 # frames hardly differ. The object probe cannot tell the encoders apart: the test split has 14 recordings, every paired
-# interval contains zero, and even the encoder that was trained with labels does no better on them than an untrained
-# one. Set-up (dots, tint) and object are partly confounded in the pack, and raw pixels see it. Slip with objects
-# left out stays within its interval of the commonest flag for every feature. So the pack trains and exercises both
-# stages; it is too small to rank encoders.
+# interval of two encoders contains zero, and even the encoder that was trained with labels (it tells three in four of
+# its own frames) does no better on them than an untrained one. Set-up (dots, tint) and object are partly confounded in
+# the pack, and raw pixels in colour see it: they are ahead of every encoder. Slip with objects left out stays within
+# its interval of the commonest flag for every feature. So the pack trains and exercises both stages; it is too small
+# to rank encoders.
 
 # %%
 head = (

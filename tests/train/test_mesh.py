@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,6 +137,13 @@ def test_the_compilation_cache_has_a_default_place(tmp_path, monkeypatch):
         assert enable_compilation_cache() == tmp_path / "cache" / "anytouch_jax"
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "anytouch_jax")
         (tmp_path / "file").write_text("")
+        kept, old, other = (tmp_path / "cache" / "anytouch_jax" / name for name in ("a-cache", "b-cache", "notes"))
+        for file in (kept, old, other):
+            file.write_bytes(b"a program")
+        for file in (old, other):
+            os.utime(file, (0, 0))
+        enable_compilation_cache()
+        assert kept.exists() and other.exists() and not old.exists()
         assert enable_compilation_cache(tmp_path / "file" / "below") is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)

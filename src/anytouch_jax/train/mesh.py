@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from anytouch_jax.train.pack import SMALL
 
 Tree = Any
 BATCH_AXES = ("data", "fsdp")
+CACHE_DAYS = 60  # a compiled program is kept
 
 
 def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:
@@ -116,13 +118,17 @@ def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
 def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
     """Keep compiled programs on disk, so that the next start of the same run need not compile again.
 
-    The default folder is anytouch_jax under $XDG_CACHE_HOME or ~/.cache. Returns it, or None where it cannot be made.
+    The default folder is anytouch_jax under $XDG_CACHE_HOME or ~/.cache; programs of more than CACHE_DAYS ago are
+    removed from it. Returns it, or None where it cannot be made.
     """
     if folder is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "anytouch_jax"
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        old = time.time() - CACHE_DAYS * 86400
+        for file in (one for one in folder.glob("*-cache") if one.stat().st_mtime < old):
+            file.unlink(missing_ok=True)
     except OSError:
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))

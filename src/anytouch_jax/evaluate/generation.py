@@ -8,7 +8,7 @@ each of their six channels in deviations over the training fields.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -86,6 +86,31 @@ def fit(
     back the generator and its losses at these steps. Raises UserError when the error stops being finite.
     """
     options = options or Fit()
+    design = _design(encoder, images, targets, source, target, options, shape)
+    params = start(design, encoder, images, targets)
+    pairs = _pairs(design, params, images, targets, val if val is not None and len(val[0]) else None)
+    program = _step(nameless(design))
+    state, still = begin(design, params)
+    losses: list[dict[str, float]] = []
+    best, made = np.inf, state.made
+    every = max(1, options.steps // 20)
+    for step in range(options.steps):
+        state, metrics = program(state, still, pairs.batch(options, step), rates(design, params["fixed"], step))
+        if step % every == every - 1 or step == options.steps - 1:
+            error = pairs.val_error(Generator(design, state.made | still))
+            losses.append(_finite(step, metrics, error))
+            if error is None or error < best:
+                best, made = error or 0.0, state.made
+            if say is not None:
+                say(", ".join(f"{name} {value:.4g}" for name, value in losses[-1].items()))
+    return Generator(design, jax.tree.map(np.asarray, made | still)), losses
+
+
+def _design(
+    encoder: Encoder | None, images: np.ndarray, targets: np.ndarray, source: str, target: str, options: Fit,
+    shape: Translation | None,
+) -> Design:  # fmt: skip
+    """What is trained. Raises UserError for a reference without a shape, and pictures of another size."""
     if shape is None:
         if encoder is None:
             raise UserError("a reference without an encoder needs its shape")
@@ -94,39 +119,53 @@ def fit(
     if images.shape[1:] != (side, side, 3) or (targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]):
         raise UserError(f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}")
     whence, less = (None, False) if encoder is None else (encoder.source, encoder.subtracts)
-    design = Design(source, target, shape, whence, options, len(images), less)
-    params = start(design, encoder, images, targets)
-    frozen = encoder is not None and options.tune == "frozen"
-    known = in_batches(_features(nameless(design)), params["encoder"], images) if frozen else None
-    real = in_batches(_judged(nameless(design)), params["encoder"], targets) if frozen and design.has_critic else None
-    program = _step(nameless(design))
-    val = None if val is None or not len(val[0]) else val
-    seen = in_batches(_features(nameless(design)), params["encoder"], val[0]) if frozen and val is not None else None
-    state, still = begin(design, params)
+    return Design(source, target, shape, whence, options, len(images), less)
+
+
+class _Pairs(NamedTuple):
+    """What a fit reads: of every pair the source's features (else its image), the target, and the critic's features of
+    it; `mean`, `scale` of the targets. `val`: source, target of other objects, and the source's features."""
+
+    x: np.ndarray
+    y: np.ndarray
+    real: np.ndarray | None
+    mean: np.ndarray
+    scale: np.ndarray
+    val: tuple[np.ndarray, np.ndarray, np.ndarray | None] | None
+
+    def batch(self, options: Fit, step: int) -> Batch:
+        """The pairs of a step: a function of the seed and the step alone."""
+        rows = np.random.default_rng([options.seed % 2**63, step]).integers(len(self.x), size=options.batch)
+        y = (self.y[rows].astype(np.float32) - self.mean) / self.scale
+        return Batch(self.x[rows], y, None if self.real is None else self.real[rows])
+
+    def val_error(self, now: Generator) -> float | None:
+        """The mean error on val; None without it."""
+        if self.val is None:
+            return None
+        source, target, seen = self.val
+        guess = now.normalised(source) if seen is None else now.from_features(seen)
+        return float(_errors(now, guess, target).mean())
+
+
+def _pairs(design: Design, params: Params, images: np.ndarray, targets: np.ndarray, val: Any) -> _Pairs:
+    """The pairs; those of a frozen encoder are seen by it once, before the first step."""
     mean, scale = units(design, params["fixed"])
-    losses: list[dict[str, float]] = []
-    best, made = np.inf, state.made
-    every = max(1, options.steps // 20)
-    for step in range(options.steps):
-        rows = np.random.default_rng([options.seed % 2**63, step]).integers(len(images), size=options.batch)
-        y = (targets[rows].astype(np.float32) - mean) / scale
-        batch = Batch(images[rows] if known is None else known[rows], y, None if real is None else real[rows])
-        state, metrics = program(state, still, batch, rates(design, params["fixed"], step))
-        if step % every == every - 1 or step == options.steps - 1:
-            losses.append({"step": step + 1} | {name: float(value) for name, value in metrics.items()})
-            if not np.isfinite(losses[-1]["error"]):
-                raise UserError(f"the error is not finite at step {step + 1}; lower the learning rate")
-            now = Generator(design, state.made | still)
-            if val is not None:
-                guess = now.normalised(val[0]) if seen is None else now.from_features(seen)
-                losses[-1]["val"] = float(_errors(now, guess, val[1]).mean())
-                if not np.isfinite(losses[-1]["val"]):
-                    raise UserError(f"the error on val is not finite at step {step + 1}; lower the learning rate")
-            if val is None or losses[-1]["val"] < best:
-                best, made = losses[-1].get("val", np.inf), state.made
-            if say is not None:
-                say(", ".join(f"{name} {value:.4g}" for name, value in losses[-1].items()))
-    return Generator(design, jax.tree.map(np.asarray, made | still)), losses
+    if design.encoder is None or design.fit.tune != "frozen":
+        return _Pairs(images, targets, None, mean, scale, None if val is None else (*val, None))
+    sees, judges = (partial(in_batches, one(nameless(design)), params["encoder"]) for one in (_features, _judged))
+    real = judges(targets) if design.has_critic else None
+    return _Pairs(sees(images), targets, real, mean, scale, None if val is None else (*val, sees(val[0])))
+
+
+def _finite(step: int, metrics: dict[str, Any], error: float | None) -> dict[str, float]:
+    """The losses of a step as they are told. Raises UserError for an error that is not finite."""
+    told = {"step": step + 1} | {name: float(value) for name, value in metrics.items()}
+    told |= {} if error is None else {"val": error}
+    for name, where in (("error", ""), ("val", " on val")):
+        if not np.isfinite(told.get(name, 0.0)):
+            raise UserError(f"the error{where} is not finite at step {step + 1}; lower the learning rate")
+    return told
 
 
 def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: np.ndarray) -> Params:

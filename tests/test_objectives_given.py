@@ -1,0 +1,156 @@
+"""What the sums are given and what they give at the edges: pixels, groups, verdicts, keep ratios, accumulation."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from tiny_models import tiny_config
+
+from anytouch_jax import objectives
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
+from anytouch_jax.nn.functional import build
+from anytouch_jax.train.step import init_state, make_step
+
+RNG = np.random.default_rng(0)
+SENSOR = np.asarray([0, 3, 1, 9, 2, 0, 4, 9], np.int32)
+CLIP = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+def pixels(*shape):
+    return RNG.integers(0, 256, (*shape, 28, 28, 3), np.uint8)
+
+
+def floats(*shape):
+    return jnp.asarray(RNG.standard_normal((*shape, 28, 28, 3)), jnp.float32)
+
+
+def changed(config, model=None, **objective):
+    return replace(
+        config, model=replace(config.model, **(model or {})), objective=replace(config.objective, **objective)
+    )
+
+
+# Pixels -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("head", ["mlp", "cosine"])
+def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeypatch, head):
+    seen = []
+
+    def spy(params, batch, noise, **options):
+        seen.append(batch)
+        return jnp.zeros(()), {}
+
+    monkeypatch.setattr(objectives, "stage2_terms", spy)
+    config = changed(tiny_config(2), {"match_head": head})
+    text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), np.zeros(0, np.int32)
+    align = AlignBatch(pixels(4, 3), SENSOR[:4], pixels(2), np.asarray([0, 2], np.int32), *text)
+    match = MatchBatch(pixels(4, 1), SENSOR[:4], pixels(4, 1), SENSOR[:4])
+    if head == "mlp":
+        match = match._replace(negative=pixels(4, 1), negative_sensor=SENSOR[:4])
+    args = {}, Stage2Batch(align, match), jax.random.key(0), jnp.float32(0.5)
+    objectives.stage2_loss(*args, net=build(config.model), config=config)
+    ((shown, told),) = seen
+    pairs = [(shown.image, align.image, CLIP), (shown.clip, align.clip, IMAGENET)]
+    pairs += [(told[i], match[i], IMAGENET) for i in ((0, 2, 4) if head == "mlp" else (0, 2))]
+    for found, given, (mean, std) in pairs:
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
+
+
+# Stage 2 ------------------------------------------------------------------------------------------------------------
+
+
+def half(batch, i):
+    """Half 0 or 1 of eight rows, and of the six slots of each kind."""
+    rows, slots = slice(4 * i, 4 * i + 4), slice(3 * i, 3 * i + 3)
+    if isinstance(batch, MatchBatch):
+        return MatchBatch(*(None if part is None else part[rows] for part in batch))
+    touch = batch.clip[rows], batch.sensor[rows]
+    image = batch.image[slots], batch.image_row[slots] - 4 * i
+    return AlignBatch(*touch, *image, batch.text[slots], batch.text_mask[slots], batch.text_row[slots] - 4 * i)
+
+
+@pytest.mark.parametrize("what", ["align", "match"])
+def test_groups_are_halves_that_do_not_know_of_each_other(what):
+    config = changed(tiny_config(2), {"match_head": "cosine"}, centre=False)
+    net = build(config.model)
+    params = net.init(jax.random.key(1))
+    if what == "align":
+        text = jnp.asarray(RNG.integers(1, 40, (6, 8)), jnp.int32)
+        rows = np.asarray([1, 0, 2, 7, 4, 6]), np.asarray([3, 1, 2, 4, 7, 6])
+        batch = AlignBatch(floats(8, 1), SENSOR, floats(6), rows[0], text, text > 0, rows[1])
+    else:
+        place = np.asarray([5, 2, 5, 1, 2, 3, 3, 5])  # some twice in a half, some in both
+        batch = MatchBatch(floats(8, 1), SENSOR, floats(8, 1), SENSOR, place=place)
+
+    @partial(jax.jit, static_argnums=1)
+    def terms(batch, groups):
+        batch = Stage2Batch(batch, None) if what == "align" else Stage2Batch(None, batch)
+        return objectives.stage2_terms(params, batch, None, net=net, config=changed(config, groups=groups))
+
+    total, found = terms(batch, 2)
+    halves = [terms(half(batch, i), 1) for i in (0, 1)]
+    names = ["align", "touch_to_vision", "text_to_touch", "vision_to_text"] if what == "align" else ["match"]
+    for name in names:
+        np.testing.assert_allclose(found[name], np.mean([half[name] for _, half in halves]), rtol=1e-5)
+    np.testing.assert_allclose(total, np.mean([value for value, _ in halves]), rtol=1e-5)
+    assert abs(float(terms(batch, 1)[1][what]) / float(found[what]) - 1) > 0.05
+
+
+@pytest.mark.parametrize("head", ["mlp", "linear"])
+def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
+    config = changed(tiny_config(2), {"match_head": head})
+    net = build(config.model)
+    params = net.init(jax.random.key(1))
+    touches = [(floats(5, 1), SENSOR[:5]) for _ in range(3)]  # an odd number: never half of them right
+    z = [np.asarray(net.apply(params, "encode", *touch)) for touch in touches]
+    z = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in z]
+    same, other = (np.asarray(net.apply(params, "match", z[0], x)) for x in z[1:])
+    match = MatchBatch(*(array for touch in touches for array in touch))
+    _, metrics = objectives.stage2_terms(params, Stage2Batch(None, match), None, net=net, config=config)
+    right = np.count_nonzero(same > 0) + np.count_nonzero(other < 0)
+    np.testing.assert_allclose(metrics["match_accuracy"], right / 10, rtol=1e-6)
+
+
+# Stage 1 ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frames", [1, 4], ids=["still", "clip"])
+@pytest.mark.parametrize("ratio", [0.0, 1.0])
+def test_all_shown_or_all_hidden_is_finite_even_of_one_row(ratio, frames):
+    config = changed(tiny_config(1), mask_ratio=ratio)
+    net = build(config.model)
+    terms = jax.jit(jax.value_and_grad(partial(objectives.stage1_terms, net=net, config=config), has_aux=True))
+    noise = jnp.asarray(RNG.random((1, 16)), jnp.float32)
+    (loss, metrics), grads = terms(net.init(jax.random.key(0)), floats(1, frames), SENSOR[:1], noise)
+    assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
+    assert (float(metrics["reconstruction"]) == 0) == (ratio == 0)
+    assert (float(loss) > 0) == (ratio == 1 or frames == 4)
+
+
+@pytest.mark.parametrize("frames", [1, 4], ids=["still", "clip"])
+def test_accumulation_of_the_real_loss_equals_the_large_batch(frames):
+    """The noise is a part of the batch here, so that a row has one mask however the batch is cut."""
+    config = tiny_config(1)
+    net = build(config.model)
+
+    def loss(params, batch, key, progress):
+        return objectives.stage1_terms(params, *batch, net=net, config=config)
+
+    batch = floats(4, frames), jnp.asarray(SENSOR[:4]), jnp.asarray(RNG.random((4, 16)), jnp.float32)
+    tx = optax.sgd(0.1)  # Adam makes a whole step of the sign of a gradient that is only noise
+    state = init_state(net.init(jax.random.key(0)), config)._replace(opt_state=tx.init(None))
+    (whole, found), (parts, others) = (
+        jax.jit(make_step(loss, tx, total_steps=8, accumulate=count))(state, batch, jax.random.key(0))
+        for count in (1, 2)
+    )
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), parts.trainable, whole.trainable)
+    for name in ("loss", "grad_norm", "update_norm"):
+        assert float(others[name]) == pytest.approx(float(found[name]), rel=1e-5)
+    assert float(found["update_norm"]) > 1e-3

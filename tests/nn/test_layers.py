@@ -1,9 +1,12 @@
 """Layers against plain formulas, and the scanned stack against the loop."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tiny_models import STACK, touch_model
+import pytest
+from tiny_models import STACK, full_model, touch_model
 
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.layers import gelu, quick_gelu
@@ -68,3 +71,24 @@ def test_rematerialisation_and_bfloat16_change_cost_not_meaning():
     assert half.dtype == stored("bfloat16")
     error = np.abs(np.asarray(half, np.float32) - np.asarray(plain)).max() / np.abs(np.asarray(plain)).max()
     assert 1e-5 < error < 0.05
+
+
+@pytest.mark.parametrize("method", ["encode", "reconstruct", "embed_image", "embed_text"])
+def test_rematerialised_stacks_give_the_same_gradient_from_work_done_again(method):
+    clip, sensor, ids = jax.random.normal(jax.random.key(2), (2, 1, 28, 28, 3)), jnp.asarray([0, 1]), jnp.arange(16)
+    args = {
+        "encode": (clip, sensor),
+        "reconstruct": (clip, sensor, ids[None, :4].repeat(2, 0), ids[None].repeat(2, 0), 1),
+        "embed_image": (clip[:, 0],),
+        "embed_text": (ids.reshape(2, 8), jnp.ones((2, 8), bool)),
+    }[method]
+    params, found = build(full_model()).init(jax.random.key(1)), []
+    for remat in (False, True):
+        net = build(full_model(remat=remat))
+        slope = jax.grad(lambda params, net=net: jnp.mean(net.apply(params, method, *args) ** 2))
+        again = re.findall(r"\b(?:remat2?|checkpoint)\[", str(jax.make_jaxpr(slope)(params)))
+        found.append((jax.jit(slope)(params), len(again)))
+    (plain, few), (remat, many) = found
+    assert many - few >= 2 * (2 if method == "reconstruct" else 1)  # of each stack, of encoder and decoder
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), remat, plain)
+    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(plain)) > 0.01

@@ -47,6 +47,17 @@ def assert_same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
+@pytest.fixture(params=[False, True], ids=["kept", "donated"])
+def donates(request, monkeypatch):
+    """Whether a step may overwrite its state, as on an accelerator; on a CPU it can, but is not allowed to."""
+    if request.param:
+        with monkeypatch.context() as patch:
+            patch.setattr(jax, "default_backend", lambda: "gpu")
+            allowed = loop.donated()
+        monkeypatch.setattr(loop, "donated", lambda: allowed)
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     """Eight steps in one go: (folder, result)."""
@@ -75,10 +86,32 @@ def test_each_kind_of_batch_is_traced_once(undisturbed):
 
 
 @pytest.mark.parametrize("devices", [1, 4])
-def test_the_callers_parameters_survive(tmp_path, devices):
+def test_the_callers_parameters_survive(tmp_path, devices, donates):
     params = jax.tree.map(jnp.asarray, toy_params())
     run(tmp_path, params=params, stop_after=1, mesh=make_mesh(devices))
     assert_same(params, toy_params())
+
+
+@pytest.mark.parametrize("ema", [None, 0.5], ids=["latest", "averaged"])
+def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monkeypatch, donates, ema):
+    states, seen, compiled = [], [], loop._Loop.compile
+
+    def watched(self, state, loss_fn):
+        step = compiled(self, state, loss_fn)
+        return lambda state, *rest: states.append(state) or step(state, *rest)
+
+    def report(step, params, batch):
+        host = jax.tree.map(np.array, (params, batch))
+        assert_same(host[1], toy_batch(step - 1))
+        seen.append(host[0])
+
+    monkeypatch.setattr(loop._Loop, "compile", watched)
+    said = []
+    result = run(tmp_path, toy_config(figure_every=1, optim={"ema": ema}), on_report=report, said=said, stop_after=3)
+    assert not any("no figures" in line for line in said), said
+    assert_same(seen[-1], result.params)
+    assert not np.array_equal(seen[0]["trunk"]["kernel"], seen[-1]["trunk"]["kernel"])
+    assert [state.trainable["trunk"]["kernel"].is_deleted() for state in states] == [donates] * 3
 
 
 @pytest.mark.parametrize("stops", [(2, 4), (3,), (1, 2, 3, 7)])

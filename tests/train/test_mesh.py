@@ -131,6 +131,18 @@ def test_a_hosts_tree_is_copied_to_its_places():
     np.testing.assert_array_equal(placed["kernel"], np.arange(64).reshape(8, 8))
 
 
+@pytest.mark.parametrize("devices", [1, 4])
+@pytest.mark.parametrize("kind", [np.array, jnp.array], ids=["host", "device"])
+def test_a_step_that_overwrites_its_state_leaves_the_callers_arrays(kind, devices):
+    tree = {"kernel": kind(np.ones((256, 256), np.float32))}
+    placed = put_state(tree, state_sharding(tree, make_mesh(devices)))
+    for _ in range(2):
+        placed, before = jax.jit(lambda tree: jax.tree.map(lambda x: x - 3, tree), donate_argnums=0)(placed), placed
+    assert before["kernel"].is_deleted()
+    np.testing.assert_array_equal(placed["kernel"], -5)
+    np.testing.assert_array_equal(tree["kernel"], 1)
+
+
 def test_the_compilation_cache_has_a_default_place(tmp_path, monkeypatch):
     before = jax.config.jax_compilation_cache_dir
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -70,9 +70,10 @@ def put_state(tree: Tree, places: Tree) -> Tree:
 
     A copy also where it could be shared: the step donates its state, and must not delete the caller's own arrays.
     """
+    host = jax.tree.map(np.asarray, tree)  # an array that lies on one of several devices would be shared all the same
     if jax.process_count() == 1:
-        return jax.device_put(tree, places, may_alias=False)
-    host = jax.tree.map(np.asarray, tree)  # not device_put: it would compare every array among all processes
+        return jax.device_put(host, places, may_alias=False)
+    # Not device_put: it would compare every array among all processes.
     return jax.tree.map(lambda x, place: jax.make_array_from_callback(x.shape, place, x.__getitem__), host, places)
 
 

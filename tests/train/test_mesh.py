@@ -132,9 +132,10 @@ def test_a_hosts_tree_is_copied_to_its_places():
 
 
 @pytest.mark.parametrize("devices", [1, 4])
-@pytest.mark.parametrize("kind", [np.array, jnp.array], ids=["host", "device"])
+@pytest.mark.parametrize("kind", ["host", "device"])
 def test_a_step_that_overwrites_its_state_leaves_the_callers_arrays(kind, devices):
-    tree = {"kernel": kind(np.ones((256, 256), np.float32))}
+    array = jnp.array(np.ones((256, 256), np.float32))
+    tree = {"kernel": array if kind == "device" else np.asarray(array)}  # aligned, so that a CPU may share it
     placed = put_state(tree, state_sharding(tree, make_mesh(devices)))
     for _ in range(2):
         placed, before = jax.jit(lambda tree: jax.tree.map(lambda x: x - 3, tree), donate_argnums=0)(placed), placed

@@ -17,6 +17,8 @@ from anytouch_jax.evaluate.golden import GRADIENT, OUTPUT, Case, Row, read_cases
 
 HERE = Path(__file__).parent / "golden"
 ALL = Path(__file__).resolve().parents[3] / "shared" / "golden"  # the whole set, where it lies beside the checkout
+WHOLE = [case.name for case in read_cases(ALL)] if ALL.is_dir() else []
+SAVED = sorted(ALL.glob("*.pth"))
 CASES = {case.name: case for case in read_cases(HERE)}
 COMPARISONS = {  # at least so many: a case that compares nothing would be within tolerance too
     "A_stage1_image": 70,
@@ -66,15 +68,21 @@ def test_every_case_of_the_folder_is_run():
     assert set(CASES) == set(COMPARISONS)
 
 
+def test_where_all_cases_lie_the_list_of_them_is_not_empty():
+    if ALL.is_dir():
+        assert set(WHOLE) > set(COMPARISONS)
+        assert {path.name.split("_")[0] for path in SAVED} == {"stage1", "stage2"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [case.name for case in read_cases(ALL)] if ALL.is_dir() else [])
+@pytest.mark.parametrize("name", WHOLE)
 def test_a_case_of_the_whole_set_is_within_tolerance(name):
     (case,) = [case for case in read_cases(ALL) if case.name == name]
     assert {r.array: (r.error, r.tolerance, r.note) for r in parity.run_case(case) if not r.good} == {}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted(ALL.glob("*.pth")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", SAVED, ids=lambda path: path.name)
 def test_the_authors_checkpoints_give_the_parameters_beside_them(path, tmp_path):
     stage = path.name.split("_")[0]
     for file in (path, ALL / f"{stage}_params.npz", ALL / f"{stage}_params.json"):

@@ -149,8 +149,8 @@ def alone(run_dir, mesh=None, **more):
     )
 
 
-def losses(run_dir):
-    return [json.loads(line)["loss"] for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+def column(run_dir, name="loss"):
+    return [json.loads(line)[name] for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def same(result, run_dir, undisturbed):
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), result.params, undisturbed[1].params
     )
-    np.testing.assert_allclose(losses(run_dir), losses(undisturbed[0]), rtol=1e-5)
+    np.testing.assert_allclose(column(run_dir), column(undisturbed[0]), rtol=1e-5)
 
 
 def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, undisturbed):
@@ -175,7 +175,7 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
     assert first.count("stopped by SIGTERM after step 6; saved") == 1 and "step 1/12" in first
     assert second == ""  # one of them speaks
     assert sorted(entry.name for entry in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000006"]
-    assert len(losses(tmp_path)) == 6
+    assert column(tmp_path, "skipped_samples") == [1 + 2] * 6  # by both
     result = alone(tmp_path, mesh=make_mesh(fsdp=4), run={"fsdp": 4})
     assert result.resumed == 6
     kernel = result.state.trainable["trunk"]["kernel"]
@@ -206,4 +206,5 @@ def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(tmp_path, undi
 def test_two_processes_of_two_devices_each(tmp_path, undisturbed):
     ended = finish(start(tmp_path, devices=2, steps=12, fsdp=4))
     assert [status for status, _ in ended] == [0, 0], ended
+    assert column(tmp_path, "skipped_samples") == [1 + 2] * 12
     same(alone(tmp_path, run={"fsdp": 2}), tmp_path, undisturbed)

@@ -24,7 +24,10 @@ def config_of(**run):
 
 
 def batches_of(index: int, count: int, *, at: int = -1, number: int = 0):
-    """The rows of process `index` of every batch; before step `at` it gets the signal `number`, or fails (-1)."""
+    """The rows of process `index` of every batch, for which it skips `index` + 1 samples.
+
+    Before step `at` it gets the signal `number`, or fails (-1).
+    """
     mine = slice(index * ROWS // count, (index + 1) * ROWS // count)
 
     def batches(start: int, stop: int):
@@ -34,7 +37,7 @@ def batches_of(index: int, count: int, *, at: int = -1, number: int = 0):
             if step == at:
                 os.kill(os.getpid(), number)
             batch = toy_batch(2 * step + 1)  # clips: one program
-            yield step, jax.tree.map(lambda part: part[mine], batch), {}
+            yield step, jax.tree.map(lambda part: part[mine], batch), {"skipped_samples": index + 1}
 
     return batches
 

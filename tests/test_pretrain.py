@@ -2,8 +2,12 @@
 
 import fcntl
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -20,6 +24,19 @@ from anytouch_jax.io import checkpoint, release
 from anytouch_jax.io.resize import resize_position
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import build
+
+TESTS = Path(__file__).parent
+ALONE = """
+import sys
+from pathlib import Path
+import numpy as np
+from runs import arrays_of, train
+from test_pretrain import clips_only, run_config
+world, stage, run, stop = sys.argv[1:]
+result = train(clips_only(run_config(Path(world), int(stage))), Path(run), stop_after=int(stop))
+np.savez(f"{run}.npz", **arrays_of(result))
+print(result.resumed, result.step)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -74,6 +91,27 @@ def test_stopping_and_going_on_is_bit_for_bit_one_run(straight, world, tmp_path)
     assert [figure.name for figure in figures] == ["reconstruction_000002.png", "reconstruction_000004.png"]
     assert all(figure.stat().st_size > 1000 for figure in figures)
     assert train(config, tmp_path / "r", said).step == 4 and "nothing to do" in said[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", [1, 2])
+def test_two_steps_and_two_more_are_bit_for_bit_four_as_users_run_them(world, tmp_path, stage):
+    """On one device and with all of XLA's optimisations, unlike this process; each part is a process of its own."""
+    settings = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
+    settings["PYTHONPATH"] = os.pathsep.join([str(TESTS.parent / "src"), str(TESTS), settings.get("PYTHONPATH", "")])
+
+    def part(name, stop):
+        command = [sys.executable, "-c", ALONE, str(world), str(stage), str(tmp_path / name), str(stop)]
+        done = subprocess.run(command, capture_output=True, text=True, env=settings, timeout=900)
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout.split()
+
+    assert [part("whole", 4), part("parts", 2), part("parts", 4)] == [["0", "4"], ["0", "2"], ["2", "4"]]
+    wanted, found = (dict(np.load(tmp_path / f"{name}.npz")) for name in ("whole", "parts"))
+    assert found.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in found)
+    for name, array in wanted.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
 
 
 def refused(config, run, **options):

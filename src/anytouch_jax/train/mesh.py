@@ -68,12 +68,12 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
 def put_state(tree: Tree, places: Tree) -> Tree:
     """Copy a host's tree to the devices, each array to its place; every process has the same tree and gives its part.
 
-    By way of the host: the step donates its state, and must not delete the caller's own arrays. `device_put` shares
-    an array that lies on one of several devices whatever `may_alias` says; memory of the host is never overwritten.
+    A copy also where it could be shared, and by way of the host: the step donates its state, and must not delete the
+    caller's own arrays, but `device_put` shares one that lies on one of several devices whatever `may_alias` says.
     """
     host = jax.tree.map(np.asarray, tree)
     if jax.process_count() == 1:
-        return jax.device_put(host, places)
+        return jax.device_put(host, places, may_alias=False)
     # Not device_put: it would compare every array among all processes.
     return jax.tree.map(lambda x, place: jax.make_array_from_callback(x.shape, place, x.__getitem__), host, places)
 

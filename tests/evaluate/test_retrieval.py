@@ -14,7 +14,8 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
 from anytouch_jax.evaluate.galleries import draw_galleries, score
-from anytouch_jax.evaluate.retrieval import averaged, cross_sensor_retrieval, difference, retrieve
+from anytouch_jax.evaluate.results import mean_interval
+from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval, difference
 
 Array = np.ndarray[Any, Any]
 COUNT, OBJECTS = 240, 24
@@ -26,8 +27,23 @@ def noise(count: int = COUNT, width: int = 16, seed: int = 0) -> Array:
     return np.random.default_rng(seed).normal(size=(count, width))
 
 
-def ask(query: Array, gallery: Array, **options: Any) -> retrieval.Retrieval:
-    return retrieve(query, gallery, NAMES, NAMES, groups=THINGS, **options)
+def ask(
+    query: Array, gallery: Array, *, match: Array | None = None, names: Any = NAMES, others: Any = NAMES,
+    things: Any = THINGS, name: str = "features", metric: Any = "cosine", centre: bool = False, seeds: int = 5,
+) -> retrieval.Retrieval:  # fmt: skip
+    """Touches of `names` by digit looked for among those of `others` by gelsight; `match` has a row for each other."""
+    near = {} if match is None else {f"label.{i}": [*np.zeros(len(names)), *match[:, i]] for i in range(match.shape[1])}
+    count = len(names) + len(others)
+    columns = {
+        "path": [f"{i}.png" for i in range(count)], "sequence": [str(i) for i in range(count)],
+        "sensor": ["digit"] * len(names) + ["gelsight"] * len(others), "frame_index": [0] * count,
+        "split": ["test"] * count, "touch": [*names, *others], "object": [*things, *[""] * len(others)],
+    }  # fmt: skip
+    return cross_sensor_retrieval(
+        manifests.from_columns(columns | near, "touches.parquet"), {name: np.concatenate([query, gallery])},
+        np.arange(count), pairs=[("digit", "gelsight")], match=tuple(near) or None, centre=(centre,),
+        metrics={name: metric}, seeds=seeds,
+    )[0]  # fmt: skip
 
 
 @pytest.mark.parametrize("options", [{}, {"match": noise(width=3, seed=5)}, {"centre": True}, {"metric": "euclidean"}])
@@ -88,14 +104,14 @@ def test_matching_takes_away_what_place_and_force_tell() -> None:
     names = [f"t{i}" for i in range(3000)]
     covariates = rng.normal(size=(3000, 2))
     query, gallery = (covariates + 0.25 * rng.normal(size=covariates.shape) for _ in range(2))
-    asked = (query[:200], gallery, names[:200], names)
-    loose = retrieve(*asked, metric="euclidean", seeds=2)
-    tight = retrieve(*asked, metric="euclidean", match=covariates)
+    asked = {"names": names[:200], "others": names, "things": names[:200]}
+    loose = ask(query[:200], gallery, metric="euclidean", seeds=2, **asked)
+    tight = ask(query[:200], gallery, metric="euclidean", match=covariates, **asked)
     assert loose.top1 > 0.2 and loose.nearness is None
     assert 0.5 * tight.chance1 <= tight.top1 < 2.5 * tight.chance1 < loose.low
     assert tight.nearness < 0.15
     texture = rng.normal(size=(3000, 8))
-    kept = retrieve(texture[:200], texture, names[:200], names, match=covariates)
+    kept = ask(texture[:200], texture, match=covariates, **asked)
     assert kept.top1 == 1.0  # what is not a covariate is found all the same
 
 
@@ -123,9 +139,9 @@ def test_no_order_of_rows_matters(matched: bool) -> None:
     first = ask(query, gallery, match=covariates if matched else None)
     assert 0.05 < first.top1 < 0.95
     mixed, turned = (np.random.default_rng(seed).permutation(COUNT) for seed in (8, 9))
-    again = retrieve(
-        query[turned], gallery[mixed], np.array(NAMES)[turned], np.array(NAMES)[mixed],
-        groups=np.array(THINGS)[turned], match=covariates[mixed] if matched else None,
+    again = ask(
+        query[turned], gallery[mixed], names=np.array(NAMES)[turned], others=np.array(NAMES)[mixed],
+        things=np.array(THINGS)[turned], match=covariates[mixed] if matched else None,
     )  # fmt: skip
     np.testing.assert_array_equal(again.found.keys, first.found.keys[turned])
     np.testing.assert_allclose(again.found.top1, first.found.top1[turned])
@@ -145,14 +161,14 @@ def test_a_units_own_touches_never_enter_its_gallery() -> None:
     """The same array as query and gallery: only touches by another unit may be looked for, or be distractors."""
     names, units = np.repeat(NAMES, 2), np.tile(["unit a", "unit b"], COUNT)
     features = noise(2 * COUNT)
-    own = retrieve(features, features, names, names, query_unit=units, gallery_unit=units, seeds=2)
-    assert own.low <= 0.02 <= own.high  # its own row would be found at once
     drawn = draw_galleries(names, names, query_unit=units, gallery_unit=units, seeds=3)
     assert (units[drawn.items] != units[drawn.queries][None, :, None]).all()
     np.testing.assert_array_equal(names[drawn.items[:, :, 0]], np.broadcast_to(names[drawn.queries], (3, 2 * COUNT)))
     assert (names[drawn.items[:, :, 1:]] != names[drawn.queries][None, :, None]).all()
+    low, high = mean_interval(score(features, features, drawn)[0], names)
+    assert low <= 0.02 <= high  # its own row would be found at once
     with pytest.raises(UserError, match="share no touch"):
-        ask(noise(), noise(), query_unit=["x"] * COUNT, gallery_unit=["x"] * COUNT)
+        draw_galleries(NAMES, NAMES, query_unit=["x"] * COUNT, gallery_unit=["x"] * COUNT)
 
 
 def test_the_interval_is_over_objects_not_over_touches() -> None:
@@ -160,10 +176,10 @@ def test_the_interval_is_over_objects_not_over_touches() -> None:
     query, gallery = noise(), noise()
     lost = np.array([int(thing.split()[1]) % 2 == 0 for thing in THINGS])
     query[lost] = noise(seed=9)[lost]
-    by_object, by_touch = ask(query, gallery), retrieve(query, gallery, NAMES, NAMES)
+    by_object, by_touch = ask(query, gallery), ask(query, gallery, things=[""] * COUNT)
     assert by_object.low < by_object.top1 < by_object.high and by_touch.low < by_touch.top1 < by_touch.high
     assert by_object.high - by_object.low > 2 * (by_touch.high - by_touch.low)
-    alone = retrieve(query, gallery, NAMES, NAMES, groups=["one"] * COUNT)
+    alone = ask(query, gallery, things=["one"] * COUNT)
     assert alone.low is None and alone.groups == 1
 
 
@@ -175,21 +191,13 @@ def test_a_paired_difference_is_narrower_than_two_intervals() -> None:
     assert mean == pytest.approx(strong.top1 - weak.top1) and low <= mean <= high
     assert high - low < weak.high - weak.low
     assert difference(weak, weak) == (0.0, 0.0, 0.0)
-    other = retrieve(base[:100], base, NAMES[:100], NAMES, name="other")
+    other = ask(base[:100], base, names=NAMES[:100], things=THINGS[:100], name="other")
     with pytest.raises(UserError, match="'other' did not answer the same queries"):
         difference(weak, other)
 
 
-def test_runs_of_several_seeds_are_averaged_query_by_query() -> None:
-    several = [ask(noise(), noise() + 1.5 * noise(seed=seed)) for seed in (1, 2, 3)]
-    whole = averaged(several, "three seeds")
-    assert whole.name == "three seeds" and whole.top1 == pytest.approx(np.mean([one.top1 for one in several]))
-    assert whole.low <= whole.top1 <= whole.high
-    np.testing.assert_allclose(whole.found.top5, np.mean([one.found.top5 for one in several], axis=0))
-
-
 def test_queries_without_a_partner_are_counted() -> None:
-    found = retrieve(noise(), noise()[:200], NAMES, NAMES[:200])
+    found = ask(noise(), noise()[:200], others=NAMES[:200])
     assert found.queries == 200 and "40 queries left out" in found.notes[0] and found.top1 == 1.0
 
 
@@ -204,18 +212,27 @@ BAD[3, 2] = np.nan
         ({"gallery_size": 1}, "too small"),
         ({"gallery_touch": ["touch 0"] * COUNT}, "'touch 0' twice"),
         ({"gallery_touch": [f"other {i}" for i in range(COUNT)]}, "share no touch"),
-        ({"query": BAD}, "query row 3 is not finite"),
-        ({"gallery": noise(width=4)}, "16 and 4 values"),
         ({"match": BAD}, "covariate row 3"),
         ({"match": noise(9)}, "match has 9 rows"),
-        ({"groups": ["a"]}, "one name for each touch"),
-        ({"query": np.zeros(COUNT)}, r"must be \(n, d\)"),
+        ({"query_unit": ["a"]}, "one name for each touch"),
     ],
 )
-def test_mistakes_are_one_sentence(options: dict[str, Any], words: str) -> None:
-    whole = {"query": noise(), "gallery": noise(), "query_touch": NAMES, "gallery_touch": NAMES} | options
+def test_mistakes_in_a_draw_are_one_sentence(options: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError, match=words):
-        retrieve(**whole)
+        draw_galleries(**{"query_touch": NAMES, "gallery_touch": NAMES} | options)
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        (BAD, "query row 3 is not finite"),
+        (noise(width=4), "4 and 16 values"),
+        (np.zeros(COUNT), r"must be \(n, d\)"),
+    ],
+)
+def test_mistakes_in_features_are_one_sentence(query: Array, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        score(query, noise(), draw_galleries(NAMES, NAMES))
 
 
 # --- manifests ---------------------------------------------------------------------------------------------------

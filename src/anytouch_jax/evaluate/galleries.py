@@ -53,7 +53,13 @@ def draw_galleries(
     gallery_unit: Any = None,
     seeds: int = 5,
 ) -> Galleries:
-    """The galleries of `retrieval.retrieve`; they depend on names, covariates and seeds, not on any order of rows."""
+    """Galleries that depend on names, covariates and seeds, not on any order of rows; equal names are one touch.
+
+    `match` (m, k): covariates of the gallery; the distractors are the nearest to the touch looked for once each
+    covariate has unit spread. Without it `seeds` galleries are drawn by chance. Items of the query's own unit never
+    enter its gallery. Raises UserError on covariates that are not finite, a gallery that is too small, or no touch in
+    common.
+    """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}")
     if gallery_size < 2:

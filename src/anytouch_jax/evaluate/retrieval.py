@@ -70,42 +70,6 @@ class Retrieval:
     found: Found | None = field(default=None, repr=False, compare=False)
 
 
-def retrieve(
-    query: Array,
-    gallery: Array,
-    query_touch: Any,
-    gallery_touch: Any,
-    *,
-    gallery_size: int = GALLERY,
-    match: Array | None = None,
-    groups: Any = None,
-    query_unit: Any = None,
-    gallery_unit: Any = None,
-    metric: Metric = "cosine",
-    centre: bool = False,
-    seeds: int = 5,
-    name: str = "features",
-) -> Retrieval:
-    """Retrieval of `query` (n, d) touches among `gallery` (m, d) touches; touches of equal name are the same.
-
-    `match` (m, k): covariates of the gallery; the distractors are the nearest to the touch looked for once each
-    covariate has unit spread. Without it `seeds` galleries are drawn by chance and averaged. `groups` (n,): objects,
-    for the interval (default: the touches). Items of the query's own unit never enter its gallery. Raises UserError
-    on features that are not finite, a gallery that is too small, or no touch in common.
-    """
-    drawn = draw_galleries(
-        query_touch, gallery_touch, gallery_size=gallery_size, match=match, query_unit=query_unit,
-        gallery_unit=gallery_unit, seeds=seeds,
-    )  # fmt: skip
-    keys = texts(query_touch, len(query)) if query_unit is None else _joined(query_touch, query_unit)
-    groups = texts(query_touch if groups is None else groups, len(query))
-    top1, top5 = score(query, gallery, drawn, metric=metric, centre=centre)
-    found = Found(keys[drawn.queries], top1, top5, groups[drawn.queries])
-    matched = () if match is None else tuple(f"column {i}" for i in range(np.shape(match)[1]))
-    about = {"name": name, "metric": metric, "centred": centre, "matched": matched}
-    return _summary(found, gallery_size, (drawn,), about)
-
-
 def cross_sensor_retrieval(
     manifest: Manifest,
     features: Mapping[str, Array],
@@ -124,7 +88,8 @@ def cross_sensor_retrieval(
     `features` {name: (len(rows), d)} of manifest `rows`, of which the deepest frame of each touch, sensor and unit
     counts. `match`: label columns, those that the manifest has are used; None draws galleries by chance. `metrics`
     {name: metric}, cosine otherwise. Touches without a value in one of the columns are left out, which a note says.
-    Raises UserError when a sensor is paired with itself, when no covariate is there, and as `retrieve`.
+    Raises UserError when a sensor is paired with itself, no covariate is there, no touch is in common, a gallery would
+    be too small, or features are not finite.
     """
     rows = np.asarray(rows)
     for name, values in features.items():
@@ -174,19 +139,6 @@ def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None
         raise UserError(f"{first.name!r} and {second.name!r} did not answer the same queries; give both the same rows")
     change = a.top1 - b.top1
     return float(change.mean()), *mean_interval(change, a.groups)
-
-
-def averaged(results: Sequence[Retrieval], name: str) -> Retrieval:
-    """Several retrievals of the same queries (an encoder trained with several seeds) as one, query by query.
-
-    Raises UserError as `difference` does.
-    """
-    for one in results[1:]:
-        difference(results[0], one)
-    tables = [one.found for one in results if one.found is not None]
-    top1, top5 = (np.mean([getattr(one, part) for one in tables], axis=0) for part in ("top1", "top5"))
-    found = replace(tables[0], top1=top1, top5=top5)
-    return replace(results[0], name=name, found=found, **_shares(found))
 
 
 def to_records(results: Sequence[Retrieval]) -> list[dict[str, Any]]:

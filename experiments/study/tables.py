@@ -96,7 +96,7 @@ def _opponent(runs: Sequence[Run], question: str, name: str, column: Column, fir
     return dict.fromkeys(first, next(iter(found.values()))) if found and name in UNSEEDED else found
 
 
-def against(table: Table, first: str | None, second: str | None, *, flip: float = 1.0) -> list[Pair]:
+def against(table: Table, first: str | None, second: str | None) -> list[Pair]:
     """Pairs of every other model of a table with `first` (or `second`) held: the paper's differences are expected."""
     found = []
     for name in table.names:
@@ -104,7 +104,7 @@ def against(table: Table, first: str | None, second: str | None, *, flip: float 
         if one == two:
             continue
         ours, theirs = (table.paper.get(model, (None,) * len(table.columns)) for model in (one, two))
-        expected = [None if a is None or b is None else flip * float(a - b) for a, b in zip(ours, theirs, strict=True)]
+        expected = [None if a is None or b is None else float(a - b) for a, b in zip(ours, theirs, strict=True)]
         found.append(Pair(f"{title(one)} against {title(two)}", one, two, expected))
     return found
 

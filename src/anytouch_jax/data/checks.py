@@ -199,12 +199,12 @@ def licence_conflicts(manifest: Manifest) -> Iterator[Finding]:
         yield Finding("licence_conflict", "warning", sentence, rows, examples, "commercial")
 
 
-def split_hash(manifest: Manifest, split: str | None = None) -> str:
-    """SHA-256 of which frame is in which split; `split` looks at one of them only.
+def split_hash(manifest: Manifest) -> str:
+    """SHA-256 of which frame is in which split.
 
     A frame is (dataset, sensor, unit, sequence, frame_index): neither the order of rows nor where files lie counts.
     """
-    table = manifest.table if split is None else manifest.table.filter(pc.equal(manifest.table["split"], split))
+    table = manifest.table
     nulls = pa.nulls(table.num_rows, pa.string())
     columns = [table[name].cast(pa.string()) if name in table.column_names else nulls for name in _FRAME]
     # A tag before the value keeps a null apart from an empty text.

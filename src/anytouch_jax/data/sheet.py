@@ -22,10 +22,8 @@ _STYLE = (
 )
 
 
-def sample_sheet(
-    manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40, seed: int = 0
-) -> Path:
-    """Write an HTML page of `count` captions drawn with `seed`, with small copies of their pictures in a folder beside.
+def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40) -> Path:
+    """Write an HTML page of `count` captions drawn by lot, with small copies of their pictures in a folder beside.
 
     The page and its folder `<name>_images` can be moved together. Raises UserError when there are no captions.
     """
@@ -33,7 +31,7 @@ def sample_sheet(
         raise UserError("there are no captions to look at")
     target = Path(path).expanduser().resolve()
     folder = target.with_name(f"{target.stem}_images")
-    chosen = np.random.default_rng(seed).permutation(len(captions))[:count]
+    chosen = np.random.default_rng(0).permutation(len(captions))[:count]
     parts = [_article(manifest, captions[at], number, folder) for number, at in enumerate(np.sort(chosen))]
     title = f"{len(parts)} of {len(captions)} captions"
     page = (

@@ -14,9 +14,7 @@ _Z = 2  # displacement along the normal, mm, the channel of a field that is draw
 _GAIN = 2.0  # by which the difference of images is enlarged
 
 
-def picture_grid(
-    path: Path, generator: Generator, images: np.ndarray, targets: np.ndarray, rows: int = 6, first: str = ""
-) -> None:
+def picture_grid(path: Path, generator: Generator, images: np.ndarray, targets: np.ndarray, rows: int = 6) -> None:
     """A grid of `rows` pairs spread over those given: a PNG, four columns.
 
     Images: the difference is twice enlarged about grey. Fields: indentation, on one scale a row; the difference from
@@ -26,7 +24,7 @@ def picture_grid(
     given, truth = images[chosen], targets[chosen]
     made = generator(given)
     draw = _fields if generator.design.shape.field else _images
-    names = [f"{first}pair {row}" for row in chosen]
+    names = [f"pair {row}" for row in chosen]
     columns = (f"{COLUMNS[0]}: {generator.design.source}", f"{COLUMNS[1]}: {generator.design.target}", *COLUMNS[2:])
     sample_grid(path, [[x, *draw(a, b)] for x, a, b in zip(given, made, truth, strict=True)], names, columns)
 

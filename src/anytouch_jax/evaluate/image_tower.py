@@ -16,7 +16,7 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.lora import merge_lora
 
 
-def image_tower_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
+def image_tower_encoder(path: str | Path) -> Encoder:
     """The image tower of a stage-2 run (LoRA merged) or of CLIP weights as an encoder of touches; nothing is trained.
 
     A still gives exactly the tower's embedding of that image; a clip that of its mean frame. There are no sensor
@@ -26,7 +26,7 @@ def image_tower_encoder(path: str | Path, *, step: int | None = None) -> Encoder
     if not path.exists():
         raise UserError(f"no run folder or weights file at {path}")
     if path.is_dir():
-        params, text, _ = checkpoint.load_params(path, step)
+        params, text, _ = checkpoint.load_params(path)
         config: Config = from_json(text)
     else:
         weights = release.read_weights(path)

@@ -139,9 +139,9 @@ def measure_loading(
     return Loading(threads, pixels, tuple(speeds), tuple(opened))
 
 
-def write_pictures(folder: Path, size: tuple[int, int], count: int, seed: int = 0) -> Path:
+def write_pictures(folder: Path, size: tuple[int, int], count: int) -> Path:
     """A manifest of `count` pictures (width, height), smooth shades with noise like those of a gel, as JPEG."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     names = [f"frames/{i:010d}.jpg" for i in range(count)]
     for name in names:

@@ -49,9 +49,7 @@ class MatchScore:
     anchors: int
 
 
-def score_matching(
-    run: str | Path, manifest: Manifest, rows: Array, features: Array, *, draws: int = DRAWS, seed: int = 0
-) -> list[MatchScore]:
+def score_matching(run: str | Path, manifest: Manifest, rows: Array, features: Array) -> list[MatchScore]:
     """Scores of a run's matcher, both ways, on manifest `rows` (n,) with its touch `features` (n, E), class pooling.
 
     Raises UserError for a run without a matching head, and where no touch was felt by two sensors.
@@ -60,7 +58,7 @@ def score_matching(
     objects = text_column(manifest, "object")[rows]
     found = []
     for negatives in WAYS:
-        anchor, positive, negative = draw_triples(manifest, rows, negatives, draws=draws, seed=seed)
+        anchor, positive, negative = draw_triples(manifest, rows, negatives)
         right, wrong = logits(features[anchor], features[positive]), logits(features[anchor], features[negative])
         correct = np.mean([right > 0, wrong <= 0], axis=0)
         sensor = manifest.codes("sensor")[rows]

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
@@ -170,11 +170,9 @@ def _placed(tree: Any, sharding: Any) -> Any:
     return jax.tree.map(lambda x, place: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tree, places)
 
 
-def simulate(
-    preset: str, devices: int, fsdp: int, batch_per_device: int, what: str = "stage1", *, dtype: str = "float32"
-) -> Layout:
-    """`layout_of` the first workload of `what`, in a child process with so many simulated devices. Raises UserError."""
-    question = json.dumps([preset, devices, fsdp, batch_per_device, what, dtype])
+def simulate(preset: str, devices: int, fsdp: int, batch_per_device: int) -> Layout:
+    """`layout_of` stage 1 on clips, in a child process with so many simulated devices. Raises UserError."""
+    question = json.dumps([preset, devices, fsdp, batch_per_device])
     return Layout(**ask("memory", question, devices))
 
 
@@ -198,9 +196,8 @@ def ask(module: str, question: str, devices: int = 1, **environ: str) -> dict[st
 
 def answer(question: str) -> None:
     """What the child process does."""
-    preset, devices, fsdp, batch, what, dtype = json.loads(question)
-    work = workloads(what, preset, batch * devices)[0]
-    work = replace(work, config=replace(work.config, model=replace(work.config.model, dtype=dtype)))
+    preset, devices, fsdp, batch = json.loads(question)
+    work = workloads("stage1", preset, batch * devices)[0]
     sys.stdout.write(json.dumps(asdict(layout_of(work, devices, fsdp))) + "\n")
 
 

@@ -230,43 +230,40 @@ def error(poured: Array, target: float) -> Error:
     return Error(float(wrong.mean()), *mean_interval(wrong, np.arange(len(wrong))))
 
 
-def write_film(path: Path, trials: Trials, task: Task, number: int = 0, *, every: int = 4, rate: float = 10.0) -> None:
-    """Write run `number` as a GIF: the frame, beside it the mass left over time and the action. Whole or not at all.
+def write_film(path: Path, trials: Trials, task: Task, *, every: int = 4) -> None:
+    """Write the first run as a GIF: the frame, beside it the mass left over time and the action. Whole or not at all.
 
-    Every `every`-th moment is shown, `rate` a second. Raises OSError.
+    Every `every`-th moment is shown, ten a second. Raises OSError.
     """
     from PIL import Image  # matplotlib cannot be had without it
 
     if trials.frames is None:
         raise ValueError("these trials kept no frames; run them with film=1")
-    last = int(trials.steps[number])
-    pages = [
-        Image.fromarray(_page(trials, task, number, step)).quantize(64)
-        for step in [*range(0, last - 1, every), last - 1]
-    ]
+    last = int(trials.steps[0])
+    pages = [Image.fromarray(_page(trials, task, step)).quantize(64) for step in [*range(0, last - 1, every), last - 1]]
     data = io.BytesIO()
-    pages[0].save(data, "gif", save_all=True, append_images=pages[1:], duration=round(1000 / rate), loop=0)
+    pages[0].save(data, "gif", save_all=True, append_images=pages[1:], duration=100, loop=0)
     write_whole(path, data.getvalue())
 
 
-def _page(trials: Trials, task: Task, number: int, step: int) -> Array:
+def _page(trials: Trials, task: Task, step: int) -> Array:
     """One page of the film, u8 RGB: drawn with OpenCV, since a figure a page would take minutes."""
     import cv2
 
     side, wide = 180, 260
     assert trials.frames is not None
-    frame = cv2.resize(trials.frames[step, number], (side, side), interpolation=cv2.INTER_CUBIC)
+    frame = cv2.resize(trials.frames[step, 0], (side, side), interpolation=cv2.INTER_CUBIC)
     chart = np.full((side, wide, 3), 255, np.uint8)
-    last, top = int(trials.steps[number]), task.beads
+    last, top = int(trials.steps[0]), task.beads
     x = 34 + np.arange(last) * (wide - 44) / max(last - 1, 1)
-    y = 30 + (side - 60) * (1 - trials.mass[:last, number] / top)
+    y = 30 + (side - 60) * (1 - trials.mass[:last, 0] / top)
     goal = int(30 + (side - 60) * (task.target / top))
     cv2.line(chart, (34, goal), (wide - 10, goal), (200, 60, 60), 1)
     cv2.rectangle(chart, (34, 30), (wide - 10, side - 30), (160, 160, 160), 1)
     points = np.stack([x, y], 1)[: step + 1].round().astype(np.int32)
     cv2.polylines(chart, [points], False, (40, 90, 170), 2, cv2.LINE_AA)
-    out = task.beads - trials.mass[step, number]
-    words = f"{ACTIONS[trials.actions[step, number]]}   {out:.1f} g out   {trials.tilt[step, number]:.1f} deg"
+    out = task.beads - trials.mass[step, 0]
+    words = f"{ACTIONS[trials.actions[step, 0]]}   {out:.1f} g out   {trials.tilt[step, 0]:.1f} deg"
     for text, place in ((words, (34, 20)), (f"{step / task.rate:.1f} s", (34, side - 10)), ("g left", (wide - 60, 46))):
         cv2.putText(chart, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
     return np.concatenate([frame, chart], 1)

@@ -107,15 +107,13 @@ def group_draws(groups: Array, draws: int, seed: int) -> tuple[Array, Array]:
     return rng.multinomial(count, np.full(count, 1.0 / count), size=draws), ids
 
 
-def mean_interval(
-    values: Array, groups: Array, *, draws: int = 1000, seed: int = 0
-) -> tuple[float | None, float | None]:
+def mean_interval(values: Array, groups: Array, *, draws: int = 1000) -> tuple[float | None, float | None]:
     """95 % percentile interval of the mean of `values` (n,) under a bootstrap over `groups` (n,).
 
     (None, None) with fewer than two groups. With a handful of groups it is too narrow, as any bootstrap; where all
     groups agree (accuracy exactly 1) it has no width.
     """
-    times, ids = group_draws(groups, draws, seed)
+    times, ids = group_draws(groups, draws, 0)
     if times.shape[1] < 2:
         return None, None
     totals = times @ np.bincount(ids, weights=np.asarray(values, np.float64))

@@ -80,7 +80,6 @@ def cross_sensor_retrieval(
     match: Sequence[str] | None = COVARIATES,
     centre: Sequence[bool] = (False, True),
     metrics: Mapping[str, Metric] | None = None,
-    group: str = "object",
     seeds: int = 5,
 ) -> list[Retrieval]:
     """Retrieval for each set of features, ordered pair of sensors and kind of centring; pooled over the pairs last.
@@ -98,7 +97,7 @@ def cross_sensor_retrieval(
     kept, place, covariates, notes = _usable(manifest, rows, match)
     sensors = text_column(manifest, "sensor")[kept]
     touch, unit = _touches(manifest, kept), _joined(sensors, text_column(manifest, "unit")[kept])
-    things = text_column(manifest, group)[kept]
+    things = text_column(manifest, "object")[kept]
     groups, keys = np.where(things == "", touch, things), _joined(touch, unit)
     drawn = {}
     for first, second in _pairs(sensors) if pairs is None else pairs:

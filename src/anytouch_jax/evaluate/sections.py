@@ -42,12 +42,12 @@ class Section:
     notes: str = ""
 
 
-def samples_section(manifest: Manifest, folder: Path, *, split: str = "test", seed: int = 0) -> list[Section]:
+def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
     """A picture for each grade of alignment: rows are touches, columns the sensors and the photograph; captions below.
 
     The touches are those that most sensors felt, of different objects as far as there are.
     """
-    rows = deepest_rows(manifest, split=split)
+    rows = deepest_rows(manifest)
     grades = text_column(manifest, "grade")[rows] if "grade" in manifest.table.column_names else np.full(len(rows), "")
     return [_samples(manifest, folder, rows[grades == grade], str(grade), seed) for grade in np.unique(grades)]
 
@@ -120,15 +120,15 @@ def losses_section(runs: Mapping[str, Path], folder: Path) -> Section:
     return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
 
 
-def reconstructions_section(manifest: Manifest, run: Path, folder: Path, *, split: str = "test") -> Section:
-    """Hidden patches filled in by stage 1, and the next frame, on a clip of each sensor of `split`."""
+def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> Section:
+    """Hidden patches filled in by stage 1, and the next frame, on a test clip of each sensor."""
     params, text, _ = checkpoint.load_params(run)
     config = from_json(text)
-    rows = manifest.rows_of(split)
+    rows = manifest.rows_of("test")
     rows = rows[~np.isin(text_column(manifest, "sensor")[rows], FIELD_SENSORS)]
     frames = config.model.frames + 1
     moving = config.objective.next_frame and config.data.clip_share > 0  # else its head for clips was never trained
-    ends = np.intersect1d(manifest.clips(frames, split)[:, -1], rows) if moving else rows[:0]
+    ends = np.intersect1d(manifest.clips(frames, "test")[:, -1], rows) if moving else rows[:0]
     kind, frames = ("clip", frames) if len(ends) else ("still", 1)
     rows = _deepest_of_sensors(manifest, ends if len(ends) else rows)
     config = replace(config, data=replace(config.data, batch_size=len(rows), on_bad_sample="error"))

@@ -34,16 +34,16 @@ def alignment(first: Array, second: Array, *, power: float = 2.0) -> float:
     return float(np.mean(np.linalg.norm(first - second, axis=1) ** power))
 
 
-def uniformity(features: Array, *, t: float = 2.0) -> float:
-    """Log of the mean of exp(-t |x - y|^2) over all pairs of unit-norm rows (Wang & Isola, 2020).
+def uniformity(features: Array) -> float:
+    """Log of the mean of exp(-2 |x - y|^2) over all pairs of unit-norm rows (Wang & Isola, 2020).
 
-    Between -4 t (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are looked at.
+    Between -8 (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are looked at.
     """
     x = _unit(_thinned(features))
     if len(x) < 2:
         raise UserError("uniformity needs two rows or more")
     likeness = (x @ x.T)[np.triu_indices(len(x), 1)]
-    return float(np.log(np.mean(np.exp(-t * np.maximum(2 - 2 * likeness, 0.0)))))
+    return float(np.log(np.mean(np.exp(-2.0 * np.maximum(2 - 2 * likeness, 0.0)))))
 
 
 def silhouette(features: Array, labels: Any) -> float | None:

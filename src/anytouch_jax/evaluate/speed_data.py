@@ -18,6 +18,7 @@ from anytouch_jax.evaluate.speed import interleaved
 
 _SIDE = (320, 240)  # pixels of the made-up frames: width, height, those of a DIGIT
 _FRAMES = 12  # of a recording
+_BATCHES = 2  # of a measurement
 
 
 @dataclass(frozen=True)
@@ -34,16 +35,12 @@ class Feed:
     difference: int
 
 
-def measure(
-    name: str, batch: int, *, rounds: int = 5, threads: Sequence[int] | None = None, batches: int = 2
-) -> list[Feed]:
+def measure(name: str, batch: int, *, rounds: int = 5) -> list[Feed]:
     """A row for each number of threads, stills and clips. Raises UserError where the folder cannot be written."""
-    threads = threads or sorted({1, 2, max(2, os.cpu_count() or 1)})
+    threads = sorted({1, 2, max(2, os.cpu_count() or 1)})
     with TemporaryDirectory() as folder:
         manifest = manifests.read([str(_world(Path(folder), max(4, batch // 4)))])
-        return [
-            row for kind in ("clip", "still") for row in _kind(manifest, name, kind, batch, rounds, threads, batches)
-        ]
+        return [row for kind in ("clip", "still") for row in _kind(manifest, name, kind, batch, rounds, threads)]
 
 
 def _world(folder: Path, recordings: int) -> Path:
@@ -65,9 +62,7 @@ def _world(folder: Path, recordings: int) -> Path:
     return folder / "manifest.csv"
 
 
-def _kind(
-    manifest: Any, name: str, kind: str, batch: int, rounds: int, threads: Sequence[int], batches: int
-) -> list[Feed]:
+def _kind(manifest: Any, name: str, kind: str, batch: int, rounds: int, threads: Sequence[int]) -> list[Feed]:
     base = preset(name)
 
     def config(count: int) -> Config:
@@ -76,10 +71,10 @@ def _kind(
 
     loaders = [Loader(manifest, config(count)) for count in threads]
     first = [next(iter(_batches(loader, 1))) for loader in loaders]
-    times = interleaved([lambda loader=loader: _batches(loader, batches) for loader in loaders], rounds)  # type: ignore[misc]
+    times = interleaved([lambda loader=loader: _batches(loader, _BATCHES) for loader in loaders], rounds)  # type: ignore[misc]
     base_times = times[0][:, 0]
     rows = []
-    for count, seconds, one in zip(threads, (t[:, 0] / batches for t in times), first, strict=True):
+    for count, seconds, one in zip(threads, (t[:, 0] / _BATCHES for t in times), first, strict=True):
         low, middle, high = np.percentile(seconds, [25, 50, 75])
         frames = one.clip.shape[0] * one.clip.shape[1]
         rows.append(
@@ -90,7 +85,7 @@ def _kind(
                 seconds=float(middle),
                 seconds_iqr=float(high - low),
                 frames_per_second=float(frames / middle),
-                ratio=float(np.median(seconds * batches / base_times)),
+                ratio=float(np.median(seconds * _BATCHES / base_times)),
                 difference=int(np.max(np.abs(one.clip.astype(int) - first[0].clip.astype(int)))),
             )
         )

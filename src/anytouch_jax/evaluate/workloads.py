@@ -149,9 +149,9 @@ def _captions(rng: np.random.Generator, model: Model, count: int) -> tuple[np.nd
 # Programs -----------------------------------------------------------------------------------------------------------
 
 
-def first_state(config: Config, seed: int = 0) -> Tree:
+def first_state(config: Config) -> Tree:
     """The state before the first step, on the device."""
-    return jax.jit(partial(init_state, config=config))(build(config.model).init(jax.random.key(seed)))
+    return jax.jit(partial(init_state, config=config))(build(config.model).init(jax.random.key(0)))
 
 
 def abstract_state(config: Config) -> Tree:

@@ -24,12 +24,12 @@ def normalise(x: Array, eps: float = 1e-12) -> Array:
     return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), eps))
 
 
-def normalise_patches(patches: Array, eps: float = 1e-6) -> Array:
+def normalise_patches(patches: Array) -> Array:
     """Each patch of each frame (..., C) to zero mean and unit *unbiased* variance (`norm_pix_loss`, golden Q6)."""
     patches = _wide(patches)
     centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
-    return centred * jax.lax.rsqrt(variance + eps)
+    return centred * jax.lax.rsqrt(variance + 1e-6)
 
 
 def reconstruction_loss(pred: Array, target: Array, hidden: Array, *, next_frame: bool) -> tuple[Array, Metrics]:

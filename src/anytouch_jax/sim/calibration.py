@@ -109,15 +109,15 @@ def circle(frame: Array, background: Array, start: Array, half: int) -> Array:
     return np.array([x, y, max(float(above[-1]) + 1.0, 1.0) if len(above) else 1.0])
 
 
-def odd_centre(frame: Array, background: Array, start: Array, half: int, span: int = 28) -> Array:
+def odd_centre(frame: Array, background: Array, start: Array, half: int) -> Array:
     """The point (x, y) near `start` about which the colour change of `frame` is most nearly an odd function.
 
     A round dent's slopes are odd about its middle, and so is the first order of its colours. u8 frames (h, w, 3);
-    windows of 2 `half` + 1 pixels, searched within `span` pixels, first in steps of 4, then of 1.
+    windows of 2 `half` + 1 pixels, searched within 28 pixels, first in steps of 4, then of 1.
     """
     change = cv2.GaussianBlur(frame.astype(np.float32) - background.astype(np.float32), (0, 0), 1.5)
     place = np.round(start).astype(int)
-    for step, reach in ((4, span), (1, 4)):
+    for step, reach in ((4, 28), (1, 4)):
         thin = 1 + step // 2  # every third pixel is enough for the first round
         best, middle = np.inf, place.copy()
         for dy in range(-reach, reach + 1, step):
@@ -154,13 +154,13 @@ def ball_cut(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, int
     return jnp.maximum(depth - cap, -1.0)
 
 
-def settle(cut: jax.Array, pitch: float, reach: float, levels: int = 6) -> jax.Array:
-    """Displacement (h, w) mm of a gel that is cut by `cut` (h, w) mm: ever narrower blurs, never below the object.
+def settle(cut: jax.Array, pitch: float, reach: float) -> jax.Array:
+    """Displacement (h, w) mm of a gel that is cut by `cut` (h, w) mm: six ever narrower blurs, never below the object.
 
     Zero where nothing cuts. A stand-in for contact mechanics that depends on one length, `reach` mm.
     """
     dent = jnp.maximum(cut, 0.0)
-    for level in range(levels):
+    for level in range(6):
         sigma = reach / pitch / 2 ** (0.8 * level)
         rows, columns = splines.blur(cut.shape[0], sigma), splines.blur(cut.shape[1], sigma)
         dent = jnp.maximum(rows @ dent @ columns.T, cut)

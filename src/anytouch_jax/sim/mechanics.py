@@ -117,10 +117,10 @@ def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
             raise UserError("a surface may hold heights in mm and -inf for no object, but no NaN and no +inf")
 
 
-def grids(shape: tuple[int, ...], least: int = COARSEST, levels: int = 3) -> list[Plan]:
-    """The grid of `shape` and coarser ones, each half of the one before, as far as they divide."""
+def grids(shape: tuple[int, ...]) -> list[Plan]:
+    """The grid of `shape` and two coarser ones, each half of the one before, as far as they divide."""
     plans = [Plan(shape[0], shape[1])]
-    while len(plans) < levels and all(n % 2 == 0 and n // 2 >= least for n in (plans[-1].rows, plans[-1].columns)):
+    while len(plans) < 3 and all(n % 2 == 0 and n // 2 >= COARSEST for n in (plans[-1].rows, plans[-1].columns)):
         plans.append(Plan(plans[-1].rows // 2, plans[-1].columns // 2))
     return plans
 

@@ -114,14 +114,13 @@ def assemble(coefficients: Array, steepest: float, widest: Array | None = None) 
     return Photometry(normal.astype(np.float32), halo.astype(np.float32), float(steepest), widest.astype(np.float32))
 
 
-def fit_shading(
-    shading: Callable[[Array, Array, Array, Array], Array], *, steepest: float = 0.95, penalty: float = 1e-7
-) -> Photometry:
+def fit_shading(shading: Callable[[Array, Array, Array, Array], Array]) -> Photometry:
     """The polynomial nearest to `shading(nx, ny, u, v) -> (N, 3)`, on a grid of normals and places, minus flat."""
+    steepest = 0.95
     side = np.linspace(-steepest, steepest, 21)
     place = np.linspace(-1, 1, 7)
     nx, ny, u, v = (a.ravel() for a in np.meshgrid(side, side, place, place, indexing="ij"))
     inside = nx**2 + ny**2 <= steepest**2
     nx, ny, u, v = nx[inside], ny[inside], u[inside], v[inside]
     change = shading(nx, ny, u, v) - shading(0 * nx, 0 * ny, u, v)
-    return assemble(ridge(design(nx, ny, u, v), change, penalty), steepest)
+    return assemble(ridge(design(nx, ny, u, v), change, 1e-7), steepest)

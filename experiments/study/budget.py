@@ -7,7 +7,7 @@ the three touches of a match 3.0 s; in proportion to the tokens for smaller pict
 (but seven tenths of stage 1, its decoder and pixels, are the same for all); 100 simulated frames a second and 10 s for
 the program of a sensor; about 25 s to start and end a training; a run's scores 6 to 350 s (220 s for those of real
 touch are reckoned: its recordings are tested in ten folds). `matrix.py --plan` prints the sum for any size; eight
-chunks, each of which makes its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do `JOBS`
+chunks, each of which makes its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do 1.35
 times as much an hour.
 """
 
@@ -21,7 +21,6 @@ from .plan import Leaf, Scenes, Size, Training
 START = 25.0  # s to compile, read and save
 FRAMES = 100.0  # simulated a second
 SENSOR = 10.0  # s to compile a sensor, or to read it from the cache
-JOBS = 1.35
 SCORES: Mapping[str, float] = {
     "q1": 30, "q2": 6, "q3": 60, "ablations": 30, "dynamics": 85, "grasp": 30, "restricted": 30, "new_sensor": 350,
     "real": 220,

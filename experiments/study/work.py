@@ -24,7 +24,6 @@ import jax
 import anytouch_jax
 from anytouch_jax.config import Config, UserError, to_json
 from anytouch_jax.evaluate import machine
-from anytouch_jax.evaluate.features import Encoder
 from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
@@ -138,10 +137,6 @@ class Work:
             "machine": machine.describe().sentence(),
             "seconds": round(time.perf_counter() - start, 1),
         } | found
-
-    def encoder(self, leaf: Leaf) -> Encoder:
-        """The encoder of a run."""
-        return scores.encoder_of(leaf, self)
 
     def _finish(self, folder: Path, about: dict[str, Any]) -> None:
         write_whole(folder / DONE, json.dumps(about) + "\n")

@@ -69,7 +69,7 @@ def test_markdown_and_json(rows):
     assert len({line.count("|") for line in lines}) == 1
     assert "sphere: rms / max %" in lines[0] and "ring: picture" in lines[0]
     assert lines[2].startswith("| exact | 32 | own |") and lines[4].startswith("| exact | 16 | 1 |")
-    assert Row(**json.loads(json.dumps(rows[0].as_dict()))) == rows[0]
+    assert Row(**json.loads(json.dumps(dataclasses.asdict(rows[0])))) == rows[0]
 
 
 def test_own_scenes_are_pressed_and_not_empty():

@@ -270,12 +270,11 @@ def test_fast_is_near_exact(surface, rms, force):
     assert np.linalg.norm(quick.pressure - right.pressure) < 0.35 * np.linalg.norm(right.pressure)
 
 
-def test_centroid_area_torque():
+def test_centroid_and_area():
     pressure = np.zeros((N, N), np.float32)
     pressure[10, 40] = 100.0
     x, y = (40 - 31.5) * 0.1, (10 - 31.5) * 0.1
     np.testing.assert_allclose(mechanics.centroid(pressure, 0.1), [x, y], rtol=1e-5)
-    np.testing.assert_allclose(mechanics.torque(pressure, 0.1), [1e-3 * y, -1e-3 * x], rtol=1e-5)
     assert mechanics.area(pressure, 0.1) == pytest.approx(0.01)
     assert not np.asarray(mechanics.centroid(np.zeros((N, N), np.float32), 0.1)).any()
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from runs import TIMING
 from train_toy import ROWS, stopping_batches, toy_batch, toy_batches, toy_config, toy_loss, toy_params
 
 from anytouch_jax.config import ConfigError, UserError
@@ -20,7 +21,6 @@ from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
 from anytouch_jax.train.optim import moments
-from anytouch_jax.train.record import TIMING
 
 TOY = Path(__file__).parent / "train_toy.py"
 SRC = Path(__file__).parents[2] / "src"

@@ -85,14 +85,6 @@ def difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
     return cv2.max(cv2.max(red, green), blue)
 
 
-def contact_score(frame: np.ndarray, background: np.ndarray) -> float:
-    """How far a frame is from the untouched gel, 0 to 255; both RGB u8 (h, w, 3) of one shape of picture.
-
-    Raises ValueError when the pictures have different proportions.
-    """
-    return _score(prepare(frame), prepare(background))
-
-
 def prepare(picture: np.ndarray) -> np.ndarray:
     """A picture RGB u8 (h, w, 3) scaled to LONG_SIDE, its dark dots and thin dark lines closed."""
     return _close(_scale(picture))
@@ -228,6 +220,7 @@ def known_contact(manifest: Manifest) -> np.ndarray:
 
 
 def _score(frame: np.ndarray, background: np.ndarray) -> float:
+    """How far a frame is from the untouched gel, 0 to 255; both from `prepare`."""
     if max(abs(a - b) for a, b in zip(frame.shape, background.shape, strict=True)) > 2:
         raise ValueError("its background has other proportions")
     if frame.shape != background.shape:

@@ -44,11 +44,6 @@ class Report:
         """Whether there is no error (warnings may be there)."""
         return not any(finding.level == "error" for finding in self.findings)
 
-    def of(self, kind: str) -> np.ndarray:
-        """The rows of all findings of a kind, i64."""
-        found = [finding.rows for finding in self.findings if finding.kind == kind]
-        return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
-
     def to_json(self) -> str:
         """The report as JSON; of each finding the first thousand row numbers."""
         findings: list[dict[str, Any]] = [

@@ -93,9 +93,6 @@ class Row:
     converged: int
     image: dict[str, float]
 
-    def as_dict(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
-
 
 @dataclass(frozen=True)
 class Setting:

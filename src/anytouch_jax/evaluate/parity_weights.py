@@ -17,7 +17,6 @@ from anytouch_jax.io.shapes import param_shapes
 from anytouch_jax.io.tree import flatten, nest
 from anytouch_jax.nn.functional import build
 
-Params = dict[str, Any]
 STAGE1 = preset("large", recipe="release")
 STAGE2 = preset("large", stage=2, recipe="release", towers="pretrained")
 # entry of K_manifest -> the layout of that file and the preset that it is a file of

@@ -23,7 +23,6 @@ from .features import Encoder
 from .pouring import FRAMES, SENSOR, START, Expert, Replay, Trials, draw_runs, run
 
 Array = npt.NDArray[Any]
-Params = Any
 UNSEEN = 10_000  # added to a seed: runs that no demonstration met
 VERSION = 3  # of how a policy learns from the same demonstrations
 LATEST = 80  # moments, 20 degrees

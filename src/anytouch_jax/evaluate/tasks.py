@@ -24,7 +24,6 @@ Array = npt.NDArray[Any]
 Which = Literal["all", "press", "contact", "moving"]
 
 FORCE, SCORE = 0.05, 7.0  # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
-DIRECTIONS = ("label.twist", "label.slide")
 _TURNED = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 _ACROSS, _DOWN = {"right": "left", "left": "right"}, {"up": "down", "down": "up"}
 

@@ -35,7 +35,6 @@ MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches a part
 VERSION = 3  # of what a seed gives; a change of the simulator raises it
 Row = dict[str, Any]
-Say = Callable[[str], None]
 
 
 def simulate(

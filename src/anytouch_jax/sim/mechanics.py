@@ -212,9 +212,3 @@ def centroid(pressure: Array, pitch: Any) -> Array:
     total = jnp.sum(pressure)
     moments = jnp.stack([jnp.sum(x * pressure), jnp.sum(y * pressure)])
     return moments / jnp.where(total > 0, total, 1)
-
-
-def torque(pressure: Array, pitch: Any) -> Array:
-    """(2,) N mm: the moment of the pressure (H, W) about the field's x and y axes, (sum y p, -sum x p)."""
-    middle, load = centroid(pressure, pitch), jnp.sum(pressure) * jnp.asarray(pitch, pressure.dtype) ** 2 * KPA_MM2
-    return load * jnp.stack([middle[1], -middle[0]])

@@ -15,16 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import UserError
-
 Array = Any  # numpy's or JAX's
 Texture = Callable[[Array, Array, float, int], Array]
 
-# A uniform height of 0 to 1 has this deviation; the correlation length is where the autocorrelation has fallen to 1/e.
-SAND_RMS = 12.0**-0.5
-SAND_LENGTH = 0.35
-BARK_RMS = 0.31  # measured; the other two in pitches, across and along the plates
-BARK_LENGTHS = (0.27, 1.03)
+SAND_LENGTH = 0.35  # pitches, where the autocorrelation has fallen to 1/e
 # The autocorrelation of normal_cdf of a Gaussian field is 6/pi asin(rho/2); with rho = exp(-r^2/l^2) it is 1/e here.
 _FALL = math.sqrt(-math.log(2 * math.sin(math.pi / (6 * math.e))))
 
@@ -153,7 +147,7 @@ def knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
 def bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Bark-like: plates along v, parted by winding furrows.
 
-    RMS `BARK_RMS`, autocorrelation 1/e at `BARK_LENGTHS` pitches along u and v.
+    RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and v; all three are measured.
     """
     n = gaussian_field(u, v, (0.55 * pitch, 2.2 * pitch), seed + 3, terms=28)
     plate = gaussian_field(u, v, (0.8 * pitch, 1.6 * pitch), seed + 4, terms=16)
@@ -209,17 +203,3 @@ GRAINS: dict[str, Texture] = {
     "grit": grit,
     "threads": weave,
 }
-
-
-def roughness(texture: str, pitch: float, depth: float) -> tuple[float, float, float]:
-    """RMS height and the correlation lengths along u and v, in mm, of sand or bark of this pitch and depth mm.
-
-    Raises UserError for another texture, and unless both are positive.
-    """
-    known = {"sand": (SAND_RMS, SAND_LENGTH, SAND_LENGTH), "bark": (BARK_RMS, *BARK_LENGTHS)}
-    if texture not in known:
-        raise UserError(f"{texture} is no random roughness; choose among {', '.join(known)}")
-    if not (pitch > 0 and depth > 0):
-        raise UserError(f"a rough surface needs a pitch and a depth above 0 mm, not {pitch} and {depth}")
-    rms, along_u, along_v = known[texture]
-    return rms * depth, along_u * pitch, along_v * pitch

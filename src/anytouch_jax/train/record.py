@@ -31,7 +31,6 @@ HARMLESS = {
     "run.save_every",
     "run.tensorboard",
 }
-TIMING = ("samples_per_second", "wait", "wait_share")  # the fields of a line that differ between equal runs
 
 
 @contextlib.contextmanager

@@ -54,7 +54,7 @@ def stage1_terms(config=CONFIG1):
 @jax.jit
 def reconstruct(params, clip):
     def total(clip):
-        pred, hidden = objectives.reconstruct(params, clip, SENSOR, NOISE, net=NET1, config=CONFIG1)
+        pred, _, hidden = objectives.reconstruct(params, clip, SENSOR, NOISE, net=NET1, config=CONFIG1)
         return jnp.sum(pred**2), (pred, hidden)
 
     return jax.value_and_grad(total, has_aux=True)(clip)

@@ -57,9 +57,8 @@ def stage1_terms(
     objective, frames = config.objective, net.model.frames
     if not objective.next_frame:
         clip = clip[:, :frames]
-    method = "reconstruct" if force is None else "reconstruct_force"
-    pred, hidden = _predict(params, method, clip, sensor, noise, net, config, decoder_sensor)
-    pixels, told = (pred, jnp.zeros(0)) if force is None else pred
+    how: dict[str, Any] = {"net": net, "config": config, "decoder_sensor": decoder_sensor}
+    pixels, told, hidden = reconstruct(params, clip, sensor, noise, **how, force=force is not None)
     target = tokens.patchify(clip, net.model.patch)
     if objective.norm_pix_loss:
         target = losses.normalise_patches(target)
@@ -67,7 +66,7 @@ def stage1_terms(
     if objective.differences and clip.shape[1] > 1:
         metrics["differences"] = losses.difference_loss(pixels, target, hidden)
         loss = loss + objective.differences * metrics["differences"]
-    if force is not None:
+    if told is not None and force is not None:
         error, terms = losses.force_loss(told, force)
         loss, metrics = loss + objective.force * error, metrics | terms
     return loss, metrics
@@ -82,30 +81,18 @@ def reconstruct(
     net: Net,
     config: Config,
     decoder_sensor: Array | None = None,
-) -> tuple[Array, Array]:
-    """Pixels (B, N, T, P*P*3) of all positions from the visible ones, and hidden (B, N); see `stage1_terms`.
+    force: bool = False,
+) -> tuple[Array, Array | None, Array]:
+    """Pixels (B, N, T, P*P*3) of all positions from the visible ones; force (B, 2) where asked for; hidden (B, N).
 
-    The encoder sees the first three frames only, whatever T is.
+    See `stage1_terms`. The encoder sees the first three frames only, whatever T is.
     """
-    return _predict(params, "reconstruct", clip, sensor, noise, net, config, decoder_sensor)
-
-
-def _predict(
-    params: Params,
-    method: str,
-    clip: Array,
-    sensor: Array,
-    noise: Array,
-    net: Net,
-    config: Config,
-    decoder_sensor: Array | None,
-) -> tuple[Any, Array]:
-    """What a method of the network predicts from the visible positions, and hidden (B, N)."""
     visible = masking.kept(net.model.patches, config.objective.keep_ratio)
     keep_ids, restore_ids, hidden = masking.random_mask(noise, visible)
     seen = clip[:, : net.model.frames]
-    pred = net.apply(params, method, seen, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
-    return pred, hidden
+    given = (seen, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
+    pixels, told = net.apply(params, "reconstruct", *given, force=force)
+    return pixels, told, hidden
 
 
 def stage1_loss(

@@ -33,7 +33,7 @@ def test_shapes():
     keep_ids, restore_ids, _ = masks()
     assert encode(PARAMS, clips(1), SENSOR).shape == (2, 12)
     assert NET.apply(PARAMS, "encode_tokens", clips(3), SENSOR, keep_ids).shape == (2, 1 + 5 + 4, 12)
-    pred = NET.apply(PARAMS, "reconstruct", clips(3), SENSOR, keep_ids, restore_ids, 4)
+    pred, _ = NET.apply(PARAMS, "reconstruct", clips(3), SENSOR, keep_ids, restore_ids, 4)
     assert pred.shape == (2, 16, 4, 147)
 
 
@@ -49,7 +49,7 @@ def test_hidden_patches_have_exactly_no_influence():
     clip = clips(3)
 
     def total(clip):
-        return jnp.sum(NET.apply(PARAMS, "reconstruct", clip, SENSOR, keep_ids, restore_ids, 4) ** 2)
+        return jnp.sum(NET.apply(PARAMS, "reconstruct", clip, SENSOR, keep_ids, restore_ids, 4)[0] ** 2)
 
     grad = np.asarray(jax.jit(jax.grad(total))(clip))
     cells = grad.reshape(2, 3, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(2, 16, -1)
@@ -78,7 +78,7 @@ def test_nor_is_one_in_the_decoder(outside):
     net = build(touch_model(decoder_sensor_tokens=True))
     keep_ids, restore_ids, _ = masks()
     own = jnp.asarray([9, outside])
-    pred = net.apply(net.init(jax.random.key(0)), "reconstruct", clips(1), SENSOR, keep_ids, restore_ids, 1, own)
+    pred, _ = net.apply(net.init(jax.random.key(0)), "reconstruct", clips(1), SENSOR, keep_ids, restore_ids, 1, own)
     assert np.isfinite(pred[0]).all() and np.isnan(pred[1]).all()
 
 
@@ -119,7 +119,7 @@ def test_long_clips_are_segments_of_three(join, width):
 
 def test_only_the_frames_asked_for_are_painted():
     keep_ids, restore_ids, _ = masks()
-    four, three = (NET.apply(PARAMS, "reconstruct", clips_3, SENSOR, keep_ids, restore_ids, t) for t in (4, 3))
+    four, three = (NET.apply(PARAMS, "reconstruct", clips_3, SENSOR, keep_ids, restore_ids, t)[0] for t in (4, 3))
     np.testing.assert_allclose(four[:, :, :3], three, rtol=1e-5, atol=1e-6)
 
 
@@ -153,5 +153,5 @@ def test_one_patch_images_and_keeping_everything():
     clip = jnp.ones((1, 1, 7, 7, 3))
     for keep in (0, 1):
         keep_ids, restore_ids, _ = random_mask(jnp.zeros((1, 1)), keep)
-        pred = net.apply(params, "reconstruct", clip, jnp.asarray([0]), keep_ids, restore_ids, 1)
+        pred, _ = net.apply(params, "reconstruct", clip, jnp.asarray([0]), keep_ids, restore_ids, 1)
         assert pred.shape == (1, 1, 1, 147) and np.isfinite(np.asarray(pred)).all()

@@ -35,7 +35,8 @@ def reconstruction_panels(
 
 @partial(jax.jit, static_argnames=("net", "config"))
 def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
-    return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
+    pixels, _, hidden = reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
+    return pixels, hidden
 
 
 def _panels(clip: np.ndarray, pred: np.ndarray, hidden: np.ndarray, net: Net, config: Config) -> np.ndarray:

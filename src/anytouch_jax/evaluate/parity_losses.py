@@ -128,7 +128,7 @@ def _stage1_outputs(params: Params, inputs: Any, *, net: Net, config: Config) ->
         noise, masking.kept(net.model.patches, config.objective.keep_ratio)
     )
     seen = clip[:, : net.model.frames]
-    pred, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
+    pred, _, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
     loss, metrics = objectives.stage1_terms(params, *inputs[:3], net=net, config=config, decoder_sensor=target)
     return {
         "ids_restore": restore_ids,

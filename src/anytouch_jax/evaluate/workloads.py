@@ -204,7 +204,7 @@ def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, An
 
 def _terms(params: Tree, batch: Any, noise: jax.Array, net: Any, config: Config) -> tuple[jax.Array, jax.Array]:
     if config.stage == 1:
-        pred, _ = objectives.reconstruct(params, batch.clip, batch.sensor, noise, net=net, config=config)
+        pred, _, _ = objectives.reconstruct(params, batch.clip, batch.sensor, noise, net=net, config=config)
         value, _ = objectives.stage1_terms(params, batch.clip, batch.sensor, noise, net=net, config=config)
         return value, pred
     value, _ = objectives.stage2_terms(params, batch, noise, net=net, config=config)

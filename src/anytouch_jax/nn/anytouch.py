@@ -99,29 +99,18 @@ class AnyTouch(nnx.Module):
         restore_ids: Array,
         frames: int,
         decoder_sensor: Array | None = None,
-    ) -> Array:
-        """Pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B, T, H, W, 3)."""
-        latent = self.encode_tokens(clip, sensor, keep_ids)
-        return self._paint(latent, restore_ids, frames, sensor if decoder_sensor is None else decoder_sensor)
+        *,
+        force: bool = False,
+    ) -> tuple[Array, Array | None]:
+        """Pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B, T, H, W, 3).
 
-    def reconstruct_force(
-        self,
-        clip: Array,
-        sensor: Array,
-        keep_ids: Array,
-        restore_ids: Array,
-        frames: int,
-        decoder_sensor: Array | None = None,
-    ) -> tuple[Array, Array]:
-        """As `reconstruct`, with force and its change (B, 2) from the class token of the visible patches."""
-        hidden = self.touch.hidden(clip, sensor, keep_ids)
-        own = sensor if decoder_sensor is None else decoder_sensor
-        pixels = self._paint(self.touch.projection(hidden), restore_ids, frames, own)
-        return pixels, self.force(self.touch.embedding(hidden))
-
-    def _paint(self, latent: Array, restore_ids: Array, frames: int, sensor: Array) -> Array:
-        own = rows_of(self.touch.sensor_tokens[...], sensor) if hasattr(self.decoder, "sensor_projection") else None
-        return self.decoder(latent, restore_ids, frames, own)
+        With `force`, force and its change (B, 2) from the class token of the visible patches; None without.
+        """
+        hidden, own = self.touch.hidden(clip, sensor, keep_ids), None
+        if hasattr(self.decoder, "sensor_projection"):
+            own = rows_of(self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor)
+        pixels = self.decoder(self.touch.projection(hidden), restore_ids, frames, own)
+        return pixels, self.force(self.touch.embedding(hidden)) if force else None
 
     def touch_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """The encoder's input sequence (B, 1 + S + K, D)."""

@@ -117,7 +117,7 @@ def test_the_compiled_encoder_of_preset_large_costs_at_most_27_percent_of_the_un
     clip = jax.ShapeDtypeStruct((1, 3, 224, 224, 3), jnp.float32)
     kept = jax.ShapeDtypeStruct((1, model.patches // 4), jnp.int32)
     sensor = jax.ShapeDtypeStruct((1,), jnp.int32)
-    hidden = lambda p, c, s, k=None: net.apply(p, "touch_hidden", c, s, k)  # noqa: E731
+    hidden = lambda p, c, s, k=None: net.apply(p, "touch.hidden", c, s, k)  # noqa: E731
     masked, whole = counted(hidden, net.abstract(), clip, sensor, kept), counted(hidden, net.abstract(), clip, sensor)
     assert 0.2 < masked / whole <= 0.27
 
@@ -139,9 +139,9 @@ def test_a_still_is_projected_as_one_frame():
     args = (jax.ShapeDtypeStruct((16, 1, 224, 224, 3), jnp.float32), jax.ShapeDtypeStruct((16,), jnp.int32))
     one_frame = 2 * 16 * model.patches * 588 * 384
     summed, positions = 3 * 588 * 384, 8 * 16 * 262 * 384  # adding kernels and tables is no projection
-    assert one_frame < counted(lambda p, *a: net.apply(p, "touch_tokens", *a), net.abstract(), *args)
+    assert one_frame < counted(lambda p, *a: net.apply(p, "touch.tokens", *a), net.abstract(), *args)
     assert (
-        counted(lambda p, *a: net.apply(p, "touch_tokens", *a), net.abstract(), *args) < one_frame + summed + positions
+        counted(lambda p, *a: net.apply(p, "touch.tokens", *a), net.abstract(), *args) < one_frame + summed + positions
     )
 
 

@@ -19,7 +19,7 @@ IDS = jnp.asarray([[48, 5, 6, 49, 49, 49, 49, 49], [48, 7, 8, 9, 10, 11, 49, 49]
 def test_text_is_causal():
     def state(embedded):
         params = PARAMS | {"text": PARAMS["text"] | {"position": embedded}}
-        hidden = NET.apply(params, "text_hidden", IDS)[0, 3]
+        hidden = NET.apply(params, "text.hidden", IDS)[0, 3]
         return hidden @ jnp.arange(1.0, len(hidden) + 1)  # the plain sum of what a norm gives is always 0
 
     grad = np.asarray(jax.grad(state)(PARAMS["text"]["position"]))
@@ -36,20 +36,20 @@ def test_padding_behind_the_end_token_changes_nothing():
 
 @pytest.mark.parametrize("outside", [50, -1])
 def test_a_token_outside_the_vocabulary_is_nan(outside):
-    hidden = np.asarray(NET.apply(PARAMS, "text_hidden", IDS.at[1, 2].set(outside)))
+    hidden = np.asarray(NET.apply(PARAMS, "text.hidden", IDS.at[1, 2].set(outside)))
     assert np.isfinite(hidden[0]).all() and np.isnan(hidden[1, 2:]).all()
 
 
 def test_the_pooled_token_is_the_largest_id_or_the_end_token_named():
-    hidden = NET.apply(PARAMS, "text_hidden", IDS)
+    hidden = NET.apply(PARAMS, "text.hidden", IDS)
     np.testing.assert_allclose(
-        NET.apply(PARAMS, "text_pooled", IDS), hidden[jnp.arange(2), jnp.asarray([3, 6])], rtol=1e-6
+        NET.apply(PARAMS, "text.pooled", IDS), hidden[jnp.arange(2), jnp.asarray([3, 6])], rtol=1e-6
     )
     model = full_model()
     named = build(replace(model, text=replace(model.text, end_token=8)))
     ids = IDS.at[0, 1].set(8)
     np.testing.assert_allclose(
-        named.apply(PARAMS, "text_pooled", ids)[0], named.apply(PARAMS, "text_hidden", ids)[0, 1], rtol=1e-6
+        named.apply(PARAMS, "text.pooled", ids)[0], named.apply(PARAMS, "text.hidden", ids)[0, 1], rtol=1e-6
     )
 
 

@@ -51,13 +51,13 @@ def test_the_stack_equals_a_loop_over_plain_blocks():
     net = build(model)
     params = net.init(jax.random.key(1))
     clip, sensor = jax.random.normal(jax.random.key(2), (2, 1, 28, 28, 3)), jnp.asarray([0, 1])
-    x = np.asarray(net.apply(params, "touch_tokens", clip, sensor), np.float64)
+    x = np.asarray(net.apply(params, "touch.tokens", clip, sensor), np.float64)
     x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + model.norm_eps)
     for layer in range(STACK.depth):
         x = reference_block(
             x, jax.tree.map(lambda p, i=layer: np.asarray(p[i], np.float64), params["touch"]["blocks"]), 2, 1e-5
         )
-    np.testing.assert_allclose(net.apply(params, "touch_hidden", clip, sensor), x, atol=2e-5)
+    np.testing.assert_allclose(net.apply(params, "touch.hidden", clip, sensor), x, atol=2e-5)
 
 
 def test_rematerialisation_and_bfloat16_change_cost_not_meaning():

@@ -133,13 +133,13 @@ def flops(function, *args):
 def test_work_follows_what_is_visible():
     clip, sensor = clips(3, 8), jnp.zeros(8, jnp.int32)
     keep_ids = masks(4, 8)[0]
-    encoder = lambda c, k: NET.apply(PARAMS, "touch_hidden", c, sensor, k)  # noqa: E731
+    encoder = lambda c, k: NET.apply(PARAMS, "touch.hidden", c, sensor, k)  # noqa: E731
     masked, full = flops(encoder, clip, keep_ids), flops(lambda c: encoder(c, None), clip)
     assert masked < full * (1 + 5 + 4) / (1 + 5 + 16) * 1.15
 
 
 def test_a_still_projects_one_frame():
-    patch = lambda c: NET.apply(PARAMS, "touch_tokens", c, jnp.zeros(8, jnp.int32))  # noqa: E731
+    patch = lambda c: NET.apply(PARAMS, "touch.tokens", c, jnp.zeros(8, jnp.int32))  # noqa: E731
     still, clip = flops(patch, clips(1, 8)), flops(patch, clips(3, 8))
     one_frame = 2 * 8 * 16 * 147 * 16
     assert still < one_frame * 1.2

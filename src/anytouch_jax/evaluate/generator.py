@@ -112,7 +112,7 @@ def encoded(design: Design, encoder: Params, pixels: Array, sensor: str) -> Arra
     model = design.shape.model
     row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
     rows = jnp.full(len(pixels), row, jnp.int32)
-    hidden: Array = build(model).apply(encoder, "touch_hidden", pixels[:, None], rows)
+    hidden: Array = build(model).apply(encoder, "touch.hidden", pixels[:, None], rows)
     return hidden.astype(jnp.float32)
 
 

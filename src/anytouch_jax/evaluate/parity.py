@@ -239,16 +239,16 @@ def _clip(case: Case) -> None:
         net, params = build(model), golden_params(case.folder, case.info["params_file"], model)
         for name, (text, mask) in texts.items():
             for output, method in (
-                ("last_hidden_state", "text_hidden"),
-                ("pooled", "text_pooled"),
+                ("last_hidden_state", "text.hidden"),
+                ("pooled", "text.pooled"),
                 ("projected", "embed_text"),
             ):
                 array = f"out/{sub}/text_{output}_{name}"
                 if array in case.arrays:
                     case.compare(array, _tower(params, text, mask, net=net, method=method))
         for output, method in (
-            ("last_hidden_state", "image_hidden"),
-            ("pooled", "image_pooled"),
+            ("last_hidden_state", "image.hidden"),
+            ("pooled", "image.pooled"),
             ("projected", "embed_image"),
         ):
             array = f"out/{sub}/vision_{output}"

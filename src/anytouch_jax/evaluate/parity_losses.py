@@ -133,8 +133,8 @@ def _stage1_outputs(params: Params, inputs: Any, *, net: Net, config: Config) ->
     return {
         "ids_restore": restore_ids,
         "mask": hidden,
-        "embeddings": net.apply(params, "touch_tokens", seen, sensor, keep_ids),
-        "last_hidden_state": net.apply(params, "touch_hidden", seen, sensor, keep_ids),
+        "embeddings": net.apply(params, "touch.tokens", seen, sensor, keep_ids),
+        "last_hidden_state": net.apply(params, "touch.hidden", seen, sensor, keep_ids),
         "latent": net.apply(params, "encode_tokens", seen, sensor, keep_ids),
         "features_unmasked": net.apply(params, "encode", seen, sensor),
         "pred": pred,

@@ -112,14 +112,6 @@ class AnyTouch(nnx.Module):
         pixels = self.decoder(self.touch.projection(hidden), restore_ids, frames, own)
         return pixels, self.force(self.touch.embedding(hidden)) if force else None
 
-    def touch_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """The encoder's input sequence (B, 1 + S + K, D)."""
-        return self.touch.tokens(clip, sensor, keep_ids)
-
-    def touch_hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """The encoder's last hidden states (B, 1 + S + K, D)."""
-        return self.touch.hidden(clip, sensor, keep_ids)
-
     def embed_image(self, image: Array) -> Array:
         """Image embeddings (V, E), not normalised."""
         return self.image(image)
@@ -127,22 +119,6 @@ class AnyTouch(nnx.Module):
     def embed_text(self, ids: Array, mask: Array | None = None) -> Array:
         """Text embeddings (L, E), not normalised."""
         return self.text(ids, mask)
-
-    def image_hidden(self, image: Array) -> Array:
-        """The image tower's last hidden states (V, 1 + N, D)."""
-        return self.image.hidden(image)
-
-    def image_pooled(self, image: Array) -> Array:
-        """The image tower's normed class token (V, D)."""
-        return self.image.pooled(image)
-
-    def text_hidden(self, ids: Array, mask: Array | None = None) -> Array:
-        """The text tower's normed hidden states (L, S, W)."""
-        return self.text.hidden(ids, mask)
-
-    def text_pooled(self, ids: Array, mask: Array | None = None) -> Array:
-        """The text tower's state at the end token (L, W)."""
-        return self.text.pooled(ids, mask)
 
     def match(self, z_first: Array, z_second: Array) -> Array:
         """Matching logits (B,) of two unit-norm touch embeddings (Eq. 5): a head on their element-wise product."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,24 +31,20 @@ class Net:
 
     def init(self, key: Array) -> Params:
         """Fresh float32 parameters, drawn on the host from a PRNG key: the same on every device and version."""
-        seed = np.asarray(jax.random.key_data(key)).tolist()
-        draw = partial(_first_value, model=self.model, seed=seed)
-        return jax.tree_util.tree_map_with_path(draw, self.abstract())
+        return _drawn(self.abstract(), self.model, key)
 
     def abstract(self) -> Params:
         """The tree of jax.ShapeDtypeStruct that `init` would return; allocates nothing."""
-        return nnx.to_pure_dict(_skeleton(self.model)[1])
+        return nnx.to_pure_dict(_skeleton(AnyTouch, self.model)[1])
 
     def apply(self, params: Params, method: str, *args: Any, **kwargs: Any) -> Any:
-        """Call a method of `AnyTouch` (encode, reconstruct, embed_image, embed_text, match, scale, ...).
+        """Call a method of `AnyTouch` (encode, embed_image, match, ...) or, by a dotted name, of a part (text.hidden).
 
         A "lora" entry is merged into the image tower on the way in.
         """
         params = merge_lora(jax.tree.map(jnp.asarray, params), self.model.lora_alpha)
-        graph, state = _skeleton(replace(self.model, lora_rank=0))
-        state = jax.tree.map(lambda leaf: leaf, state)  # a copy: the skeleton is shared between traces
-        nnx.replace_by_pure_dict(state, params)
-        return getattr(nnx.merge(graph, state), method)(*args, **kwargs)
+        module = _with(params, *_skeleton(AnyTouch, replace(self.model, lora_rank=0)))
+        return operator.attrgetter(method)(module)(*args, **kwargs)
 
 
 def build(model: Model) -> Net:
@@ -67,27 +64,29 @@ class Part:
 
     def init(self, key: Array) -> Params:
         """Fresh float32 parameters, by the rules of `Net.init`."""
-        seed = np.asarray(jax.random.key_data(key)).tolist()
-        draw = partial(_first_value, model=self.options.model, seed=seed)
-        return jax.tree_util.tree_map_with_path(draw, nnx.to_pure_dict(_part(self)[1]))
+        return _drawn(nnx.to_pure_dict(_skeleton(self.kind, self.options)[1]), self.options.model, key)
 
     def apply(self, params: Params, *args: Any) -> Any:
         """Call the module."""
-        graph, state = _part(self)
-        state = jax.tree.map(lambda leaf: leaf, state)  # a copy, as in `Net.apply`
-        nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, params))
-        return nnx.merge(graph, state)(*args)
+        return _with(jax.tree.map(jnp.asarray, params), *_skeleton(self.kind, self.options))(*args)
 
 
-@lru_cache(maxsize=16)
-def _part(part: Part) -> tuple[Any, Any]:
-    return nnx.split(nnx.eval_shape(lambda: part.kind(part.options)))
+@lru_cache(maxsize=24)
+def _skeleton(kind: Callable[[Any], Any], options: Any) -> tuple[Any, Any]:
+    """Graph and abstract state of a module."""
+    return nnx.split(nnx.eval_shape(lambda: kind(options)))
 
 
-@lru_cache(maxsize=8)
-def _skeleton(model: Model) -> tuple[Any, Any]:
-    """Graph and abstract state of a network."""
-    return nnx.split(nnx.eval_shape(lambda: AnyTouch(model)))
+def _with(params: Params, graph: Any, state: Any) -> Any:
+    """The module of a skeleton with these parameters."""
+    state = jax.tree.map(lambda leaf: leaf, state)  # a copy: the skeleton is shared between traces
+    nnx.replace_by_pure_dict(state, params)
+    return nnx.merge(graph, state)
+
+
+def _drawn(abstract: Params, model: Model, key: Array) -> Params:
+    seed = np.asarray(jax.random.key_data(key)).tolist()
+    return jax.tree_util.tree_map_with_path(partial(_first_value, model=model, seed=seed), abstract)
 
 
 def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: Model, seed: list[int]) -> Array:

@@ -53,7 +53,7 @@ class TouchEncoder(nnx.Module):
         self.projection = Dense(width, model.embed, model, bias=False)
         self.patch_size, self.remat = model.patch, model.remat
 
-    def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None) -> Array:
+    def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """The input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
         patches = tokens.patchify(clip, self.patch_size)
         position = jnp.broadcast_to(self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape))

@@ -3,7 +3,7 @@
 Each `run` returns an exit status. Heavy imports wait until a command runs.
 """
 
-from anytouch_jax.commands import (
+from anytouch_jax.commands import (  # noqa: F401
     adapt,
     annotate,
     bench,
@@ -24,25 +24,3 @@ from anytouch_jax.commands import (
     translate,
     verify,
 )
-
-__all__ = [
-    "adapt",
-    "annotate",
-    "bench",
-    "contact",
-    "convert",
-    "embed",
-    "export",
-    "index",
-    "info",
-    "pack",
-    "parity",
-    "pour",
-    "probe",
-    "report",
-    "retrieve",
-    "simulate",
-    "train",
-    "translate",
-    "verify",
-]

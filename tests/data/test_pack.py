@@ -4,6 +4,7 @@ import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -362,14 +363,14 @@ def test_a_read_that_comes_in_pieces_is_put_together(make, tmp_path, monkeypatch
 def test_few_shards_are_open_at_once_and_threads_do_not_mind(make, tmp_path, monkeypatch):
     loose = make(_rows())
     again = manifests.read(pack(loose, tmp_path / "out", shard_bytes=1))
-    monkeypatch.setattr(packed, "_OPEN", 2)
+    monkeypatch.setattr(packed, "_shard", lru_cache(2)(packed._Shard))
     before = len(os.listdir("/proc/self/fd"))
     rows = np.random.default_rng(0).integers(24, size=600)
     with ThreadPoolExecutor(8) as pool:
         got = list(pool.map(lambda row: packed.read_file(again.file(row)), rows.tolist()))
     want = [loose.file(row).read_bytes() for row in range(24)]
     assert all(data == want[row] for data, row in zip(got, rows, strict=True))
-    assert len(packed._SHARDS) == 2 and len(os.listdir("/proc/self/fd")) <= before + 2
+    assert packed._shard.cache_info().currsize == 2 and len(os.listdir("/proc/self/fd")) <= before + 2
 
 
 def test_what_is_a_row_of_a_shard_and_what_is_a_file(tmp_path):

@@ -11,7 +11,7 @@ import hashlib
 import os
 import stat
 import threading
-from collections import OrderedDict
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +45,7 @@ def split_packed(path: Path) -> tuple[Path, int] | None:
 
 def forget() -> None:
     """Close all shards that are held open (after they were written anew)."""
-    with _LOCK:
-        _SHARDS.clear()
+    _shard.cache_clear()
 
 
 def _read_loose(path: Path) -> bytes:
@@ -113,20 +112,4 @@ def _read_index(path: Path) -> np.ndarray:
     return index
 
 
-_LOCK = threading.Lock()
-_SHARDS: OrderedDict[Path, _Shard] = OrderedDict()
-
-
-def _shard(path: Path) -> _Shard:
-    """The open shard; the least recently used one is closed when its last reader is done with it."""
-    with _LOCK:
-        held = _SHARDS.get(path)
-        if held is not None:
-            _SHARDS.move_to_end(path)
-            return held
-    opened = _Shard(path)
-    with _LOCK:
-        held = _SHARDS.setdefault(path, opened)
-        while len(_SHARDS) > _OPEN:
-            _SHARDS.popitem(last=False)
-    return held
+_shard = lru_cache(_OPEN)(_Shard)  # the least recently used one is closed when its last reader is done with it

@@ -14,7 +14,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
 from anytouch_jax.evaluate.galleries import draw_galleries, score
-from anytouch_jax.evaluate.results import mean_interval
+from anytouch_jax.evaluate.results import mean_interval, plain
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval, difference
 
 Array = np.ndarray[Any, Any]
@@ -299,8 +299,8 @@ def test_a_manifest_is_scored_by_pairs_and_pooled(touched: manifests.Manifest) -
     assert found[6].top1 == 1.0 and found[20].low <= 1 / 20 <= found[20].high
     mean, low, _ = difference(found[6], found[20])
     assert mean > low > 0.8
-    plain = json.loads(json.dumps(retrieval.to_records(found)))
-    assert plain[6]["top1"] == 1.0 and "found" not in plain[6]
+    told = json.loads(json.dumps(plain(found)))
+    assert told[6]["top1"] == 1.0 and "found" not in told[6]
 
 
 def test_only_the_deepest_frames_count(touched: manifests.Manifest) -> None:

@@ -28,7 +28,7 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate import features, retrieval
     from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
-    from anytouch_jax.evaluate.results import markdown
+    from anytouch_jax.evaluate.results import markdown, plain
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     least = Range(2, math.inf, "2 or more, the touch and at least one other")
@@ -69,7 +69,7 @@ def run(options: Retrieve) -> int:
         say(note)
     if options.out is not None:
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
-        write_whole(options.out, json.dumps(about | {"results": retrieval.to_records(scored)}, indent=2) + "\n")
+        write_whole(options.out, json.dumps(about | {"results": plain(scored)}, indent=2) + "\n")
     return 0
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import tempfile
 import time
@@ -65,7 +64,7 @@ def write_report(
             lines.append(f"![{section.title}](figures/{_placed(section.figure, folder / 'figures' / name)})")
         lines += [part.strip() for part in (section.table, section.notes) if part]
     if numbers is not None:
-        write_whole(folder / "report.json", _json(numbers) + "\n")
+        write_whole(folder / "report.json", json.dumps(results.plain(numbers), indent=2, allow_nan=False) + "\n")
     write_whole(folder / "report.md", "\n\n".join(lines) + "\n")
     return folder / "report.md"
 
@@ -77,24 +76,6 @@ def _placed(figure: Path, target: Path) -> str:
     if figure.resolve() != target.resolve():
         write_whole(target, figure.read_bytes())
     return target.name
-
-
-def _json(numbers: Mapping[str, Any]) -> str:
-    return json.dumps(_plain(numbers), indent=2, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = dataclasses.fields(value)
-        return {one.name: _plain(getattr(value, one.name)) for one in fields if one.name not in ("outcome", "found")}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, Path):
-        return str(value)
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -190,17 +191,21 @@ def parts_of(correct: Array, groups: Array, subsets: Mapping[str, Array], test: 
 
 def to_json(results: Sequence[Result]) -> str:
     """The results as a JSON list of objects, without outcomes; a number that does not exist is null."""
-    plain = [dataclasses.asdict(one) for one in results]
-    for one in plain:
-        one.pop("outcome", None)
-    return json.dumps([_finite(one) for one in plain], indent=2, allow_nan=False)
+    return json.dumps(plain(results), indent=2, allow_nan=False)
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+def plain(value: Any) -> Any:
+    """A value as JSON takes it: records as objects without what single rows did, what is not finite as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return {one.name: plain(getattr(value, one.name)) for one in fields if one.name not in ("outcome", "found")}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, Path):
+        return str(value)
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -138,14 +138,6 @@ def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None
         raise UserError(f"{first.name!r} and {second.name!r} did not answer the same queries; give both the same rows")
     change = a.top1 - b.top1
     return float(change.mean()), *mean_interval(change, a.groups)
-
-
-def to_records(results: Sequence[Retrieval]) -> list[dict[str, Any]]:
-    """The results as plain dicts for JSON, without what single queries did."""
-    records = [dataclasses.asdict(replace(one, found=None)) for one in results]
-    for one in records:
-        del one["found"]
-    return records
 
 
 def _summary(found: Found, size: int, drawn: Sequence[Galleries], about: Mapping[str, Any]) -> Retrieval:

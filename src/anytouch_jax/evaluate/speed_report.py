@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.evaluate.results import markdown
+from anytouch_jax.evaluate.results import markdown, plain
 from anytouch_jax.evaluate.speed import Row
 from anytouch_jax.whole import write_whole
 
@@ -95,10 +94,10 @@ def points(rows: Sequence[Row]) -> dict[str, tuple[float, float]]:
 
 def as_dict(row: Any) -> dict[str, Any]:
     """A record as JSON takes it: a number that is not finite is null."""
-    values = row._asdict() if isinstance(row, tuple) else dataclasses.asdict(row)  # type: ignore[attr-defined]
+    values: dict[str, Any] = plain(row._asdict() if isinstance(row, tuple) else row)  # type: ignore[attr-defined]
     if isinstance(row, Row):
-        values |= {"samples_per_second": row.samples_per_second, "gflops": row.gflops}
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+        values |= plain({"samples_per_second": row.samples_per_second, "gflops": row.gflops})
+    return values
 
 
 def write(folder: Path, name: str, text: str, numbers: Mapping[str, Any]) -> Path:

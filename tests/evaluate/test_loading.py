@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -28,7 +26,8 @@ def test_every_variant_is_measured_beside_plain_decoding(measured):
     assert names[:2] == [m.PLAIN, m.PLAIN_LINEAR] and m.NO_JITTER in names and names[-1] == m.ALL
     assert {f"only {name}" for name in ("brightness", "contrast", "saturation", "hue")} < set(names)
     assert len(found.speeds) == 2 * len(names) and all(one.images_per_second > 0 for one in found.speeds)
-    assert found.share((48, 40), m.PLAIN) == 1.0 and found.share((32, 24), m.ALL) > 0
+    shares = {(one.size, one.variant): one.share for one in found.speeds}
+    assert shares[(48, 40), m.PLAIN] == 1.0 and shares[(32, 24), m.ALL] > 0
 
 
 def test_a_large_manifest_is_opened_up_to_its_first_batch(measured):
@@ -46,7 +45,6 @@ def test_the_figures_are_printed(measured):
     _, found = measured
     text = found.to_markdown()
     assert "| 32 x 24 | decode + resize |" in text and "| 450 | 2 |" in text and "100%" in text
-    assert json.loads(found.to_json())["opened"][0]["rows"] == 450
 
 
 def test_the_augmentations_are_those_of_stage_one():

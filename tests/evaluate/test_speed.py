@@ -278,7 +278,6 @@ def test_an_embedding_is_measured_from_pixels_on_the_host():
 def test_the_peak_is_that_of_a_square_product():
     run, operations = machine.matmul("float32", 32)
     assert run()[0].shape == (32, 32) and operations == 2 * 32**3
-    assert machine.peak("bfloat16", size=32, rounds=2) > 0
     (product,) = machine.matmul("bfloat16", 32)[0]()
     assert product.dtype == jnp.float32  # the one form of it that a CPU computes fast
     assert machine.describe().cores >= 1 and "jax" in machine.describe().sentence()

@@ -25,6 +25,7 @@ import pyarrow.parquet
 from anytouch_jax.config import Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.loader import Loader
+from anytouch_jax.evaluate.results import markdown
 
 SIZES = ((320, 240), (640, 480))
 PLAIN, PLAIN_LINEAR, NO_JITTER, ALL = (
@@ -73,35 +74,24 @@ class Loading:
     speeds: tuple[Speed, ...]
     opened: tuple[Opened, ...]
 
-    def share(self, size: tuple[int, int], variant: str) -> float:
-        """The share of plain decoding that a variant reaches."""
-        return next(one.share for one in self.speeds if (one.size, one.variant) == (tuple(size), variant))
-
-    def to_json(self) -> str:
-        """All figures as JSON."""
-        about = {"threads": self.threads, "pixels": self.pixels}
-        rows = {"speeds": [one._asdict() for one in self.speeds], "opened": [one._asdict() for one in self.opened]}
-        return json.dumps(about | rows, indent=1) + "\n"
-
     def to_markdown(self) -> str:
         """Two tables: throughput, and opening."""
-        lines = [f"{self.threads} threads, pictures resized to {self.pixels} x {self.pixels}, JPEG", ""]
-        lines += ["| pictures | what is done | images/s | share of decode + resize | by processor time |"]
-        lines += ["|---|---|---|---|---|"]
-        lines += [
-            f"| {one.size[0]} x {one.size[1]} | {one.variant} | {one.images_per_second:.0f} | {one.share:.0%} | "
-            f"{one.cpu_share:.0%} |"
-            for one in self.speeds
+        speeds = [
+            (f"{w} x {h}", variant, f"{speed:.0f}", f"{share:.0%}", f"{cpu_share:.0%}")
+            for (w, h), variant, speed, share, cpu_share in self.speeds
         ]
-        if self.opened:
-            lines += ["", "| rows | stage | read | prepare | first batch | memory, read | memory, largest |"]
-            lines += ["|---|---|---|---|---|---|---|"]
-        lines += [
-            f"| {one.rows:,} | {one.stage} | {one.read:.2f} s | {one.prepare:.2f} s | {one.first_batch:.2f} s | "
-            f"{one.read_mb:.0f} MB | {one.peak_mb:.0f} MB |"
-            for one in self.opened
-        ]
-        return "\n".join(lines) + "\n"
+        opened = [
+            (f"{x.rows:,}", str(x.stage), *(f"{seconds:.2f} s" for seconds in (x.read, x.prepare, x.first_batch)),
+             f"{x.read_mb:.0f} MB", f"{x.peak_mb:.0f} MB")
+            for x in self.opened
+        ]  # fmt: skip
+        heads = ("pictures", "what is done", "images/s", "share of decode + resize", "by processor time")
+        text = f"{self.threads} threads, pictures resized to {self.pixels} x {self.pixels}, JPEG\n\n"
+        text += markdown(heads, speeds) + "\n"
+        if opened:
+            names = ("rows", "stage", "read", "prepare", "first batch", "memory, read", "memory, largest")
+            text += "\n" + markdown(names, opened) + "\n"
+        return text
 
 
 def measure_loading(

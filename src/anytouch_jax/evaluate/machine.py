@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import platform
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -86,17 +85,3 @@ def matmul(
         return jax.block_until_ready([product(a, b) for _ in range(times)])
 
     return run, 2.0 * size**3 * times
-
-
-def peak(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
-    """Operations a second of the best of some matrix products: what a share of the peak is a share of."""
-    run, operations = matmul(dtype, size)
-    run()
-    best = min(_timed(run) for _ in range(rounds))
-    return operations / best
-
-
-def _timed(run: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start

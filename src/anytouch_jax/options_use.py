@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-Paths = tuple[Path, ...]
+from anytouch_jax.options import Paths
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import UserError
+from anytouch_jax.data.edit import replace_column, select
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import Manifest
 
@@ -137,23 +138,23 @@ def mark_contact(
     contact[background] = 0  # what the split says
     contact = np.where(np.isnan(given), contact, given > 0)
     free = contact == 0
-    table = _set(manifest.table, "label.contact_score", pa.array(score, pa.float32(), mask=np.isnan(score)), keep=True)
+    table, name, kept = manifest.table, "label.contact_score", "label.contact_score_given"
+    if name in table.column_names:
+        table = table.select([one for one in table.column_names if one != kept]).append_column(kept, table[name])
+    marked = replace_column(replace(manifest, table=table), name, pa.array(score, pa.float32(), mask=np.isnan(score)))
     column = pa.array(np.nan_to_num(contact).astype(np.int64), pa.int64(), mask=np.isnan(contact))
-    table = _set(table, "label.contact", column)
+    marked = replace_column(marked, "label.contact", column)
     stays = np.ones(len(manifest), bool)
     if drop:
         stays = ~free | background
     if not stays.any():
         raise UserError("every frame is without contact by these thresholds; nothing would be left")
-    marked = replace(
-        manifest, table=table.filter(pa.array(stays)), source=manifest.source[stays], number=manifest.number[stays]
-    )
     names = sorted(set(manifest.table["sensor"].to_pylist()))
     used = {name: float({**THRESHOLDS, **(thresholds or {})}.get(name, DEFAULT_THRESHOLD)) for name in names}
     unknown = int(np.isnan(contact).sum())
     report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
                            int(np.isfinite(given).sum()), scores.counts, used)  # fmt: skip
-    return marked, report
+    return select(marked, np.flatnonzero(stays)), report
 
 
 def limits_of(manifest: Manifest, thresholds: Mapping[str, float] | None, share: float) -> np.ndarray:
@@ -175,19 +176,6 @@ def _highest(manifest: Manifest, score: np.ndarray) -> np.ndarray:
     best = np.zeros(codes.max() + 1)
     np.fmax.at(best, codes, score)
     return np.asarray(best[codes])
-
-
-def _set(table: pa.Table, name: str, column: pa.Array, *, keep: bool = False) -> pa.Table:
-    if name not in table.column_names:
-        return table.append_column(name, column)
-    at = table.column_names.index(name)
-    if keep:
-        given = f"{name}_given"
-        if given in table.column_names:
-            table = table.drop_columns([given])
-            at = table.column_names.index(name)
-        table = table.append_column(given, table[name])
-    return table.set_column(at, name, column)
 
 
 def _scale(picture: np.ndarray) -> np.ndarray:

@@ -18,11 +18,12 @@ FOLDS = 5
 SELECT_ROWS = 20_000  # on so many rows an option is chosen; the head that is reported has all
 
 
-def thinned(rows: Array) -> Array:
-    """At most SELECT_ROWS of `rows`, evenly by chance and always the same."""
-    if len(rows) <= SELECT_ROWS:
+def thinned(rows: Array, most: int | None = None) -> Array:
+    """At most `most` (SELECT_ROWS) of `rows`, evenly by chance and always the same."""
+    most = most or SELECT_ROWS
+    if len(rows) <= most:
         return rows
-    return rows[np.sort(np.random.default_rng(0).choice(len(rows), SELECT_ROWS, replace=False))]
+    return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
 
 
 def best_of(scores: Any) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..config import UserError
+from .choices import thinned
 
 Array = npt.NDArray[Any]
 MOST = 4000  # rows that pairwise figures look at
@@ -39,7 +40,7 @@ def uniformity(features: Array) -> float:
 
     Between -8 (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are looked at.
     """
-    x = _unit(_thinned(features))
+    x = _unit(thinned(np.asarray(features), MOST))
     if len(x) < 2:
         raise UserError("uniformity needs two rows or more")
     likeness = (x @ x.T)[np.triu_indices(len(x), 1)]
@@ -53,11 +54,11 @@ def silhouette(features: Array, labels: Any) -> float | None:
     """
     from sklearn.metrics import silhouette_score
 
-    labels = _thinned(np.asarray(labels).astype(str))
+    labels = thinned(np.asarray(labels).astype(str), MOST)
     count = len(np.unique(labels))
     if not 2 <= count < len(labels):
         return None
-    return float(silhouette_score(_unit(_thinned(features)), labels, metric="cosine"))
+    return float(silhouette_score(_unit(thinned(np.asarray(features), MOST)), labels, metric="cosine"))
 
 
 def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:
@@ -103,10 +104,3 @@ def _unit(features: Array) -> Array:
     if x.ndim != 2 or not np.isfinite(x).all():
         raise UserError(f"features must be finite and (n, d); these are {x.shape}, with NaN or Inf if that is right")
     return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
-
-
-def _thinned(values: Array) -> Array:
-    values = np.asarray(values)
-    if len(values) <= MOST:
-        return values
-    return values[np.sort(np.random.default_rng(0).choice(len(values), MOST, replace=False))]

@@ -93,13 +93,7 @@ def _kind(manifest: Any, name: str, kind: str, batch: int, rounds: int, threads:
 
 
 def _batches(loader: Loader, count: int) -> list[Any]:
-    stream = loader.stream(0, count)
-    try:
-        return [batch for _, batch, _ in stream]
-    finally:
-        close = getattr(stream, "close", None)
-        if close is not None:
-            close()
+    return [batch for _, batch, _ in loader.stream(0, count)]
 
 
 def to_markdown(rows: Sequence[Feed]) -> str:

@@ -24,14 +24,14 @@ def _scores(values, reason="given"):
 
 def test_precision_recall_and_correlation_on_a_table_of_hand(tmp_path):
     manifest = _manifest(tmp_path, **{"label.force": [0.0, 0.5, 2.0, 3.0, 0.0, None]})
-    got = r.contact_quality(manifest, scores=_scores([1, 2, 9, 9, 9, 9]))
+    got = r.contact_quality(manifest, _scores([1, 2, 9, 9, 9, 9]))
     assert (got.reference, got.above, got.rows, got.skipped) == ("label.force", 0.0, 5, 1)
     assert (got.positives, got.found, got.hits) == (3, 3, 2)
     assert (got.precision, got.recall) == (2 / 3, 2 / 3)
     assert got.correlation == pytest.approx(np.corrcoef([1, 2, 9, 9, 9], [0, 0.5, 2, 3, 0])[0, 1])
     assert got.parts == {"sensor digit": (5, 2 / 3, 2 / 3), "background given": (5, 2 / 3, 2 / 3)}
     assert "precision 0.667, recall 0.667" in got.lines()[0]
-    strict = r.contact_quality(manifest, scores=_scores([1, 2, 9, 9, 9, 9]), above=1.0)
+    strict = r.contact_quality(manifest, _scores([1, 2, 9, 9, 9, 9]), above=1.0)
     assert (strict.positives, strict.recall) == (2, 1.0)
 
 
@@ -42,16 +42,16 @@ def test_splits_references_and_nothing_to_compare(tmp_path):
         **{"label.contact": [1, 0, 0], "label.contact_score": [9.0, 9.0, 1.0]},
     )
     scores = _scores([9, 9, 9])
-    assert r.contact_quality(manifest, scores=scores).rows == 2  # background rows say nothing
-    assert r.contact_quality(manifest, scores=scores, split="test").precision == 0
-    assert np.isnan(r.contact_quality(manifest, scores=scores, split="test").recall)
-    assert r.contact_quality(manifest, scores=scores, reference="label.contact_score").precision == 1
+    assert r.contact_quality(manifest, scores).rows == 2  # background rows say nothing
+    free = r.contact_quality(_manifest(tmp_path, **{"label.contact": [0]}), _scores([9]))
+    assert free.precision == 0 and np.isnan(free.recall)
+    assert r.contact_quality(manifest, scores, reference="label.contact_score").precision == 1
     with pytest.raises(UserError, match=r"no column label\.depth"):
-        r.contact_quality(manifest, reference="label.depth", scores=scores)
+        r.contact_quality(manifest, scores, reference="label.depth")
     with pytest.raises(UserError, match=r"both a value in label\.contact and a score"):
-        r.contact_quality(manifest, scores=_scores([np.nan] * 3, "none"))
+        r.contact_quality(manifest, _scores([np.nan] * 3, "none"))
     with pytest.raises(UserError, match="holds something that is no number"):
-        r.contact_quality(_manifest(tmp_path, **{"label.force": ["x"]}), scores=_scores([1]))
+        r.contact_quality(_manifest(tmp_path, **{"label.force": ["x"]}), _scores([1]))
 
 
 def test_pressed_frames_with_known_force_are_told_from_free_ones(tmp_path):
@@ -63,10 +63,11 @@ def test_pressed_frames_with_known_force_are_told_from_free_ones(tmp_path):
         picture = 110 + bump[..., None] * np.array([1, 0, -1]) + rng.normal(0, 2, (60, 80, 3))
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.clip(picture, 0, 255).astype(np.uint8))
     manifest = _manifest(tmp_path, **{"label.force": force.tolist()})
-    got = r.contact_quality(manifest)  # no background is given: it is estimated from the ten frames
+    scores = contact_scores(manifest)  # no background is given: it is estimated from the ten frames
+    got = r.contact_quality(manifest, scores)
     assert (got.precision, got.recall) == (1.0, 1.0)
     assert got.correlation > 0.85
-    path = r.contact_picture(manifest, contact_scores(manifest), tmp_path / "out" / "contact.png", rows=1)
+    path = r.contact_picture(manifest, scores, tmp_path / "out" / "contact.png", rows=1)
     picture = decode(path)
     assert picture.shape == (2 * (28 + r.TILE), r.TILE * r.PER_ROW, 3)
     tile, shift = picture[28 : 28 + r.TILE, : r.TILE], picture[56 + r.TILE :, : r.TILE]

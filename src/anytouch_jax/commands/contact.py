@@ -40,9 +40,7 @@ def run(options: Contact) -> int:
     marked, report = contact.mark_contact(manifest, scores, thresholds=limits, share=options.share, drop=options.drop)
     print("\n".join(report.lines()))
     if options.check:
-        quality = contact_quality(
-            manifest, reference=options.reference, above=options.above, scores=scores, thresholds=limits
-        )
+        quality = contact_quality(manifest, scores, reference=options.reference, above=options.above, thresholds=limits)
         print("\n".join(quality.lines()))
     if options.picture is not None:
         say(f"{contact_picture(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")

@@ -149,8 +149,7 @@ def mark_contact(
         stays = ~free | background
     if not stays.any():
         raise UserError("every frame is without contact by these thresholds; nothing would be left")
-    names = sorted(set(manifest.table["sensor"].to_pylist()))
-    used = {name: float({**THRESHOLDS, **(thresholds or {})}.get(name, DEFAULT_THRESHOLD)) for name in names}
+    used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
     unknown = int(np.isnan(contact).sum())
     report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
                            int(np.isfinite(given).sum()), scores.counts, used)  # fmt: skip

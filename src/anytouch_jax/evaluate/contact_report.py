@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data.contact import DEFAULT_THRESHOLD, THRESHOLDS, ContactScores, contact_scores
+from anytouch_jax.data.contact import ContactScores, limits_of
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.whole import write_whole
@@ -77,43 +77,35 @@ def known_contact_by(manifest: Manifest, reference: str | None = None) -> tuple[
 
 def contact_quality(
     manifest: Manifest,
+    scores: ContactScores,
     *,
     reference: str | None = None,
     above: float | None = None,
-    split: str | None = None,
-    scores: ContactScores | None = None,
     thresholds: Mapping[str, float] | None = None,
-    workers: int = 2,
 ) -> ContactQuality:
     """Compare the filter's verdict with column `reference` > `above` (default: the first of REFERENCES that is there).
 
-    Only rows of `split` (default: all but `background`) that have a value and a score are compared. `thresholds`
-    replaces entries of THRESHOLDS. Raises UserError when no such column or row is there.
+    Rows that have a value and a score are compared, but those of the split `background`. `thresholds` replaces entries
+    of THRESHOLDS. Raises UserError when no such column or row is there.
     """
     name, truth = known_contact_by(manifest, reference)
     limit = REFERENCES.get(name, 0.0) if above is None else above
-    splits = np.asarray(manifest.table["split"].to_pylist(), object)
-    rows = np.flatnonzero(splits == split if split else splits != "background")
-    known = rows[~np.isnan(truth[rows])]
-    scores = scores or contact_scores(manifest, known, workers=workers)
-    used = known[~np.isnan(scores.score[known])]
+    asked = np.asarray(manifest.table["split"].to_pylist(), object) != "background"
+    used = np.flatnonzero(asked & ~np.isnan(truth) & ~np.isnan(scores.score))
     if not used.size:
         raise UserError(f"no row has both a value in {name} and a score")
+    score, origins = scores.score[used], scores.reasons[used]
     sensors = np.asarray(manifest.table["sensor"].to_pylist(), object)[used]
-    limits = {**THRESHOLDS, **(thresholds or {})}
-    found = scores.score[used] > np.array([limits.get(one, DEFAULT_THRESHOLD) for one in sensors])
-    there = truth[used] > limit
-    whole = ContactQuality(
-        name, limit, len(used), len(rows) - len(used), int(there.sum()), int(found.sum()), int((there & found).sum()),
-        _correlation(scores.score[used], truth[used]), {},
-    )  # fmt: skip
-    groups = {f"sensor {one}": sensors == one for one in sorted(set(sensors.tolist()))}
-    origins = scores.reasons[used]
-    groups |= {f"background {one}": origins == one for one in sorted(set(origins.tolist()))}
-    for one, mine in groups.items():
-        hits = int((there & found & mine).sum())
-        whole.parts[one] = int(mine.sum()), _share(hits, (found & mine).sum()), _share(hits, (there & mine).sum())
-    return whole
+    found, there = score > limits_of(manifest, thresholds, 0.0)[used], truth[used] > limit
+    hit = there & found
+    groups = {f"sensor {one}": sensors == one for one in sorted(set(sensors))}
+    groups |= {f"background {one}": origins == one for one in sorted(set(origins))}
+    parts = {
+        one: (int(mine.sum()), _share(hit[mine], found[mine]), _share(hit[mine], there[mine]))
+        for one, mine in groups.items()
+    }
+    counts = (len(used), int(asked.sum()) - len(used), int(there.sum()), int(found.sum()), int(hit.sum()))
+    return ContactQuality(name, limit, *counts, _correlation(score, truth[used]), parts)
 
 
 def contact_picture(manifest: Manifest, scores: ContactScores, path: str | Path, *,
@@ -123,9 +115,7 @@ def contact_picture(manifest: Manifest, scores: ContactScores, path: str | Path,
     Frames are spread evenly over the scores on each side, so the doubtful ones stand at the border: the end of the
     dropped and the start of the kept. The number is the score. Raises UserError when no row has a score.
     """
-    sensors = manifest.table["sensor"].to_pylist()
-    table = {**THRESHOLDS, **(thresholds or {})}
-    limits = np.array([table.get(one, DEFAULT_THRESHOLD) for one in sensors])
+    limits = limits_of(manifest, thresholds, 0.0)
     splits = np.asarray(manifest.table["split"].to_pylist(), object)
     known = np.flatnonzero(~np.isnan(scores.score) & (splits != "background"))
     if not known.size:
@@ -172,8 +162,8 @@ def _tile(manifest: Manifest, row: int, score: float, colour: tuple[int, int, in
     return tile
 
 
-def _share(part: int, whole: int) -> float:
-    return part / int(whole) if whole else float("nan")
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    return int(part.sum()) / int(whole.sum()) if whole.any() else float("nan")
 
 
 def _correlation(score: np.ndarray, truth: np.ndarray) -> float:

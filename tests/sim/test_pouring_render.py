@@ -11,6 +11,7 @@ import pytest
 
 from anytouch_jax.sim import mechanics, pouring, pouring_render, shear
 from anytouch_jax.sim.pouring import Load, Task
+from anytouch_jax.sim.units import gel_of
 
 SIDE = 56
 
@@ -53,7 +54,7 @@ def test_the_grip_presses_with_its_force(held, setup):
 def test_a_unit_load_moves_the_skin_as_the_full_model_does(held, setup):
     """Sticking, by the weighted sum; and with a slipping rim, whose extra motion is Mindlin's."""
     grasp, contact = held
-    gel, pitch = pouring_render.gel_of(setup.unit), pouring_render.PITCH
+    gel, pitch = gel_of(pouring_render.SENSOR, setup.unit), pouring_render.PITCH
     centre = mechanics.centroid(contact.pressure, pitch)
     step = jax.jit(partial(shear.shear_step, None, contact, gel=gel, pitch=pitch, centre=centre, iterations=300))
     for friction, motion in ((1e4, (0.0, 0.2, 0.0)), (0.7, (0.05, 0.25, 0.02)), (0.25, (0.0, 0.3, 0.0))):

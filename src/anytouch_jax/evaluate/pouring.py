@@ -16,6 +16,7 @@ from anytouch_jax.whole import write_whole
 
 from ..sim import pouring, pouring_render
 from ..sim.pouring import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
+from ..sim.units import stack
 from .results import mean_interval
 
 Array = npt.NDArray[Any]
@@ -133,7 +134,7 @@ def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
     """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
     setups = [pouring.draw_setup(task, np.random.default_rng([seed % 2**63, number])) for number in range(count)]
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(count))
-    return pouring.stack(setups), keys
+    return stack(setups), keys
 
 
 @partial(jax.jit, static_argnames=("task",))

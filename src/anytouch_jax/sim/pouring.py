@@ -7,7 +7,6 @@ The gel's normal lies between t and d. g, mm, s, N, rad; everything is a pure fu
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -148,11 +147,6 @@ def draw_setup(task: Task, rng: np.random.Generator) -> Setup:
         "lean": math.tan(math.radians(rng.normal(0, 0.7))),
     }
     return Setup(**{name: np.asarray(value, np.float32) for name, value in values.items()}, unit=unit)
-
-
-def stack(setups: Sequence[Setup]) -> Setup:
-    """Several runs as one, with a leading axis for vmap."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *setups)
 
 
 def begin(setup: Setup, task: Task, key: Array) -> State:

@@ -7,7 +7,6 @@ slipping rim gives way. `sim.shear.shear_step` with its history is what this is 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ from . import mechanics, optics, shear
 from .mechanics import Contact, Gel
 from .pouring import Load, Setup
 from .sensors import SENSORS, look
-from .units import Unit, from_gel
+from .units import from_gel, gel_of
 
 SENSOR = SENSORS["gelsight_mini"]
 ROWS, COLUMNS = 48, 64
@@ -41,12 +40,6 @@ class Grasp(NamedTuple):
     behind: Array
 
 
-def gel_of(unit: Unit) -> Gel:
-    """The gel of a sensor's unit."""
-    gel = SENSOR.gel
-    return replace(gel, modulus=gel.modulus * unit.modulus, thickness=gel.thickness * unit.thickness)
-
-
 def surface(setup: Setup) -> Array:
     """Heights (ROWS, COLUMNS) mm of the cylinder over the round gel, 0 where it is met first."""
     x, y = mechanics.positions((ROWS, COLUMNS), PITCH)
@@ -60,7 +53,7 @@ def surface(setup: Setup) -> Array:
 
 def hold(setup: Setup, side: int) -> tuple[Grasp, Contact]:
     """The gel's answers in one run, for pictures of `side` pixels, and the contact under the grip."""
-    gel, z = gel_of(setup.unit), surface(setup)
+    gel, z = gel_of(SENSOR, setup.unit), surface(setup)
     press = jax.vmap(partial(mechanics.press, gel=gel, pitch=PITCH, iterations=40), in_axes=(None, 0))
     depths = jnp.geomspace(0.05, 2.0, 8)
     tried = press(z, depths).force

@@ -7,7 +7,6 @@ labels need it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from .mechanics import Contact, Fidelity, Gel
 from .objects import Object
 from .scene import Recording, Scenes
 from .sensors import SENSORS, Sensor, look
-from .units import from_gel, stack, turned
+from .units import from_gel, gel_of, stack, turned
 
 SPACING = 0.1  # mm a pixel of a relief
 RELIEF = 400  # pixels of a relief: 40 mm, more than any field turned by any angle, and its motion
@@ -104,9 +103,7 @@ def record(
     """
     (rows, columns), pitch = solve_grid(sensor)
     y, x = jnp.meshgrid(*((jnp.arange(n) - (n - 1) / 2) * pitch for n in (rows, columns)), indexing="ij")
-    gel = replace(
-        sensor.gel, modulus=sensor.gel.modulus * clip.unit.modulus, thickness=sensor.gel.thickness * clip.unit.thickness
-    )
+    gel = gel_of(sensor, clip.unit)
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
     relief = surfaces(clip, x, y)
     contact = jax.vmap(press)(relief, clip.depth)
@@ -221,9 +218,7 @@ class Recorder:
         clips = [self._clip(recording) for recording in recordings[first : first + self._at_once]]
         count = len(clips)
         clips += clips[-1:] * (self._at_once - count)  # one shape, one compilation
-        several = stack([clip.unit for clip in clips])
-        batch = Clip(*(np.stack(values) for values in zip(*(c._replace(unit=0) for c in clips), strict=True)))
-        takes = jax.device_get(self._program(recordings[0].sensor)(batch._replace(unit=several)))
+        takes = jax.device_get(self._program(recordings[0].sensor)(stack(clips)))
         return [jax.tree.map(lambda x, i=i: x[i], takes) for i in range(count)]
 
     def _program(self, name: str) -> Any:

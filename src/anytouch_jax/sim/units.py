@@ -7,14 +7,18 @@ which part of the gel the camera shows and from which side, and only the rendere
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .mechanics import Gel
 from .sensors import Sensor
 
+Tree = TypeVar("Tree")
 Leaf = Any  # numpy as drawn, jax under vmap and jit
 
 
@@ -99,6 +103,12 @@ def from_gel(unit: Unit, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Arr
     return turned(x - unit.offset[0], y - unit.offset[1], -unit.rotation)
 
 
-def stack(units: list[Unit]) -> Unit:
-    """Several units as one, with a leading axis for vmap."""
-    return Unit(*(np.stack(values) for values in zip(*units, strict=True)))
+def gel_of(sensor: Sensor, unit: Unit) -> Gel:
+    """The gel of a sensor's unit."""
+    gel = sensor.gel
+    return replace(gel, modulus=gel.modulus * unit.modulus, thickness=gel.thickness * unit.thickness)
+
+
+def stack(several: Sequence[Tree]) -> Tree:
+    """Several units, or records that hold one, as one, with a leading axis for vmap."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *several)

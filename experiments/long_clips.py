@@ -32,11 +32,13 @@ from typing import Any
 
 import numpy as np
 from study import asked, page
+from study.results import noted
 
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import machine, plots, probe, tasks
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder
 from anytouch_jax.evaluate.results import markdown
+from anytouch_jax.train.watch import silent
 from anytouch_jax.whole import write_whole
 
 RUN, DATA = asked.path("RUN", "runs/stage2"), asked.path("DATA", "data/scenes/manifest.parquet")
@@ -121,11 +123,8 @@ if not TABLE:
 
 def finished(path: Path) -> dict[str, Any] | None:
     """What was measured with these settings, if it was; with TABLE=1 whatever was measured."""
-    try:
-        found: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return found if TABLE or found.get("settings") == SETTINGS else None
+    found = noted(path)
+    return found if found and (TABLE or found.get("settings") == SETTINGS) else None
 
 
 def make(name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -140,7 +139,7 @@ def make(name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def seen(frames: int, join: Any) -> dict[str, Any]:
-    read, values = embed_rows(encoder, table, rows, frames, "both", join, say=lambda _: None)
+    read, values = embed_rows(encoder, table, rows, frames, "both", join, say=silent)
     if len(read) < len(rows):
         raise SystemExit(f"{len(rows) - len(read)} rows cannot be read; `anytouch verify` says what is wrong with them")
     found = scores(values)

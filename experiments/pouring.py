@@ -28,7 +28,6 @@
 # %%
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict
 from functools import cache
@@ -37,6 +36,7 @@ from typing import Any
 
 import numpy as np
 from study import asked, page
+from study.results import noted
 
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.evaluate import plots, pouring, pouring_bounds, pouring_policy, pouring_table, pouring_tuning
@@ -112,10 +112,7 @@ def settings_of(mode: str) -> dict[str, Any]:
 
 def finished(path: Path, settings: dict[str, Any], source: str) -> bool:
     """Whether a row is there with these settings; one of another encoder or size is done again."""
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return False
+    found = noted(path)
     return bool(found.get("settings") == settings and found.get("source") == source)
 
 

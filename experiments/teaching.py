@@ -44,6 +44,7 @@ from anytouch_jax.evaluate.contacts import background_difference, contact_vector
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.sim.dataset import VERSION
+from anytouch_jax.train.watch import silent
 from anytouch_jax.whole import write_whole
 
 WORK, OUT, TABLE = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results"), asked.switch("TABLE")
@@ -145,7 +146,7 @@ def features(encoders: dict[str, Encoder], seed: int, table: Any, rows: np.ndarr
     plain = replace(one.config, data=replace(one.config.data, background="keep"))
     fresh = {"untrained": random_encoder(one.config, seed), "untrained, whole picture": random_encoder(plain, seed)}
     every = (encoders | fresh).items()
-    return {name: embed_rows(e, table, rows, pooling=pooling, say=lambda _: None)[1] for name, e in every}
+    return {name: embed_rows(e, table, rows, pooling=pooling, say=silent)[1] for name, e in every}
 
 
 # %% [markdown]

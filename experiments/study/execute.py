@@ -18,7 +18,7 @@ from anytouch_jax.whole import write_whole
 
 from . import budget, plan
 from .plan import Leaf, Scenes, Size, Training
-from .results import differences, simulated
+from .results import differences, noted, simulated
 
 Say = Callable[[str], None]
 PAUSE = 5.0  # s until what others work on is looked at again
@@ -54,10 +54,7 @@ class Outcome(NamedTuple):
 
 def is_done(leaf: Leaf, out: Path) -> bool:
     """Whether `out` has the JSON of just this run."""
-    try:
-        return bool(json.loads((out / leaf.file).read_text(encoding="utf-8")).get("identity") == leaf.identity)
-    except (OSError, ValueError):
-        return False
+    return bool(noted(out / leaf.file).get("identity") == leaf.identity)
 
 
 def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
@@ -70,11 +67,8 @@ def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
     size, questions = leaves[0].size, {leaf.question for leaf in leaves}
     ours = {"simulator": plan.simulator(), "settings": plan.settings(size), "size": size.name}
     for path in sorted(out.glob("*.json")):
-        try:
-            theirs = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            continue  # broken: it is made again
-        if not isinstance(theirs, dict) or theirs.get("question") not in questions:
+        theirs = noted(path)
+        if theirs.get("question") not in questions:  # or broken: it is made again
             continue
         if simulated(theirs) != ours["simulator"]:
             what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"

@@ -76,6 +76,15 @@ def read(folder: Path) -> list[Run]:
     return found
 
 
+def noted(path: Path) -> dict[str, Any]:
+    """What a file of notes holds; nothing where there is none, or a broken one."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def simulated(about: Mapping[str, Any]) -> int:
     """The version of the simulator that a record is of; those that note none are of the first."""
     return int(about.get("simulator", 1))

@@ -33,6 +33,7 @@ from anytouch_jax.whole import alone, write_whole
 from . import cuts, plan, scores
 from .cuts import content_hash
 from .plan import Leaf, Scenes, Size, Training
+from .results import noted
 
 Say = Callable[[str], None]
 DONE, BEGUN = "done.json", "begun.json"
@@ -77,11 +78,11 @@ class Work:
 
     def made(self, one: Scenes, size: Size) -> bool:
         """Whether a data set is there, and of this size and this simulator."""
-        return bool(_noted(self.folder / one.name / DONE).get("of") == _of(one, size))
+        return bool(noted(self.folder / one.name / DONE).get("of") == _of(one, size))
 
     def _trained(self, one: Training, sets: set[str]) -> bool:
         """Whether a training is finished, on the data that are there now."""
-        of = _noted(self.run_of(one) / DONE).get("of")
+        of = noted(self.run_of(one) / DONE).get("of")
         needed = {name.partition("/")[0] for name in one.manifests} - {plan.REAL}
         return of is not None and needed <= sets and of == self._contents(one)
 
@@ -91,7 +92,7 @@ class Work:
 
     def train(self, one: Training) -> None:
         start, run, of = time.perf_counter(), self.run_of(one), self._contents(one)
-        before = _noted(run / BEGUN) or _noted(run / DONE)
+        before = noted(run / BEGUN) or noted(run / DONE)
         if before.get("of", of) != of:
             self.say(f"  {run.name} was trained on other data: it is begun anew")
             shutil.rmtree(run)
@@ -121,7 +122,7 @@ class Work:
         self._forget()
         trained, data = [], {name: content_hash(self.manifest(name)) for name in found.pop("data")}
         for one in leaf.trainings:
-            about = _noted(self.run_of(one) / DONE)
+            about = noted(self.run_of(one) / DONE)
             data |= about.pop("of")  # what it learned from, whatever is there now
             of = {"key": one.key, "stage": one.config.stage, "config": json.loads(to_json(one.config))}
             trained.append(of | about)
@@ -176,15 +177,6 @@ def _simulated(one: Scenes, size: Size) -> Simulated:
 
 def _of(one: Scenes, size: Size) -> str:
     return repr((one, size.frames, size.objects, size.pixels, size.contact, VERSION))
-
-
-def _noted(path: Path) -> dict[str, Any]:
-    """What a file of notes holds; nothing where there is none."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 @cache

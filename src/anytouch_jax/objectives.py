@@ -199,29 +199,20 @@ def stage2_terms(
         align, terms = losses.alignment_loss(*z, scale, objective.pair_weights, **how)
         total, metrics = total + align, metrics | terms | {"align": align, "temperature": 1 / scale}
         if objective.reconstruct and noise is not None:
-            pixels, terms = stage1_terms(
-                params,
-                batch.align.clip,
-                batch.align.sensor,
-                noise,
-                net=net,
-                config=config,
-                decoder_sensor=decoder_sensor,
-            )
+            own: dict[str, Any] = {"net": net, "config": config, "decoder_sensor": decoder_sensor}
+            pixels, terms = stage1_terms(params, batch.align.clip, batch.align.sensor, noise, **own)
             total, metrics = total + pixels, metrics | terms
-    if batch.match is not None and net.model.match_head == "cosine":
-        first, second = z_touch
-        scale, place = net.apply(params, "scale"), batch.match.place
-        match, right = losses.contrast_loss(first, second, scale, groups=objective.groups, place=place)
-        total = total + objective.match_weight * match
-        metrics |= {"match": match, "match_accuracy": right}
-    elif batch.match is not None:
-        z_anchor, z_positive, z_negative = z_touch
-        positive, negative = (net.apply(params, "match", z_anchor, z) for z in (z_positive, z_negative))  # Eq. 5
-        match = losses.matching_loss(positive, negative)
-        total = total + objective.match_weight * match
-        right = jnp.concatenate([positive > 0, negative < 0])
-        metrics |= {"match": match, "match_accuracy": jnp.mean(right.astype(jnp.float32))}
+    if batch.match is not None:
+        if net.model.match_head == "cosine":
+            first, second = z_touch
+            scale, place = net.apply(params, "scale"), batch.match.place
+            match, right = losses.contrast_loss(first, second, scale, groups=objective.groups, place=place)
+        else:
+            z_anchor, *others = z_touch
+            positive, negative = (net.apply(params, "match", z_anchor, z) for z in others)  # Eq. 5
+            match = losses.matching_loss(positive, negative)
+            right = jnp.mean(jnp.concatenate([positive > 0, negative < 0]).astype(jnp.float32))
+        total, metrics = total + objective.match_weight * match, metrics | {"match": match, "match_accuracy": right}
     return total, metrics
 
 

@@ -30,6 +30,7 @@ Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 _KINDS: tuple[Literal["still"], Literal["clip"]] = ("still", "clip")
 _NEVER = -1
+_PICTURED, _TOLD = (VISION, BOTH), (BOTH, TEXT)  # strata whose rows have an image, a text
 _KIND, _PART, _ORDER, _TRIPLE, _GALLERY = 1, 2, 3, 4, 5  # tags that keep the random streams of one seed apart
 
 
@@ -189,28 +190,20 @@ class Loader:
         ]  # fmt: skip
         seed, rows = self.config.run.seed % 2**63, self.config.data.batch_size
         order = np.random.default_rng([seed, _ORDER, step]).permutation(rows)
+        draws = [draws[at] for at in order]
+        pictured, told = ([slot for slot, draw in enumerate(draws) if draw[0] in kinds] for kinds in (_PICTURED, _TOLD))
         image_row, text_row = np.full(pool.strata.images, rows, np.int32), np.full(self._texts(pool), rows, np.int32)
-        wanted: list[tuple[int, int | None, int | None]] = []  # stratum, image slot and text slot of every row
-        images = texts = 0
-        for slot, at in enumerate(order):
-            stratum, image, text = draws[at][0], None, None
-            if stratum in (VISION, BOTH):
-                image, images = images, images + 1
-                image_row[image] = slot
-            if stratum in (BOTH, TEXT):
-                text, texts = texts, texts + 1
-                text_row[text] = slot
-            wanted.append((stratum, image, text))
+        image_row[: len(pictured)], text_row[: len(told)] = pictured, told
+        image, text = ({slot: i for i, slot in enumerate(slots)} for slots in (pictured, told))
         clip, sensor = self._empty(rows, pool.windows.shape[1])
         batch = AlignBatch(clip, sensor, *self._slots(image_row, text_row))
         force = None if self._force is None else np.full((len(sensor), 2), UNKNOWN)
         jobs: list[Any] = []
-        for slot, (at, (stratum, image, text)) in enumerate(zip(order, wanted, strict=True)):
-            _, index, epoch = draws[at]
+        for slot, (stratum, index, epoch) in enumerate(draws):
             mine = Slots(
                 self._shard.place(slot, rows),
-                self._shard.place(image, len(image_row)),
-                self._shard.place(text, len(text_row)),
+                self._shard.place(image.get(slot), len(image_row)),
+                self._shard.place(text.get(slot), len(text_row)),
             )
             if mine == Slots(None, None, None):
                 continue
@@ -218,7 +211,7 @@ class Loader:
             size = len(pool.members[stratum])
             job = partial(fill_slot, write, size, step, slot, self.config, index, epoch)
             jobs.append(job if mine.touch is not None else partial(_uncounted, job))
-        return Work((batch, force), jobs, {"images": images, "texts": texts})
+        return Work((batch, force), jobs, {"images": len(pictured), "texts": len(told)})
 
     def _caption_length(self) -> int:
         """How many tokens a caption is padded to: the longest of the manifest, in eights, at most the text tower's.
@@ -255,7 +248,7 @@ class Loader:
         if whole or mine.touch is not None:
             self._reader.touch(rows, epoch, None if mine.touch is None else batch.clip[mine.touch])
         picture = None
-        if stratum in (VISION, BOTH) and (whole or mine.image is not None):
+        if stratum in _PICTURED and (whole or mine.image is not None):
             picture = self._reader.vision(rows[-1], epoch)
         if mine.touch is not None:
             batch.sensor[mine.touch] = self._sensor[rows[-1]]

@@ -9,8 +9,6 @@ from flax import nnx
 from tiny_models import touch_model
 
 from anytouch_jax.config import Stack
-from anytouch_jax.nn import product as product_module
-from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.layers import Block, gelu
 from anytouch_jax.nn.product import product, stored
 
@@ -44,23 +42,6 @@ def test_a_product_and_its_gradients_are_those_of_the_rounded_operands(shape):
     for ours, wanted in zip(found, (a @ b, c @ b.T, a.T @ c), strict=True):
         assert ours.dtype == jnp.float32
         np.testing.assert_allclose(ours, wanted, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("frames", [1, 3])
-def test_kernels_rounded_once_give_the_same_bits(frames):
-    net = build(touch_model(dtype="bfloat16"))
-    params = net.init(jax.random.key(0))
-    clip = jax.random.normal(jax.random.key(1), (2, frames, 28, 28, 3))
-    encode = jax.jit(lambda p: net.apply(p, "encode_both", clip, jnp.asarray([0, 3])))
-    once = product_module.rounded(params, "bfloat16")
-    for ours, wanted in zip(encode(once), encode(params), strict=True):
-        np.testing.assert_array_equal(ours, wanted)
-    kinds = {jax.tree_util.keystr(path): x.dtype for path, x in jax.tree_util.tree_leaves_with_path(once)}
-    narrow = {name for name, kind in kinds.items() if kind == jnp.bfloat16}
-    assert "['touch']['projection']['kernel']" in narrow and "['touch']['patch']['kernel']" in kinds.keys() - narrow
-    assert all(name.endswith("['kernel']") for name in narrow)
-    same = product_module.rounded(params, "float32")
-    assert all(a is b for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(params), strict=True))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

@@ -21,7 +21,6 @@ from anytouch_jax.data.transforms import subtract_background, touch_evaluation
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
-from anytouch_jax.nn.product import rounded
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.whole import replacing
 
@@ -109,7 +108,7 @@ class Encoder:
         count, run = len(clips), self._run(pooling, join)
         if not count:  # the network has no shape for nothing: embed one and give none
             clips, rows = np.zeros((1, *clips.shape[1:]), np.uint8), np.zeros(1, np.int32)
-        return np.asarray(run(self.placed, clips, rows.astype(np.int32)))[:count]
+        return np.asarray(run(self._placed, clips, rows.astype(np.int32)))[:count]
 
     def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
         key = (pooling, join)
@@ -118,9 +117,9 @@ class Encoder:
         return self._compiled[key]
 
     @cached_property
-    def placed(self) -> dict[str, Any]:
-        """The parameters on the device, where they stay, rounded to the model's arithmetic."""
-        return rounded(jax.device_put(self.params), self.config.model.dtype)
+    def _placed(self) -> dict[str, Any]:
+        """The parameters on the device, where they stay."""
+        return jax.device_put(self.params)
 
     @cached_property
     def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:

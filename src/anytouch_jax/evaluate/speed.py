@@ -20,7 +20,6 @@ from anytouch_jax.config import UserError
 from anytouch_jax.evaluate import machine
 from anytouch_jax.evaluate.variants import BASELINE, Program, Variant, cold, compiled, traced_as, variants_of
 from anytouch_jax.evaluate.workloads import Workload, first_state, make_batch, normalised, values_of
-from anytouch_jax.nn.product import rounded
 from anytouch_jax.train.step import merge
 
 Tree = Any
@@ -237,10 +236,7 @@ def step_calls(programs: Sequence[Program], state: Tree) -> list[Callable[[], ob
 
 def embed_calls(programs: Sequence[Program], touch: Tree) -> list[Callable[[], object]]:
     """A call takes pixels from the host and brings features back, as a control loop would."""
-    types = [program.work.config.model.dtype for program in programs]
-    params = {dtype: rounded({"touch": touch}, dtype) for dtype in set(types)}
-    call = lambda p, given: np.asarray(p.call(given, *p.batch[:2]))  # noqa: E731
-    return [partial(call, program, params[dtype]) for program, dtype in zip(programs, types, strict=True)]
+    return [partial(lambda p: np.asarray(p.call({"touch": touch}, *p.batch[:2])), program) for program in programs]
 
 
 def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wrong: Mapping[str, float]) -> Row:

@@ -145,10 +145,11 @@ def compile_for_one(
     """The encoder for one touch u8 (1, T, H, W, 3) of one sensor, compiled and run once; parameters on the device."""
     side = encoder.config.model.image_size
     run = jax.jit(partial(touch_features, net=encoder.net, pooling=pooling, join=join))
-    clip, row = jax.device_put((np.zeros((1, frames, side, side, 3), np.uint8), np.full(1, sensor, "i4")))
-    compiled = run.lower(encoder.placed, clip, row).compile()
-    compiled(encoder.placed, clip, row).block_until_ready()
-    return lambda clip: compiled(encoder.placed, clip, row)
+    given = jax.device_put((encoder.params, np.zeros((1, frames, side, side, 3), np.uint8), np.full(1, sensor, "i4")))
+    compiled = run.lower(*given).compile()
+    compiled(*given).block_until_ready()
+    params, _, row = given
+    return lambda clip: compiled(params, clip, row)
 
 
 def _stream(

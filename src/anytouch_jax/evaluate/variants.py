@@ -18,7 +18,6 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from anytouch_jax.evaluate.workloads import Workload, embed_of, make_batch, step_of
 from anytouch_jax.nn import functional, layers
-from anytouch_jax.nn.product import rounded
 from anytouch_jax.train.mesh import donated
 
 Tree = Any
@@ -128,8 +127,7 @@ def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
         args = (state, batch, jax.eval_shape(lambda: jax.random.key(0)))
         batch = jax.device_put(batch)
     else:
-        given = jax.eval_shape(partial(rounded, dtype=work.config.model.dtype), state)
-        function, args = jax.jit(embed_of(work.config)), (given, *batch[:2])
+        function, args = jax.jit(embed_of(work.config)), (state, *batch[:2])
     with cold(), traced_as(variant):
         start = time.perf_counter()
         lowered = function.lower(*args)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,22 +26,6 @@ def product(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
     if stored(dtype) != dtype:
         return checkpoint_name(_narrow(x.astype(stored(dtype)), kernel, jnp.dtype(dtype)), "product")
     return x.astype(dtype) @ kernel.astype(dtype)
-
-
-def rounded(params: Any, dtype: DTypeLike) -> Any:
-    """Parameters to embed with and not to train: the kernels of linear layers rounded to 16 bits once, as each of their
-    products would round them anew; all others, and those of a model of more bits, as they are.
-
-    The patch kernels stay: for a still they are summed before they are rounded.
-    """
-    if jnp.dtype(dtype).itemsize != 2:
-        return params
-
-    def leaf(path: Any, x: Array) -> Array:
-        names = jax.tree_util.keystr(path, simple=True, separator="/")
-        return x.astype(dtype) if names.endswith("/kernel") and "patch/" not in names else x
-
-    return jax.tree_util.tree_map_with_path(leaf, params)
 
 
 # A policy of jax.checkpoint: keep the products of matrices, ours among them, and do the rest anew.

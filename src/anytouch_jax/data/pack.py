@@ -74,10 +74,13 @@ def pack(
     files = distinct_files(manifest)
     finished = target.is_file() and (folder / "README.md").is_file()
     plan = {"version": _VERSION, "manifest": manifest.content_hash, "shard_bytes": shard_bytes}
-    stamp = _stamp(manifest, files)
-    if isinstance(stamp, PackError) and not finished:
-        raise stamp
-    _claim(folder, plan, None if isinstance(stamp, PackError) else stamp, finished)
+    try:
+        stamp = _stamp(manifest, files)
+    except PackError:
+        if not finished:
+            raise  # before hours of packing the others
+        stamp = None
+    _claim(folder, plan, stamp, finished)
     if finished:
         if say:
             say(f"{folder} was finished before: left as it is")
@@ -103,18 +106,18 @@ def pack(
     return target
 
 
-def _stamp(manifest: Manifest, files: Files) -> str | PackError:
-    """A digest of where the files are, their sizes and times: equal manifests may show other pictures. The error of
-    the first that is not there, which must be told before hours of packing the others."""
+def _stamp(manifest: Manifest, files: Files) -> str:
+    """A digest of where the files are, their sizes and times: equal manifests may show other pictures. Raises PackError
+    for the first that is not there."""
     digest = hashlib.sha256()
     for row, column in zip(files.row, files.column, strict=True):
         try:
             path = manifest.file(row, column)
             about = os.stat((split_packed(path) or (path,))[0])
         except FileNotFoundError:
-            return _cannot(manifest, int(row), str(column), "the file is missing")
+            raise _cannot(manifest, int(row), str(column), "the file is missing") from None
         except (OSError, UserError) as error:
-            return _cannot(manifest, int(row), str(column), str(error))
+            raise _cannot(manifest, int(row), str(column), str(error)) from None
         digest.update(f"{path}\0{about.st_size}\0{about.st_mtime_ns}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -128,11 +129,13 @@ def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        old = time.time() - CACHE_DAYS * 86400
-        for file in (one for one in folder.glob("*-cache") if one.stat().st_mtime < old):
-            file.unlink(missing_ok=True)
     except OSError:
         return None
+    old = time.time() - CACHE_DAYS * 86400
+    for file in folder.glob("*-cache"):
+        with contextlib.suppress(OSError):  # another process removes it, or it is somebody else's
+            if file.stat().st_mtime < old:
+                file.unlink()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     compilation_cache.reset_cache()  # else a program compiled before would have switched it off for good
     return folder

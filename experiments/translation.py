@@ -15,11 +15,14 @@
 # straight, one motion for all of them frame by frame; a quarter of the objects, by whole pairs of primitive and
 # texture, is only ever tested on. Training stops where the error on the objects of a third split is smallest.
 #
-#     make translation RUNS="anytouch=runs/stage2 t3=runs/t3"
+#     make translation
 #
-# `RUNS` names the encoders, name=run folder or weights file; one that is not there is replaced by a random encoder and
-# called so. Each is compared with two plain references trained on the same pairs: copying the mean training target,
-# and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
+# trains the encoders, too: AnyTouch and T3-style as in Tables 2 to 4, AnyTouch's stage 1 by itself, and its stage 2
+# with the reconstruction kept as in the authors' release; one of each a seed, on the scenes of `make experiments`
+# (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs. `RUNS="anytouch=runs/stage2
+# t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c for one a seed. Each is compared
+# with two plain references trained on the same pairs: copying the mean training target, and a U-Net (images) or an MLP
+# on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
 # What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
 # is made of these files alone (`TABLE=1`: nothing but that). `WORK=` and `OUT=` in the environment are where data and
@@ -39,12 +42,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import asked, page
+from study import asked, page, plan, remaining
+from study.work import Work
 
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import generation, pairs
-from anytouch_jax.evaluate.features import Encoder, load_encoder, random_encoder
+from anytouch_jax.evaluate.features import Encoder, load_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
 from anytouch_jax.evaluate.results import markdown, seed_interval, verdict
@@ -57,7 +61,7 @@ from anytouch_jax.whole import write_whole
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
 NAME = "translation_quick" if QUICK else "translation"
 WORK, OUT = asked.path("WORK", "runs/translation"), asked.path("OUT", "experiments/results")
-RUNS = asked.runs("anytouch=runs/stage2 t3=runs/t3")
+RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 TOUCHES, STEPS = asked.number("TOUCHES", 24 if QUICK else 400), asked.number("STEPS", 40 if QUICK else 600)
 SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
 TUNE = asked.names("TUNE", "frozen", ("frozen", "fine"))
@@ -81,22 +85,12 @@ PAIRS = WORK / f"pairs-{TOUCHES}"
 # %% [markdown]
 # ## What the encoders may be trained on
 #
-# The paper takes the coarse data of the same objects out of pre-training. `without_objects` does so by name: it keeps
-# the rows whose object is in no split of the pairs. `REMAINING="coarse.parquet ..." make translation` writes
-# `coarse_remaining.parquet` beside each and stops; train the encoders on that.
+# The paper takes the coarse data of the same objects out of pre-training. `study/remaining.py` does so by name: it
+# keeps the rows whose object is in no split of the pairs. For encoders of your own `REMAINING="coarse.parquet ..."
+# make translation` writes `coarse_remaining.parquet` beside each and stops; train them on that.
 
 
 # %%
-def write_remaining(path: Path) -> Path:
-    """The manifest without the objects of the pairs, beside the one given."""
-    whole = manifests.read(path)
-    kept = pairs.without_objects(whole, manifests.read(PAIRS / "manifest.parquet"))
-    target = path.with_name(f"{path.stem}_remaining{path.suffix}")
-    manifests.write(kept, target)
-    print(f"{target}: {len(kept)} of {len(whole)} rows are of objects that the pairs do not have")
-    return target
-
-
 def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
     """How many objects of the pairs the encoder was trained on in its last stage, if its manifests are still there."""
     files = [Path(path) for path in encoder.config.data.manifests]
@@ -166,26 +160,25 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
     print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
 
-def encoders(table: manifests.Manifest) -> dict[str, tuple[Encoder, str]]:
-    """Every encoder of RUNS by the name that it has in the table, with the objects that it knows of the pairs."""
-    found: dict[str, tuple[Encoder, str]] = {}
-    trained = [load_encoder(path).config for path in RUNS.values() if Path(path).exists()]
-    for number, (name, path) in enumerate(RUNS.items()):
-        if Path(path).exists():
-            encoder = load_encoder(path)
-            found[name] = (encoder, overlap(encoder, table))
-        else:
-            print(f"there is no run {path}: {name} is replaced by a random encoder")
-            found[f"{name} (random encoder)"] = (random_encoder((trained or [preset("tiny")])[0], number), "0")
+def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
+    """By the name that they have in the table, and by seed: those of RUNS, else those that this page trains."""
+    if RUNS:
+        loaded = {path: load_encoder(path) for paths in RUNS.values() for path in paths}
+        return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
+    found: dict[str, dict[int, Encoder]] = {}
+    for seed in SEEDS:
+        trained = remaining.train(Work(STUDY), plan.QUICK if QUICK else plan.FULL, seed, table)
+        for name, path in trained.items():
+            found.setdefault(name, {})[seed] = load_encoder(path)
     return found
 
 
 def one_table(several: Sequence[dict[str, Any]]) -> None:
     """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
-    (errors of pictures of another size are no rivals), two encoders of one name."""
+    (errors of pictures of another size are no rivals), two encoders of one name and seed."""
     ways = {(one["touches"], one["pairs"], one["fit"]["steps"], one["size"], one["subtracts"]) for one in several}
-    known = {(one["name"], one["encoder"]) for one in several}
-    if len(ways) > 1 or len(known) > len({name for name, _ in known}):
+    known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
+    if len(ways) > 1 or len(known) > len({one[:2] for one in known}):
         raise UserError(
             f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
             f"make no table together ({sorted(map(str, ways | known))}): choose another OUT"
@@ -203,14 +196,16 @@ def all_runs() -> None:
     table = manifests.read(PAIRS / "manifest.parquet")
     if os.environ.get("REMAINING"):
         for word in os.environ["REMAINING"].split():
-            write_remaining(Path(word))
+            remaining.write_remaining(Path(word), table)
         raise SystemExit(0)
     known = encoders(table)
     content = table.content_hash[:16]
-    plain = seen_by(next(iter(known.values()))[0])  # one view for all, the references too
-    plans = [(name, one, tune) for name, (one, _) in known.items() for tune in TUNE] + [(PIXELS, None, "scratch")]
+    plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
+    wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in remaining.NOT_TUNED]
+    plans = [*wanted, (PIXELS, "scratch")]
     every = {}
-    for (task, seed), (name, encoder, tune) in product(product(TASKS, SEEDS), plans):
+    for (task, seed), (name, tune) in product(product(TASKS, SEEDS), plans):
+        encoder = known[name][seed] if name in known else None
         about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content)
         stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
         every[RUN_FILES / f"{stem}.json"] = (about, encoder)
@@ -218,7 +213,8 @@ def all_runs() -> None:
     one_table([*(about for about, _ in every.values()), *map(_settings_of, there)])
     counts = RUN_FILES / "overlap.json"
     before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
-    write_whole(counts, json.dumps(before | {name: count for name, (_, count) in known.items()}) + "\n")
+    met = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
+    write_whole(counts, json.dumps(before | {name: " to ".join(found) for name, found in met.items()}) + "\n")
     for source, target in TASKS:
         mine = [(*one, file) for file, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
         todo = [one for one in mine if not (one[2].exists() and _settings_of(one[2]) == one[0])]
@@ -312,15 +308,17 @@ def in_units(found: list[dict[str, Any]]) -> str:
 physical = [(name, *(in_units(of(task, name)) for task in TASKS)) for name in names]
 first = records[0]
 tunes = {r["settings"]["fit"]["tune"] for r in records if r["settings"]["name"] != PIXELS}
-named = " ".join(f"{name}=..." for name in sorted({r["settings"]["name"] for r in records} - {PIXELS}))
+ours = {(r["settings"]["name"], r["settings"]["encoder"]) for r in records if r["settings"]["name"] != PIXELS}
+own = len(ours) > len({name for name, _ in ours})
 steps = sorted({r["settings"]["fit"]["steps"] for r in records})  # more than one: some runs are of another size
 lines = [
     "# One sensor's touch as another would feel it",
     "",
     f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, {first['pairs'][2]} of "
     f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
-    f"{len({r['settings']['fit']['seed'] for r in records})} seeds of the translation, each over the same encoder. By "
-    f'`{"TUNE=frozen,fine " if len(tunes) > 1 else ""}make translation RUNS="{named}"`.',
+    f"{len({r['settings']['fit']['seed'] for r in records})} seeds, each over "
+    f"{'encoders of its own' if own else 'the same encoders'}. By "
+    f"`{'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`.",
     "",
     markdown(head, cells),
     "",
@@ -337,7 +335,7 @@ lines = [
     "",
 ]
 if not any(record["critic"] for record in records):
-    lines += ["No critic judged the images: these encoders see touches less the untouched gel, no whole picture.", ""]
+    lines += ["No critic judged the images.", ""]
 lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]
 lines += [f"![{path.stem}]({NAME}/{path.name})" for path in sorted(RUN_FILES.glob("*.png"))]
 lines.append("")

@@ -42,12 +42,16 @@ def path(name: str, usual: str | Path) -> Path:
     return Path(os.environ.get(name) or usual)
 
 
-def runs(usual: str = "") -> dict[str, str]:
-    """`RUNS`: encoders by the names that they have in a table, name=path with blanks between. Raises UserError."""
-    words = (os.environ.get("RUNS") or usual).split()
+def runs() -> dict[str, list[str]]:
+    """`RUNS`: encoders by the names that they have in a table, name=path with blanks between; name=a,b,c gives seeds 0,
+    1, 2 an encoder of their own. Raises UserError for one that is not there."""
+    words = os.environ.get("RUNS", "").split()
     if wrong := [word for word in words if "=" not in word]:
         raise UserError(f"RUNS: name=path for every run, not {wrong[0]!r}")
-    return dict(word.split("=", 1) for word in words)
+    found = {name: paths.split(",") for name, paths in (word.split("=", 1) for word in words)}
+    if lost := [path for paths in found.values() for path in paths if not Path(path).exists()]:
+        raise UserError(f"RUNS: there is no run {lost[0]}")
+    return found
 
 
 def _whole(name: str, word: str, least: int) -> int:

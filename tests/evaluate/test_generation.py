@@ -17,6 +17,7 @@ from pair_world import arrays
 from tiny_models import tiny_config
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Stack, UserError
+from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.evaluate import generation
 from anytouch_jax.evaluate.features import random_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
@@ -25,11 +26,10 @@ from anytouch_jax.evaluate.generator import (
     Design,
     Fit,
     Generator,
-    encoded,
     features,
+    judged,
     load,
     nameless,
-    pooled,
     predict,
     save,
 )
@@ -164,17 +164,36 @@ def test_each_network_moves_against_the_other():
     state, still = generation.begin(one, params)
     x = np.asarray(features(one, params["encoder"], X[:8]))
     y = np.asarray(normalise_touch(Y[:8]))
-    judged = lambda pixels: pooled(one, encoded(one, params["encoder"], pixels, "duragel"))  # noqa: E731
-    batch, rates = generation.Batch(x, y, np.asarray(judged(y))), generation.rates(one, params["fixed"], 1)
+    seen = lambda pixels: judged(one, params["encoder"], pixels, None)  # noqa: E731
+    batch, rates = generation.Batch(x, y, np.asarray(seen(y))), generation.rates(one, params["fixed"], 1)
     after, _ = generation._step(nameless(one))(state, still, batch, rates)
 
     def looks(made, critic, real=None):
         out = predict(one, made | still, x) if real is None else real
-        return float(one.critic.apply(critic["head"], judged(out)).mean())
+        return float(one.critic.apply(critic["head"], seen(out)).mean())
 
     assert looks(after.made, state.critic) > looks(state.made, state.critic)
     gap = lambda critic: looks(None, critic, y) - looks(state.made, critic)  # noqa: E731
     assert gap(after.critic) > gap(state.critic)
+
+
+def test_an_encoder_that_knows_touches_less_the_gel_judges_them_so():
+    """Its critic reads painted and real images as `subtract_background` would show them."""
+    config = ENCODER.config
+    less = replace(ENCODER, config=replace(config, data=replace(config.data, background="subtract")))
+    gel = np.random.default_rng(1).integers(60, 200, Y.shape[1:], np.uint8)
+    touched = np.where(np.arange(len(Y)) % 3 == 0, 1, 0)[:, None, None, None] * np.uint8(90)
+    targets = np.clip(gel.astype(int) - touched, 0, 255).astype(np.uint8)  # a third of the pairs touch every place
+    found, losses = generation.fit(less, X, targets, **SENSORS, options=Fit(steps=2, batch=8), shape=IMAGE)
+    assert found.design.has_critic and "critic" in losses[-1]
+    bare = found.params["fixed"]["gel"]
+    np.testing.assert_allclose(bare, np.asarray(normalise_touch(gel)), atol=1e-5)
+    images = np.random.default_rng(2).integers(0, 256, Y.shape, np.uint8)
+    shown = np.stack(subtract_background(images, gel))
+    assert (shown == 0).any() and (shown == 255).any()  # clipped on both sides
+    one, seen = found.design, np.asarray(judged(found.design, less.params, normalise_touch(images), bare))
+    np.testing.assert_allclose(seen, judged(one, less.params, normalise_touch(shown), None), atol=1e-4)
+    assert "gel" not in generation.fit(ENCODER, X, Y, **SENSORS, options=Fit(steps=1), shape=IMAGE)[0].params["fixed"]
 
 
 def test_equal_seeds_give_equal_generators_and_others_do_not(made):

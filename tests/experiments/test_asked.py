@@ -25,7 +25,15 @@ def test_what_is_not_given_is_as_usual(monkeypatch):
         monkeypatch.setenv(name, "")  # as make passes on what is not set
     assert asked.number("STEPS", 7) == 7 and asked.numbers("SEEDS", "0,2") == [0, 2]
     assert asked.names("TUNE", "fine", ("fine", "frozen")) == ["fine"] and asked.path("OUT", "x") == Path("x")
-    assert asked.runs("a=b c=d=e") == {"a": "b", "c": "d=e"} and asked.runs() == {}
+    assert asked.runs() == {}
+
+
+def test_runs_are_names_and_paths(monkeypatch, tmp_path):
+    one, two = (tmp_path / name for name in ("b", "d=e"))
+    for path in (one, two):
+        path.touch()
+    monkeypatch.setenv("RUNS", f"a={one} c={two},{one}")
+    assert asked.runs() == {"a": [str(one)], "c": [str(two), str(one)]}
 
 
 @pytest.mark.parametrize(
@@ -36,6 +44,7 @@ def test_what_is_not_given_is_as_usual(monkeypatch):
         ("SEEDS", "0,-1", "SEEDS must be a whole number of 0 or more, not '-1'"),
         ("TUNE", "frozen,finely", "TUNE=frozen,finely: there is no 'finely'; choose among fine, frozen"),
         ("RUNS", "a=b runs/x", "RUNS: name=path for every run, not 'runs/x'"),
+        ("RUNS", "a=/,runs/none", "RUNS: there is no run runs/none"),
     ],
 )
 def test_mistakes_are_one_sentence(monkeypatch, name, word, sentence):

@@ -59,13 +59,24 @@ def test_pouring(tmp_path, tiny_run, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_translation(tmp_path, tiny_run, monkeypatch, capsys):
+def test_translation(tmp_path, tiny_run, monkeypatch):
     size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "WORK": tmp_path / "work", "OUT": tmp_path}
-    visit("translation", monkeypatch, RUNS=f"anytouch={tiny_run} t3={tmp_path / 'none'}", **size)
-    assert "t3 is replaced by a random encoder" in capsys.readouterr().out
+    visit("translation", monkeypatch, RUNS=f"anytouch={tiny_run} t3={tiny_run}", **size)
     found = [json.loads(path.read_text()) for path in (tmp_path / "translation_quick").glob("*-*.json")]
     assert len(found) == 9 and all(one["error"] > 0 for one in found)
     page = (tmp_path / "translation_quick.md").read_text()
-    assert "mean of the training targets" in page and "t3 (random encoder), frozen" in page
+    assert "mean of the training targets" in page and "t3, frozen" in page and "over the same encoders" in page
     visit("translation", monkeypatch, TABLE=1)
     assert (tmp_path / "translation_quick.md").read_text() == page
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp_path, monkeypatch):
+    size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "TUNE": "frozen,fine", "OUT": tmp_path}
+    visit("translation", monkeypatch, WORK=tmp_path / "work", STUDY=tmp_path / "study", **size)
+    folder = tmp_path / "translation_quick"
+    names = {path.stem.split("tac3d-", 1)[1] for path in folder.glob("digit-tac3d-*.json")}
+    frozen = {f"{name}-frozen-0" for name in ("anytouch", "anytouch_release", "stage1", "t3")}
+    assert names == frozen | {"anytouch-fine-0", "t3-fine-0", "pixels-scratch-0"}
+    assert set(json.loads((folder / "overlap.json").read_text()).values()) == {"0"}

@@ -78,6 +78,19 @@ def test_nothing_flows_below_the_angle_of_repose(seed):
     assert (np.asarray(states.mass) == TASK.beads).all() and not np.asarray(states.flowing).any()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cylinder_full_to_the_brim_flows_just_over_the_angle_of_repose(seed):
+    """Nothing else holds the beads back: they break loose 0.4 to 2 degrees over it."""
+    setup = setup_of(seed, tilt=0.0)
+    brim = TASK.beads / float(setup.bulk) / (math.pi * float(setup.radius) ** 2)
+    setup = setup._replace(height=np.float32(1.0005 * brim))  # slices are summed in float32
+    states = play(setup, actions_of((POUR, 300)), seed)
+    first = int(np.asarray(states.flowing).argmax())
+    over = math.degrees(float(states.tilt[first] - setup.repose))
+    assert 0.4 <= over <= 2 + TASK.step + 0.1
+    assert (np.asarray(states.mass)[:first] == TASK.beads).all()
+
+
 def test_a_waiting_cylinder_stops_flowing_and_a_tilted_one_goes_on():
     setup = setup_of(2)
     states = play(setup, actions_of((POUR, 130)), 0)
@@ -208,6 +221,30 @@ def test_the_weight_is_there_at_every_tilt():
         weight = (100 + float(setup.empty)) * 1e-3 * GRAVITY
         assert float(jnp.hypot(*found.shear)) == pytest.approx(weight, rel=1e-5)
         assert float(jnp.arctan2(*found.shear)) == pytest.approx(tilt, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_fingers_balance_gravity_and_its_moment(seed):
+    """Forces and moments by vectors: a finger stands at +R n, with the gel, and one at -R n; both bear f k and f e."""
+    setup = setup_of(seed, share=0.5, relax=0.0)
+    tilt, slope, mass = 0.8, 0.4, 70.0
+    found = still(at(setup, tilt=tilt, mass=mass, slope=slope), setup)
+    d, k = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+    t, m = np.cross(k, d), float(setup.mount)
+    n, radius, total = math.cos(m) * t + math.sin(m) * d, float(setup.radius), mass + float(setup.empty)
+    e = np.cross(n, k)
+    across, up = (float(x) for x in pouring.heap(jnp.asarray(mass), jnp.asarray(slope), setup))
+    middle = mass * across * d + (mass * up + float(setup.empty) * float(setup.height) / 2) * k
+    arm = middle / total - float(setup.grip_height) * k
+    gravity = total * 1e-3 * GRAVITY * (math.sin(tilt) * d - math.cos(tilt) * k)
+    moment = np.cross(arm, gravity)
+    on_gel = float(found.shear[0]) * e - float(found.shear[1]) * k + (float(found.normal) - float(setup.grip)) * n
+    on_other = gravity - on_gel
+    np.testing.assert_allclose(on_gel @ n, gravity @ n / 2, atol=1e-4)
+    held = np.cross(radius * n, on_gel) + np.cross(-radius * n, on_other) + 2 * float(found.twist) * n
+    np.testing.assert_allclose(held @ n, moment @ n, rtol=1e-4)
+    np.testing.assert_allclose(held @ e, moment @ e, rtol=1e-3)
+    assert abs(moment @ n) > 1 and abs(moment @ e) > 1  # N mm
 
 
 def test_the_gel_toward_the_lip_is_pressed_and_less_mass_loads_less():

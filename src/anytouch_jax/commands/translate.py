@@ -84,8 +84,6 @@ def _fit(options: Translate) -> int:
     made, losses = generation.fit(
         encoder, x, y, source=options.source, target=options.to, val=val, options=how, say=say
     )
-    if how.adversarial and not made.design.has_critic and not made.design.shape.field:  # a field never has one
-        say("no critic took part: the encoder knows touches less the untouched gel, and the targets are whole pictures")
     ours, mean = generation.errors(made, test_x, test_y), generation.mean_errors(made, test_y)
     picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}

@@ -24,11 +24,10 @@ from anytouch_jax.evaluate.generator import (
     Fit,
     Generator,
     Params,
-    encoded,
     features,
     in_batches,
+    judged,
     nameless,
-    pooled,
     predict,
     units,
 )
@@ -153,7 +152,8 @@ def _pairs(design: Design, params: Params, images: np.ndarray, targets: np.ndarr
     mean, scale = units(design, params["fixed"])
     if design.encoder is None or design.fit.tune != "frozen":
         return _Pairs(images, targets, None, mean, scale, None if val is None else (*val, None))
-    sees, judges = (partial(in_batches, one(nameless(design)), params["encoder"]) for one in (_features, _judged))
+    sees = partial(in_batches, _features(nameless(design)), params["encoder"])
+    judges = partial(in_batches, _judged(nameless(design)), (params["encoder"], params["fixed"].get("gel")))
     real = judges(targets) if design.has_critic else None
     return _Pairs(sees(images), targets, real, mean, scale, None if val is None else (*val, sees(val[0])))
 
@@ -180,6 +180,8 @@ def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: 
     fixed = {"mean": mean, "scale": scale}
     if design.shape.field:
         fixed["unit_mean"], fixed["unit_scale"] = _moments(targets)
+    if design.has_critic and design.subtracts:
+        fixed["gel"] = untouched(targets[::every][:_SAMPLE], *units(design, fixed))
     middle, spread = mean_target(targets, *units(design, fixed))
     return params | {"fixed": fixed | {"target": middle, "spread": spread}}
 
@@ -189,6 +191,11 @@ def _moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flat = values.reshape(-1, values.shape[-1]).astype(np.float64)
     mean, scale = flat.mean(0), flat.std(0)
     return mean.astype(np.float32), np.where(scale > 1e-9, scale, 1).astype(np.float32)
+
+
+def untouched(targets: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The untouched gel of the target, normalised: the median of its images, few of which touch a given place."""
+    return ((np.median(targets, axis=0) - mean) / scale).astype(np.float32)
 
 
 def mean_target(targets: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -210,9 +217,7 @@ def _features(design: Design) -> Any:
 
 @lru_cache(maxsize=8)
 def _judged(design: Design) -> Any:
-    return jax.jit(
-        lambda encoder, images: pooled(design, encoded(design, encoder, normalise_touch(images), design.target))
-    )
+    return jax.jit(lambda seen, images: judged(design, seen[0], normalise_touch(images), seen[1]))
 
 
 # One step -----------------------------------------------------------------------------------------------------------
@@ -252,7 +257,7 @@ def _step(design: Design) -> Any:
 
     def judge_features(critic: Params, still: Params, pixels: Array) -> Array:
         encoder = still["encoder"] if frozen else critic["encoder"]
-        return pooled(design, encoded(design, encoder, pixels, design.target))
+        return judged(design, encoder, pixels, still["fixed"].get("gel"))
 
     def made_loss(made: Params, critic: Params, still: Params, batch: Batch, weight: Array) -> Any:
         params = made | still

@@ -38,6 +38,7 @@ from anytouch_jax.objectives import normalise_touch
 FILE = "generator.safetensors"
 Params = dict[str, Any]
 _BATCH = 64
+_GREY = (0, 128, 255)  # least, middle and most of a touch less its gel (`data.transforms.subtract_background`)
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,8 @@ class Design:
 
     @property
     def has_critic(self) -> bool:
-        """Images are judged by an encoder where the weight is not 0; fields and references never, nor where the encoder
-        `subtracts`: the targets are whole pictures, which it has never seen."""
-        return self.encoder is not None and not self.subtracts and not self.shape.field and self.fit.adversarial > 0
+        """Images are judged by an encoder where the weight is not 0; fields and references never."""
+        return self.encoder is not None and not self.shape.field and self.fit.adversarial > 0
 
 
 def features(design: Design, encoder: Params | None, images: Array) -> Array:
@@ -116,8 +116,16 @@ def encoded(design: Design, encoder: Params, pixels: Array, sensor: str) -> Arra
     return hidden.astype(jnp.float32)
 
 
-def pooled(design: Design, hidden: Array) -> Array:
-    """What a critic reads: class token and mean of the patch tokens (B, 2 D)."""
+def judged(design: Design, encoder: Params, pixels: Array, gel: Array | None) -> Array:
+    """What a critic reads of normalised images of the target: class token and mean of the patch tokens (B, 2 D).
+
+    `gel`: the target's untouched gel, alike, which is taken off for an encoder that `subtracts`.
+    """
+    if gel is not None:
+        grey = (np.array(_GREY)[:, None, None, None, None] / 255 - np.array(IMAGENET_MEAN)) / np.array(IMAGENET_STD)
+        low, middle, high = grey.astype(np.float32)  # (1, 1, 1, 3)
+        pixels = jnp.clip(pixels - gel[None] + middle, low, high)
+    hidden = encoded(design, encoder, pixels, design.target)
     return jnp.concatenate([hidden[:, 0], hidden[:, design.shape.special :].mean(1)], axis=-1)
 
 

@@ -1,0 +1,65 @@
+"""Encoders of Tables 2 to 4 trained anew without some objects: the paper takes the coarse data of the objects that a
+translation is tested on out of pre-training (App. "Cross-sensor generation"); here every row of such an object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.evaluate import pairs
+
+from . import cuts, plan
+from .plan import Leaf, Size, Training
+from .work import Work
+
+LESS = "_remaining"
+NOT_TUNED = (("anytouch_release", "fine"), ("stage1", "fine"))  # they tell why a frozen row is what it is
+
+
+def write_remaining(path: Path, taken: Manifest) -> Path:
+    """The manifest at `path` without the objects of `taken`, beside it. Raises UserError when nothing is left."""
+    whole = manifests.read(path)
+    kept = pairs.without_objects(whole, taken)
+    target = path.with_name(f"{path.stem}{LESS}{path.suffix}")
+    manifests.write(kept, target)
+    print(f"{target}: {len(kept)} of {len(whole)} rows are of objects that the pairs do not have")
+    return target
+
+
+def trainings(size: Size, seed: int) -> dict[str, Training]:
+    """AnyTouch, its stage 1, its stage 2 with the reconstruction kept as in the authors' release, and T3-style."""
+    whole, t3 = (plan.training(size, recipe, seed) for recipe in ("anytouch", "t3"))
+    assert whole.init is not None
+    keeps = replace(whole.config, objective=replace(whole.config.objective, reconstruct=True))
+    found = {"anytouch": whole, "anytouch_release": Training(keeps, whole.init), "stage1": whole.init, "t3": t3}
+    return {name: less(one) for name, one in found.items()}
+
+
+def less(one: Training) -> Training:
+    """The training, and those before it, on what remains of their manifests."""
+    names = tuple(
+        f"{name}{LESS}" if "/" in name else f"{name}/{Path(cuts.WHOLE).stem}{LESS}"
+        for name in one.config.data.manifests
+    )
+    config = replace(one.config, data=replace(one.config.data, manifests=names))
+    return Training(config, less(one.init) if one.init else None)
+
+
+def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]:
+    """Run folders by name, trained where they are not there yet, on data sets of `work` that are made alike."""
+    asked = trainings(size, seed)
+    leaves = [Leaf("translation", name, seed, one, size) for name, one in asked.items()]
+    data = sorted({name for one in asked.values() for name in one.manifests})
+    sets = {name.partition("/")[0] for name in data}
+    for one in plan.scenes(size):
+        if one.name in sets and not work.made(one, size):
+            work.make(one, size)
+    for name in data:
+        write_remaining(work.manifest(name.removesuffix(LESS)), taken)
+    for leaf in leaves:
+        for training in leaf.trainings:
+            if training.key not in work.ready(leaf):
+                work.train(training)
+    return {name: work.run_of(one) for name, one in asked.items()}

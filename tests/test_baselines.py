@@ -145,5 +145,10 @@ def test_train_refuses_a_baseline_that_does_not_fit(capsys: pytest.CaptureFixtur
     assert "no_pretraining is not trained" in told("--baseline", "no_pretraining")
     assert "t3 has no stage 2" in told("--baseline", "t3", "--stage", "2")
     init = ("--stage", "2", "--init", str(tmp_path))
+    assert "--objective.match-keep does nothing in stage 1; leave it out" in told("--objective.match-keep", "0.5")
+    masked = ("--objective.mask-ratio", "0.5", *init)
+    assert "--objective.mask-ratio does nothing in stage 2 without --objective.reconstruct" in told(*masked)
+    for kept in (("--objective.reconstruct", *masked), ("--recipe", "release", *masked), ("--baseline", "t3")):
+        assert "there is no manifest" in told(*kept)
     assert "no_stage1 has no stage 1: leave out --init" in told("--baseline", "no_stage1", *init)
     assert "there is no manifest" in told("--baseline", "no_matching", *init)

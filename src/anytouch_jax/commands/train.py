@@ -6,9 +6,14 @@ import signal
 
 from anytouch_jax import baselines
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import Config, UserError
+from anytouch_jax.config import Config, UserError, preset
 from anytouch_jax.options import Train
 from anytouch_jax.train.watch import Terminated, terminating
+
+# Fields of `config.Objective` that only one stage reads.
+_ALIGNING = ("alpha_tv", "alpha_tl", "alpha_vl", "touch_text_sum", "match_weight", "match_keep", "reconstruct")
+_ALIGNING += ("groups", "centre")
+_MASKING = ("mask_ratio", "norm_pix_loss", "next_frame")
 
 
 def run(options: Train, config: Config) -> int:
@@ -22,12 +27,25 @@ def run(options: Train, config: Config) -> int:
         raise UserError("--clip gives stage 2 the towers of CLIP: add --towers pretrained, or leave --clip out")
     if options.stop_after is not None and options.stop_after < 0:
         raise UserError(f"--stop-after must be 0 or more, not {options.stop_after}")
+    _refuse_objectives(options, config)
     try:
         with terminating():
             return _train(options, config)
     except Terminated:
         say(f"stopped by SIGTERM before a step of {options.run} was under way; the same command starts it, or goes on")
         return 0
+
+
+def _refuse_objectives(options: Train, config: Config) -> None:
+    """Raise UserError for settings of a loss that this stage does not have: they would do nothing."""
+    usual = preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
+    usual, objective = baselines.apply(options.baseline, usual), config.objective
+    where, names = "in stage 1", _ALIGNING
+    if options.stage == 2:
+        where, names = "in stage 2 without --objective.reconstruct", () if objective.reconstruct else _MASKING
+    for name in names:
+        if getattr(objective, name) != getattr(usual.objective, name):
+            raise UserError(f"--objective.{name.replace('_', '-')} does nothing {where}; leave it out")
 
 
 def _train(options: Train, config: Config) -> int:

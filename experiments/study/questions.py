@@ -248,7 +248,11 @@ def new_sensor(runs: Sequence[Run]) -> Part:
         "No sign is claimed. Reconstruction goes through the decoder of stage 1, which stage 2 has left behind.\n\n"
     )
     table = markdown(("tokens, frames", "seeds", *adaptation.TASKS), lines)
-    return Part("A new sensor", f"{text}{table}\n\n{said}".rstrip(), ())
+    wide = (*(f"fitted, {adaptation.FRAMES[-1]} {kind}" for kind in ("unlabelled", "labelled")), "seen")
+    pairs = [Pair(f"{title(one)} against {NOTHING}", one, NOTHING, (None,) * len(columns)) for one in wide]
+    found = judge(several, "new_sensor", columns, pairs)
+    parts = (f"{text}{table}", said.rstrip(), "\n".join(map(sentence, found)))
+    return Part("A new sensor", "\n\n".join(part for part in parts if part), found)
 
 
 NOTHING = "universal, 0 unlabelled"
@@ -273,6 +277,10 @@ def dynamics(runs: Sequence[Run]) -> Part:
     found = judge(views, "dynamics", dynamic(ANY), pairs)
     trained = Pair("dynamic training against stills only, on clips", "anytouch", "static_only", (1, 1, 1, 1), (0, 2, 3))
     found += judge(runs, "dynamics", dynamic("clips"), (trained,))
+    for name in names[2:]:
+        for columns, what in ((dynamic("clips"), "on clips"), (STATIC, "static tasks")):
+            pair = Pair(f"{title(name)}, against AnyTouch, {what}", name, "anytouch", (None,) * len(columns))
+            found += judge(runs, "dynamics", columns, (pair,))
     text = (
         "Twist and slide are directions of the picture as it is. Training flips touches, and the positive of a match\n"
         "apart from its anchor, which asks the encoder to overlook directions; a probe sees frames unflipped. The\n"

@@ -113,11 +113,11 @@ bench-torch: $(STAMP) ## beside PyTorch, in a venv of its own: [PRESET= BATCH= O
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
 	$(PYTHON) experiments/bench_gpu.py $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
-pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: RUNS="anytouch=path static=path t3=path" [QUICK=1 OUT=]
-	RUNS="$(RUNS)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/pouring.py
+pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="anytouch=path static=path t3=path" STUDY= QUICK=1 OUT=]
+	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/pouring.py
 
-translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: RUNS="anytouch=path t3=path" [QUICK=1 OUT=]
-	RUNS="$(RUNS)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
+translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: [RUNS="anytouch=path t3=path" STUDY= QUICK=1 OUT=]
+	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
 
 long-clips: RUN ?= runs/stage2
 long-clips: $(STAMP) $(scenes) ## longer clips, what they see beside what they cost: [RUN= DATA= QUICK=1 OUT=]

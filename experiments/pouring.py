@@ -17,13 +17,13 @@
 # the scales demonstrates; a small MLP over features of four segments (the last two, the first of the lifted cylinder
 # and that of the standing one) imitates it, the encoder frozen or fine-tuned.
 #
-# `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3" .venv/bin/python experiments/pouring.py`, or
-# `make pouring RUNS=...`. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without
-# a path an untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only),
-# `anytouch`. `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is
-# finished is not done again. QUICK=1 is a trial of minutes;
-# TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS, TUNE (steps of fine-tuning), MODES and OUT in the environment
-# change the size and the place.
+# `make pouring` takes the encoders of Tables 2 to 4, one of each a seed, from `make experiments` (`STUDY=runs/matrix`),
+# and trains those that are not there. `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3"` takes encoders of
+# yours. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without a path an
+# untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only), `anytouch`.
+# `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is finished is
+# not done again. QUICK=1 is a trial of minutes; TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS, TUNE (steps of
+# fine-tuning), MODES and OUT in the environment change the size and the place.
 
 # %%
 from __future__ import annotations
@@ -35,8 +35,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import asked, page
+from study import asked, page, plan
 from study.results import noted
+from study.work import Work
 
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.evaluate import plots, pouring, pouring_bounds, pouring_policy, pouring_table, pouring_tuning
@@ -49,7 +50,7 @@ from anytouch_jax.whole import write_whole
 enable_compilation_cache()
 
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
-RUNS = asked.runs()
+RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
 MODES = asked.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", pouring_table.MODES)
 TRIALS, DEMOS = asked.number("TRIALS", 10 if QUICK else 30), asked.number("DEMOS", 12 if QUICK else 200)
@@ -69,8 +70,18 @@ if unknown := set(RUNS) - set(pouring_table.PAPER):
 
 
 # %%
+@cache
+def of_the_tables(seed: int) -> dict[str, Path]:
+    """The runs of Tables 2 to 4 by the names of the rows; the image tower of AnyTouch's is the one untouched."""
+    size = plan.QUICK if QUICK else plan.FULL
+    recipes = {"none": "anytouch", "t3": "t3", "static": "static_only", "anytouch": "anytouch"}
+    return Work(STUDY).runs({name: plan.training(size, recipe, seed) for name, recipe in recipes.items()}, size)
+
+
 def path_of(name: str, seed: int) -> str | None:
     """The run of a row: one for all seeds, or one each."""
+    if not RUNS:
+        return str(of_the_tables(seed)[name])
     paths = RUNS.get(name) or (RUNS.get("anytouch") if name == "static" else None)
     return paths[seed % len(paths)] if paths else None
 
@@ -88,7 +99,7 @@ def encoder_of(name: str, seed: int) -> Encoder | None:
 
 def source_of(name: str, seed: int, encoder: Encoder) -> str:
     """What a row's encoder is, and a mark of its weights: a run that was trained anew is another encoder."""
-    shown = "" if name in RUNS or name == "none" else f", {pouring_table.SHOWN}"
+    shown = "" if name in RUNS or name == "none" or not RUNS else f", {pouring_table.SHOWN}"
     path = path_of(name, seed)
     return f"{'untrained' if path is None else Path(path).name} (weights {encoder.mark}{shown})"
 

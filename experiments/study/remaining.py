@@ -11,7 +11,7 @@ from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.evaluate import pairs
 
 from . import cuts, plan
-from .plan import Leaf, Size, Training
+from .plan import Size, Training
 from .work import Work
 
 LESS = "_remaining"
@@ -50,16 +50,7 @@ def less(one: Training) -> Training:
 def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]:
     """Run folders by name, trained where they are not there yet, on data sets of `work` that are made alike."""
     asked = trainings(size, seed)
-    leaves = [Leaf("translation", name, seed, one, size) for name, one in asked.items()]
-    data = sorted({name for one in asked.values() for name in one.manifests})
-    sets = {name.partition("/")[0] for name in data}
-    for one in plan.scenes(size):
-        if one.name in sets and not work.made(one, size):
-            work.make(one, size)
-    for name in data:
+    work.make_sets({name for one in asked.values() for name in one.manifests}, size)
+    for name in sorted({name for one in asked.values() for name in one.manifests}):
         write_remaining(work.manifest(name.removesuffix(LESS)), taken)
-    for leaf in leaves:
-        for training in leaf.trainings:
-            if training.key not in work.ready(leaf):
-                work.train(training)
-    return {name: work.run_of(one) for name, one in asked.items()}
+    return work.runs(asked, size)

@@ -12,7 +12,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache
@@ -110,6 +110,23 @@ class Work:
             raise KeyboardInterrupt
         self._finish(run, about | {"resumed_at_step": result.resumed})
         self._forget()
+
+    def make_sets(self, manifests: Collection[str], size: Size) -> None:
+        """Make the data sets that these manifests are cut from, where they are not there yet."""
+        wanted = {name.partition("/")[0] for name in manifests}
+        for one in plan.scenes(size):
+            if one.name in wanted and not self.made(one, size):
+                self.make(one, size)
+
+    def runs(self, asked: Mapping[str, Training], size: Size) -> dict[str, Path]:
+        """The run folders of trainings by name; what is not trained yet is, and its data are made."""
+        for name, last in asked.items():
+            self.make_sets(last.manifests, size)
+            leaf = Leaf("encoders", name, last.config.run.seed, last, size)
+            for one in leaf.trainings:
+                if one.key not in self.ready(leaf):
+                    self.train(one)
+        return {name: self.run_of(last) for name, last in asked.items()}
 
     def resolved(self, config: Config) -> Config:
         """A plan's configuration with the names of manifests made files."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from study import plan, remaining
+from study.work import Work
 
 from anytouch_jax.data import manifest as manifests
 
@@ -18,15 +19,12 @@ def table(path: Path, objects: list[str]) -> manifests.Manifest:
     return manifests.from_columns(columns, path)
 
 
-class Study:
+class Study(Work):
     """`Work` without frames or networks; it remembers what it was asked for."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.sets, self.trained = folder, [], []
-
-    def manifest(self, name):
-        dataset, _, part = name.partition("/")
-        return self.folder / dataset / f"{part or 'contact'}.parquet"
+        super().__init__(folder)
+        self.sets, self.trained = [], []
 
     def made(self, one, size):
         return one.name in self.sets
@@ -44,9 +42,6 @@ class Study:
         for name in one.config.data.manifests:
             assert set(manifests.read(self.manifest(name)).column("object").to_pylist()) == {"bolt", "coin"}
         self.trained.append(one)
-
-    def run_of(self, one):
-        return self.folder / "trained" / one.key
 
 
 def test_encoders_learn_from_what_remains_and_are_trained_once(tmp_path):

@@ -11,9 +11,9 @@ from anytouch_jax.options import Train
 from anytouch_jax.train.watch import Terminated, terminating
 
 # Fields of `config.Objective` that only one stage reads.
-_ALIGNING = ("alpha_tv", "alpha_tl", "alpha_vl", "touch_text_sum", "match_weight", "match_keep", "reconstruct")
-_ALIGNING += ("groups", "centre")
-_MASKING = ("mask_ratio", "norm_pix_loss", "next_frame")
+_ALIGNING: tuple[str, ...] = ("alpha_tv", "alpha_tl", "alpha_vl", "touch_text_sum", "match_weight", "match_keep")
+_ALIGNING += ("reconstruct", "groups", "centre")
+_MASKING: tuple[str, ...] = ("mask_ratio", "norm_pix_loss", "next_frame")
 
 
 def run(options: Train, config: Config) -> int:

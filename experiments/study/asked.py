@@ -1,6 +1,7 @@
 """What the environment asks of a page: switches, numbers and names, with one sentence where one makes no sense.
 
-A mistake of the user's ends a page that is run as a script with that sentence; in a notebook it is an exception.
+A mistake of the user's ends a page that is run as a script with that sentence, as Ctrl-C does; in a notebook it is an
+exception.
 """
 
 from __future__ import annotations
@@ -65,8 +66,11 @@ def _whole(name: str, word: str, least: int) -> int:
 
 
 def _plainly(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    name = Path(sys.argv[0]).name
     if issubclass(kind, UserError):
-        print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
+    elif issubclass(kind, KeyboardInterrupt):
+        print(f"{name}: interrupted; the same command goes on", file=sys.stderr)
     else:
         _before(kind, error, trace)
 

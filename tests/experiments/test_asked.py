@@ -59,3 +59,9 @@ def test_a_page_that_is_run_as_a_script_ends_with_the_sentence(monkeypatch):
     monkeypatch.setenv("RUN", "nix")
     found = subprocess.run([sys.executable, PAGES / "long_clips.py"], capture_output=True, text=True, check=False)
     assert found.returncode == 1 and found.stderr == "long_clips.py: no run folder or weights file at nix\n"
+
+
+def test_a_page_that_is_interrupted_says_so():
+    words = [sys.executable, "-c", "from study import asked\nraise KeyboardInterrupt"]
+    found = subprocess.run(words, capture_output=True, text=True, check=False, cwd=PAGES)
+    assert found.returncode != 0 and found.stderr == "-c: interrupted; the same command goes on\n"

@@ -173,6 +173,21 @@ def test_numbers_out_of_range_are_one_sentence(args, said, capsys, tmp_path, wor
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.parametrize(
+    "error", [RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes."), MemoryError()]
+)
+def test_too_little_memory_is_a_sentence(capsys, monkeypatch, error):
+    def run(name, args):
+        raise error
+
+    monkeypatch.setattr("anytouch_jax.cli._run", run)
+    assert "there is not enough memory for this; ask for less at once" in mistake(capsys, "train", "--data", "m.csv")
+    error.args = ("a bug",)
+    if isinstance(error, RuntimeError):
+        with pytest.raises(RuntimeError, match="a bug"):
+            main(["train"])
+
+
 def test_missing_files(capsys, tmp_path, tiny_run, world):
     missing = tmp_path / "none.csv"
     assert str(missing) in mistake(capsys, "train", "--data", missing, "--run", tmp_path / "r")

@@ -274,7 +274,12 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     (tmp_path / "empty").mkdir()
     assert str(tmp_path / "empty") in refused(stage2, tmp_path / "a", init=tmp_path / "empty")
     other = run_config(world, 2, model={"embed": 16})
-    assert "touch/projection/kernel has (16, 12) instead of (16, 16)" in refused(other, tmp_path / "b", init=run)
+    assert "this run would use 16: add --model.embed 12" in refused(other, tmp_path / "b", init=run)
+    wide = replace(other.model.touch, width=32, heads=1)
+    several = refused(replace(other, model=replace(other.model, touch=wide)), tmp_path / "b", init=run)
+    assert several.endswith(
+        f"add --model.embed 12 --model.touch.width 16 --model.touch.heads {other.model.touch.heads}"
+    )
     other = run_config(world, 2, model={"activation": "quick_gelu"})
     assert "trained with gelu, this run would use quick_gelu" in refused(other, tmp_path / "b", init=run)
     other = run_config(world, 2)

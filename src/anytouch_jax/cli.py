@@ -39,6 +39,7 @@ _COMMANDS: dict[str, tuple[type, str]] = {
     "convert": (Convert, "weights in and out"),
     "bench": (Bench, "speed against error, on this machine"),
 }
+_SMALLER = "ask for less at once (--batch, --size, --gallery ...), a smaller --preset, or --model.remat in training"
 # What these require is given by place, not by name.
 _POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert, Translate, Info)
 
@@ -88,6 +89,11 @@ def _main(argv: Sequence[str] | None) -> int:
     except OSError as error:  # a disk, a folder, a name: never a programming error
         advice = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         print(f"anytouch {args[0]}: {error.filename or 'a file'}: {error.strerror or error}{advice}", file=sys.stderr)
+        return 1
+    except (MemoryError, RuntimeError) as error:  # XLA's is a RuntimeError
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print(f"anytouch {args[0]}: there is not enough memory for this; {_SMALLER}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -267,13 +267,20 @@ def _same_size(path: Path, before: Config, config: Config) -> None:
         )
 
 
-def _same_form(path: Path, before: Model, config: Config) -> None:
-    """Raise UserError where weights fit by their shapes, but were trained with other heads or epsilons."""
-    for name in ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps"):
-        theirs, ours = (attrgetter(name)(model) for model in (before, config.model))
-        if theirs != ours:
-            option = f"--model.{name.replace('_', '-')} {theirs}"
-            raise UserError(f"{path} was trained with {name} {theirs}, this run would use {ours}: add {option}")
+_SHAPES: tuple[str, ...] = ("patch", "embed", "frames", "sensor_tokens")
+_SHAPES += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
+_UNSEEN = ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")  # no shape hangs on them
+
+
+def _same_form(path: Path, before: Model, config: Config, names: Sequence[str] = (*_SHAPES, *_UNSEEN)) -> None:
+    """Raise UserError, with all the options that are missing, where weights are of a network of another form."""
+    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in names}
+    other = {name: (theirs, ours) for name, (theirs, ours) in pairs.items() if theirs != ours}
+    if other:
+        told = ", ".join(f"{name} {theirs}" for name, (theirs, _) in other.items())
+        used = ", ".join(str(ours) for _, ours in other.values())
+        options = " ".join(f"--model.{name.replace('_', '-')} {theirs}" for name, (theirs, _) in other.items())
+        raise UserError(f"{path} was trained with {told}, this run would use {used}: add {options}")
 
 
 def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
@@ -298,8 +305,8 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
         detected = release.model_of(file, weights)
         about = release.read_metadata(file)
         shown = about.get(release.BACKGROUND_KEY, "keep")
-        if release.MODEL_KEY in about:  # else its heads are a guess
-            _same_form(file, detected, config)
+        guessed = release.MODEL_KEY not in about  # its heads are, where it does not tell
+        _same_form(file, detected, config, _SHAPES if guessed else (*_SHAPES, *_UNSEEN))
         params, stored = release.to_params(weights, detected), detected.sensors
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,6 +43,21 @@ def write_whole(path: str | Path, data: bytes | str, *, sync: bool = True, part:
     """Write a file whole or not at all, text as UTF-8. Raises OSError, with the file's name (see `replacing`)."""
     with replacing(path, sync=sync, part=part) as target:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A folder to fill, which becomes `path`, that is empty or not there, when the block ends; on an error nothing
+    stays."""
+    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+    try:
+        part.mkdir(parents=True)
+        yield part
+        if path.is_dir():
+            path.rmdir()
+        os.replace(part, path)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _opened(path: str | Path) -> IO[bytes]:

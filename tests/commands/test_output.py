@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from anytouch_jax.commands.output import check_folder, check_home
+from anytouch_jax.commands.output import check_apart, check_folder, check_home
 from anytouch_jax.config import UserError
 
 WORK = {
@@ -35,6 +35,44 @@ def test_what_is_read_is_not_written_over(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UserError, match="pipe is no regular file"):
         check_folder(tmp_path / "pipe")
+
+
+def test_two_outputs_are_two_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    check_apart(out=tmp_path / "a", report=None, sheet=tmp_path / "b", other=None)
+    with pytest.raises(UserError, match="--out and --commercial-only name the same file; give each its own"):
+        check_apart(out=tmp_path / "a", commercial_only=tmp_path / "b" / ".." / "a")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["contact", "touch.parquet", "--picture", "c.parquet", "--out", "c.parquet"], "--out and --picture name the"),
+        (["contact", "touch.parquet", "--picture", "c.jpg"], "must end in .png"),
+        (["verify", "touch.parquet", "--repair", "r.csv", "--out", "r.csv"], "--repair and --out name the same file"),
+        (["verify", "touch.parquet", "--commercial-only", "r.csv", "--out", "r.csv"], "--commercial-only and --out"),
+        (["annotate", "touch.parquet", "--sheet", "x.csv", "--out", "x.csv", "--yes"], "--out and --sheet name"),
+    ],
+)
+def test_outputs_that_would_replace_each_other_are_refused(mistake, pressed, monkeypatch, words, told):
+    monkeypatch.chdir(pressed.parent)
+    monkeypatch.setattr(WORK[words[0]], lambda *args, **options: pytest.fail("the work began"))
+    assert told in mistake(*words)
+
+
+def test_a_picture_of_the_data_is_not_written_over(mistake, pressed, monkeypatch):
+    frame = next(path for path in sorted(pressed.parent.rglob("*.png")))
+    before = frame.read_bytes()
+    assert "is a file that is read; name another one with --picture" in mistake(
+        "contact", pressed, "--picture", frame, "--out", pressed.parent / "c.parquet"
+    )
+    assert frame.read_bytes() == before
+
+
+def test_the_files_of_a_run_are_not_written_over(mistake, pressed, tiny_run, monkeypatch):
+    monkeypatch.setattr(WORK["probe"], lambda *args, **options: pytest.fail("the work began"))
+    words = ("probe", "--run", tiny_run, "--data", pressed, "--out", tiny_run / "config.json")
+    assert "config.json is a file that is read" in mistake(*words)
 
 
 @pytest.mark.parametrize(

@@ -227,6 +227,14 @@ def test_equal_sequences_of_two_manifests_are_no_leak(make, tmp_path):
     assert set(_kinds(verify(both))) == {"leak_file", "duplicate"}  # the same colours, but not the same sequences
 
 
+def test_a_slip_in_the_name_of_a_sensor_is_told(make):
+    names = ["digit", "dgit", "dgit", "gelsight_mni", "my_gel", "universal"]
+    report = verify(make([{"sensor": name, "sequence": f"s{i}"} for i, name in enumerate(names)]))
+    told = [finding for finding in report.findings if finding.kind == "unknown_sensor"]
+    assert [(one.level, one.rows.tolist()) for one in told] == [("warning", [1, 2]), ("warning", [3])]
+    assert told[0].sentence == "2 rows are of sensor 'dgit', which is not known: did you mean digit?"
+
+
 def test_frames_out_of_order_and_frames_twice(make):
     frames = [0, 2, 1, 3, 3, 0]
     rows = [{"sequence": "s" if i < 5 else "r", "frame_index": frame} for i, frame in enumerate(frames)]

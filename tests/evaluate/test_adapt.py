@@ -184,6 +184,23 @@ def test_models_that_cannot_be_adapted_say_so(run, table, tmp_path):
         adapt(other, table, "gelslim")
 
 
+def test_an_adapted_run_is_written_whole_or_not_at_all(run, table, tmp_path, monkeypatch):
+    adapted = adapt(run, table, "gelslim", frames=2, steps=1)
+
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "out").mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.Checkpoints, "save", full)
+        for name in ("out", "new"):
+            with pytest.raises(OSError, match="No space left"):
+                save(adapted, run, tmp_path / name)
+    assert list(tmp_path.iterdir()) == [tmp_path / "out"] and not any((tmp_path / "out").iterdir())
+    save(adapted, run, tmp_path / "out")  # the same command again
+    assert checkpoint.load_params(tmp_path / "out")[1]
+
+
 def test_a_run_that_does_not_tell_what_it_saw_is_taken_at_its_word(run, table, tmp_path):
     params, text, _ = checkpoint.load_params(run)
     said = []

@@ -191,6 +191,17 @@ def test_a_manifest_gives_what_its_pictures_give(encoder, world):
         np.testing.assert_allclose(value, wanted[0], atol=1e-5)
 
 
+def test_every_touch_may_have_a_sensor_of_its_own(encoder):
+    side, names = encoder.config.model.image_size, encoder.config.model.sensors
+    frames = np.random.default_rng(0).integers(0, 256, (3, side, side, 3), np.uint8)
+    told = ["gelsight_mini", "digit", "gelsight_mini"]
+    found = encoder.embed(frames, told)
+    np.testing.assert_array_equal(found, encoder.embed(frames, np.array([names.index(name) for name in told])))
+    np.testing.assert_array_equal(found, encoder.embed(frames, np.array(told)))
+    with pytest.raises(UserError, match="one for each of the 3 touches"):
+        encoder.embed(frames, told[:2])
+
+
 def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
     manifest = manifests.read(world)
     rows, values = embed_rows(encoder, manifest, np.asarray([3, 6]), 3, "both", batch=8)

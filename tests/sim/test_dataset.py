@@ -304,7 +304,8 @@ def test_frames_that_did_not_converge_are_counted(tmp_path, capsys, monkeypatch)
     ("words", "told"),
     [
         (["--sensors", "tac3d", "--fields", "pressure"], "none of the sensors has a camera"),
-        (["--size", "8"], "size must be at least 16, or 0 for each sensor's own resolution, not 8"),
+        (["--size", "8"], "size is 16 to 4096 pixels, or 0 for each sensor's own resolution, not 8"),
+        (["--size", "20000"], "size is 16 to 4096 pixels, or 0 for each sensor's own resolution, not 20000"),
     ],
 )
 def test_what_would_do_nothing_is_refused(tmp_path, capsys, words, told):

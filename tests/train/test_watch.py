@@ -50,4 +50,7 @@ def test_the_summary_tells_of_waiting_for_data_when_it_is_much():
 
 
 def test_the_summary_tells_of_trouble():
+    told = "  2 samples could not be read and were replaced"
+    assert summary(row(3, skipped_samples=2.0)) == "loss 0.5000  30 samples/s" + told
+    assert summary(row(3, skipped_samples=0.0)) == "loss 0.5000  30 samples/s"
     assert summary(row(3, loss=None, skipped_batches=2)) == "loss not finite  30 samples/s  skipped 2"

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
+from anytouch_jax.commands.output import beside, check_apart, check_folder, check_new, write_new
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
@@ -50,6 +50,7 @@ def run(options: Annotate) -> int:
     if not options.estimate:
         check_new(manifest, target)
         check_folder(target, read=() if options.captions is None else (options.captions,))
+    check_apart(out=target, sheet=options.sheet)
     if options.sheet is not None:
         check_folder(options.sheet, "--sheet", read=manifest.files)
     if options.captions is not None:

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
-from anytouch_jax.commands.output import beside, check_folder, check_new, write_new
+from anytouch_jax.commands.output import beside, check_apart, check_folder, check_new, write_new
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
+from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Contact
 from anytouch_jax.strict_json import Range, in_range
 
@@ -28,8 +29,12 @@ def run(options: Contact) -> int:
     target = options.out or (None if options.check else beside(options.manifest, "contact"))
     if target is not None:
         check_new(manifest, target)
+    check_apart(out=target, picture=options.picture)
     if options.picture is not None:
-        check_folder(options.picture, "--picture", read=manifest.files)
+        if options.picture.suffix.lower() != ".png":
+            raise UserError(f"--picture {options.picture} must end in .png")
+        frames = map(manifest.file, range(len(manifest))) if options.picture.exists() else ()
+        check_folder(options.picture, "--picture", read=(*manifest.files, *frames))
     limits = dict(options.threshold)
     contact.limits_of(manifest, limits, options.share)  # mistakes are told before the work
     if options.check:

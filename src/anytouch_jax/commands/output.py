@@ -69,6 +69,18 @@ def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path
         raise UserError(f"the folder {path.parent} cannot be written to; choose another {option}")
 
 
+def check_apart(**outputs: Path | None) -> None:
+    """Raise UserError where two outputs, by the names of their options, are one file: the second would replace the
+    first."""
+    named: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if path is not None:
+            option, place = f"--{name.replace('_', '-')}", path.expanduser().resolve()
+            if place in named:
+                raise UserError(f"{named[place]} and {option} name the same file; give each its own")
+            named[place] = option
+
+
 def check_home(folder: Path, option: str = "--out") -> None:
     """As `check_folder`, for a folder that will be filled after long work: its parents are made, it is not."""
     if folder.is_dir():

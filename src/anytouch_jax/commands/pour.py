@@ -62,7 +62,7 @@ def _record(options: Pour, folder: Path) -> int:
     task, path = Task(markers=options.markers), folder / "manifest.parquet"
     if path.exists():
         raise UserError(f"{path} is there already; record into another folder, or remove this one first")
-    check_folder(path)
+    check_folder(path, "--record")
     say(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=options.size)
     print(pouring_recordings.write(folder, shown, task))
@@ -141,10 +141,10 @@ def _simulated(options: Pour, out: Path) -> int:
     results = {"touch": trials} | {k: pouring.run(task, setups, keys, rival) for k, rival in rivals.items()}
     for name, one in results.items():
         print(f"{name}: mean error {sentence(one, task.target)}")
-    pouring.write_film(out / "pour.gif", trials, task)
     pouring_recordings.save_policy(out, policy)
     found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
     write_whole(out / "pour.json", json.dumps(about | {"poured": found}, indent=2) + "\n")
+    pouring.write_film(out / "pour.gif", trials, task)
     say(f"film, policy and results in {out}")
     return 0
 

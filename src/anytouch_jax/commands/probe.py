@@ -26,7 +26,8 @@ def run(options: Probe) -> int:
 
     check_options(options)
     if options.out is not None:
-        check_folder(options.out, read=(*options.data, *options.run))
+        own = (run / name for run in options.run for name in ("config.json", "metrics.jsonl", "tokenizer.json"))
+        check_folder(options.out, read=(*options.data, *options.run, *own))
     if options.cache is not None:
         check_home(options.cache, "--cache")
     enable_compilation_cache()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anytouch_jax.commands.output import check_folder, check_new, write_new, write_text
+from anytouch_jax.commands.output import check_apart, check_folder, check_new, write_new, write_text
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UserError
 from anytouch_jax.options_data import Verify
@@ -23,8 +23,7 @@ def run(options: Verify) -> int:
 
     if options.swap and options.repair is None:
         raise UserError("--swap exchanges files in the repaired copy: say where it goes with --repair OUT")
-    if options.repair is not None and options.repair == options.commercial_only:
-        raise UserError("--repair and --commercial-only name the same file; give each its own")
+    check_apart(repair=options.repair, commercial_only=options.commercial_only, out=options.out)
     manifest = manifests.read(options.manifests)
     check_swap(manifest, options.swap)  # before the work
     for target in (options.repair, options.commercial_only):
@@ -33,7 +32,7 @@ def run(options: Verify) -> int:
     if options.commercial_only is not None:
         commercial_only(manifest)  # a manifest without such rows is told before the work
     if options.out is not None:
-        check_folder(options.out, read=(*manifest.files, *(path for path in (options.repair,) if path)))
+        check_folder(options.out, read=manifest.files)
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)
     print(report.to_markdown(), end="")
     if options.out is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL
 from anytouch_jax.data.licences import NO, commercial_use
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.scan import OK, STATES, Scan
@@ -187,6 +189,17 @@ def frame_order(manifest: Manifest) -> Iterator[Finding]:
     if rows.size:
         sentence = f"{rows.size} rows stand after a later frame of their sequence"
         yield Finding("frame_order", "warning", sentence, rows, tuple(map(example, rows[:EXAMPLES])), "frame_index")
+
+
+def misspelt_sensors(manifest: Manifest) -> Iterator[Finding]:
+    """Names of sensors that are nearly known ones: a name of one's own is no fault, a slip of the pen is."""
+    names = np.array(manifest.column("sensor").to_pylist(), str)
+    known = (*(name for name in SENSORS if name != UNIVERSAL), *FIELD_SENSORS)
+    for name in sorted(set(names.tolist()) - set(known)):
+        if near := difflib.get_close_matches(name.lower(), known, 1, 0.8):
+            rows = np.flatnonzero(names == name)
+            sentence = f"{rows.size} rows are of sensor {name!r}, which is not known: did you mean {near[0]}?"
+            yield Finding("unknown_sensor", "warning", sentence, rows, (), "sensor")
 
 
 def licence_conflicts(manifest: Manifest) -> Iterator[Finding]:

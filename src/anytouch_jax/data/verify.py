@@ -109,6 +109,7 @@ def verify(
         *swapped(manifest, found),
         *checks.split_leaks(manifest, objects=objects),
         *checks.frame_order(manifest),
+        *checks.misspelt_sensors(manifest),
         *checks.licence_conflicts(manifest),
     ]
     levels = ("error", "warning", "info")

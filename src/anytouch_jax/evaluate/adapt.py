@@ -25,7 +25,7 @@ from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses
 from anytouch_jax.train.record import Record
-from anytouch_jax.whole import write_whole
+from anytouch_jax.whole import whole_folder, write_whole
 
 Params = dict[str, Any]
 Say = Callable[[str], None]
@@ -102,10 +102,14 @@ def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     """Write a run folder that embed, probe and retrieve read. Raises UserError when `out` holds something already."""
     out = Path(out)
     check_empty(out)
-    out.mkdir(parents=True, exist_ok=True)
+    with whole_folder(out) as folder:
+        _save(adapted, Path(run), folder)
+
+
+def _save(adapted: Adapted, run: Path, out: Path) -> None:
     text = to_json(adapted.config)
     write_whole(out / "config.json", text + "\n")
-    tokenizer = Path(run) / "tokenizer.json"
+    tokenizer = run / "tokenizer.json"
     if tokenizer.exists():
         shutil.copyfile(tokenizer, out / "tokenizer.json")
     record = Record(out, 0)
@@ -120,8 +124,10 @@ def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     checkpoints = checkpoint.Checkpoints(
         out / "checkpoints", keep=1, config_json=text, metadata=adapted.about
     )  # fmt: skip
-    checkpoints.save(len(adapted.losses), state, {"loss": adapted.after})
-    checkpoints.close()
+    try:
+        checkpoints.save(len(adapted.losses), state, {"loss": adapted.after})
+    finally:
+        checkpoints.close()
 
 
 def choose(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -82,11 +82,13 @@ class Encoder:
         return f"{zlib.crc32(b''.join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(self.params))):08x}"
 
     def embed(
-        self, clips: Any, sensor: str | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class", join: Join = "mean"
-    ) -> np.ndarray:
+        self, clips: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
+        join: Join = "mean",
+    ) -> np.ndarray:  # fmt: skip
         """Features (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or one (H, W, 3), at the model's size.
 
-        `sensor` is a name for all, or rows i32 (B,). T is 1 (a still), 3 (a clip) or more: segments joined by `join`.
+        `sensor` is a name for all, names (B,), or rows i32 (B,). T is 1 (a still), 3 (a clip) or more: segments joined
+        by `join`.
         An encoder that `subtracts` wants them less the untouched gel: see `Sight`.
         `pooling`: the class token's embedding (what alignment trains), the mean over patch tokens, or both (B, 2E).
         Raises UserError for another shape or type.
@@ -101,6 +103,8 @@ class Encoder:
             )
         check_frames(self.config.model, clips.shape[1])
         rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
+        if rows.dtype.kind in "UO":
+            rows = np.array([self.sensor_row(name) for name in rows.reshape(-1)], np.int32).reshape(rows.shape)
         if rows.shape != (len(clips),):
             raise UserError(f"sensor rows must be one for each of the {len(clips)} touches, not {rows.shape}")
         if rows.min(initial=0) < 0 or rows.max(initial=0) >= len(self.config.model.sensors):

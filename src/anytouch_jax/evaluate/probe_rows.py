@@ -74,8 +74,8 @@ def prepare(
         raise UserError(f"the label is {y[rows['test']][0]:g} on every row of test; R2 has no meaning there")
     if tested and not measured and not np.isin(y[rows["test"]], seen).any():
         raise UserError(
-            "no class of test is in train: whole ones are held out there; take another label, or --tasks object, which "
-            "deals recordings of the same objects anew"
+            "no class of test is in train: whole ones are held out there; take another label, or a task of --tasks, "
+            "which deals the recordings anew"
         )
     notes = _remarks(rows, y, names, groups, split, has, measured)
     return Rows(x, y, names, groups, rows["train"], rows["val"], rows["test"], notes)

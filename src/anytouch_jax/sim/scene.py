@@ -25,6 +25,7 @@ Grade = Literal["fine", "coarse"]
 Motion = Literal["hold", "slide", "twist"]
 
 FIELDS = ("displacement", "pressure", "shear")
+LARGEST = 4096  # pixels of a side
 # Tags that keep the random streams of a seed apart.
 _OBJECTS, _TOUCH, _RECORDING, _PHOTO, _CAPTION, _UNIT = 1, 2, 3, 4, 5, 6
 
@@ -74,8 +75,8 @@ class Scenes:
         for name, least in (("touches", 1), ("frames", 1), ("objects", 1)):
             if getattr(self, name) < least:
                 raise UserError(f"{name} must be at least {least}, not {getattr(self, name)}")
-        if self.size < 16 and self.size:
-            raise UserError(f"size must be at least 16, or 0 for each sensor's own resolution, not {self.size}")
+        if self.size and not 16 <= self.size <= LARGEST:
+            raise UserError(f"size is 16 to {LARGEST} pixels, or 0 for each sensor's own resolution, not {self.size}")
         if self.fields and all(SENSORS[name].kind == "field" for name in self.sensors):
             raise UserError("fields are written beside pictures, and none of the sensors has a camera: leave them away")
         if not (0 <= self.depth[0] <= self.depth[1] < math.inf):

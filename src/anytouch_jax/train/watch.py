@@ -61,6 +61,8 @@ def summary(row: Mapping[str, Any]) -> str:
     """The few numbers of a line of metrics that a user watches."""
     loss = "not finite" if row["loss"] is None else f"{row['loss']:.4f}"
     skipped = f"  skipped {row['skipped_batches']}" if row["skipped_batches"] else ""
+    replaced = row.get("skipped_samples", 0)
+    skipped += f"  {replaced:.0f} samples could not be read and were replaced" if replaced else ""
     waits = f"  waits for data {row['wait_share']:.0%}" if row.get("wait_share", 0) >= _WORTH_TELLING else ""
     return f"loss {loss}  {row['samples_per_second']:.0f} samples/s{skipped}{waits}"
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.checks import misspelt_sensors
 from anytouch_jax.data.readers import (
     cloth,
     feel,
@@ -134,6 +135,8 @@ def index(name: str, root: str | Path, out: str | Path | None = None, *, options
             f"the manifest {target} cannot be written: {error.strerror}; name another file with --out, in a folder "
             "that contains the data"
         ) from None
+    for finding in misspelt_sensors(manifest):
+        notes.say(finding.sentence)
     return _report(one, target, manifest, notes)
 
 

@@ -50,7 +50,14 @@ def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
     floats = RGB.astype(np.float32) / 255
     (tmp_path / "float.tiff").write_bytes(_encoded(".tiff", floats))
     np.testing.assert_array_equal(images.decode(tmp_path / "float.tiff"), RGB)
-    for name, array in (("f", floats.astype(np.float64)), ("u", RGB), ("g", grey), ("d", RGB.astype(np.uint16) * 257)):
+    big = (RGB.astype(np.uint16) * 257).astype(">u2")
+    for name, array in (
+        ("b", big),
+        ("f", floats.astype(np.float64)),
+        ("u", RGB),
+        ("g", grey),
+        ("d", RGB.astype(np.uint16) * 257),
+    ):
         np.save(tmp_path / f"{name}.npy", array)
         np.testing.assert_array_equal(
             images.decode(tmp_path / f"{name}.npy"), RGB if name != "g" else np.stack([grey] * 3, -1)

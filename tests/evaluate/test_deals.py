@@ -146,5 +146,10 @@ def test_values_from_sums():
     assert deals.accuracy_of(np.array([3.0, 4.0])) == 0.75
 
 
+def test_a_value_that_no_draw_has_has_no_interval():
+    still = np.stack([np.ones(20), np.ones(20), np.full(20, 3.0), np.full(20, 9.0), np.ones(20)], 1)
+    assert interval([Sums(np.array([f"g{i // 2}" for i in range(20)]), still)], deals.r2_of) == (None, None)
+
+
 def test_one_test_group_has_no_interval():
     assert interval([sums_of(np.ones(3), np.array(["a"] * 3))], deals.accuracy_of) == (None, None)

@@ -81,6 +81,12 @@ def test_only_the_published_protocol_follows_the_labels_of_test() -> None:
     assert choices["honest"][0] == choices["honest"][1]
 
 
+@pytest.mark.parametrize("penalties", [(), (0.0, 1.0), (-1.0,)])
+def test_penalties_are_above_nought(penalties: tuple[float, ...]) -> None:
+    with pytest.raises(UserError, match="penalties and numbers of neighbours are above 0, at least one of them, not"):
+        linear_probe(*table(apart=1.0), penalties=penalties)
+
+
 def test_the_published_choice_is_the_best_on_test() -> None:
     features, labels, groups, split = table(apart=1.0)
     penalties = (30.0, 1.0, 0.01, 1e-5)

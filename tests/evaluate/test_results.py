@@ -95,6 +95,13 @@ def test_one_group_has_no_interval() -> None:
     assert r2_interval(np.ones(5), np.arange(5.0), np.zeros(5)) == (None, None)
 
 
+def test_an_offset_changes_no_r2_interval() -> None:
+    rng = np.random.default_rng(0)
+    truth, error, groups = rng.standard_normal(60), 0.1 * rng.standard_normal(60), np.arange(60) // 3
+    np.testing.assert_allclose(r2_interval(error, truth + 1.7e9, groups), r2_interval(error, truth, groups), atol=1e-5)
+    assert r2_interval(error, np.ones(60), groups) == (None, None)
+
+
 def test_r2_interval_holds_the_value() -> None:
     rng = np.random.default_rng(0)
     truth, error, groups = rng.normal(size=600), 0.5 * rng.normal(size=600), np.arange(600) // 3

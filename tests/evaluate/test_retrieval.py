@@ -71,6 +71,15 @@ def test_constant_features_score_chance_exactly(metric: Any, centre: bool, level
 
 
 @pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 1e7), (1e-12, 0.0)])
+def test_neither_scale_nor_offset_changes_an_order_of_distances(centre: bool, scale: float, offset: float) -> None:
+    query, gallery = noise(seed=1), noise(seed=1) + 2.0 * noise(seed=2)
+    plain = ask(query, gallery, metric="euclidean", centre=centre)
+    other = ask(query * scale + offset, gallery * scale + offset, metric="euclidean", centre=centre)
+    assert 0.05 < plain.top1 < 1 and other.top1 == pytest.approx(plain.top1)
+
+
+@pytest.mark.parametrize("centre", [False, True])
 def test_rounding_errors_are_no_features(centre: bool) -> None:
     """What differs in the last digits is a constant, even where the same touch has the same digits."""
     same = 3.0 + 1e-13 * noise()

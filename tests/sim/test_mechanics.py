@@ -288,8 +288,27 @@ def test_centroid_and_area():
         (np.full((8, 8), np.nan), 0.1, 0.1, {}, "NaN"),
         (np.zeros((2, 8, 8)), 0.1, 0.1, {}, "vmap"),
         (np.zeros((8, 8)), 0.1, 0.1, {"fidelity": "exactly"}, "fidelity"),
+        (np.zeros((8, 8)), float("inf"), 0.1, {}, "depth"),
+        (np.zeros((8, 8)), 0.1, float("inf"), {}, "pitch"),
+        (np.zeros((8, 8)), 0.1, 0.1, {"modulus_object": 0.0}, "modulus_object must be above 0"),
     ],
 )
 def test_mistakes_are_named(surface, depth, pitch, options, word):
     with pytest.raises(UserError, match=word):
         press(surface, depth, Gel(), pitch, **options)
+
+
+@pytest.mark.parametrize(
+    ("gel", "fidelity", "word"),
+    [
+        (Gel(modulus=-1.0), "exact", "modulus must be above 0"),
+        (Gel(modulus=float("nan")), "exact", "modulus must be above 0"),
+        (Gel(thickness=0.0), "exact", "thickness must be above 0"),
+        (Gel(poisson=1.0), "exact", "Poisson ratio is 0 to 0.5"),
+        (Gel(thickness=0.09), "exact", "too thin for this grid: 0.1 mm is the least"),
+        (Gel(thickness=0.25), "fast", "too thin for this grid: 0.3 mm is the least"),
+    ],
+)
+def test_gels_that_cannot_be_are_named(gel, fidelity, word):
+    with pytest.raises(UserError, match=word):
+        press(np.zeros((64, 64)), 0.05, gel, 0.1, fidelity=fidelity)

@@ -113,7 +113,7 @@ def _to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
         )
     if max(pixels.shape[:2]) > MOST_TIMES * min(pixels.shape[:2]):
         raise ImageError(f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: that is a strip, not a picture")
-    pixels = pixels[..., :3]
+    pixels = pixels[..., :3].astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.uint16:
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     elif np.issubdtype(pixels.dtype, np.floating):

@@ -287,4 +287,5 @@ def _tested(rows: deals.Rows, cut: deals.Cut, said: Array) -> deals.Sums:
     if not rows.measured:
         return deals.Sums(rows.groups[cut.test], np.stack([(said == truth).astype(np.float64), ones], 1))
     error = said - truth
+    truth = truth - rows.y.mean()  # an offset changes no R2, and its square hides the spread
     return deals.Sums(rows.groups[cut.test], np.stack([error**2, np.abs(error), truth, truth**2, ones], 1))

@@ -123,7 +123,8 @@ def mae_of(sums: Array) -> Array:
 def interval(tested: Sequence[Sums], value: Any) -> tuple[float | None, float | None]:
     """95 % percentile interval of `value` (sums -> number) of the mean over seeds, drawing groups and seeds anew.
 
-    The seeds share the drawn groups, as they share the test rows. (None, None) with fewer than two groups.
+    The seeds share the drawn groups, as they share the test rows. (None, None) with fewer than two groups, and where no
+    draw has a value.
     """
     names = np.unique(np.concatenate([one.groups for one in tested]))
     if len(names) < 2:
@@ -137,5 +138,7 @@ def interval(tested: Sequence[Sums], value: Any) -> tuple[float | None, float | 
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.stack([value(times @ total) for total in totals], 1)
     drawn = np.where(chosen > 0, chosen * values, 0).sum(1)
+    if not np.isfinite(drawn).any():
+        return None, None
     low, high = np.percentile(drawn[np.isfinite(drawn)], [2.5, 97.5])
     return float(low), float(high)

@@ -118,6 +118,8 @@ def score(
     if q.shape[1] != g.shape[1]:
         raise UserError(f"query and gallery features have {q.shape[1]} and {g.shape[1]} values; they must be alike")
     q, g = _prepared(q, metric, centre)[drawn.queries], _prepared(g, metric, centre)
+    if metric == "euclidean":
+        q, g = _comparable(q, g)
     top1, top5 = np.zeros(len(q)), np.zeros(len(q))
     for start in range(0, len(q), _CHUNK):
         here = slice(start, start + _CHUNK)
@@ -136,13 +138,21 @@ def score(
 
 def _prepared(values: Array, metric: Metric, centre: bool) -> Array:
     """Rows to be compared by their products; what is left of a constant after centring is nothing, not noise."""
-    least = _TIE * np.abs(values).max(initial=0.0)
+    least = _TIE * np.abs(values).max(initial=0.0) if centre else 0.0
     if centre:
         values = values - values.mean(axis=0, keepdims=True)
     if metric == "euclidean":
-        return values
+        return np.where(np.abs(values) > least, values, 0.0)
     size = np.linalg.norm(values, axis=1, keepdims=True)
     return np.where(size > least, values / np.maximum(size, 1e-300), 0.0)
+
+
+def _comparable(q: Array, g: Array) -> tuple[Array, Array]:
+    """Both moved and scaled alike, which changes no order of distances, so that none of these is lost in rounding."""
+    least, middle = _TIE * max(np.abs(q).max(initial=0.0), np.abs(g).max(initial=0.0)), g.mean(axis=0, keepdims=True)
+    q, g = (np.where(np.abs(one - middle) > least, one - middle, 0.0) for one in (q, g))
+    size = max(np.abs(q).max(initial=0.0), np.abs(g).max(initial=0.0))
+    return (q / size, g / size) if size > 0 else (q, g)
 
 
 def _sorted(touch: Any, unit: Any, side: str) -> _Side:

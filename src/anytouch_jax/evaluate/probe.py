@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..config import UserError
 from .choices import NEIGHBOURS, PENALTIES, RIDGE
 from .probe_models import Linear, Scaling, commonest, nearest, path, ridge, vote
 from .probe_rows import Rows, Scores, bootstraps, choose, folded, prepare
@@ -182,7 +183,10 @@ def regression_probe(
 
 
 def _strongest_first(options: Sequence[float]) -> list[float]:
-    """Penalties (or k) in falling order, each once: a strong fit is a good start for the next weaker one."""
+    """Penalties (or k) in falling order, each once: a strong fit is a good start for the next weaker one. Raises
+    UserError where there is none, and for one that is not above 0."""
+    if not options or min(options) <= 0:
+        raise UserError(f"penalties and numbers of neighbours are above 0, at least one of them, not {list(options)}")
     return sorted(set(options), reverse=True)
 
 

@@ -152,11 +152,14 @@ def r2_interval(error: Array, truth: Array, groups: Array) -> tuple[float | None
     times, ids = group_draws(groups, 1000, 0)
     if times.shape[1] < 2:
         return None, None
+    truth = truth - truth.mean()  # an offset changes no R2, and its square hides the spread
     rows, squares, sums, wrong = (
         times @ np.bincount(ids, weights=one) for one in (np.ones_like(truth), truth**2, truth, error**2)
     )
     spread = squares - sums**2 / rows
     good = spread > 1e-12 * squares  # a draw of equal labels has no R2
+    if not good.any():
+        return None, None
     low, high = np.percentile(1 - wrong[good] / spread[good], [2.5, 97.5])
     return float(low), float(high)
 

@@ -78,9 +78,12 @@ def press(
     conjugate gradients on the contact set (Polonsky and Keer 1999) to `tolerance`, at most `iterations` (300). `fast`:
     `iterations` (2) projected gradients on this grid, after twice and four times as many on coarser ones, and the
     object where the gel still cuts it, as Taxim (Si and Yuan 2022) keeps its contact. For a batch, `jax.vmap`.
-    Raises UserError on a negative depth or a surface of NaN, where their values are known.
+    Raises UserError where the values are known and make no sense: a negative depth, a surface of NaN, moduli that are
+    not above 0, a gel thinner than a pixel (of the coarsest grid and half of it, with `fast`), on which its response
+    has no meaning.
     """
     _check(surface, depth, pitch, fidelity)
+    _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)
     surface = jnp.asarray(surface)
     if surface.dtype not in (jnp.float32, jnp.float64):
         surface = surface.astype(jnp.float32)
@@ -109,12 +112,24 @@ def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
     if np.ndim(surface) != 2:
         raise UserError(f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap for more")
     for name, value, least in (("depth", depth, 0.0), ("pitch", pitch, 1e-12)):
-        if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) >= least):
+        if not isinstance(value, jax.core.Tracer) and not np.all((np.asarray(value) >= least) & np.isfinite(value)):
             raise UserError(f"{name} must be {'at least 0' if least == 0 else 'above 0'} mm, not {value}")
     if not isinstance(surface, jax.core.Tracer):
         values = np.asarray(surface)
         if np.isnan(values).any() or np.isposinf(values).any():
             raise UserError("a surface may hold heights in mm and -inf for no object, but no NaN and no +inf")
+
+
+def _check_elastic(shape: tuple[int, ...], gel: Gel, pitch: Any, fidelity: str, modulus_object: Any) -> None:
+    if not 0 <= gel.poisson <= 0.5:
+        raise UserError(f"a gel's Poisson ratio is 0 to 0.5, not {gel.poisson}")
+    for name, value in (("modulus", gel.modulus), ("thickness", gel.thickness), ("modulus_object", modulus_object)):
+        if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
+            raise UserError(f"{name} must be above 0, not {value}")
+    if not any(isinstance(value, jax.core.Tracer) for value in (pitch, gel.thickness)):
+        least = np.asarray(pitch) * (1.5 * 2 ** (len(grids(shape)) - 1) if fidelity == "fast" else 1)
+        if np.any(np.asarray(gel.thickness) < least):
+            raise UserError(f"a gel of {gel.thickness} mm is too thin for this grid: {least:g} mm is the least")
 
 
 def grids(shape: tuple[int, ...]) -> list[Plan]:

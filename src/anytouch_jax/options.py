@@ -113,8 +113,9 @@ class Embed:
 class Probe:
     """Probe a label column with frozen features: linear and kNN, beside raw pixels and a random encoder.
 
-    Example: anytouch probe --run runs/stage1 --data manifest.csv --label object --where label.contact_score 7
+    Example: anytouch probe --run runs/stage1 --data manifest.csv --label object
 
+    With --where label.contact_score 7 firm touches alone, once `anytouch contact` has scored the frames.
     The penalty is chosen on split val, or by cross-validation in groups inside train; the report is on split test.
     --tasks and --benchmark run the battery instead: objects and recordings apart, dealt anew by every seed.
     An option that would do nothing there (--label, --group, --leave-out, --where, --sensor) is refused.

@@ -58,12 +58,12 @@ class Loader:
             raise UserError(f"devices must be 1 or more, not {devices}")
         if config.stage == 2 and config.data.batch_size % config.objective.groups:
             raise UserError(
-                f"a batch of {config.data.batch_size} does not divide by objective.groups={config.objective.groups}"
+                f"a batch of {config.data.batch_size} does not divide by --objective.groups {config.objective.groups}"
             )
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
         if config.stage == 2 and config.model.match_head == "cosine" and self._match_size % config.objective.groups:
             raise UserError(
-                f"{self._match_size} touches to match do not divide by objective.groups={config.objective.groups}"
+                f"{self._match_size} touches to match do not divide by --objective.groups {config.objective.groups}"
             )
         for name, number in (("devices", devices), ("batch_size", config.data.batch_size)):
             self._shard.check(number, name)

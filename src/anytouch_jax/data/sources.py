@@ -147,18 +147,18 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
     for name, weight in wanted:
         if name not in there:
             known = ", ".join(sorted(there)) or "none: its column 'dataset' is empty"
-            raise UserError(f"data.weights names the dataset {name!r}, but split {config.data.split!r} has {known}")
+            raise UserError(f"--loader.weights names the dataset {name!r}, but split {config.data.split!r} has {known}")
         if not 0 <= weight < 1e6:
-            raise UserError(f"data.weights of {name!r} is how often it is drawn in an epoch, not {weight}")
+            raise UserError(f"--loader.weights of {name!r} is how often it is drawn in an epoch, not {weight}")
     if len(set(dict(wanted))) < len(wanted):
-        raise UserError("data.weights names a dataset twice")
+        raise UserError("--loader.weights names a dataset twice")
     if not wanted:
         return None, []
     weights = np.ones(len(manifest))
     for name, weight in wanted:
         weights[np.asarray(pc.fill_null(pc.equal(column, name), False))] = weight
     if not weights[rows].any():
-        raise UserError(f"data.weights leaves out every row of split {config.data.split!r}")
+        raise UserError(f"--loader.weights leaves out every row of split {config.data.split!r}")
     said = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
     return weights, [f"an epoch draws {said}, other datasets once"]
 

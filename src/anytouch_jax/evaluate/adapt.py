@@ -77,7 +77,10 @@ def adapt(
     if not frames:
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", about)
     if config.stage == 2 and not (config.objective.reconstruct or labels):
-        say("the decoder of this run is that of its stage 1: reconstruct from a stage-1 run, or fit with --labels")
+        say(
+            "this stage 2 did not train the decoder, through which the tokens are fitted: they may be worse than the "
+            "universal ones; take a stage-1 run, or fit with --labels"
+        )
     classes, prototypes = _classes(run, manifest, sensor, labels, say)
     fitted = choose(manifest, sensor, "train", frames, classes, seed)
     clip, target = _read(manifest, config, fitted), classes[fitted]

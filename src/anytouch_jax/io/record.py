@@ -91,6 +91,8 @@ def resolve(folder: Path, step: int | None) -> Path:
         if step is not None and step != int(folder.name):
             raise CheckpointError(f"{folder} is the checkpoint of step {int(folder.name)}, not of step {step}")
         return folder
+    if folder.is_file():
+        raise CheckpointError(f"{folder} is a file; give the folder of a run, which has checkpoints")
     present = steps(folder)
     if not present:
         raise CheckpointError(f"there is no complete checkpoint in {folder}; train first, or give another folder")

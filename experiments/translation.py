@@ -283,7 +283,7 @@ def against(task: tuple[str, str], better: str, worse: str) -> str:
 
 
 claims = []
-for ours in (name for name in names if name.startswith("anytouch")):  # and its variants, anytouch_...
+for ours in (name for name in names if name.startswith(("anytouch", "stage1"))):  # its variants, and its stage 1
     rivals = [name for name in names if name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
     rivals += [*(name for name in names if "pixels" in name), MEAN]
     claims += [(f"{ours} below {rival}", *(against(task, ours, rival) for task in TASKS)) for rival in rivals]

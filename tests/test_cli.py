@@ -108,6 +108,9 @@ def test_the_help_shows_what_is_given_by_place(capsys):
 def test_help_all_lists_the_configuration_with_the_defaults_of_the_preset(capsys):
     assert run("train", "--help-all", "--preset", "small") == 0
     out = capsys.readouterr().out
+    told = " ".join(out.replace("│", " ").split())
+    for meaning in ("share of the patches that a touch keeps in matching", "decay of an average of the parameters"):
+        assert meaning in told  # of the docstrings of the configuration
     for option in ("--model.touch.width", "--objective.mask-ratio", "--optim.clip-norm", "--loader.threads"):
         assert option in out
     assert "(default: 384)" in out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import os
 import sys
 import warnings
@@ -187,8 +188,18 @@ def _parse_train(args: list[str]) -> tuple[Train, Config]:
     if asked:
         rest, closing = ["--help"], ""
     default = Sections(config.model, config.objective, config.optim, config.data, config.run)
-    s = _parse(Sections, "train [the options of --help]", rest, default, closing)
+    s = _parse(_told() if asked else Sections, "train [the options of --help]", rest, default, closing)
     return options, replace(config, model=s.model, objective=s.objective, optim=s.optim, data=s.loader, run=s.loop)
+
+
+def _told() -> type[Sections]:
+    """`Sections`, of which --help shows what the docstring of each class says of its fields."""
+    import tyro
+
+    hints = get_type_hints(Sections)
+    kinds = {name: Annotated[kind, tyro.conf.arg(help=inspect.cleandoc(kind.__doc__))] for name, kind in hints.items()}
+    about = {"__doc__": Sections.__doc__}
+    return make_dataclass("Sections", kinds.items(), bases=(Sections,), frozen=True, namespace=about)
 
 
 def _split_sections(args: list[str]) -> tuple[list[str], list[str]]:

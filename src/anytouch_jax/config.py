@@ -103,7 +103,7 @@ class Optim:
 
 @dataclass(frozen=True)
 class Data:
-    """What is read and how it is augmented. `jitter` is (brightness, contrast, saturation, hue).
+    """What is read and how it is augmented (in config.json `data`). `jitter`: brightness, contrast, saturation, hue.
 
     `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the release).
     `split_steps`: stage 2 takes align and match batches in separate steps (the release). `weights`: (dataset, how often
@@ -147,7 +147,10 @@ class Data:
 
 @dataclass(frozen=True)
 class Run:
-    """One training run: length, saving, reporting, devices."""
+    """One training run (`run` in config.json): `steps` in all, a checkpoint every `save_every` steps (0: the last one),
+    of which the last `keep` and the best stay, pictures every `figure_every` (0: none). `max_skipped`: steps in a row
+    that may be skipped since their loss or gradient is not finite. `fsdp`: devices that share parameters and moments.
+    """
 
     seed: int = 0
     steps: int = 1000

@@ -48,7 +48,9 @@ class Model:
 
     `image` and `text` None leave the towers out (stage 1); `lora_rank` 0: no LoRA. `sensors` names the rows of sensor
     tokens (Sec. 3.5) and of patch encoders if each has its own (T3); row "universal" serves sensors never seen.
-    `match_head` "cosine" is ours, see `ops.losses.contrast_loss`.
+    `match_head` "cosine" is ours, see `ops.losses.contrast_loss`. `embed`: values of an embedding; `frames` of a clip;
+    `temperature` of InfoNCE at the start (it is learned); `attention`: "auto" is the fastest form on this machine, all
+    give the same numbers (`nn/attention.py`); `remat`: activations are computed again instead of kept.
     """
 
     image_size: int

@@ -102,9 +102,14 @@ def check_empty(out: Path) -> None:
 
 
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
-    """Write a run folder that embed, probe and retrieve read. Raises UserError when `out` holds something already."""
+    """Write a run folder that embed, probe and retrieve read. Raises UserError when `out` holds something already, and
+    when the disk has no room for it."""
     out = Path(out)
     check_empty(out)
+    disk = next(folder for folder in out.absolute().parents if folder.is_dir())
+    size, free = sum(leaf.nbytes for leaf in jax.tree.leaves(adapted.params)), shutil.disk_usage(disk).free
+    if size > free:
+        raise UserError(f"{out} takes {size / 1e6:.1f} MB and {disk} has {free / 1e6:.1f} MB left; free some space")
     with whole_folder(out) as folder:
         _save(adapted, Path(run), folder)
 

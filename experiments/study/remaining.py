@@ -50,7 +50,8 @@ def less(one: Training) -> Training:
 def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]:
     """Run folders by name, trained where they are not there yet, on data sets of `work` that are made alike."""
     asked = trainings(size, seed)
-    work.make_sets({name for one in asked.values() for name in one.manifests}, size)
-    for name in sorted({name for one in asked.values() for name in one.manifests}):
+    names = sorted({name for one in asked.values() for name in one.manifests})
+    work.make_sets(names, size)
+    for name in names:
         write_remaining(work.manifest(name.removesuffix(LESS)), taken)
     return work.runs(asked, size)

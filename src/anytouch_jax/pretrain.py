@@ -305,9 +305,10 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
         detected = release.model_of(file, weights)
         about = release.read_metadata(file)
         shown = about.get(release.BACKGROUND_KEY, "keep")
-        guessed = release.MODEL_KEY not in about  # its heads are, where it does not tell
-        _same_form(file, detected, config, _SHAPES if guessed else (*_SHAPES, *_UNSEEN))
         params, stored = release.to_params(weights, detected), detected.sensors
+        if "decoder" in params:  # else it is refused below
+            guessed = release.MODEL_KEY not in about  # its heads are, where it does not tell
+            _same_form(file, detected, config, _SHAPES if guessed else (*_SHAPES, *_UNSEEN))
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
     if shown != config.data.background:

@@ -70,7 +70,7 @@ def load(path: str | Path) -> Tokenizer:
     """Read a `tokenizer.json`, given as the file or its folder. Raises UserError when it is missing or unfit."""
     path = Path(path).expanduser()
     if not path.exists() and path.name != "tokenizer.json":
-        raise UserError(f"there is no tokenizer at {path}: there is nothing; give a tokenizer.json, or its folder")
+        raise UserError(f"there is no tokenizer at {path}, nor anything else; give a tokenizer.json, or its folder")
     file = path / "tokenizer.json" if path.is_dir() else path
     if not file.is_file():
         raise UserError(f"there is no tokenizer {file}; give the tokenizer.json that lies beside CLIP's weights")

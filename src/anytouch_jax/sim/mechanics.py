@@ -79,8 +79,8 @@ def press(
     `iterations` (2) projected gradients on this grid, after twice and four times as many on coarser ones, and the
     object where the gel still cuts it, as Taxim (Si and Yuan 2022) keeps its contact. For a batch, `jax.vmap`.
     Raises UserError where the values are known and make no sense: a negative depth, a surface of NaN, moduli that are
-    not above 0, a gel thinner than a pixel (of the coarsest grid and half of it, with `fast`), on which its response
-    has no meaning.
+    not above 0, a gel thinner than a pixel (with `fast`: than one and a half of its coarsest grid's), whose response
+    the grid cannot hold.
     """
     _check(surface, depth, pitch, fidelity)
     _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)

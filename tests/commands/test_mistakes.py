@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "data" / "readers"))  # reader_world.py
 
@@ -93,14 +94,16 @@ def test_an_absolute_path_is_called_so(mistake, tiny_run, tmp_path):
     assert "is absolute; write it relative to the manifest's folder" in said
 
 
-def test_a_video_that_ends_early_is_told_of(anytouch, tiny_run, tmp_path):
+@pytest.mark.parametrize("stream", [[], ["--stream"]])
+def test_a_video_that_ends_early_is_told_of(anytouch, tiny_run, tmp_path, stream):
     film = tmp_path / "a.avi"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 64))
     for shade in np.random.default_rng(0).integers(0, 255, (30, 64, 64, 3), np.uint8):
         writer.write(shade)
     writer.release()
-    said = anytouch("embed", "--run", tiny_run, "--input", film, "--sensor", "digit", "--out", tmp_path / "f.npz")
+    words = ("--run", tiny_run, "--input", film, "--sensor", "digit", "--out", tmp_path / "f.npz", *stream)
+    said = anytouch("embed", *words)
     assert said.status == 0 and "is it whole" not in said.err
     film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
-    said = anytouch("embed", "--run", tiny_run, "--input", film, "--sensor", "digit", "--out", tmp_path / "f.npz")
+    said = anytouch("embed", *words)
     assert said.status == 0 and "could be read; is it whole?" in said.err

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,15 @@ import numpy as np
 import pytest
 from touch_world import SENSORS, make_touches
 
-from anytouch_jax.config import UserError
+from anytouch_jax.config import UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import plots
-from anytouch_jax.evaluate.features import load_encoder
 from anytouch_jax.evaluate.matching import MatchScore
 from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, demo_report, write_report
 from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval
 from anytouch_jax.evaluate.sections import Section, matching_section, retrieval_section, samples_section
+from anytouch_jax.io import checkpoint
 
 NAMES = (RANDOM, "stage 1", "stage 2")
 
@@ -178,11 +180,23 @@ def test_the_section_of_matching_shows_both_ways() -> None:
 
 
 @pytest.fixture(scope="module")
-def demo(touched: Path, tiny_run: Path, tmp_path_factory: Any) -> tuple[Path, list[str]]:
-    """The report of a tiny run on the small world; the same run stands for both stages."""
+def later(tiny_run: Path, tmp_path_factory: Any) -> Path:
+    """A run that calls itself one of stage 2, with the weights and the log of `tiny_run`."""
+    run = tmp_path_factory.mktemp("later") / "stage2"
+    params, config, about = checkpoint.load_params(tiny_run)
+    told = {"config_json": to_json(replace(from_json(config), stage=2)), "metadata": {"seen": about["seen"]}}
+    with contextlib.closing(checkpoint.Checkpoints(run / "checkpoints", keep=1, **told)) as out:
+        out.save(2, {"trainable": params}, {"loss": 1.0})
+    shutil.copy(tiny_run / "metrics.jsonl", run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def demo(touched: Path, tiny_run: Path, later: Path, tmp_path_factory: Any) -> tuple[Path, list[str]]:
+    """The report of a tiny run on the small world; its weights stand for both stages."""
     said: list[str] = []
     out = tmp_path_factory.mktemp("report") / "new"
-    return demo_report(touched, tiny_run, tiny_run, out, said.append, touches=24, gallery_size=10), said
+    return demo_report(touched, tiny_run, later, out, said.append, touches=24, gallery_size=10), said
 
 
 def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
@@ -220,7 +234,7 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
         assert all(one["metric"] == ("euclidean" if one["name"] == VECTOR else "cosine") for one in kind)
         assert all(one["low"] <= one["top1"] <= one["high"] for one in pooled)
         best = {one["name"]: one["top1"] for one in pooled if not one["centred"]}
-        assert best["stage 1"] == best["stage 2"]  # one run in both places
+        assert best["stage 1"] == best["stage 2"]  # the same weights in both places
         assert best[PIXELS] > 0.25  # the world's textures are plain to see
     assert numbers["retrieval"]["differences"]["fine"]["stage 1"] == [0, 0, 0]
     none = {"found": [], "notes": ["not scored: the run has no matching head; give one of stage 2"]}
@@ -237,14 +251,16 @@ def test_the_reconstructions_show_each_sensor(demo: tuple[Path, list[str]]) -> N
     assert image.shape == (16 + 3 * 32, 11 * 32, 3)
 
 
-def test_a_report_says_what_it_could_not_score(touched: Path, tiny_run: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_report_says_what_it_could_not_score(
+    touched: Path, tiny_run: Path, later: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
     """No background, no covariates, no forces, too few touches: the report is made and names each."""
     table = manifests.read(touched).table
     gone = ("label.x", "label.y", "label.depth", "label.force", "label.area", "background_path", "grade")
     poor = touched.parent / "poor.parquet"
     manifests.write(manifests.from_columns(table.drop_columns(list(gone)).to_pydict(), poor), poor)
     monkeypatch.setattr("anytouch_jax.evaluate.report.reconstructions_section", lambda *args: Section("none"))
-    path = demo_report(poor, tiny_run, tiny_run, tmp_path, lambda _: None, touches=12)
+    path = demo_report(poor, tiny_run, later, tmp_path, lambda _: None, touches=12)
     text = path.read_text()
     for words in (
         "no baseline by pixels minus background: row ", f"no baseline by {VECTOR}: the manifest has none",
@@ -267,16 +283,16 @@ def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, tmp_path: 
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_of_stage_two_does_not_stand_for_stage_one(touched: Path, tiny_run: Path, monkeypatch: Any) -> None:
-    encoder = load_encoder(tiny_run)
-    later = replace(encoder, config=replace(encoder.config, stage=2))
-    monkeypatch.setattr("anytouch_jax.evaluate.report.load_encoder", lambda _: later)
-    with pytest.raises(UserError, match="is a run of stage 2; give the one of stage 1 that it began from"):
-        demo_report(touched, tiny_run, tiny_run, tiny_run.parent / "never")
+def test_a_run_stands_for_its_own_stage_alone(touched: Path, tiny_run: Path, later: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"--stage1 .* is a run of stage 2; give the one of stage 1 that it began from"):
+        demo_report(touched, later, later, tmp_path / "never")
+    with pytest.raises(UserError, match=r"--stage2 .* is a run of stage 1; give one of stage 2 that began from it"):
+        demo_report(touched, tiny_run, tiny_run, tmp_path / "never")
+    assert not (tmp_path / "never").exists()
 
 
 def test_a_report_that_fails_leaves_the_one_before(
-    demo: tuple[Path, list[str]], touched: Path, tiny_run: Path, monkeypatch: Any
+    demo: tuple[Path, list[str]], touched: Path, tiny_run: Path, later: Path, monkeypatch: Any
 ) -> None:
     folder = demo[0].parent
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -286,5 +302,5 @@ def test_a_report_that_fails_leaves_the_one_before(
 
     monkeypatch.setattr("anytouch_jax.evaluate.report._probes", fail)
     with pytest.raises(UserError, match="in the midst of it"):
-        demo_report(touched, tiny_run, tiny_run, folder, lambda _: None, touches=12, gallery_size=10, seed=1)
+        demo_report(touched, tiny_run, later, folder, lambda _: None, touches=12, gallery_size=10, seed=1)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -81,6 +82,8 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         join=options.join,
     )
     result = stream.collect(embedded, _print_line if lines else None)
+    if not live and not result.interrupted:
+        _say_cut(options.input, int(result.numbers[-1]) + 1 if len(result.numbers) else 0)
     if not len(result.numbers) and not result.interrupted:
         raise UserError(f"{options.input} has too few frames for a clip of {options.frames} at stride {options.stride}")
     if not lines:
@@ -139,7 +142,6 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
 
 def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame."""
-    from anytouch_jax.data.images import frames_told
     from anytouch_jax.evaluate import features
 
     row, see = encoder.sensor_row(options.sensor, say), _sight(encoder, options)
@@ -167,14 +169,22 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
             flush()
     flush()
     count = len(names)
-    told = 0 if options.input.is_dir() else frames_told(options.input)
-    if 0.98 * told > count + 2:  # some containers only estimate it
-        say(f"{options.input} tells of {told} frames and {count} could be read; is it whole?")
+    if not options.input.is_dir():
+        _say_cut(options.input, count)
     if not values:
         raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames} that can be read")
     index = np.array(ends)
     keys = {"frame_index": index} | ({"path": np.array(names)[index]} if options.input.is_dir() else {})
     return features.Features(np.concatenate(values), index, keys, max(0, count - options.frames + 1) - len(index))
+
+
+def _say_cut(video: Path, count: int) -> None:
+    """Tell of a video of which fewer frames could be read than it tells of."""
+    from anytouch_jax.data.images import frames_told
+
+    told = frames_told(video)
+    if 0.98 * told > count + 2:  # some containers only estimate it
+        say(f"{video} tells of {told} frames and {count} could be read; is it whole?")
 
 
 def _named_frames(options: Embed) -> Iterator[tuple[str, np.ndarray | None]]:

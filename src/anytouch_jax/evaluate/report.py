@@ -110,7 +110,7 @@ def demo_report(
     `touches` bounds how many touches of test are looked at, and half as many of train and of val, each by its deepest
     frame. Writes the folder `out` as `write_report` does; gives back the path of report.md. Figures are drawn elsewhere
     until all is done, so that a report that fails leaves an earlier one as it was. Raises UserError, also for a run of
-    stage 2 in the place of stage 1, and for weights files.
+    the other stage, and for weights files.
     """
     clock, out = time.perf_counter(), Path(out)
     table = manifests.read(manifest)
@@ -123,13 +123,14 @@ def demo_report(
 
 
 def _of_stage(run: Path, stage: int) -> Encoder:
-    """The encoder of a run. Raises UserError for a weights file, which has no losses to show, and for one of stage 2
-    in the place of stage 1."""
+    """The encoder of a run. Raises UserError for a weights file, which has no losses to show, and for a run of the
+    other stage."""
     if run.is_file():
         raise UserError(f"--stage{stage} {run} is a weights file; give the folder of a run of stage {stage}")
     encoder = load_encoder(run)
-    if stage == 1 and encoder.config.stage == 2:
-        raise UserError(f"--stage1 {run} is a run of stage 2; give the one of stage 1 that it began from")
+    if encoder.config.stage != stage:
+        meant = "the one of stage 1 that it began from" if stage == 1 else "one of stage 2 that began from it"
+        raise UserError(f"--stage{stage} {run} is a run of stage {encoder.config.stage}; give {meant}")
     return encoder
 
 

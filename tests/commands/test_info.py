@@ -29,6 +29,18 @@ def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
     assert f"encoder: {tiny_run}" in found and anytouch("info", world.parent).out.startswith(str(world))
 
 
+def test_a_damaged_checkpoint_is_told_of(anytouch, tiny_run, tmp_path):
+    shutil.copytree(tiny_run, tmp_path / "run")
+    assert "is damaged: its file" not in anytouch("info", tmp_path / "run").out
+    largest = max((tmp_path / "run" / "checkpoints").rglob("*"), key=lambda file: file.stat().st_size * file.is_file())
+    with open(largest, "r+b") as file:
+        file.seek(largest.stat().st_size // 2)
+        file.write(b"not what was here")
+    said = anytouch("info", tmp_path / "run")
+    assert said.status == 0 and "a run of stage 1" in said.out
+    assert "is damaged: its file" in said.out and "there is no intact older checkpoint" in said.out
+
+
 def test_weights_tell_whose_names_they_have(anytouch, tmp_path):
     import jax
 

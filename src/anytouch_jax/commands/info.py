@@ -68,8 +68,14 @@ def _folder(path: Path) -> list[str]:
 def _run(path: Path) -> list[str]:
     from anytouch_jax.config import from_json
     from anytouch_jax.io import checkpoint
+    from anytouch_jax.io.record import CheckpointError, checked, resolve
 
     about = checkpoint.read_metadata(path)
+    try:
+        checked(resolve(path, None))
+        damage = []
+    except CheckpointError as error:
+        damage = [str(error)]
     config: Config = from_json(about["config"])
     kept = checkpoint.steps(path / "checkpoints")
     lowest = checkpoint.best_of(path / "checkpoints")
@@ -82,6 +88,7 @@ def _run(path: Path) -> list[str]:
             f"{path}: the run {source['run']}, with tokens of {source['sensor']} fitted to {source['frames']} frames",
             _model(config.model),
             _sensors(config.model, about.get("seen")),
+            *damage,
         ]
     return [
         f"{path}: a run of stage {config.stage}, step {about['step']} of {config.run.steps}"
@@ -94,6 +101,7 @@ def _run(path: Path) -> list[str]:
         f"data: {', '.join(config.data.manifests) or 'none named'}"
         + (f" (content {about['data'][:12]})" if about.get("data") else ""),
         *([f"loss {loss:.4g}, the mean since the checkpoint before"] if loss is not None else []),
+        *damage,
     ]
 
 

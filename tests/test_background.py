@@ -71,18 +71,19 @@ def test_training_and_probes_read_the_same_differences(touches):
     assert np.abs(plain.astype(int) - Loader(table, config).batch(0).clip).max() > 20
 
 
-def test_another_light_leaves_the_untouched_gel_grey(touches):
-    """Colour is jittered before the gel is taken off: after it a change of brightness would outshine the contact."""
+@pytest.mark.parametrize("change", [{"jitter": (0.4, 0.4, 0.5, 0.3), "flip": 0.5}, {"affine": (20.0, 0.1, 0.1)}])
+def test_another_light_or_place_leaves_the_untouched_gel_grey(touches, change):
+    """A touch is changed before the gel is taken off: after it a change of brightness would outshine the contact."""
     table = manifests.read(touches)
     columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
     columns["path"] = columns["background_path"]  # nobody touches
     bare = manifests.from_columns(columns, touches.parent / "bare.parquet")
     config = settings(touches)
-    config = replace(config, data=replace(config.data, jitter=(0.4, 0.4, 0.5, 0.3), flip=0.5))
+    config = replace(config, data=replace(config.data, **change))
     assert all((Loader(bare, config).batch(step).clip == 128).all() for step in range(3))
     seen = [Loader(table, config).batch(step).clip.astype(int) for step in range(3)]
     plain = [Loader(table, settings(touches)).batch(step).clip.astype(int) for step in range(3)]
-    assert all(np.abs(a - b).max() > 5 for a, b in zip(seen, plain, strict=True))  # and the contact is jittered
+    assert all(np.abs(a - b).max() > 5 for a, b in zip(seen, plain, strict=True))  # and the contact is changed
 
 
 def test_a_row_without_a_background_is_named_or_skipped(touches):

@@ -105,6 +105,8 @@ class Optim:
 class Data:
     """What is read and how it is augmented (in config.json `data`). `jitter`: brightness, contrast, saturation, hue.
 
+    `affine`: degrees by which a touch is turned at most, share of the picture's side by which it is moved, share by
+    which it grows or shrinks; zeros (the paper and the release) leave it where it is.
     `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the release).
     `split_steps`: stage 2 takes align and match batches in separate steps (the release). `weights`: (dataset, how often
     it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is what the recipe does (the release
@@ -130,6 +132,7 @@ class Data:
     aligned_text: bool = True
     background: Literal["keep", "subtract"] = "keep"
     flip: float = 0.5
+    affine: tuple[float, float, float] = (0.0, 0.0, 0.0)
     jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)
     rotation: float = 20.0
     tokenizer: str | None = None
@@ -139,10 +142,9 @@ class Data:
     on_bad_sample: Literal["error", "skip"] = "error"
 
     def __post_init__(self) -> None:
-        in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE, jitter=NOT_NEGATIVE)
-        in_range(
-            "--loader.", self, rotation=NOT_NEGATIVE, threads=NOT_NEGATIVE, prefetch=NOT_NEGATIVE, cache=NOT_NEGATIVE
-        )
+        in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE)
+        others = ("affine", "jitter", "rotation", "threads", "prefetch", "cache")
+        in_range("--loader.", self, **dict.fromkeys(others, NOT_NEGATIVE))
 
 
 @dataclass(frozen=True)

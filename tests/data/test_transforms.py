@@ -52,6 +52,42 @@ def test_flips_are_exact_mirrors_in_all_four_forms():
     np.testing.assert_array_equal(both, forms[3])
 
 
+def _blob(affine, key):
+    """Share of the picture, and place of the middle (share of the side from the picture's), of a disc after a map."""
+    disc = cv2.circle(np.zeros((64, 64, 3), np.uint8), (32, 32), 10, (255, 255, 255), -1)
+    out = t.touch_transform([disc], 64, _rng(key), replace(PLAIN, affine=affine))[0, ..., 0] / 255
+    rows, columns = np.indices(out.shape)
+    return out.mean(), np.array([(columns * out).sum(), (rows * out).sum()]) / out.sum() / 64 - 0.5
+
+
+def test_an_affine_map_turns_grows_and_moves_within_its_bounds():
+    area, middle = _blob((0.0, 0.0, 0.0), 0)
+    moved, grown = [], []
+    for key in range(40):
+        same, here = _blob((180.0, 0.0, 0.0), key)
+        assert abs(same / area - 1) < 0.02 and np.abs(here - middle).max() < 0.02  # a disc looks alike from all sides
+        same, here = _blob((0.0, 0.2, 0.0), key)
+        assert abs(same / area - 1) < 0.02
+        moved.append(here - middle)
+        grown.append(_blob((0.0, 0.0, 0.5), key)[0] / area)
+    moved, grown = np.array(moved), np.array(grown)
+    assert 0.15 < np.abs(moved).max() <= 0.201 and np.abs(moved.mean(0)).max() < 0.06  # in both directions, both ways
+    assert 1.5**-2 * 0.97 < grown.min() < 0.6 and 1.7 < grown.max() < 1.5**2 * 1.03
+
+
+def test_a_turn_is_a_turn_and_edges_are_mirrored():
+    line = np.zeros((65, 65, 3), np.uint8)
+    line[32] = 255
+    angles = set()
+    for key in range(6):
+        out = t.touch_transform([line], 65, _rng(key), replace(PLAIN, affine=(90.0, 0.0, 0.0)))[0, ..., 0]
+        rows, columns = np.nonzero(out[12:-12, 12:-12] > 127)
+        angles.add(round(float(np.degrees(np.linalg.eigh(np.cov(columns, rows))[1][:, 1] @ [0, 1]))))
+    assert len(angles) >= 5
+    flat = np.full((1, 24, 24, 3), 90, np.uint8)
+    np.testing.assert_array_equal(t.touch_transform(flat, 24, _rng(), replace(PLAIN, affine=(30.0, 0.3, 0.3))), flat)
+
+
 def _slow_jitter(frame, factors, order):
     """torchvision's ColorJitter on floats, pixel by pixel."""
     grey = np.array([0.2989, 0.587, 0.114])

@@ -52,7 +52,7 @@ class Reader:
         change both: a change of brightness alone would outshine the contact. Raises SampleError.
         """
         size, data = self.config.model.image_size, self.config.data
-        plain = epoch is None or not (data.flip or any(data.jitter))
+        plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
         # Nothing but the size: frames are resized once, unless the gel is to be taken off frames as they are.
         how = None if epoch is None or (plain and data.background == "subtract") else self._resized
         frames = [read_picture(self.manifest, row, how=how) for row in rows]

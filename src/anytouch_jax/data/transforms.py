@@ -38,8 +38,9 @@ def touch_transform(
 ) -> np.ndarray:
     """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), one draw for all frames.
 
-    The whole image is resized (no crop), flipped in both directions with probability `config.flip` each, then
-    jittered in colour by `config.jitter` (the release's augmentation). `out`: where to write, else a new array.
+    The whole image is resized (no crop), flipped in both directions with probability `config.flip` each, turned, moved
+    and scaled about its middle by up to `config.affine` (what comes in at an edge is its mirror image), then jittered
+    in colour by `config.jitter` (the release's augmentation but for `affine`). `out`: where to write, else a new array.
     """
     across, down = rng.random(2) < config.flip
     out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
@@ -48,7 +49,21 @@ def touch_transform(
         _resize(frame, target if plain is None else plain)
         if plain is not None:  # NumPy takes thirty times as long
             cv2.flip(plain, -1 if across and down else int(across), dst=target)
+    if any(config.affine):
+        warp = _affine(size, rng, config.affine)
+        for frame in out:
+            frame[...] = cv2.warpAffine(frame, warp, (size, size), borderMode=cv2.BORDER_REFLECT_101)
     return colour_jitter(out, rng, config.jitter, out) if any(config.jitter) else out
+
+
+def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, float]) -> np.ndarray:
+    """A random map of pixels f64 (2, 3): a turn and a growth about the middle, then a move (see `config.Data.affine`)."""
+    turn, grow, across, down = rng.uniform(-1, 1, 4)
+    degrees, share, growth = spread
+    middle = (size - 1) / 2
+    warp = cv2.getRotationMatrix2D((middle, middle), turn * degrees, (1 + growth) ** grow)
+    warp[:, 2] += np.array([across, down]) * share * size
+    return warp
 
 
 def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None) -> np.ndarray:

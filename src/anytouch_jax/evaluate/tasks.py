@@ -2,8 +2,8 @@
 
 A direction is a label of the picture as it is: a flip of the picture changes it. Pre-training flips touches
 (`data.flip`, as the release), the positive of a matching pair independently of its anchor, which teaches the encoder to
-overlook directions. Probes see every frame unflipped. Whoever trains with direction labels sets `--loader.flip 0`, or
-changes the label with the picture by `mirrored`.
+overlook directions. Probes see every frame unflipped. Whoever trains with direction labels sets `--loader.flip 0` (and
+turns nothing by `--loader.affine`), or changes the label with the picture by `mirrored`.
 """
 
 from __future__ import annotations

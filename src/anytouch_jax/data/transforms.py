@@ -57,7 +57,7 @@ def touch_transform(
 
 
 def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, float]) -> np.ndarray:
-    """A random map of pixels f64 (2, 3): a turn and a growth about the middle, then a move (see `config.Data.affine`)."""
+    """A random map of pixels f64 (2, 3): a turn and a growth about the middle, then a move (`config.Data.affine`)."""
     turn, grow, across, down = rng.uniform(-1, 1, 4)
     degrees, share, growth = spread
     middle = (size - 1) / 2

@@ -85,7 +85,7 @@ def test_the_interval_covers_the_truth_about_95_times_in_100() -> None:
     hits = 0
     for _ in range(200):
         values = rng.random(240) < rng.beta(2, 2, 60)[groups]
-        low, high = mean_interval(values, groups, draws=400)
+        low, high = mean_interval(values, groups)
         hits += low <= 0.5 <= high
     assert 180 <= hits <= 200
 

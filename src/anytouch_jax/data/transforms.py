@@ -60,10 +60,9 @@ def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, flo
     """A random map of pixels f64 (2, 3): a turn and a growth about the middle, then a move (`config.Data.affine`)."""
     turn, grow, across, down = rng.uniform(-1, 1, 4)
     degrees, share, growth = spread
-    middle = (size - 1) / 2
+    middle, move = (size - 1) / 2, np.array([across, down]) * share * size
     warp = cv2.getRotationMatrix2D((middle, middle), turn * degrees, (1 + growth) ** grow)
-    warp[:, 2] += np.array([across, down]) * share * size
-    return warp
+    return np.column_stack([warp[:, :2], warp[:, 2] + move])
 
 
 def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None) -> np.ndarray:

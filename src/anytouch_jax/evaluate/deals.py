@@ -10,11 +10,9 @@ import numpy.typing as npt
 
 from ..config import UserError
 from .choices import dealt
-from .results import Protocol
+from .results import Protocol, group_draws
 
 Array = npt.NDArray[Any]
-
-DRAWS = 1000
 
 
 class Cut(NamedTuple):
@@ -132,11 +130,11 @@ def interval(tested: Sequence[Sums], value: Any) -> tuple[float | None, float | 
     totals = np.zeros((len(tested), len(names), tested[0].sums.shape[1]))
     for total, one in zip(totals, tested, strict=True):
         np.add.at(total, np.searchsorted(names, one.groups), one.sums)
-    rng = np.random.default_rng(0)
-    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), DRAWS)
-    chosen = rng.multinomial(len(tested), np.full(len(tested), 1 / len(tested)), DRAWS) / len(tested)
+    chosen = np.concatenate(list(group_draws(len(tested), stream=1))) / len(tested)
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.stack([value(times @ total) for total in totals], 1)
+        values = np.concatenate(
+            [np.stack([value(times @ total) for total in totals], 1) for times in group_draws(len(names))]
+        )
     drawn = np.where(chosen > 0, chosen * values, 0).sum(1)
     if not np.isfinite(drawn).any():
         return None, None

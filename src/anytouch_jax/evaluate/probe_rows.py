@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..config import UserError
 from .choices import FOLDS, best_of, dealt, thinned
-from .results import Protocol, group_draws
+from .results import Protocol
 
 Array = npt.NDArray[Any]
 Scores = Callable[[Array, Array, Sequence[float]], list[float]]  # (fit rows, scored rows, options) -> higher is better
@@ -172,6 +172,7 @@ def folded(rows: Rows, used: Array, count: int) -> Iterator[tuple[Array, Array]]
 def bootstraps(rows: Rows, seeds: int) -> Iterator[tuple[Array, Array]]:
     """For each seed the train rows of a bootstrap over groups, and how often each was drawn."""
     for seed in range(seeds):
-        times, ids = group_draws(rows.groups[rows.train], 1, seed)
-        weights = times[0][ids].astype(np.float32)
+        names, ids = np.unique(rows.groups[rows.train], return_inverse=True)
+        times = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)))
+        weights = times[ids].astype(np.float32)
         yield rows.train[weights > 0], weights[weights > 0]

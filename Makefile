@@ -66,7 +66,7 @@ help: ## list the targets
 
 setup: $(STAMP) ## make .venv with the pinned versions
 
-demo: $(STAMP) ## simulate, train both stages, probe and report, in 5 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2]
+demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2]
 	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
 	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1 $(DEMO1)

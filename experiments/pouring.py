@@ -209,13 +209,13 @@ if not TABLE or not (figures / "pouring.gif").exists():
 # %%
 rows = pouring_table.read_rows(FOLDER)
 runs = {run for row in rows for run in row.runs}
-seeds = len({run.split("/")[0] for run in runs})
+seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
 fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
 picture = f"{FOLDER.name}.png"
 pouring_table.draw(figures / picture, rows)
 text = f"""# Pouring by touch alone (simulated)
 
-{len(runs)} runs a row ({seeds} seeds of learning, {len(runs) // seeds} trials each{
+{len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
     "; fewer: " + ", ".join(fewer) if fewer else ""
 }); mean
 |poured - {TASK.target:g} g| with its 95 % interval over runs. The paper's numbers are of a robot: only the order can be
@@ -229,7 +229,7 @@ flow and the load, {VERSION} now):
 ![frames](figures/pouring_frames.png)
 ![film](figures/pouring.gif)
 
-Made by `make pouring`, from the JSON in `{FOLDER.name}/`.
+Made by `SEEDS={",".join(seeds)} make pouring`, from the JSON in `{FOLDER.name}/`.
 """
 write_whole(PAGE, text)
 print(text)

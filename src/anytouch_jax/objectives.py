@@ -224,8 +224,10 @@ def _touches(batch: Stage2Batch, model: Model) -> tuple[Touches, Touches]:
     where a head tells pairs apart one by one, negative."""
     align, match = batch
     aligned = [] if align is None else [(align.clip[:, : model.frames], align.sensor)]
-    several = (0, 2) if model.match_head == "cosine" else (0, 2, 4)
-    return aligned, [] if match is None else [(match[i], match[i + 1]) for i in several]
+    if match is None:
+        return aligned, []
+    pair = [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
+    return aligned, pair if model.match_head == "cosine" else [*pair, (match.negative, match.negative_sensor)]
 
 
 def stage2_loss(

@@ -82,7 +82,7 @@ class Embed:
     run: Path
     """Run folder or weights file (.pth, .safetensors)."""
     input: Path
-    """Manifest (.csv, .parquet), folder of frames, or video file; with --stream a camera's number or a video."""
+    """Manifest (.csv, .parquet), folder of frames, a picture or a video; with --stream a camera's number or a video."""
     out: Path
     """The .npz to write: features (n, d), rows (n,), key/* (n,). With --stream also - for JSON lines on stdout."""
     split: str | None = None

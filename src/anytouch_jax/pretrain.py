@@ -297,14 +297,14 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
         _same_activation(path, before.model.activation, config)
         _same_form(path, before.model, config)
         params = release.served(params, before, told)
-        stored, shown = before.model.sensors, before.data.background
+        stored, shown, seen = before.model.sensors, before.data.background, told.get("seen", ())
     else:
         file = _weights_file(path)
         _same_activation(file, release.told_activation(file), config)
         weights = release.read_weights(file)
         detected = release.model_of(file, weights)
         about = release.read_metadata(file)
-        shown = about.get(release.BACKGROUND_KEY, "keep")
+        shown, seen = about.get(release.BACKGROUND_KEY, "keep"), about.get(release.SEEN_KEY, "").split(",")
         params, stored = release.to_params(weights, detected), detected.sensors
         if "decoder" in params:  # else it is refused below
             guessed = release.MODEL_KEY not in about  # its heads are, where it does not tell
@@ -316,6 +316,9 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
             f"{path} was trained with --loader.background {shown}, this run with {config.data.background}: its "
             "encoder has never seen touches like these"
         )
+    if lost := [name for name in stored if name in seen and name not in config.model.sensors]:
+        kept = " ".join((*config.model.sensors, *lost))
+        say(f"the tokens of {', '.join(lost)} in {path} are left behind; --model.sensors {kept} keeps them")
     if anew := sorted((parts & set(params)) - {"touch", "decoder"}):
         say(f"of {path} the touch encoder and the decoder are taken; {', '.join(anew)} start anew")
     if params["touch"]["position"].shape[0] != config.model.patches + 1:

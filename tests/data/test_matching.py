@@ -31,18 +31,21 @@ def test_an_unknown_unit_is_not_another_unit():
     assert _draws(matches, 2)[0] == {3}
 
 
-def test_negatives_are_elsewhere_and_of_another_object():
+def test_negatives_are_elsewhere_and_where_asked_of_another_object():
     keys = _keys(
         touch=[0, 0, 1, 2, 2, -1, -1, -1, -1],
         sensor=[0, 1, 0, 0, 1, 0, 0, 0, 0],
         object=[5, 5, 5, 6, 6, 6, 5, -1, -1],
         dataset=[0, 0, 0, 0, 0, 0, 0, 0, 1],
     )
-    matches = Matches(np.arange(9), keys)
+    matches = Matches(np.arange(9), keys, other_object=True)
     assert matches.anchors.tolist() == [0, 1, 3, 4]
     # 2 is the same object, 6 too; 7 may be the very same place; 8 is of another data set.
     assert _draws(matches, 0)[1] == {3, 4, 5, 8}
     assert _draws(matches, 3)[1] == {0, 1, 2, 6, 8}
+    anywhere = Matches(np.arange(9), keys)  # Sec. 3.4: "any other object or location"; 6 may be 0's own place
+    assert _draws(anywhere, 0)[1] == {2, 3, 4, 5, 8}
+    assert _draws(anywhere, 3)[1] == {0, 1, 2, 6, 8}
 
 
 def test_negatives_are_uniform():
@@ -58,7 +61,7 @@ def test_negatives_are_uniform():
 def test_a_rare_negative_is_found():
     touch = np.array([0, 0, *[1] * 3000, 2])
     keys = _keys(touch=touch, sensor=np.array([0, 1, *[0] * 3001]), object=np.array([*[0] * 3002, 1]))
-    assert _draws(Matches(np.arange(3003), keys), 0, 20)[1] == {3002}
+    assert _draws(Matches(np.arange(3003), keys, other_object=True), 0, 20)[1] == {3002}
 
 
 def test_one_object_only_gives_its_other_places():
@@ -82,7 +85,7 @@ def test_laws_hold_on_random_tables(seed):
     columns = {name: rng.integers(-1, high, 60) for name, high in zip(Keys._fields, (8, 3, 4, 4, 2), strict=True)}
     columns["sensor"] = np.abs(columns["sensor"])
     keys, pool = _keys(**columns), rng.permutation(60)[:40]
-    matches = Matches(pool, keys)
+    matches, elsewhere = Matches(pool, keys), Matches(pool, keys, other_object=True)
     brute = []
     for a, row in enumerate(pool):
         same = [r for r in pool if keys.touch[r] == keys.touch[row] >= 0]
@@ -96,5 +99,7 @@ def test_laws_hold_on_random_tables(seed):
             p, n = pool[list(matches.draw(int(anchor), np.random.default_rng(key)))]
             assert keys.touch[p] == keys.touch[a] and p != a
             assert keys.sensor[p] != keys.sensor[a] or keys.unit[p] != keys.unit[a]
+            assert keys.touch[n] != keys.touch[a]
+            p, n = pool[list(elsewhere.draw(int(anchor), np.random.default_rng(key)))]
             assert keys.touch[n] != keys.touch[a]
             assert keys.object[n] != keys.object[a] or keys.object[a] == -1

@@ -198,7 +198,7 @@ def test_every_touch_may_have_a_sensor_of_its_own(encoder):
     found = encoder.embed(frames, told)
     np.testing.assert_array_equal(found, encoder.embed(frames, np.array([names.index(name) for name in told])))
     np.testing.assert_array_equal(found, encoder.embed(frames, np.array(told)))
-    with pytest.raises(UserError, match="one for each of the 3 touches"):
+    with pytest.raises(UserError, match="one integer for each of the 3 touches"):
         encoder.embed(frames, told[:2])
 
 

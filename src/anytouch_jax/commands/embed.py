@@ -141,7 +141,8 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
 
 
 def _embed_frames(encoder: Encoder, options: Embed) -> Any:
-    """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame."""
+    """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame; no window reaches
+    over a frame that is missing or cannot be read."""
     from anytouch_jax.evaluate import features
 
     row, see = encoder.sensor_row(options.sensor, say), _sight(encoder, options)
@@ -159,9 +160,12 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
             values.append(z[: len(waiting)])
             waiting.clear()
 
-    for name, frame in _named_frames(options):
+    last = None
+    for number, name, frame in _numbered_frames(options):
         names.append(name)
+        ring = ring if last is None or number == last + 1 else []
         ring = [] if frame is None else [*ring, see(frame)][-options.frames :]
+        last = number
         if len(ring) == options.frames:
             waiting.append(np.stack(ring))
             ends.append(len(names) - 1)
@@ -169,12 +173,12 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
             flush()
     flush()
     count = len(names)
-    if not options.input.is_dir():
+    if not any(names):
         _say_cut(options.input, count)
     if not values:
         raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames} that can be read")
     index = np.array(ends)
-    keys = {"frame_index": index} | ({"path": np.array(names)[index]} if options.input.is_dir() else {})
+    keys = {"frame_index": index} | ({"path": np.array(names)[index]} if any(names) else {})
     return features.Features(np.concatenate(values), index, keys, max(0, count - options.frames + 1) - len(index))
 
 
@@ -187,24 +191,27 @@ def _say_cut(video: Path, count: int) -> None:
         say(f"{video} tells of {told} frames and {count} could be read; is it whole?")
 
 
-def _named_frames(options: Embed) -> Iterator[tuple[str, np.ndarray | None]]:
-    """Name and RGB pixels u8 of a folder's pictures, in natural order, or of a video's frames, which have no names. A
-    picture that cannot be read is None where bad samples are skipped: no clip reaches over it."""
-    from anytouch_jax.data.images import ImageError, decode, frames_from_video, pictures_in
+def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | None]]:
+    """Number, name and RGB pixels u8 of a picture, of a folder's pictures in natural order, or of a video's frames,
+    which have no names. A picture that cannot be read is None where bad samples are skipped."""
+    from anytouch_jax.data.images import SUFFIXES, ImageError, decode, frame_numbers, frames_from_video, pictures_in
 
+    if options.input.suffix.lower() in SUFFIXES and options.input.is_file():
+        yield 0, options.input.name, decode(options.input)
+        return
     if not options.input.is_dir():
-        yield from (("", frame) for frame in frames_from_video(options.input))
+        yield from ((number, "", frame) for number, frame in enumerate(frames_from_video(options.input)))
         return
     files, beside = pictures_in(options.input)
     if beside:
         say(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
-    for file in files:
+    for number, file in zip(frame_numbers([file.name for file in files]), files, strict=True):
         try:
-            yield file.name, decode(file)
+            yield number, file.name, decode(file)
         except ImageError:
             if options.on_bad_sample == "error":
                 raise
-            yield file.name, None
+            yield number, file.name, None
 
 
 def _refuse_unused(options: Embed) -> None:

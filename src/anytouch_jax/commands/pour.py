@@ -88,9 +88,10 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
 
     encoder = load_encoder(str(options.run))
     about = {"run": str(options.run), "recordings": str(path), "seed": options.seed}
-    about |= {"stills": options.stills, "fine_tuned": options.fine_tune}
-    _claim(out, about)
+    about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "steps": options.steps}
     found = pouring_recordings.read(path, encoder.config.model.image_size)
+    about["data"] = found.data
+    _claim(out, about)
     shown, unseen = found.part(False), found.part(True)
     say(f"{len(shown.steps)} runs of {found.sensor} to learn from, {len(unseen.steps)} of split test")
     policy, learning = _policy(options, encoder, shown, found.sensor)
@@ -124,6 +125,7 @@ def _simulated(options: Pour, out: Path) -> int:
     task = Task(markers=options.markers)
     about = {"run": str(options.run), "target": task.target, "demonstrations": options.demos, "seed": options.seed}
     about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
+    about |= {"steps": options.steps}
     _claim(out, about)
     say(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=side)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -26,6 +27,7 @@ BACKGROUND, PHOTO = "background", "photo"  # pictures beside the frames of a rec
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
 if hasattr(cv2, "IMREAD_COLOR_RGB"):
     _JPEG_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+_BITS, _ALPHA = 258, 338  # tags of a TIFF: bits of a sample; what the fourth sample is (2: unassociated alpha)
 _HEADER_1, _HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
 cv2.setNumThreads(1)  # the loader has its own threads
@@ -58,7 +60,7 @@ def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
         pixels = _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
         raise ImageError(f"{name} cannot be read: {error}") from None
-    return _to_rgb(pixels, name)
+    return to_rgb(pixels, name)
 
 
 def _unpack(data: bytes) -> np.ndarray:
@@ -102,7 +104,8 @@ def _array(data: bytes) -> np.ndarray:
     return np.frombuffer(data, kind, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
-def _to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
+def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
+    """Pixels of a picture as RGB u8 (h, w, 3), by the rules of `decode`; `path` is for errors. Raises ImageError."""
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or 0 in pixels.shape:
@@ -189,6 +192,8 @@ def _jpeg_scan(data: bytes) -> int:
 
 
 def _tiff_size(data: bytes) -> tuple[int, int]:
+    """Width and height. Raises ValueError for a stack of pictures, of which OpenCV reads the first alone, and for 8-bit
+    colours beside an unassociated alpha, by which OpenCV multiplies them."""
     order = "<" if data[:2] == b"II" else ">"
     (at,) = struct.unpack(order + "I", data[4:8])
     (count,) = struct.unpack(order + "H", data[at : at + 2])
@@ -198,8 +203,16 @@ def _tiff_size(data: bytes) -> tuple[int, int]:
         if tag in (256, 257):
             (side,) = struct.unpack(order + ("H2x" if kind == 3 else "I"), data[entry + 8 : entry + 12])
             found[tag] = max(side, found.get(tag, 0))  # decoders go by the first or by the last one
-    if len(found) != 2:
+        elif tag in (_BITS, _ALPHA):
+            long = struct.unpack(order + "I", data[entry + 4 : entry + 8])[0] > 2  # two of 16 bits fit in place
+            where = struct.unpack(order + "I", data[entry + 8 : entry + 12])[0] if long else entry + 8
+            (found[tag],) = struct.unpack(order + "H", data[where : where + 2])
+    if not {256, 257} <= found.keys():
         raise ValueError("the picture is corrupt")
+    if int.from_bytes(data[at + 2 + 12 * count : at + 6 + 12 * count]):
+        raise ValueError("it holds several pictures; write a file for each")
+    if found.get(_ALPHA) == 2 and found.get(_BITS) == 8:
+        raise ValueError("it has an alpha channel by which its colours would be multiplied; write it without alpha")
     return found[256], found[257]
 
 
@@ -256,6 +269,15 @@ def pictures_in(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     if not files:
         raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)})")
     return sorted(files, key=lambda file: frame_order(file.name)), beside
+
+
+def frame_numbers(names: Sequence[str]) -> list[int]:
+    """The numbers of frames in order: those at the end of their names where these count frames (some neighbours are one
+    apart), so that a frame left out is a gap; else 0, 1, 2, ..."""
+    ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
+    numbers = [int(end[1]) for end in ends if end]
+    counts = len(numbers) == len(names) and min((b - a for a, b in itertools.pairwise(numbers)), default=0) == 1
+    return numbers if counts else list(range(len(names)))
 
 
 def frame_order(name: str) -> tuple[float, list[tuple[int, str]]]:

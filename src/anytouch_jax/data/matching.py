@@ -26,10 +26,12 @@ class Matches:
     `anchors` ids i64 into `pool`: rows whose touch was also felt by another sensor, or else by another unit, and
     that have a negative. `one_object`: all of the pool is one known object, so negatives are its other places.
     `same_sensor`: negatives are of the positive's sensor; a partner whose sensor felt no other known place is none.
+    `other_object`: negatives are of another object where there is one (the release); else of "any other object or
+    location" (Sec. 3.4).
     """
 
-    def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False) -> None:
-        self.pool, self.same_sensor, self._keys = pool, same_sensor, keys
+    def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False, other_object: bool = False) -> None:
+        self.pool, self.same_sensor, self.other_object, self._keys = pool, same_sensor, other_object, keys
         mine = Keys(*(key[pool] for key in keys))  # not held: of millions of rows one copy is enough
         touch, thing = mine.touch, mine.object
         self._rows: dict[int, np.ndarray] = {}
@@ -50,8 +52,7 @@ class Matches:
 
     def draw(self, anchor: int, rng: np.random.Generator, sensor: int | None = None) -> tuple[int, int]:
         """(positive, negative) for `anchor`, as ids into `pool`: partner of another sensor (of `sensor`, where that
-        felt the place), or else another unit; and, uniformly, a row that is surely another place, of another object
-        where objects are known."""
+        felt the place), or else another unit; and, uniformly, a row that is surely another place."""
         keys, row = self._keys, self.pool[anchor]
         low, high = np.searchsorted(self._sorted, keys.touch[row] + np.array([0, 1]))
         same = self._order[low:high]
@@ -77,7 +78,7 @@ class Matches:
     def _negatives(self, anchor: int, sensor: int | None = None) -> np.ndarray:
         ids = np.arange(len(self.pool)) if sensor is None else self._of_sensor(sensor)
         found = ids[self._elsewhere(anchor, ids)]
-        if not found.size:  # no other object: another known place of the same one
+        if not found.size and self.other_object:  # there is none: another known place of the same one
             touch = self._keys.touch[self.pool[ids]]
             found = ids[(touch >= 0) & (touch != self._keys.touch[self.pool[anchor]])]
         return found
@@ -89,16 +90,17 @@ class Matches:
         return self._rows[sensor]
 
     def _elsewhere(self, anchor: int, ids: np.ndarray) -> np.ndarray:
-        """Which `ids` are surely another place, and not of the anchor's object: bool of the shape of `ids`."""
+        """Which `ids` are surely another place, and, with `other_object`, not of the anchor's: bool of `ids`' shape."""
         keys, rows, row = self._keys, self.pool[ids], self.pool[anchor]
 
         def differs(key: np.ndarray) -> np.ndarray:
             return (key[rows] != key[row]) & (key[rows] >= 0) & (key[row] >= 0)
 
-        same_object = (keys.object[rows] == keys.object[row]) & (keys.object[row] >= 0)
         unknown = keys.touch[rows] < 0
         place = differs(keys.touch) | (unknown & (differs(keys.object) | differs(keys.dataset)))
-        return place & ~same_object
+        if not self.other_object:
+            return place
+        return place & ~((keys.object[rows] == keys.object[row]) & (keys.object[row] >= 0))
 
 
 def _has_partner(keys: Keys, usable: np.ndarray) -> np.ndarray:

@@ -26,11 +26,11 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.files import Files, distinct_files
-from anytouch_jax.data.licences import licences
+from anytouch_jax.data.licences import card
 from anytouch_jax.data.manifest import Manifest, with_own_keys
 from anytouch_jax.data.packed import INDEX, forget, read_file, split_packed
 from anytouch_jax.data.table import PATHS
-from anytouch_jax.whole import replacing, write_whole
+from anytouch_jax.whole import alone, replacing, write_whole
 
 _PICTURES = tuple(name for name in PATHS if name not in ("path", "field_path"))
 GROUPS = {"touch": ("path",), "shared": _PICTURES, "field": ("field_path",)}
@@ -85,7 +85,17 @@ def pack(
         if say:
             say(f"{folder} was finished before: left as it is")
         return target
-    orders = _orders(manifest, files)
+    with alone(folder / "pack.json") as mine:
+        if not mine:
+            raise PackError(f"another process packs into {folder}: wait for it, or choose another folder")
+        return _pack(manifest, files, folder, shard_bytes, threads, say)
+
+
+def _pack(
+    manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, say: Callable[[str], None] | None
+) -> Path:
+    """Write the shards, the manifest and, last, the card; gives back the manifest's path."""
+    target, orders = folder / "manifest.parquet", _orders(manifest, files)
     sums: dict[str, str] = _read_sums(folder)
     shard_of, row_of = np.empty(len(files), np.int64), np.empty(len(files), np.int64)
     names: list[str] = []
@@ -102,7 +112,7 @@ def pack(
     forget()
     packed = _repoint(manifest, target, files, names, shard_of, row_of)
     manifests.write(packed, target)
-    write_whole(folder / "README.md", _card(packed, orders))
+    write_whole(folder / "README.md", card(packed, orders))
     return target
 
 
@@ -332,17 +342,3 @@ def _read_sums(folder: Path) -> dict[str, str]:
     path = folder / "SHA256SUMS"
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
-
-
-def _card(packed: Manifest, groups: Iterable[str]) -> str:
-    """README.md: which files make which table, for the Hub and for `datasets`."""
-    configs = "".join(f"- config_name: {group}\n  data_files: {group}/*.parquet\n" for group in groups)
-    terms = "".join(
-        f"| {one.name or 'none given'} | {one.rows} | {', '.join(one.datasets)} |\n" for one in licences(packed)
-    )
-    return (
-        f"---\nconfigs:\n{configs}---\n{len(packed)} tactile frames, content {packed.content_hash}.\n\n"
-        "`manifest.parquet` is the manifest for `anytouch`; its paths name a shard and a row.\n"
-        "The other tables are the stored files, for viewing and for other tools.\n\n"
-        f"| licence | rows | datasets |\n|---|---|---|\n{terms}"
-    )

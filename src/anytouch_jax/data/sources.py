@@ -292,7 +292,8 @@ class _Finder(NamedTuple):
 
     def _pairs(self, kind: int, keys: Keys) -> Pairs | None:
         windows = self.windows(kind, self.config.model.frames)
-        matches = Matches(windows[:, -1], keys, same_sensor=self.config.data.negatives == "same_sensor")
+        wanted = {"same_sensor": self.config.data.negatives == "same_sensor"}
+        matches = Matches(windows[:, -1], keys, **wanted, other_object=self.config.recipe == "release")
         if not matches.anchors.size:
             return None
         weights, seed = self._weights_of(windows[matches.anchors]), self.config.run.seed

@@ -89,6 +89,8 @@ def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: n
 
 
 def _resize(frame: np.ndarray, target: np.ndarray) -> None:
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:  # OpenCV would write elsewhere
+        raise ImageError(f"a frame must be RGB uint8 (height, width, 3), not {frame.dtype} {frame.shape}")
     smaller = min(frame.shape[:2]) > len(target)
     how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     cv2.resize(frame, (target.shape[1], len(target)), dst=target, interpolation=how)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import UserError
-from anytouch_jax.data.contact import ContactScores, limits_of
+from anytouch_jax.data.contact import ContactScores, known_contact, limits_of
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.whole import write_whole
@@ -69,6 +69,8 @@ def known_contact_by(manifest: Manifest, reference: str | None = None) -> tuple[
         raise UserError(
             f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with"
         )
+    if name == "label.contact":
+        return name, known_contact(manifest)
     try:
         return name, np.array([np.nan if one is None else float(one) for one in manifest.table[name].to_pylist()])
     except (TypeError, ValueError):

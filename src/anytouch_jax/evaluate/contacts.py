@@ -92,17 +92,21 @@ def contact_vector(manifest: Manifest, rows: Array) -> Array:
 def background_difference(manifest: Manifest, rows: Array, size: tuple[int, int] = (24, 32)) -> Array:
     """Frame minus background in RGB, averaged down to `size` (rows, columns): f32 (n, 3 * rows * columns) in -1..1.
 
-    Raises UserError that names the row without a background, or whose background has another size.
+    Raises UserError that names the row without a background, or whose background has other proportions.
     """
-    behind: dict[str, Array] = {}
+    behind: dict[str, tuple[Array, float]] = {}
     found = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
         if manifest.value(row, "background_path") is None:
             raise UserError(f"{manifest.where(row)} has no background_path; give one, or leave this baseline out")
         file = manifest.file(row, "background_path")
         if str(file) not in behind:
-            behind[str(file)] = _small(decode(file), size)
-        found[place] = _small(decode(manifest.file(row)), size) - behind[str(file)]
+            gel = decode(file)
+            behind[str(file)] = _small(gel, size), gel.shape[1] / gel.shape[0]
+        frame, (small, proportion) = decode(manifest.file(row)), behind[str(file)]
+        if abs(frame.shape[1] / frame.shape[0] / proportion - 1) > 0.05:
+            raise UserError(f"{manifest.where(row)}: its background_path has other proportions than the frame")
+        found[place] = _small(frame, size) - small
     return found
 
 

@@ -137,7 +137,9 @@ def call_of(
         "background": encoder.config.data.background,
         "pooling": pooling,
         "join": join,
+        "dtype": model.dtype,
         "sensors": {name: row for row, name in enumerate(model.sensors)},
+        "seen": None if encoder.seen is None else list(encoder.seen),
     }
 
 

@@ -8,14 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, from_json
 from anytouch_jax.data.evaluation import evaluation
+from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.transforms import subtract_background, touch_evaluation
 from anytouch_jax.io import checkpoint, release
@@ -105,8 +107,10 @@ class Encoder:
         rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
         if rows.dtype.kind in "UO":
             rows = np.array([self.sensor_row(name) for name in rows.reshape(-1)], np.int32).reshape(rows.shape)
-        if rows.shape != (len(clips),):
-            raise UserError(f"sensor rows must be one for each of the {len(clips)} touches, not {rows.shape}")
+        if rows.shape != (len(clips),) or rows.dtype.kind not in "iu":
+            raise UserError(
+                f"sensor rows must be one integer for each of the {len(clips)} touches, not {rows.dtype} {rows.shape}"
+            )
         if rows.min(initial=0) < 0 or rows.max(initial=0) >= len(self.config.model.sensors):
             raise UserError(f"sensor rows must be 0 to {len(self.config.model.sensors) - 1}")
         count, run = len(clips), self._run(pooling, join)
@@ -132,13 +136,16 @@ class Encoder:
 
 class Sight:
     """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
-    u8 (h, w, 3), the picture of the untouched gel; the first frame serves where none is given."""
+    (a frame), the picture of the untouched gel; the first frame serves where none is given."""
 
-    def __init__(self, encoder: Encoder, background: np.ndarray | None = None) -> None:
-        self._encoder, self._background = encoder, background
+    def __init__(self, encoder: Encoder, background: npt.ArrayLike | None = None) -> None:
+        self._encoder = encoder
+        self._background = None if background is None else to_rgb(np.asarray(background), "the background")
 
-    def __call__(self, frame: np.ndarray) -> np.ndarray:
-        """A frame u8 (h, w, 3) as u8 (size, size, 3)."""
+    def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
+        """A frame (h, w, 3), or another form of picture that `data.images.decode` reads (grey, RGBA, u16, floats of
+        0..1), as RGB u8 (size, size, 3). Raises ImageError for any other."""
+        frame = to_rgb(np.asarray(frame), "the frame")
         if self._encoder.subtracts:
             self._background = frame if self._background is None else self._background
             frame = subtract_background([frame], self._background)[0]
@@ -155,6 +162,9 @@ def touch_features(
     params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
 ) -> jax.Array:
     """Features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,), to be traced: see `Encoder.embed`."""
+    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
+        if value not in get_args(kind):
+            raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
     clips = normalise_touch(clips)
     if pooling == "class":
         return net.apply(params, "encode", clips, sensor, join).astype(jnp.float32)

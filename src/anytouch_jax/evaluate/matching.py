@@ -93,7 +93,7 @@ def draw_triples(
     """(anchors, positives, negatives) as places in `rows`, i64 (m,) each: `draws` of every anchor, as in training."""
     names = ("touch", "sensor", "unit", "object", "dataset")
     keys = Keys(*(manifest.codes(name, own=name == "touch") for name in names))
-    matches = Matches(rows, keys, same_sensor=negatives == "same_sensor")
+    matches = Matches(rows, keys, same_sensor=negatives == "same_sensor", other_object=True)
     if not matches.anchors.size:
         which = "" if negatives == "any" else ", one of which felt another place"
         raise UserError(f"no touch of these rows was felt by two sensors{which}: there is nothing to match")

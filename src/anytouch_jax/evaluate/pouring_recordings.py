@@ -37,11 +37,13 @@ POLICY, WEIGHTS = "policy.npz", "encoder.safetensors"
 
 
 class Recordings(NamedTuple):
-    """Runs as trials of B (masses are unknown: NaN), those of the test split last: `test` (B,); and their sensor."""
+    """Runs as trials of B (masses are unknown: NaN), those of the test split last: `test` (B,); their sensor, and the
+    content hash of their manifest (`data`)."""
 
     trials: Trials
     test: Array
     sensor: str
+    data: str
 
     def part(self, test: bool) -> Trials:
         """The runs of test, or those to learn from; no copy."""
@@ -84,12 +86,13 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
 def read(path: Path, side: int) -> Recordings:
     """The runs of a manifest, frames resized to `side` pixels. Raises UserError: no labels, gaps, too short a run."""
     table = manifests.read(path)
-    if not table.present("label.action").all():
-        raise UserError(f"{path}: label.action must be {', '.join(ACTIONS)} on every row")
-    sensors = np.unique(text_column(table, "sensor"))
+    split = text_column(table, "split")
+    part = np.isin(split, LEARNING)
+    if not table.present("label.action")[part].all():
+        raise UserError(f"{path}: label.action must be {', '.join(ACTIONS)} on every row of {', '.join(LEARNING)}")
+    sensors = np.unique(text_column(table, "sensor")[part])
     if len(sensors) > 1:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
-    split = text_column(table, "split")
     runs = sorted(_runs(table, path), key=lambda rows: split[rows[0]] == "test")
     test = np.array([split[rows[0]] == "test" for rows in runs])
     if not test.any() or test.all():
@@ -105,7 +108,7 @@ def read(path: Path, side: int) -> Recordings:
     frames = np.stack([np.stack([frame(int(row)) for row in rows]) for rows in order])
     unknown = np.full(order.shape, np.nan)
     trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
-    return Recordings(trials, test, str(sensors[0]))
+    return Recordings(trials, test, str(sensors[0]), table.content_hash)
 
 
 def _runs(table: Manifest, path: Path) -> list[Array]:

@@ -21,6 +21,7 @@ from anytouch_jax.whole import write_whole
 from ..config import FIELD_SENSORS, UserError
 from ..data import manifest as manifests
 from ..data.manifest import Manifest
+from ..io import checkpoint
 from . import baseline, matching, probe, results, retrieval, space
 from .contacts import background_difference, contact_vector, deepest_rows
 from .features import Encoder, embed_rows, load_encoder, random_encoder, text_column
@@ -141,7 +142,7 @@ def _contents(
     first, second = _of_stage(stage1, 1), _of_stage(stage2, 2)
     encoders = {RANDOM: random_encoder(first.config, seed), "stage 1": first, "stage 2": second}
     numbers: dict[str, Any] = {"data": table.content_hash, "stage1": str(stage1), "stage2": str(stage2)}
-    sections = [_facts(table, first, second), *samples_section(table, out, seed=seed)]
+    sections = [_facts(table, first, second, _lineage(stage1, stage2)), *samples_section(table, out, seed=seed)]
     sections.append(losses_section({"stage 1": stage1, "stage 2": stage2}, out))
     sections.append(reconstructions_section(table, stage1, out))
     say("report: samples, losses and reconstructions are drawn")
@@ -159,7 +160,17 @@ def _contents(
     return [*sections, section], numbers
 
 
-def _facts(table: Manifest, first: Encoder, second: Encoder) -> Section:
+def _lineage(stage1: Path, stage2: Path) -> str:
+    """A sentence where a stage 2 did not begin from this stage 1, else nothing."""
+    init = (checkpoint.read_metadata(stage2).get("source") or {}).get("init")
+    if init is None:
+        return "Stage 2 began from nothing trained, so this stage 1 is no part of it."
+    began = Path(init)
+    same = began.resolve() == stage1.resolve() or (not began.exists() and began.name == stage1.resolve().name)
+    return "" if same else f"Stage 2 began from another run ({began.name}), so this stage 1 is no part of it."
+
+
+def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Section:
     split, objects = text_column(table, "split"), text_column(table, "object")
     touch, sensors = table.codes("touch", own=True), text_column(table, "sensor")
     rows = []
@@ -174,8 +185,11 @@ def _facts(table: Manifest, first: Encoder, second: Encoder) -> Section:
         f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of {second.config.data.batch_size}, "
         f"recipe {second.config.recipe}, towers {second.config.towers}. All figures below are of split test."
     )
+    shown = (first.config.data.background, second.config.data.background)
+    if shown[0] != shown[1]:
+        lineage += f" Stage 1 sees touches with background {shown[0]}, stage 2 with background {shown[1]}."
     counted = results.markdown(("split", "frames", "touches", "objects", "sensors"), rows)
-    return Section("Data and runs", text, counted)
+    return Section("Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else "")
 
 
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:

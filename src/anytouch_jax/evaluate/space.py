@@ -76,15 +76,19 @@ def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:
 
 
 def describe(features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features") -> Space:
-    """All figures of features (n, d); positive pairs are all rows of the same touch by different sensors."""
-    x, sensors = np.asarray(features), np.asarray(sensors).astype(str)
+    """All figures of features (n, d); positive pairs are all rows of the same touch by different sensors.
+
+    Rows whose object is not known ("") have no part in the silhouette by object.
+    """
+    x, sensors, objects = np.asarray(features), np.asarray(sensors).astype(str), np.asarray(objects).astype(str)
+    known = objects != ""
     first, second = _positive_pairs(sensors, np.asarray(touches).astype(str))
     return Space(
         name=name,
         alignment=alignment(x[first], x[second]) if len(first) else None,
         uniformity=uniformity(x),
         silhouette_sensor=silhouette(x, sensors),
-        silhouette_object=silhouette(x, objects),
+        silhouette_object=silhouette(x[known], objects[known]),
         rows=len(x),
     )
 

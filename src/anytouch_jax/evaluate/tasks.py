@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from ..config import UserError
+from ..data.contact import known_contact
 from ..data.manifest import KEYS, Manifest
 from .features import text_column
 
@@ -214,15 +215,17 @@ def _best(rows: Array, sequence: Array, first: Array, second: Array) -> Array:
 
 
 def _touching(table: Manifest) -> Array:
-    """Whether a frame is contact, bool (rows,): by force, by score or by mark; all of a file without these.
+    """Whether a frame is contact, bool (rows,): by force, by mark (`anytouch contact`) or by score; all of a file
+    without these.
 
-    Force first: a score is of the picture, and would leave out soft objects, by sensors unequally.
+    Force first: a mark or a score is of the picture, and would leave out soft objects, by sensors unequally.
     """
-    score, force, mark = (_number(table, f"label.{name}") for name in ("contact_score", "force", "contact"))
+    force, score = (_number(table, f"label.{name}") for name in ("force", "contact_score"))
+    mark = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
         here = table.source == source
-        for values, least in ((force, FORCE), (score, SCORE), (mark, 0.5)):
+        for values, least in ((force, FORCE), (mark, 0.5), (score, SCORE)):
             if np.isfinite(values[here]).any():
                 touches[here] = np.nan_to_num(values[here], nan=-1.0) > least
                 break

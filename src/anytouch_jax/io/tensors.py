@@ -33,7 +33,8 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
             os.umask(umask)
             os.chmod(part, 0o666 & ~umask)  # the library gives a file that only its owner may read
     except Exception as error:  # the library wraps OSError in its own kind
-        raise WeightsError(f"could not write {path}: {error}") from error
+        advice = "; free some space" if "No space left" in str(error) else ""
+        raise WeightsError(f"could not write {path}: {error}{advice}") from error
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

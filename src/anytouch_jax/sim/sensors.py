@@ -50,7 +50,8 @@ class Lights:
 @dataclass(frozen=True)
 class Markers:
     """A lattice of ink spots in the skin: `pitch` mm, `radius` mm, spots `aspect` times as wide as high, `share` of
-    the units that carry them, darkness of the ink, `bend`: growth of the lattice from middle to corner (lens)."""
+    the units that carry them, darkness of the ink. `bend`: a lens's barrel, by which the lattice shrinks outwards, from
+    `pitch` / (1 - bend) in the middle."""
 
     pitch: float
     radius: float

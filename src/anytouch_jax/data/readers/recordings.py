@@ -12,13 +12,11 @@ recording where there is none, is the group of the hash split.
 
 from __future__ import annotations
 
-import itertools
-import re
 from pathlib import Path
 from typing import Any
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
-from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_order
+from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers, frame_order
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
@@ -94,12 +92,7 @@ def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]
         arrays = [name for name in names if name not in pictures]
         notes.skip("array beside pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = pictures
-    ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
-    numbers = [int(end[1]) for end in ends if end]
-    steps = {b - a for a, b in itertools.pairwise(numbers)}
-    if len(numbers) == len(names) and min(steps, default=0) == 1:
-        return list(zip(numbers, names, strict=True))
-    return list(enumerate(names))
+    return list(zip(frame_numbers(names), names, strict=True))
 
 
 READER = Reader(

@@ -457,3 +457,18 @@ def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path
     np.testing.assert_array_equal(new["allsight"], old["universal"])
     assert not np.array_equal(named, old["universal"])
     assert json.loads((tmp_path / "r" / "config.json").read_text())["model"]["sensors"] == list(names)
+
+
+def test_tokens_of_a_sensor_that_are_left_behind_are_told_of(world, tmp_path):
+    config = run_config(world)
+    wide = replace(config.model, sensors=(*config.model.sensors[:-1], "my_gel", config.model.sensors[-1]))
+    stored = checkpoint.Checkpoints(
+        tmp_path / "one" / "checkpoints", keep=1, config_json=to_json(replace(config, model=wide)),
+        metadata={"seen": ["digit", "my_gel"]},
+    )  # fmt: skip
+    stored.save(1, {"trainable": build(wide).init(jax.random.key(0))}, {"loss": 1.0})
+    stored.close()
+    for name, model, told in (("a", config.model, True), ("b", wide, False)):
+        said: list[str] = []
+        train(replace(run_config(world), model=model), tmp_path / name, said, init=tmp_path / "one", stop_after=0)
+        assert any("the tokens of my_gel" in line and "--model.sensors " in line for line in said) == told, said

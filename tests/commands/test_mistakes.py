@@ -107,3 +107,20 @@ def test_a_video_that_ends_early_is_told_of(anytouch, tiny_run, tmp_path, stream
     film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
     said = anytouch("embed", *words)
     assert said.status == 0 and "could be read; is it whole?" in said.err
+
+
+def test_no_clip_of_a_folder_reaches_over_a_missing_number(anytouch, tiny_run, tmp_path):
+    folder, out = tmp_path / "frames", tmp_path / "f.npz"
+    folder.mkdir()
+    for number in (0, 1, 2, 5, 6, 7, 8):
+        cv2.imwrite(str(folder / f"img{number:03d}.png"), np.full((32, 32, 3), number * 9, np.uint8))
+    words = ("--run", tiny_run, "--sensor", "digit", "--out", out)
+    assert anytouch("embed", *words, "--input", folder, "--frames", 3).status == 0
+    with np.load(out) as found:
+        assert [Path(name).stem for name in found["key/path"]] == ["img002", "img007", "img008"]
+    assert anytouch("embed", *words, "--input", folder / "img005.png").status == 0
+    with np.load(out) as one:
+        alone = one["features"]
+    assert anytouch("embed", *words, "--input", folder).status == 0
+    with np.load(out) as every:
+        np.testing.assert_allclose(alone, every["features"][3:4], rtol=1e-5, atol=1e-6)

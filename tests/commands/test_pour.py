@@ -55,6 +55,8 @@ def test_a_policy_of_other_settings_is_not_written_over(anytouch, tiny_run, tmp_
     said = anytouch("pour", "--run", tiny_run, "--demos", 2, "--out", tmp_path)
     assert said.status == 1 and "holds a policy of other settings (fine_tuned, markers)" in said.err
     assert "choose another folder with --out" in said.err and len(list(tmp_path.iterdir())) == 1
+    said = anytouch("pour", "--run", tiny_run, "--demos", 2, "--steps", 3, "--out", tmp_path)
+    assert said.status == 1 and "other settings (fine_tuned, markers, steps)" in said.err
 
 
 def test_without_a_run_one_is_asked_for(anytouch):

@@ -26,7 +26,7 @@ from runs import run_config
 from anytouch_jax.commands.train import run
 from anytouch_jax.options import Train
 from test_train_processes import config_of
-sys.exit(run(Train((), Path({run!r})), config_of(Path({world!r}), {stage}, **{more!r})))
+sys.exit(run(Train((), Path({run!r}), stage={stage}), config_of(Path({world!r}), {stage}, **{more!r})))
 """
 
 

@@ -247,3 +247,22 @@ def test_a_strip_is_no_picture(tmp_path):
     path.write_bytes(cv2.imencode(".png", np.zeros((1, 2000, 3), np.uint8))[1].tobytes())
     with pytest.raises(images.ImageError, match="that is a strip, not a picture"):
         images.decode(path)
+
+
+def test_a_tiff_that_opencv_would_read_wrong_is_refused(tmp_path):
+    from PIL import Image
+
+    plain, clear = Image.fromarray(RGB), Image.fromarray(np.dstack([RGB, np.full(RGB.shape[:2], 128, np.uint8)]))
+    plain.save(tmp_path / "one.tif")
+    np.testing.assert_array_equal(images.decode(tmp_path / "one.tif"), RGB)
+    plain.save(tmp_path / "several.tif", save_all=True, append_images=[plain, plain])
+    clear.save(tmp_path / "clear.tif")
+    for name, sentence in (("several", "holds several pictures"), ("clear", "colours would be multiplied")):
+        with pytest.raises(images.ImageError, match=rf"{name}\.tif cannot be read: .*{sentence}"):
+            images.decode(tmp_path / f"{name}.tif")
+
+
+def test_frames_are_numbered_by_what_counts_them():
+    assert images.frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
+    assert images.frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
+    assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []

@@ -437,3 +437,14 @@ def test_other_pictures_under_the_same_table_are_another_pack(make, tmp_path):
     for row in range(len(loose)):
         loose.file(row).unlink(missing_ok=True)  # packed and done with
     assert pack(loose, tmp_path / "out") == target
+
+
+def test_two_processes_do_not_pack_into_one_folder(make, tmp_path):
+    from anytouch_jax.whole import alone
+
+    source, out = make(_rows()), tmp_path / "packed"
+    pack(source, out)
+    (out / "README.md").unlink()  # as if it were still under way
+    with alone(out / "pack.json"), pytest.raises(PackError, match=r"another process packs into .*: wait for it"):
+        pack(source, out)
+    assert pack(source, out).is_file()

@@ -153,3 +153,9 @@ def test_a_value_that_no_draw_has_has_no_interval():
 
 def test_one_test_group_has_no_interval():
     assert interval([sums_of(np.ones(3), np.array(["a"] * 3))], deals.accuracy_of) == (None, None)
+
+
+def test_the_interval_has_the_width_of_a_binomial() -> None:
+    right = np.random.default_rng(0).permutation(400) < 200
+    low, high = interval([sums_of(right, np.arange(400))], deals.accuracy_of)
+    assert high - low == pytest.approx(2 * 1.96 * 0.5 / 20, rel=0.05)

@@ -9,13 +9,14 @@ import pytest
 from runs import run_config
 from tiny_models import touch_model
 
-from anytouch_jax.config import Config, UserError, from_json, to_json
+from anytouch_jax.config import Config, Data, UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.evaluate.features import (
     Encoder,
     Features,
+    Sight,
     embed_rows,
     load_encoder,
     random_encoder,
@@ -306,3 +307,36 @@ def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
         embed_rows(blind, manifest, np.array([0, 1]))
     with pytest.raises(UserError, match=r"none of the 2 rows can be read; `anytouch verify` says"):
         embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip")
+
+
+def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
+    """OpenCV writes a resized frame of another type elsewhere, and leaves what was in memory."""
+    encoder = load_encoder(tiny_run)
+    see = Sight(encoder)
+    rgb = np.random.default_rng(0).integers(0, 256, (40, 52, 3), np.uint8)
+    grey = rgb[..., :1]
+    alpha = np.concatenate([rgb, grey], -1)
+    wanted, of_grey = see(rgb), see(np.repeat(grey, 3, -1))
+    for other in (alpha, rgb.astype(np.uint16) * 257, rgb.astype(np.float32) / 255, rgb / 255.0, rgb.tolist()):
+        other = np.asarray(other, np.uint8) if isinstance(other, list) else other
+        np.testing.assert_array_equal(see(other), wanted)
+    for other in (grey, grey[..., 0], grey[..., 0].astype(np.float64) / 255):
+        np.testing.assert_array_equal(see(other), of_grey)
+    for bad in (rgb.astype(np.float32), rgb.astype(np.int32), rgb[None], np.zeros((0, 4, 3), np.uint8)):
+        with pytest.raises(UserError, match="the frame has"):
+            see(bad)
+    less = Sight(replace(encoder, config=replace(encoder.config, data=Data(background="subtract"))), grey[..., 0])
+    assert (less(grey) == 128).all()
+    for bad in (grey, alpha, rgb.astype(np.float32)):
+        with pytest.raises(UserError, match="a frame must be RGB uint8"):
+            touch_evaluation([bad], 28)
+
+
+def test_names_of_pooling_and_join_and_rows_are_checked(tiny_run):
+    encoder = load_encoder(tiny_run)
+    with pytest.raises(UserError, match="pooling is one of class, mean, both, not 'cls'"):
+        encoder.embed(CLIPS, "digit", pooling="cls")
+    with pytest.raises(UserError, match="join is one of mean, sum, concat, not 'max'"):
+        encoder.embed(CLIPS, "digit", join="max")
+    with pytest.raises(UserError, match="one integer for each"):
+        encoder.embed(CLIPS, np.full(len(CLIPS), 0.5))

@@ -333,6 +333,10 @@ def test_a_sign_is_decided_over_seeds_not_over_runs(tmp_path):
     rows = {row.name: row for row in pouring_table.read_rows(tmp_path)}
     found = pouring_table.difference(rows["anytouch"], rows["static"])
     assert found.low < 0 < found.high and verdict(found.low, found.high, 3, wanted=-1) == "undecided"
+    mean, low, high = rows["static"].error
+    assert (
+        mean == pytest.approx(9 + 1 / 30) and low < 0 and high - mean == pytest.approx(4.303 * 7.95 / 3**0.5, rel=1e-3)
+    )
 
 
 def test_runs_that_were_never_turned_back_are_told(tmp_path):

@@ -87,9 +87,7 @@ def test_what_is_unused_teaches_nobody_and_an_empty_choice_is_the_action(shown, 
 
 def test_recordings_teach_what_the_demonstrations_teach(shown, manifest, encoder):
     found = pouring_recordings.read(manifest, SIDE)
-    direct = pouring_policy.learn_frozen(
-        encoder, pouring_recordings.Recordings(shown, found.test, "").part(False), FAST, stills=False
-    )
+    direct = pouring_policy.learn_frozen(encoder, found._replace(trials=shown).part(False), FAST, stills=False)
     read = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=False)
     for a, b in zip(direct.head.layers, read.head.layers, strict=True):
         np.testing.assert_array_equal(a[0], b[0])
@@ -170,6 +168,15 @@ def test_mistakes_are_named(manifest, columns, sentence):
     path = changed(manifest, "wrong", **columns)
     with pytest.raises(UserError, match=sentence.replace("?", r"\?")):
         pouring_recordings.read(path, SIDE)
+
+
+def test_rows_that_take_no_part_need_no_action(manifest):
+    def last(value):
+        return lambda x: [*x[:-1], value]
+
+    runs = {"sequence": last("gel"), "frame_index": last(0), "split": last("background")}
+    path = changed(manifest, "gel", **runs, **{"label.action": last(None), "sensor": last("digit")})
+    assert pouring_recordings.read(path, SIDE).sensor == "gelsight_mini"
 
 
 def test_files_that_do_not_belong_together(shown, encoder, tmp_path):

@@ -17,7 +17,7 @@ from touch_world import SENSORS, make_touches
 
 from anytouch_jax.config import UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.evaluate import plots
+from anytouch_jax.evaluate import plots, report
 from anytouch_jax.evaluate.matching import MatchScore
 from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, demo_report, write_report
 from anytouch_jax.evaluate.results import markdown
@@ -215,6 +215,7 @@ def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
     assert "| test | 360 | 30 | 10 | digit, gelsight, gelslim |" in text
     assert str(path) in said[-1] and not any(one.name.startswith(".") for one in path.parent.rglob("*"))
     assert "roughness: the manifest has no column label.roughness" in text
+    assert "**Stage 2 began from nothing trained, so this stage 1 is no part of it.**" in text
     assert str(path.parent.parent) not in text  # no path of the machine
 
 
@@ -281,6 +282,23 @@ def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, tmp_path: 
         (tmp_path / "w.safetensors").write_bytes(b"")
         demo_report(touched, tiny_run, tmp_path / "w.safetensors", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("init", "sentence"),
+    [
+        ("{run}", ""),
+        ("elsewhere/{name}", ""),  # moved since
+        ("elsewhere/other", "Stage 2 began from another run (other), so this stage 1 is no part of it."),
+        (None, "Stage 2 began from nothing trained, so this stage 1 is no part of it."),
+    ],
+)
+def test_runs_that_do_not_belong_together_are_told_of(
+    tiny_run: Path, monkeypatch: Any, init: str | None, sentence: str
+) -> None:
+    told = None if init is None else init.format(run=tiny_run, name=tiny_run.name)
+    monkeypatch.setattr(checkpoint, "read_metadata", lambda _: {"source": {"init": told}})
+    assert report._lineage(tiny_run, tiny_run) == sentence
 
 
 def test_a_run_stands_for_its_own_stage_alone(touched: Path, tiny_run: Path, later: Path, tmp_path: Path) -> None:

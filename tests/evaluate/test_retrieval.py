@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from touch_world import SENSORS, make_touches
@@ -403,3 +404,8 @@ def test_pixels_minus_background(touched: manifests.Manifest) -> None:
     assert not background_difference(same, rows, (8, 8)).any()
     with pytest.raises(UserError, match=r"row \d+ of .* has no background_path"):
         background_difference(with_columns(touched, ("background_path",)), rows)
+    narrow = touched.file(0).parent / "narrow.png"
+    cv2.imwrite(str(narrow), np.zeros((10, 100, 3), np.uint8))
+    relative = str(narrow.relative_to(touched.files[0].parent))
+    with pytest.raises(UserError, match="its background_path has other proportions"):
+        background_difference(with_columns(touched, background_path=[relative] * len(touched)), rows)

@@ -89,3 +89,12 @@ def test_nan_is_refused() -> None:
     for figure in (uniformity, tsne, lambda x: silhouette(x, np.arange(9) % 2)):
         with pytest.raises(UserError, match="finite"):
             figure(bad)
+
+
+def test_rows_of_no_known_object_are_no_object() -> None:
+    x = np.random.default_rng(0).normal(size=(60, 4))
+    x[20:40] += 3
+    names = np.array(["a"] * 20 + ["b"] * 20 + [""] * 20)
+    touches = np.arange(60).astype(str)
+    found = space.describe(x, names, names, touches).silhouette_object
+    assert found == pytest.approx(space.silhouette(x[:40], names[:40]))

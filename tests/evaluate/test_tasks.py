@@ -87,6 +87,10 @@ def test_a_file_with_scores_takes_scored_contact_only():
     assert len(select(table(plain), TASKS["object"]).rows) == 3  # nothing is known of contact: all take part
     marked = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact=i) for i in range(2)]
     assert select(table(marked), TASKS["object"]).rows.tolist() == [[1]]
+    # A mark is what training goes by, whatever the score (it has a limit of its own for each sensor); words are marks.
+    both = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact=mark, label__contact_score=s)
+            for i, (mark, s) in enumerate((("True", 5.0), ("False", 9.0), ("1", 6.7)))]  # fmt: skip
+    assert select(table(both), TASKS["object"]).rows.tolist() == [[0], [2]]
 
 
 def test_groups_fall_back_to_the_recording():

@@ -22,6 +22,16 @@ def test_gelu_is_the_exact_form_in_value_and_derivative():
     assert np.abs(np.asarray(gelu(X) - jax.nn.gelu(X, approximate=True))).max() > 1e-4  # and not the tanh form
 
 
+def test_gelu_keeps_its_negative_tail_in_sixteen_bits():
+    x = jnp.linspace(-5, 5, 2001).astype(jnp.bfloat16)
+    exact = np.asarray(jax.nn.gelu(x.astype(jnp.float32), approximate=False))
+    slope = np.asarray(jax.vmap(jax.grad(lambda v: jax.nn.gelu(v, approximate=False)))(x.astype(jnp.float32)))
+    ours, ours_slope = (np.asarray(f(x), np.float32) for f in (jax.jit(gelu), jax.jit(jax.vmap(jax.grad(gelu)))))
+    assert gelu(x).dtype == jnp.bfloat16
+    np.testing.assert_allclose(ours, exact, rtol=2**-8, atol=1e-6)  # rounded once
+    np.testing.assert_allclose(ours_slope, slope, rtol=2**-8, atol=1e-6)
+
+
 def test_quick_gelu():
     np.testing.assert_allclose(quick_gelu(X), X / (1 + np.exp(-1.702 * np.asarray(X))), rtol=1e-5, atol=1e-7)
 

@@ -107,6 +107,16 @@ def test_matching_logits_have_all_their_digits(head):
     np.testing.assert_array_equal(first, second)
 
 
+def test_the_mlp_matches_the_product_scaled_by_its_width():
+    net = build(touch_model(match_head="mlp"))
+    params = net.init(jax.random.key(0))
+    first, second = np.asarray(jax.random.normal(jax.random.key(1), (2, 5, 12)))
+    up, down = (jax.tree.map(np.asarray, params["matcher"][name]) for name in ("up", "down"))
+    hidden = np.asarray(jax.nn.gelu((first * second * 12) @ up["kernel"] + up["bias"], approximate=False))
+    wanted = (hidden @ down["kernel"] + down["bias"])[:, 0]
+    np.testing.assert_allclose(net.apply(params, "match", first, second), wanted, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
 def test_long_clips_are_segments_of_three(join, width):
     clip = clips(8)

@@ -251,3 +251,29 @@ def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the
     images = [np.asarray(draw(jnp.full((96, 128), depth))).astype(float) for depth in (0.0, 0.1, 3.0, 6.0)]
     np.testing.assert_allclose(images[2], images[3], atol=1)  # the rounding of slopes that should be zero
     assert images[3].mean() > 0.4 * images[0].mean() and images[1].mean() != images[0].mean()
+
+
+def test_markers_creep_outwards_in_a_dent(monkeypatch):
+    seen = []
+
+    def remember(ink, x, y, *rest):
+        seen.append((np.asarray(x), np.asarray(y)))
+        return jnp.zeros(x.shape)
+
+    monkeypatch.setattr(optics.markers, "coverage", remember)
+    for dent in (FLAT, bump()):
+        optics.render(dent, STILL, PITCH, SLIM, MARKED, None, resolution=SIZE)
+    (x, y), (came_x, came_y) = seen
+    ring = np.abs(np.hypot(x, y) - 1.5) < 0.4
+    outwards = ((x - came_x) * x + (y - came_y) * y)[ring] / np.hypot(x, y)[ring]
+    assert outwards.min() > 0.01 and np.abs((x - came_x)[np.hypot(x, y) > 6]).max() < 0.01
+
+
+def test_a_bent_lattice_shrinks_outwards():
+    ink = Markers(pitch=1.25, radius=0.1, bend=0.12)
+    x = jnp.linspace(0, 9.9, 4001)[None]
+    spots = np.asarray(markers.coverage(ink, x, jnp.zeros((1, 1)), jnp.zeros(2), 1.0, 0.02, 10.0))[0] > 0.5
+    edges = np.flatnonzero(np.diff(spots.astype(int)))  # the first spot, at 0, ends at the first
+    middles = (edges[1:-1:2] + edges[2::2]) / 2 * 9.9 / 4000
+    gaps = np.diff(np.concatenate([[0.0], middles]))
+    assert (np.diff(gaps) < 0).all() and gaps[0] == pytest.approx(1.25 / 0.88, rel=0.01)

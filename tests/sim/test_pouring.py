@@ -299,3 +299,20 @@ def test_blows_are_small_and_come_only_with_movement():
     draws = jax.vmap(lambda key: shaken(flowing._replace(key=key), setup).shear)(keys)
     away = np.asarray(draws - still(flowing, setup).shear[None])
     assert 1e-3 < away.std() < 0.05 and abs(away.mean()) < 5 * away.std() / math.sqrt(1000)
+
+
+def test_blows_have_the_spread_of_so_many_beads():
+    """`rate` g/s of beads that have fallen by the radius: Poisson's number in an exposure, each a blow of m v / t."""
+    setup = setup_of(0, bead=5.0, jolt=0.0)
+    flowing = at(setup, tilt=1.0)._replace(rate=jnp.asarray(5.0))
+    keys = jax.random.split(jax.random.key(1), 4000)
+    away = jax.vmap(lambda key: shaken(flowing._replace(key=key), setup).normal)(keys) - still(flowing, setup).normal
+    gram = 2.5e-3 * math.pi / 6 * 5.0**3
+    blow = gram * 1e-3 * math.sqrt(2 * 9.81 * float(setup.radius) * 1e-3) * 60  # N over 1/60 s
+    assert float(jnp.std(away)) == pytest.approx(math.sqrt(5.0 / 60 / gram) * blow, rel=0.05)
+
+
+def test_the_grip_relaxes_in_seconds():
+    setup = setup_of(0, relax=0.1, relax_time=2.0, grip=8.0)
+    upright = at(setup)._replace(steps=jnp.asarray(10))  # at 5 Hz two seconds
+    assert float(still(upright, setup).normal) == pytest.approx(8.0 * (1 - 0.1 * (1 - math.exp(-1))), rel=1e-4)

@@ -107,3 +107,11 @@ def test_noise_is_the_keys(held, setup):
     one, two, again = (np.asarray(picture(grasp, setup, load(y=0.5), jax.random.key(k))).astype(int) for k in (0, 1, 0))
     np.testing.assert_array_equal(one, again)
     assert 0.05 < np.abs(one - two).mean() < 4
+
+
+def test_a_twist_slips_where_friction_on_the_disc_ends_it(held, setup):
+    """Full slip of a disc under even pressure: a torque of 2/3 mu P a."""
+    grasp, _ = held
+    limit = 2 / 3 * 0.7 * 7.0 * float(jnp.interp(7.0, grasp.forces, jnp.full(len(grasp.forces), grasp.radius)))
+    size = [float(jnp.abs(skin(grasp, setup, load(twist=share * limit))[1]).max()) for share in (0.9, 1.0, 1.5)]
+    assert size[0] < 0.95 * size[1] and size[2] == pytest.approx(size[1], rel=1e-3)

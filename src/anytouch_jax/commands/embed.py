@@ -82,8 +82,8 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         join=options.join,
     )
     result = stream.collect(embedded, _print_line if lines else None)
-    if not live and not result.interrupted:
-        _say_cut(options.input, int(result.numbers[-1]) + 1 if len(result.numbers) else 0)
+    if not live and not result.interrupted and len(result.numbers):
+        _say_cut(options.input, int(result.numbers[-1]) + 1)
     if not len(result.numbers) and not result.interrupted:
         raise UserError(f"{options.input} has too few frames for a clip of {options.frames} at stride {options.stride}")
     if not lines:

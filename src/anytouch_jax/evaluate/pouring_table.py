@@ -52,6 +52,21 @@ class Row(NamedTuple):
         """|poured - target| (n,) g."""
         return np.abs(self.poured - self.target)
 
+    @property
+    def error(self) -> Error:
+        """Its mean, with the 95 % interval over seeds (Student's t), whose runs share one policy; of one seed over
+        its runs."""
+        each = _by_seed(self.wrong, self.runs)
+        if len(each) < 2:
+            return error(self.poured, self.target)
+        return Error(float(self.wrong.mean()), *seed_interval(each))
+
+
+def _by_seed(values: Array, runs: Sequence[str]) -> tuple[float, ...]:
+    """The mean over each seed's runs ("seed/number")."""
+    seed = np.array([run.split("/")[0] for run in runs])
+    return tuple(float(values[seed == one].mean()) for one in np.unique(seed))
+
 
 def record(
     name: str,
@@ -131,8 +146,7 @@ def difference(a: Row, b: Row) -> Difference:
     if not shared:
         raise UserError(f"rows {a.name} and {b.name} have no run in common; run them with the same seeds")
     change = np.array([a.wrong[a.runs.index(run)] - b.wrong[b.runs.index(run)] for run in shared])
-    seed = np.array([run.split("/")[0] for run in shared])
-    each = tuple(float(change[seed == one].mean()) for one in np.unique(seed))
+    each = _by_seed(change, shared)
     return Difference(float(change.mean()), *seed_interval(each), each)
 
 
@@ -178,7 +192,7 @@ def _paper(name: str, mode: int) -> str:
 
 
 def _cell(row: Row) -> str:
-    return _words(error(row.poured, row.target)) + (f", {row.lost} never turned back" if row.lost else "")
+    return _words(row.error) + (f", {row.lost} never turned back" if row.lost else "")
 
 
 def _words(found: Error, form: str = ".1f") -> str:

@@ -218,8 +218,8 @@ text = f"""# Pouring by touch alone (simulated)
 {len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
     "; fewer: " + ", ".join(fewer) if fewer else ""
 }); mean
-|poured - {
-    TASK.target:g} g| with its 95 % interval over seeds (Student's t; the runs of a seed share one policy). The paper's numbers are of a robot: only the order can be
+|poured - {TASK.target:g} g| with its 95 % interval over seeds (Student's t; the runs of a seed share one policy).
+The paper's numbers are of a robot: only the order can be
 compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
 claimed of fewer than three. Each row has one encoder unless several are named below. Settings (`version` is that of the
 flow and the load, {VERSION} now):

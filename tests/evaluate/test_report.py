@@ -273,7 +273,7 @@ def test_a_report_says_what_it_could_not_score(
     assert "| test | stage 2 | - | - | - |" in text
 
 
-def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, tmp_path: Path) -> None:
+def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, later: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no run folder"):
         demo_report(touched, tmp_path / "none", tiny_run, tmp_path / "out")
     with pytest.raises(UserError, match="there is no manifest"):
@@ -281,6 +281,8 @@ def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, tmp_path: 
     with pytest.raises(UserError, match=r"--stage2 .*w\.safetensors is a weights file"):
         (tmp_path / "w.safetensors").write_bytes(b"")
         demo_report(touched, tiny_run, tmp_path / "w.safetensors", tmp_path / "out")
+    with pytest.raises(UserError, match="split test gives 3 frames to look at; a report needs 4: more --touches"):
+        demo_report(touched, tiny_run, later, tmp_path / "out", lambda _: None, touches=1)
     assert not (tmp_path / "out").exists()
 
 

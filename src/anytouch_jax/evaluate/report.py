@@ -43,6 +43,7 @@ RANDOM, PIXELS, VECTOR = "random encoder", "pixels minus background", "area, cen
 LABELS = ("hardness", "roughness", "material", "indenter")
 QUANTITIES = ("force",)
 _T_SNE_ROWS = 800
+FEWEST = 4  # rows of a t-SNE
 
 
 def write_report(
@@ -194,7 +195,10 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
 
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
-    rows = np.concatenate([_chosen(table, name, count, seed) for name, count in most.items()])
+    chosen = [_chosen(table, name, count, seed) for name, count in most.items()]
+    if (found := len(chosen[-1])) < FEWEST:  # before the work
+        raise UserError(f"split test gives {found} frames to look at; a report needs {FEWEST}: more --touches")
+    rows = np.concatenate(chosen)
     classes, patches = {}, {}
     for name, encoder in encoders.items():
         found, values = embed_rows(encoder, table, rows, pooling="both", say=say)

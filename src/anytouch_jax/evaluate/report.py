@@ -196,8 +196,8 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
     chosen = [_chosen(table, name, count, seed) for name, count in most.items()]
-    if (found := len(chosen[-1])) < FEWEST:  # before the work
-        raise UserError(f"split test gives {found} frames to look at; a report needs {FEWEST}: more --touches")
+    if (there := len(chosen[-1])) < FEWEST:  # before the work
+        raise UserError(f"split test gives {there} frames to look at; a report needs {FEWEST}: more --touches")
     rows = np.concatenate(chosen)
     classes, patches = {}, {}
     for name, encoder in encoders.items():

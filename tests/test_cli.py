@@ -110,10 +110,13 @@ def test_help_all_lists_the_configuration_with_the_defaults_of_the_preset(capsys
     out = capsys.readouterr().out
     told = " ".join(out.replace("│", " ").split())
     for meaning in ("share of the patches that a touch keeps in matching", "decay of an average of the parameters"):
-        assert meaning in told  # of the docstrings of the configuration
+        assert meaning in told  # of the comments of the configuration
     for option in ("--model.touch.width", "--objective.mask-ratio", "--optim.clip-norm", "--loader.threads"):
         assert option in out
     assert "(default: 384)" in out
+    lines = [line.strip("│ ") for line in out.splitlines()]
+    fields = [(line, after) for line, after in zip(lines, lines[1:]) if line.startswith("--")]
+    assert len(fields) > 70 and not [line for line, after in fields if after.startswith("(default")]  # all are explained
 
 
 def test_help_needs_no_heavy_imports():

@@ -30,33 +30,25 @@ CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.261302
 
 @dataclass(frozen=True)
 class Objective:
-    """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix).
+    """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix)."""
 
-    `touch_text_sum`: weigh the touch-text pair by alpha (the release) instead of alpha / 2 (Eq. 4).
-    `reconstruct`: keep the stage-1 loss on the align batches of stage 2 (the release).
-    `groups`: the batch is cut in that many shares and negatives stay within a share (1: the whole batch).
-    `centre`: embeddings less their mean over the batch before they are compared (towers from scratch, which else
-    collapse to one point). `match_keep`: share of the patches that a touch keeps in matching (ours, after FLIP).
-    `differences`, `force`: stage-1 weights of frame differences, of model.force_head.
-    """
-
-    mask_ratio: float = 0.75
-    norm_pix_loss: bool = False
-    next_frame: bool = True
-    alpha_tv: float = 1.0
-    alpha_tl: float = 1.0
-    alpha_vl: float = 0.2
-    touch_text_sum: bool = False
-    match_weight: float = 0.1
-    match_keep: float = 1.0
-    reconstruct: bool = False
-    groups: int = 1
-    centre: bool = False
-    universal_start: float = 0.0
-    universal_end: float = 0.75
-    universal_shared: bool = False
-    differences: float = 0.0
-    force: float = 0.0
+    mask_ratio: float = 0.75  # share of the patches that is hidden
+    norm_pix_loss: bool = False  # predict pixels that are normalised within each patch
+    next_frame: bool = True  # a clip predicts the frame after it, too
+    alpha_tv: float = 1.0  # weight of touch and vision (Eq. 4)
+    alpha_tl: float = 1.0  # weight of touch and text
+    alpha_vl: float = 0.2  # weight of vision and text
+    touch_text_sum: bool = False  # touch and text by alpha (the release) instead of alpha / 2 (Eq. 4)
+    match_weight: float = 0.1  # weight of cross-sensor matching beside alignment
+    match_keep: float = 1.0  # share of the patches that a touch keeps in matching (ours, after FLIP)
+    reconstruct: bool = False  # keep the loss of stage 1 on the align batches of stage 2 (the release)
+    groups: int = 1  # shares of the batch within which negatives stay; 1: the whole batch
+    centre: bool = False  # embeddings less their batch mean (towers from scratch, which else collapse to a point)
+    universal_start: float = 0.0  # share of samples that get the universal tokens, first step (Sec. 3.5)
+    universal_end: float = 0.75  # ... and last step; linear in between
+    universal_shared: bool = False  # one draw for the whole batch (the release)
+    differences: float = 0.0  # stage 1: weight of the differences between frames (ours)
+    force: float = 0.0  # stage 1: weight of force and its change, by model.force_head (ours)
 
     def __post_init__(self) -> None:
         shares = ("mask_ratio", "match_keep", "universal_start", "universal_end")
@@ -79,20 +71,19 @@ class Objective:
 
 @dataclass(frozen=True)
 class Optim:
-    """AdamW and its schedule (appendix "Implementation details"). `warmup` is in steps; None: an epoch, or a share of
-    the run where that is less. `ema`: decay of an average of the parameters, which is then what is used."""
+    """AdamW and its schedule (appendix "Implementation details")."""
 
-    learning_rate: float = 2e-4
-    min_rate: float = 0.0
-    warmup: int | None = None
-    decay: Literal["linear", "cosine"] = "linear"
-    beta1: float = 0.9
-    beta2: float = 0.99
-    eps: float = 1e-8
-    weight_decay: float = 0.1
-    clip_norm: float | None = None
-    ema: float | None = None
-    accumulate: int = 1
+    learning_rate: float = 2e-4  # the highest, after the warm-up
+    min_rate: float = 0.0  # the last one
+    warmup: int | None = None  # steps; None: an epoch, or a share of the run where that is less
+    decay: Literal["linear", "cosine"] = "linear"  # how the rate falls after the warm-up
+    beta1: float = 0.9  # AdamW's
+    beta2: float = 0.99  # AdamW's
+    eps: float = 1e-8  # AdamW's
+    weight_decay: float = 0.1  # of matrices; vectors have none
+    clip_norm: float | None = None  # largest norm of the gradient; None: any
+    ema: float | None = None  # decay of an average of the parameters, which is then what is used; None: no average
+    accumulate: int = 1  # batches whose gradients make one update
 
     def __post_init__(self) -> None:
         in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=BELOW_1, accumulate=COUNT)
@@ -103,43 +94,35 @@ class Optim:
 
 @dataclass(frozen=True)
 class Data:
-    """What is read and how it is augmented (in config.json `data`). `jitter`: brightness, contrast, saturation, hue.
+    """What is read and how it is augmented (`data` in config.json).
 
-    `affine`: degrees by which a touch is turned at most, share of the picture's side by which it is moved, share by
-    which it grows or shrinks; zeros (the paper and the release) leave it where it is.
-    `order`: stills and clips take turns (`alternate`, the paper) or come in a random order (`random`, the release).
-    `split_steps`: stage 2 takes align and match batches in separate steps (the release). `weights`: (dataset, how often
-    it is drawn in an epoch), 0 leaves it out, 1 for those that are not named; None is what the recipe does (the release
-    in stage 2: RELEASE_WEIGHTS, where they are there). `negatives`: of matching, from any sensor or from the
-    positive's, so that the sensor alone does not tell them apart. `require`: draw only rows that have these;
-    `contact_only`: leave out rows that `label.contact` calls free (see `anytouch contact`), since the paper's frames
-    are contact frames; rows of which nothing is known stay, and a clip counts by its last frame. `aligned_text`: train
-    on the text of rows whose touch other sensors or units felt too. `background` "subtract": touches are shown less the
-    picture of the untouched gel (`background_path`), on middle grey: what is left is the contact, not the unit's own
-    tint, lights and dots. Beyond the paper (its successor does). `cache`: MB of frames that are kept in memory.
+    `contact_only` is there because the paper's frames are contact frames; rows of which nothing is known stay, and a
+    clip counts by its last frame. `background` "subtract" leaves the contact on middle grey, not the unit's own tint,
+    lights and dots (beyond the paper; its successor does). `weights` None is what the recipe does: the release in stage
+    2 RELEASE_WEIGHTS, where they are there.
     """
 
-    manifests: tuple[str, ...] = ()
-    split: str = "train"
-    batch_size: int = 64
-    clip_share: float = 0.5
-    order: Literal["alternate", "random"] = "alternate"
-    split_steps: bool = False
-    weights: tuple[tuple[str, float], ...] | None = None
-    negatives: Literal["any", "same_sensor"] = "any"
-    require: tuple[Literal["image", "text"], ...] = ()
-    contact_only: bool = False
-    aligned_text: bool = True
-    background: Literal["keep", "subtract"] = "keep"
-    flip: float = 0.5
-    affine: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)
-    rotation: float = 20.0
-    tokenizer: str | None = None
-    threads: int = 2
-    prefetch: int = 4
-    cache: int = 512
-    on_bad_sample: Literal["error", "skip"] = "error"
+    manifests: tuple[str, ...] = ()  # files to train on (--data)
+    split: str = "train"  # rows to train on
+    batch_size: int = 64  # samples a step (--batch)
+    clip_share: float = 0.5  # share of clips; the rest are stills
+    order: Literal["alternate", "random"] = "alternate"  # stills and clips take turns, or are mixed (the release)
+    split_steps: bool = False  # stage 2: align and match batches in separate steps (the release)
+    weights: tuple[tuple[str, float], ...] | None = None  # dataset, times an epoch (0: never; 1 if not named)
+    negatives: Literal["any", "same_sensor"] = "any"  # sensors of matching's negatives: any, the positive's
+    require: tuple[Literal["image", "text"], ...] = ()  # draw only rows that have these
+    contact_only: bool = False  # leave out rows that `label.contact` calls free (`anytouch contact`)
+    aligned_text: bool = True  # use the text of rows whose touch other sensors or units felt too
+    background: Literal["keep", "subtract"] = "keep"  # as it is, or less the untouched gel (`background_path`)
+    flip: float = 0.5  # chance of a mirror image, for each direction
+    affine: tuple[float, float, float] = (0.0, 0.0, 0.0)  # at most: degrees, shift and growth as shares of the side
+    jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)  # brightness, contrast, saturation, hue
+    rotation: float = 20.0  # photographs are turned by so many degrees at most
+    tokenizer: str | None = None  # file; None: the run's own, else CLIP's (--clip), else made of the captions
+    threads: int = 2  # that read and augment
+    prefetch: int = 4  # batches made ahead
+    cache: int = 512  # MB of frames that are kept in memory
+    on_bad_sample: Literal["error", "skip"] = "error"  # a file that cannot be read: stop, or replace and count it
 
     def __post_init__(self) -> None:
         in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE)
@@ -149,19 +132,16 @@ class Data:
 
 @dataclass(frozen=True)
 class Run:
-    """One training run (`run` in config.json): `steps` in all, a checkpoint every `save_every` steps (0: the last one),
-    of which the last `keep` and the best stay, pictures every `figure_every` (0: none). `max_skipped`: steps in a row
-    that may be skipped since their loss or gradient is not finite. `fsdp`: devices that share parameters and moments.
-    """
+    """One training run (`run` in config.json)."""
 
-    seed: int = 0
-    steps: int = 1000
-    save_every: int = 200
-    keep: int = 3
-    figure_every: int = 200
-    max_skipped: int = 20
-    tensorboard: bool = False
-    fsdp: int = 1
+    seed: int = 0  # of everything drawn
+    steps: int = 1000  # of the whole schedule
+    save_every: int = 200  # steps between checkpoints; 0: the last one alone
+    keep: int = 3  # checkpoints that stay beside the best: the last ones
+    figure_every: int = 200  # steps between pictures; 0: none
+    max_skipped: int = 20  # steps in a row that may be skipped since loss or gradient is not finite
+    tensorboard: bool = False  # write TensorBoard events too
+    fsdp: int = 1  # devices that share parameters and moments
 
     def __post_init__(self) -> None:
         in_range("--loop.", self, seed=SEED, steps=COUNT, keep=COUNT, fsdp=COUNT)

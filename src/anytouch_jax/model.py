@@ -16,12 +16,12 @@ FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 
 @dataclass(frozen=True)
 class Stack:
-    """A stack of transformer blocks: `width` channels, `depth` blocks, `heads`, `mlp` hidden channels."""
+    """A stack of transformer blocks."""
 
-    width: int
-    depth: int
-    heads: int
-    mlp: int
+    width: int  # channels
+    depth: int  # blocks
+    heads: int  # of attention
+    mlp: int  # hidden channels of a block
 
     def __post_init__(self) -> None:
         in_range("", self, width=COUNT, depth=NOT_NEGATIVE, heads=COUNT, mlp=COUNT)
@@ -31,12 +31,12 @@ class Stack:
 
 @dataclass(frozen=True)
 class TextTower:
-    """CLIP's text tower. `end_token` None pools at the largest id (CLIP), else at its first occurrence."""
+    """CLIP's text tower."""
 
     stack: Stack
-    vocab: int = 49408
-    length: int = 77
-    end_token: int | None = None
+    vocab: int = 49408  # tokens
+    length: int = 77  # of a caption in tokens, with its ends
+    end_token: int | None = None  # whose first occurrence is pooled; None: that of the largest id (CLIP)
 
     def __post_init__(self) -> None:
         in_range("--model.text.", self, vocab=COUNT, length=COUNT)
@@ -46,36 +46,32 @@ class TextTower:
 class Model:
     """Everything that decides the shapes and the arithmetic of the network.
 
-    `image` and `text` None leave the towers out (stage 1); `lora_rank` 0: no LoRA. `sensors` names the rows of sensor
-    tokens (Sec. 3.5) and of patch encoders if each has its own (T3); row "universal" serves sensors never seen.
-    `match_head` "cosine" is ours, see `ops.losses.contrast_loss`. `embed`: values of an embedding; `frames` of a clip;
-    `temperature` of InfoNCE at the start (it is learned); `attention`: "auto" is the fastest form on this machine, all
-    give the same numbers (`nn/attention.py`); `remat`: activations are computed again instead of kept.
+    `sensors` names the rows of sensor tokens (Sec. 3.5), and of patch encoders if each has its own (T3).
     """
 
-    image_size: int
-    patch: int
-    embed: int
-    touch: Stack
-    decoder: Stack
-    image: Stack | None = None
-    text: TextTower | None = None
-    frames: int = 3
-    sensors: tuple[str, ...] = SENSORS
-    sensor_tokens: int = 5
-    activation: Literal["gelu", "quick_gelu"] = "gelu"
-    norm_eps: float = 1e-5
-    decoder_norm_eps: float = 1e-12
-    decoder_sensor_tokens: bool = False
-    patch_encoder: Literal["shared", "sensor"] = "shared"
-    force_head: bool = False
-    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"
-    lora_rank: int = 0
-    lora_alpha: float = 16.0
-    temperature: float = 0.07
-    dtype: Literal["float32", "bfloat16", "float64"] = "float32"
-    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"
-    remat: bool = False
+    image_size: int  # pixels of a side
+    patch: int  # pixels of a patch's side
+    embed: int  # values of an embedding
+    touch: Stack  # touch encoder
+    decoder: Stack  # decoder of stage 1
+    image: Stack | None = None  # image tower; None: none (stage 1)
+    text: TextTower | None = None  # text tower; None: none (stage 1)
+    frames: int = 3  # of a clip
+    sensors: tuple[str, ...] = SENSORS  # names; "universal" serves those never seen
+    sensor_tokens: int = 5  # of each sensor
+    activation: Literal["gelu", "quick_gelu"] = "gelu"  # of the encoders; CLIP's own weights want quick_gelu
+    norm_eps: float = 1e-5  # of layer norms
+    decoder_norm_eps: float = 1e-12  # of the decoder's
+    decoder_sensor_tokens: bool = False  # the decoder gets the sensor tokens themselves, not as encoded
+    patch_encoder: Literal["shared", "sensor"] = "shared"  # one for all sensors, or one each (T3)
+    force_head: bool = False  # stage 1 tells force and its change, from labels
+    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # cosine is ours: `ops.losses.contrast_loss`
+    lora_rank: int = 0  # of the image tower's LoRA; 0: none
+    lora_alpha: float = 16.0  # LoRA's scale, over its rank
+    temperature: float = 0.07  # of InfoNCE at the start; it is learned
+    dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # of the arithmetic; parameters are float32
+    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"  # forms of one sum; auto: the fastest here
+    remat: bool = False  # activations are computed again, not kept: less memory, slower
 
     def __post_init__(self) -> None:
         in_range("--model.", self, image_size=COUNT, patch=COUNT, embed=COUNT, frames=COUNT, temperature=ABOVE_0)

@@ -40,7 +40,7 @@ from study import asked
 from anytouch_jax.cli import main
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import baseline, machine, probe, results, retrieval
-from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
+from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.sim.dataset import VERSION
@@ -168,7 +168,7 @@ def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, A
     table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
     rows = deepest_rows(table, table.rows_of("test"))
     found = features(encoders, seed, table, rows, "class")
-    found |= {"pixels": background_difference(table, rows), "vector": contact_vector(table, rows)}
+    found |= {"pixels": baseline.background_difference(table, rows), "vector": contact_vector(table, rows)}
     scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(True,), metrics={"vector": "euclidean"})
     pooled = {one.name: one.found for one in scored if one.query_sensor == retrieval.ALL and one.found}
     groups = pooled["stage 2"].groups
@@ -182,7 +182,7 @@ def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any
     rows = np.concatenate([deepest_rows(table, table.rows_of(split)) for split in ("train", "val", "test")])
     split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
     found = features(encoders, seed, table, rows, "both")
-    found["pixels"] = baseline.reduce(background_difference(table, rows), split == "train")
+    found["pixels"] = baseline.reduce(baseline.background_difference(table, rows), split == "train")
     probed: dict[str, Any] = {"data": table.content_hash}
     for label in (*NAMED, *UNNAMED):
         values, right, tested = [table.value(int(row), f"label.{label}") for row in rows], {}, groups[:0]

@@ -1,5 +1,6 @@
 """The command line: help, mistakes and their answers, and each subcommand on a small run."""
 
+import itertools
 import json
 import os
 import pkgutil
@@ -115,8 +116,10 @@ def test_help_all_lists_the_configuration_with_the_defaults_of_the_preset(capsys
         assert option in out
     assert "(default: 384)" in out
     lines = [line.strip("│ ") for line in out.splitlines()]
-    fields = [(line, after) for line, after in zip(lines, lines[1:]) if line.startswith("--")]
-    assert len(fields) > 70 and not [line for line, after in fields if after.startswith("(default")]  # all are explained
+    fields = [(line, after) for line, after in itertools.pairwise(lines) if line.startswith("--")]
+    assert len(fields) > 70 and not [
+        line for line, after in fields if after.startswith("(default")
+    ]  # all are explained
 
 
 def test_help_needs_no_heavy_imports():

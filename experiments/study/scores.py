@@ -15,7 +15,8 @@ import numpy as np
 from anytouch_jax.config import Config
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery, retrieval, space
-from anytouch_jax.evaluate.contacts import background_difference, contact_vector
+from anytouch_jax.evaluate.baseline import background_difference
+from anytouch_jax.evaluate.contacts import contact_vector
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.image_tower import image_tower_encoder
 from anytouch_jax.evaluate.tasks import Task

@@ -26,7 +26,8 @@ def run(options: Retrieve) -> int:
     """Score cross-sensor retrieval of frozen features, print a table, write JSON when asked."""
     from anytouch_jax.data import manifest as manifests
     from anytouch_jax.evaluate import features, retrieval
-    from anytouch_jax.evaluate.contacts import background_difference, contact_vector, deepest_rows
+    from anytouch_jax.evaluate.baseline import background_difference
+    from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
     from anytouch_jax.evaluate.results import markdown, plain
     from anytouch_jax.train.mesh import enable_compilation_cache

@@ -15,49 +15,59 @@ from ..data.manifest import Manifest
 from ..data.samples import read_picture
 
 Array = npt.NDArray[Any]
-RAW_SIZE = (240, 320)  # rows and columns of a picture before it is averaged down
-KEPT = 256  # backgrounds in memory, 230 kB each
+Size = tuple[int, int]  # rows, columns
+RAW_SIZE = (240, 320)  # of a picture before `row_pixels` averages it down
+SMALL = (24, 32)
 
 
-def raw_pixels(
-    frames: Array, backgrounds: Array, has_background: Array | None = None, *, size: tuple[int, int] = (24, 32)
-) -> Array:
-    """Pixels, in colour, and their difference from the background, both averaged down to `size` (rows, columns).
+def raw_pixels(frame: Array, background: Array | None, size: Size = SMALL) -> Array:
+    """Pixels, in colour, and their difference from the background, both averaged down to `size`.
 
-    `frames`, `backgrounds`: u8 RGB (n, h, w, 3) -> f32 (n, 2 * rows * columns * 3), in 0..1. The difference is 0
-    where `has_background` (n,) is false. It may be called in pieces. Raises UserError when shapes do not match.
+    `frame`, `background`: u8 RGB (h, w, 3) -> f32 (2 * rows * columns * 3), in 0..1. The difference is 0 without a
+    background. Raises UserError when shapes do not match.
     """
-    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.shape != backgrounds.shape:
-        raise UserError(f"frames {frames.shape} and backgrounds {backgrounds.shape} must both be (n, h, w, 3)")
-    small = _shrink(frames, size)
-    change = small - _shrink(backgrounds, size)
-    if has_background is not None:
-        change[~np.asarray(has_background, bool)] = 0.0
-    return np.concatenate([small, change], axis=1)
+    if frame.ndim != 3 or frame.shape[-1] != 3 or (background is not None and frame.shape != background.shape):
+        others = "" if background is None else f" and background {background.shape}"
+        raise UserError(f"frame {frame.shape}{others} must be of one shape (h, w, 3)")
+    seen = _small(frame, size)
+    return np.concatenate([seen, np.zeros_like(seen) if background is None else seen - _small(background, size)])
 
 
 def row_pixels(table: Manifest, row: int, grounds: dict[Path, Array]) -> Array:
-    """`raw_pixels` of a row of a manifest, f32 (2 * 2304,); `grounds` keeps some backgrounds, which many rows share.
+    """`raw_pixels` of a row of a manifest, f32 (2 * 2304,); `grounds` keeps backgrounds, which many rows share.
 
     Raises SampleError, which names row and file.
     """
-    frame = _same_size(read_picture(table, row))
-    has = table.value(row, "background_path") is not None
-    ground = np.zeros_like(frame)
-    if has:
+    frame, ground = _same_size(read_picture(table, row)), None
+    if table.value(row, "background_path") is not None:
         file = table.file(row, "background_path")
         if file not in grounds:
-            if len(grounds) >= KEPT:
+            if len(grounds) >= 256:  # 230 kB each
                 grounds.clear()
             grounds[file] = _same_size(read_picture(table, row, "background_path"))
         ground = grounds[file]
-    return raw_pixels(frame[None], ground[None], np.array([has]))[0]
+    return raw_pixels(frame, ground)
 
 
-def _same_size(image: Array) -> Array:
-    if image.shape[:2] == RAW_SIZE:
-        return image
-    return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
+def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> Array:
+    """Frame minus background in RGB, averaged down to `size`: f32 (n, 3 * rows * columns) in -1..1.
+
+    Raises UserError that names the row without a background, or whose background has other proportions.
+    """
+    behind: dict[Path, tuple[Array, float]] = {}
+    found = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
+    for place, row in enumerate(map(int, rows)):
+        if table.value(row, "background_path") is None:
+            raise UserError(f"{table.where(row)} has no background_path; give one, or leave this baseline out")
+        file = table.file(row, "background_path")
+        if file not in behind:
+            gel = read_picture(table, row, "background_path")
+            behind[file] = _small(gel, size), gel.shape[1] / gel.shape[0]
+        frame, (small, proportion) = read_picture(table, row), behind[file]
+        if abs(frame.shape[1] / frame.shape[0] / proportion - 1) > 0.05:
+            raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame")
+        found[place] = _small(frame, size) - small
+    return found
 
 
 def reduce(features: Array, train: Array, components: int = 200) -> Array:
@@ -73,19 +83,12 @@ def reduce(features: Array, train: Array, components: int = 200) -> Array:
     return projection.transform(features).astype(np.float32)
 
 
-def _shrink(images: Array, size: tuple[int, int]) -> Array:
-    """Area averages (n, rows * columns * 3) in 0..1 of u8 images (n, h, w, 3)."""
-    count, height, width, colours = images.shape
-    rows, columns = _area(height, size[0]), _area(width, size[1])
-    lower = rows @ images.reshape(count, height, -1).astype(np.float32)
-    small = columns @ lower.reshape(count, size[0], width, colours)
-    return np.asarray(small / 255.0, np.float32).reshape(count, -1)
+def _same_size(image: Array) -> Array:
+    if image.shape[:2] == RAW_SIZE:
+        return image
+    return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
 
 
-def _area(fine: int, coarse: int) -> Array:
-    """(coarse, fine) weights of area averaging: the overlap of each coarse cell with each fine one; rows sum to 1."""
-    edges = np.arange(coarse + 1) * (fine / coarse)
-    left, right = edges[:-1, None], edges[1:, None]
-    cells = np.arange(fine)[None]
-    overlap = np.clip(np.minimum(right, cells + 1) - np.maximum(left, cells), 0, None)
-    return (overlap / overlap.sum(1, keepdims=True)).astype(np.float32)
+def _small(image: Array, size: Size) -> Array:
+    """Area averages, f32 (rows * columns * 3) in 0..1, of a picture u8 (h, w, 3)."""
+    return cv2.resize(image.astype(np.float32) / 255, size[::-1], interpolation=cv2.INTER_AREA).ravel()

@@ -1,17 +1,15 @@
-"""What a manifest itself says of its touches: the deepest frame, the contact's numbers, the picture's difference."""
+"""What a manifest itself says of its touches: the deepest frame, the contact's numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 from ..config import UserError
-from ..data.images import decode
 from ..data.manifest import Manifest
 from .features import text_column
 
@@ -87,28 +85,3 @@ def contact_vector(manifest: Manifest, rows: Array) -> Array:
         spread = here.std(axis=0, keepdims=True)
         values[sensors == sensor] = (here - here.mean(axis=0, keepdims=True)) / np.where(spread > 0, spread, 1.0)
     return values.astype(np.float32)
-
-
-def background_difference(manifest: Manifest, rows: Array, size: tuple[int, int] = (24, 32)) -> Array:
-    """Frame minus background in RGB, averaged down to `size` (rows, columns): f32 (n, 3 * rows * columns) in -1..1.
-
-    Raises UserError that names the row without a background, or whose background has other proportions.
-    """
-    behind: dict[str, tuple[Array, float]] = {}
-    found = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
-    for place, row in enumerate(map(int, rows)):
-        if manifest.value(row, "background_path") is None:
-            raise UserError(f"{manifest.where(row)} has no background_path; give one, or leave this baseline out")
-        file = manifest.file(row, "background_path")
-        if str(file) not in behind:
-            gel = decode(file)
-            behind[str(file)] = _small(gel, size), gel.shape[1] / gel.shape[0]
-        frame, (small, proportion) = decode(manifest.file(row)), behind[str(file)]
-        if abs(frame.shape[1] / frame.shape[0] / proportion - 1) > 0.05:
-            raise UserError(f"{manifest.where(row)}: its background_path has other proportions than the frame")
-        found[place] = _small(frame, size) - small
-    return found
-
-
-def _small(image: Array, size: tuple[int, int]) -> Array:
-    return cv2.resize(image.astype(np.float32) / 255, size[::-1], interpolation=cv2.INTER_AREA).ravel()

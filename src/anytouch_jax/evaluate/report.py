@@ -23,7 +23,8 @@ from ..data import manifest as manifests
 from ..data.manifest import Manifest
 from ..io import checkpoint
 from . import baseline, matching, probe, results, retrieval, space
-from .contacts import background_difference, contact_vector, deepest_rows
+from .baseline import background_difference
+from .contacts import contact_vector, deepest_rows
 from .features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from .sections import (
     Section,

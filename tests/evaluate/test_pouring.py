@@ -186,10 +186,23 @@ def test_features_of_demonstrations_are_those_of_the_encoder(shown, encoder):
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
     assert z.shape == (7, 2, 12)
     clip = shown.frames[2:5, 1][None]
-    np.testing.assert_allclose(z[2, 1], encoder.embed(clip, "gelsight_mini")[0], atol=1e-5)
-    still = pouring_policy.features(encoder, shown, stills=True, batch=8)
-    np.testing.assert_allclose(still[2, 1], encoder.embed(shown.frames[4, 1], "gelsight_mini")[0], atol=1e-5)
-    assert np.abs(still - z).max() > 1e-4
+    np.testing.assert_allclose(z[2, 1], encoder.embed(clip, "gelsight_mini", pooling="mean")[0], atol=1e-5)
+    still = pouring_policy.features(encoder, shown, stills=True, pooling="both", batch=8)
+    frame = encoder.embed(shown.frames[4, 1], "gelsight_mini", pooling="both")
+    np.testing.assert_allclose(still[2, 1], frame[0], atol=1e-5)
+    assert np.abs(still[..., 12:] - z).max() > 1e-4
+
+
+def test_moments_that_are_learned_have_all_their_inputs(shown, encoder):
+    """Every LAG-th moment: the segment before one is that of another, so the rest need not be embedded."""
+    z = pouring_policy.features(encoder, shown, stills=True, batch=8)
+    learned = (np.arange(4)[:, None] - np.array([0, 1])) % pouring_policy.LAG == 0
+    part = pouring_policy.features(encoder, shown, stills=True, batch=8, learned=learned)
+    assert (part != 0).any(-1).sum() == 3 + 3 < (z != 0).any(-1).sum()  # of run 0 the numbers 0, 3, 6, of run 1 0, 3, 4
+    whole, few = (pouring_policy.moments(shown, pouring_policy.input_table(one), learned) for one in (z, part))
+    assert len(whole[0]) == 3
+    for one, other in zip(whole, few, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_touch_sees_in_a_run_what_it_learned_from(shown, encoder):
@@ -230,7 +243,7 @@ def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
     clips = pouring_policy.segments(encoder, shown.frames, where.reshape(-1, 2), 3).reshape(6, 6, 3, SIDE, SIDE, 3)
     params = {"encoder": encoder.params, "head": {"basis": policy.head.basis, "layers": policy.head.layers}}
     row = encoder.sensor_row(policy.sensor)
-    found = pouring_tuning.logits_of(params, clips, net=encoder.net, mean=policy.head.mean, sensor=row)
+    found = pouring_tuning.logits_of(params, clips, net=encoder.net, pooling="mean", mean=policy.head.mean, sensor=row)
     moment = chains.numbers[:, 3:] - pouring_policy.LIFTED
     runs = np.broadcast_to(chains.runs[:, None], moment.shape)
     expected = wanted.reshape(4, 2, 3)[moment, runs]

@@ -5,6 +5,7 @@ The recordings are those of the simulation: real ones have the same form.
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -113,6 +114,18 @@ def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_p
     policy = pouring_policy.learn_frozen(replace(encoder, seen=("digit", "gelsight_mini")), shown, FAST, stills=True)
     pouring_recordings.save_policy(tmp_path, policy)
     assert pouring_recordings.load_policy(tmp_path).encoder.seen == ("digit", "gelsight_mini")
+
+
+def test_a_policy_on_disk_knows_how_its_features_are_pooled(shown, encoder, tmp_path):
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, pooling="both"), stills=True)
+    pouring_recordings.save_policy(tmp_path, policy)
+    assert pouring_recordings.load_policy(tmp_path).pooling == "both"
+    with np.load(tmp_path / "policy.npz") as file:
+        arrays = dict(file)
+    told = json.loads(str(arrays["about"]))
+    del told["pooling"]  # as written before policies could choose
+    np.savez(tmp_path / "policy.npz", **(arrays | {"about": np.asarray(json.dumps(told))}))
+    assert pouring_recordings.load_policy(tmp_path).pooling == "class"
 
 
 def test_a_policy_takes_frames_of_the_camera(shown, encoder):

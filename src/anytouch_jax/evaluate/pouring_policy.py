@@ -19,12 +19,12 @@ import optax
 from ..config import UserError
 from ..data.transforms import touch_evaluation
 from ..sim.pouring import ACTIONS, WAIT, Setup, State, Task
-from .features import Encoder
+from .features import Encoder, Pooling
 from .pouring import FRAMES, SENSOR, START, Expert, Replay, Trials, draw_runs, run
 
 Array = npt.NDArray[Any]
-UNSEEN = 10_000  # added to a seed: runs that no demonstration met
-VERSION = 3  # of how a policy learns from the same demonstrations
+UNSEEN = 20_000  # added to a seed: runs that no demonstration met
+VERSION = 4  # of how a policy learns from the same demonstrations
 LATEST = 80  # moments, 20 degrees
 LOOKS = 30  # times that the held-out demonstrations are looked at while a policy learns
 LAG = 3  # moments from the segment before to the last one
@@ -35,8 +35,9 @@ LIFTED = START - FRAMES + 1  # the number of the first segment of the lifted cyl
 class Learning:
     """How a policy learns: `steps` of AdamW at `rate` on batches of `batch` moments, `width` hidden units.
 
-    Features are many and demonstrations few: the MLP is given the first `components` principal components of its
-    inputs, and the weights are kept that did best on a share `held_out` of the demonstrations. Fine-tuning goes on for
+    Features (`pooling` as in `Encoder.embed`; the class token holds less of the load than the mean of the patches) are
+    many and demonstrations few: the MLP is given the first `components` principal components of its inputs, and the
+    weights are kept that did best on a share `held_out` of the demonstrations. Fine-tuning goes on for
     `tune_steps` on `tune_moments` of each of `tune_runs` runs, at `tune_rate` (the encoder's; the MLP's is twice
     `rate`), which rises for a tenth of the steps and then falls.
     """
@@ -47,6 +48,7 @@ class Learning:
     width: int = 128
     decay: float = 1e-2
     components: int = 32
+    pooling: Pooling = "mean"
     held_out: float = 0.2
     tune_steps: int = 400
     tune_runs: int = 16
@@ -105,25 +107,31 @@ def features(
     trials: Trials,
     *,
     stills: bool,
+    pooling: Pooling = "mean",
     sensor: str = SENSOR,
     batch: int = 64,
     sides: Array | None = None,
+    learned: Array | None = None,
 ) -> Array:
     """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end.
 
-    `sides` (B, 2): in which mirrors the runs are shown (`segments`).
+    `sides` (B, 2): in which mirrors the runs are shown (`segments`). `learned` (S - START, B): embed the segments of
+    these moments of choice alone, and those of the standing and of the lifted cylinder; the others are 0.
     """
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
-    where = np.argwhere(trials.taken[FRAMES - 1 :])
+    wanted = trials.taken[FRAMES - 1 :].copy()
+    if learned is not None:
+        wanted[1:LIFTED], wanted[LIFTED + 1 :] = False, (wanted[LIFTED:] & learned)[1:]
+    where = np.argwhere(wanted)
     ahead = 1 if stills else FRAMES
-    found = np.zeros((*trials.taken[FRAMES - 1 :].shape, encoder.config.model.embed), np.float32)
+    width = encoder.config.model.embed * (2 if pooling == "both" else 1)
+    found = np.zeros((*wanted.shape, width), np.float32)
     for start in range(0, len(where), batch):
         part = where[start : start + batch]
         padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
-        found[tuple(part.T)] = encoder.embed(segments(encoder, trials.frames, padded, ahead, sides), sensor)[
-            : len(part)
-        ]
+        clips = segments(encoder, trials.frames, padded, ahead, sides)
+        found[tuple(part.T)] = encoder.embed(clips, sensor, pooling=pooling)[: len(part)]
     return found
 
 
@@ -249,15 +257,24 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
 class Touch:
     """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features.
 
-    `loss`: of imitation, on the demonstrations held out (of a fine-tuned one: of its last steps).
+    `pooling`: of its features. `loss`: of imitation, on the demonstrations held out (of a fine-tuned one: of its last
+    steps).
     """
 
     looks = True
 
     def __init__(
-        self, encoder: Encoder, head: Head, *, stills: bool, sensor: str = SENSOR, loss: float = math.nan
+        self,
+        encoder: Encoder,
+        head: Head,
+        *,
+        stills: bool,
+        pooling: Pooling = "mean",
+        sensor: str = SENSOR,
+        loss: float = math.nan,
     ) -> None:
-        self.encoder, self.head, self.stills, self.sensor, self.loss = encoder, head, stills, sensor, loss
+        self.encoder, self.head, self.sensor, self.loss = encoder, head, sensor, loss
+        self.stills, self.pooling = stills, pooling
 
     def begin(self, count: int) -> None:
         """Forget the frames and features of the last runs."""
@@ -275,7 +292,7 @@ class Touch:
         if len(self._frames) < FRAMES:
             return np.full(len(frames), WAIT)
         stack = np.stack(self._frames[-1:] if self.stills else self._frames, 1)
-        self._z.append(self.encoder.embed(stack, self.sensor))
+        self._z.append(self.encoder.embed(stack, self.sensor, pooling=self.pooling))
         if len(self._z) <= LIFTED:
             return np.full(len(frames), WAIT)
         before = self._z[max(len(self._z) - 1 - LAG, LIFTED)]
@@ -283,19 +300,28 @@ class Touch:
         return predict(self.head, x)
 
 
-def moments(trials: Trials, x: Array) -> tuple[Array, Array, Array]:
-    """The moments of choice of all demonstrations, from inputs x (S - START, B, d): inputs, choices and runs (n,)."""
-    taken = trials.taken[START:]
+def moments(trials: Trials, x: Array, learned: Array | None = None) -> tuple[Array, Array, Array]:
+    """The moments of choice of all demonstrations, from inputs x (S - START, B, d): inputs, choices and runs (n,).
+
+    `learned` (S - START, B): only these."""
+    taken = trials.taken[START:] if learned is None else trials.taken[START:] & learned
     return x[taken], trials.choices[START:][taken], np.nonzero(taken)[1]
 
 
 def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR) -> Touch:
-    """A policy over frozen features, from demonstrations with frames of `sensor`: each as it is, and in a mirror."""
-    mirrors = np.array([[0, 1], [1, 0], [1, 1]])
-    sides = np.random.default_rng(learning.seed % 2**63).choice(mirrors, len(trials.steps))
-    views = [features(encoder, trials, stills=stills, sensor=sensor, sides=side) for side in (None, sides)]
-    x, actions, runs = (
-        np.concatenate(both) for both in zip(*(moments(trials, input_table(z)) for z in views), strict=True)
-    )
+    """A policy over frozen features, from demonstrations with frames of `sensor`: each as it is, and in a mirror.
+
+    It learns from every LAG-th moment of a run: those between resemble them, and cost as much.
+    """
+    rng, pooling = np.random.default_rng(learning.seed % 2**63), learning.pooling
+    sides = rng.choice(np.array([[0, 1], [1, 0], [1, 1]]), len(trials.steps))
+    first = rng.integers(LAG, size=len(trials.steps))
+    learned = (np.arange(len(trials.actions) - START)[:, None] - first) % LAG == 0
+    views = [
+        features(encoder, trials, stills=stills, pooling=pooling, sensor=sensor, sides=side, learned=learned)
+        for side in (None, sides)
+    ]
+    found = [moments(trials, input_table(z), learned) for z in views]
+    x, actions, runs = (np.concatenate(both) for both in zip(*found, strict=True))
     head, loss = imitate(x, actions, runs, learning)
-    return Touch(encoder, head, stills=stills, sensor=sensor, loss=loss)
+    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, loss=loss)

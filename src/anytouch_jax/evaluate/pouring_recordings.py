@@ -200,7 +200,9 @@ def save_policy(folder: Path, policy: Touch) -> None:
     checkpoint.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
-    told = json.dumps({"stills": policy.stills, "sensor": policy.sensor, "encoder": encoder.mark})
+    told = json.dumps(
+        {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "encoder": encoder.mark}
+    )
     data = io.BytesIO()
     arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
     np.savez(data, about=np.asarray(told), **arrays)
@@ -216,6 +218,7 @@ def load_policy(folder: Path | str) -> Touch:
         with np.load(io.BytesIO((folder / POLICY).read_bytes()), allow_pickle=False) as file:
             arrays, told = dict(file), json.loads(str(file["about"]))
         stills, sensor, mark = bool(told["stills"]), str(told["sensor"]), told["encoder"]
+        pooling = told.get("pooling", "class")  # of earlier policies
         count = sum(name.startswith("w/") for name in arrays)
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
         head = Head(arrays["mean"], arrays["basis"], layers)
@@ -223,4 +226,4 @@ def load_policy(folder: Path | str) -> Touch:
         raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
     if mark != encoder.mark:
         raise UserError(f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}; pour again")
-    return Touch(encoder, head, stills=stills, sensor=sensor)
+    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor)

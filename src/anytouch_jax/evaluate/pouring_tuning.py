@@ -21,8 +21,7 @@ import optax
 
 from ..config import UserError
 from ..nn.functional import Net
-from ..objectives import normalise_touch
-from .features import Encoder
+from .features import Pooling, touch_features
 from .pouring import FRAMES, Trials
 from .pouring_policy import LAG, LIFTED, Head, Learning, Touch, forward, inputs, segments
 
@@ -60,7 +59,7 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     """
     assert trials.frames is not None
     encoder, stills, runs = policy.encoder, policy.stills, learning.tune_runs
-    step, state, params = _tuner(encoder, encoder.sensor_row(policy.sensor), policy.head, learning)
+    step, state, params = _tuner(policy, learning)
     rng = np.random.default_rng(learning.seed % 2**63)
     losses: list[jax.Array] = []
     for _ in range(learning.tune_steps):
@@ -77,13 +76,12 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     late = float(np.mean(jax.device_get(losses[-max(1, learning.tune_steps // 10) :])))
     if not math.isfinite(late):
         raise UserError(f"fine-tuning went astray (its loss is {late}); lower tune_rate, {learning.tune_rate:g} now")
-    return Touch(tuned, head, stills=stills, sensor=policy.sensor, loss=late)
+    return Touch(tuned, head, stills=stills, pooling=policy.pooling, sensor=policy.sensor, loss=late)
 
 
-def _tuner(
-    encoder: Encoder, sensor: int, head: Head, learning: Learning
-) -> tuple[Callable[..., tuple[Params, Any, jax.Array]], Any, Params]:
+def _tuner(policy: Touch, learning: Learning) -> tuple[Callable[..., tuple[Params, Any, jax.Array]], Any, Params]:
     """The compiled step of fine-tuning, its optimiser's state and its parameters."""
+    encoder, head = policy.encoder, policy.head
     params = {"encoder": encoder.params, "head": {"basis": head.basis, "layers": head.layers}}
     steps = learning.tune_steps
 
@@ -98,7 +96,8 @@ def _tuner(
             {"encoder": "encoder", "head": "head"},
         ),
     )
-    logits = partial(logits_of, net=encoder.net, mean=head.mean, sensor=sensor)
+    sensor = encoder.sensor_row(policy.sensor)
+    logits = partial(logits_of, net=encoder.net, pooling=policy.pooling, mean=head.mean, sensor=sensor)
 
     def loss_of(params: Params, clips: jax.Array, choices: jax.Array, inside: jax.Array) -> jax.Array:
         losses = optax.softmax_cross_entropy_with_integer_labels(logits(params, clips), choices)
@@ -113,13 +112,15 @@ def _tuner(
     return step, optimiser.init(params), params
 
 
-def logits_of(params: Params, clips: jax.Array, *, net: Net, mean: jax.Array, sensor: int) -> jax.Array:
+def logits_of(
+    params: Params, clips: jax.Array, *, net: Net, pooling: Pooling, mean: jax.Array, sensor: int
+) -> jax.Array:
     """Logits (R, C, 3) of the moments of chains, from their segments (R, 3 + C, T, h, w, 3), and parameters of the
     encoder and of the MLP with its basis."""
     runs, count = clips.shape[:2]
     flat = clips.reshape(runs * count, *clips.shape[2:])
     rows = jnp.full(len(flat), sensor, jnp.int32)
-    z = net.apply(params["encoder"], "encode", normalise_touch(flat), rows, "mean").astype(jnp.float32)
+    z = touch_features(params["encoder"], flat, rows, net=net, pooling=pooling, join="mean")
     z = z.reshape(runs, count, -1)
     before, now = z[:, 2:-1], z[:, 3:]
     standing, lifted = (jnp.broadcast_to(z[:, i : i + 1], now.shape) for i in (0, 1))

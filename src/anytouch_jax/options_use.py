@@ -68,7 +68,7 @@ class Pour:
     out: Path | None = None
     """Folder for pour.gif (the first trial), pour.json and the policy (default: pour in the run's folder)."""
     demos: int = 120
-    """Demonstrations of the expert, who sees the scales; two hundred are better, forty too few."""
+    """Demonstrations of the expert, who sees the scales; a thousand are better (memory: 5 GB of 84 pixels)."""
     stills: bool = False
     """Features of single frames, not of segments of three."""
     fine_tune: bool = False

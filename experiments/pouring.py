@@ -22,12 +22,14 @@
 # yours. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without a path an
 # untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only), `anytouch`.
 # `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is finished is
-# not done again. QUICK=1 is a trial of minutes; TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS, TUNE (steps of
-# fine-tuning), MODES and OUT in the environment change the size and the place.
+# not done again. QUICK=1 is a trial of minutes; TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS (a thousand of
+# 84 pixels take 9 GB at the most), TUNE (steps of fine-tuning), MODES, NAME (of the page and its folder) and OUT in
+# the environment change the size and the place.
 
 # %%
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import asdict
 from functools import cache
@@ -56,7 +58,8 @@ MODES = asked.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", pouring
 TRIALS, DEMOS = asked.number("TRIALS", 10 if QUICK else 30), asked.number("DEMOS", 12 if QUICK else 1000)
 TUNE = asked.number("TUNE", 20 if QUICK else 400)
 OUT = asked.path("OUT", "experiments/results")
-FOLDER, PAGE = OUT / ("pouring-quick" if QUICK else "pouring"), OUT / ("pouring-quick.md" if QUICK else "pouring.md")
+NAME = asked.path("NAME", "pouring-quick" if QUICK else "pouring").name
+FOLDER, PAGE = OUT / NAME, OUT / f"{NAME}.md"
 TASK = Task()
 
 if unknown := set(RUNS) - set(pouring_table.PAPER):
@@ -213,7 +216,10 @@ seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
 fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
 picture = f"{FOLDER.name}.png"
 pouring_table.draw(figures / picture, rows)
-text = f"""# Pouring by touch alone (simulated)
+settings = max((row.settings for row in rows), key=len)
+told = json.loads(settings)
+other = "" if told["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
+text = f"""# Pouring by touch alone (simulated), {told["demonstrations"]} demonstrations
 
 {len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
     "; fewer: " + ", ".join(fewer) if fewer else ""
@@ -223,14 +229,14 @@ The paper's numbers are of a robot: only the order can be
 compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
 claimed of fewer than three. Each row has one encoder unless several are named below. Settings (`version` is that of the
 flow and the load, {VERSION} now):
-{max((row.settings for row in rows), key=len)}.
+{settings}.
 
 {pouring_table.table(rows)}
 ![errors](figures/{picture})
 ![frames](figures/pouring_frames.png)
 ![film](figures/pouring.gif)
 
-Made by `SEEDS={",".join(seeds)} make pouring`, from the JSON in `{FOLDER.name}/`.
+Made by `SEEDS={",".join(seeds)} make pouring`, from the JSON in `{FOLDER.name}/`.{other}
 """
 write_whole(PAGE, text)
 print(text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +74,8 @@ def _policy(options: Pour, encoder: Encoder, shown: Trials, sensor: str) -> tupl
     """The policy learned from demonstrations, as the options say."""
     from anytouch_jax.evaluate import pouring_policy, pouring_tuning
 
-    learning = pouring_policy.Learning(seed=options.seed, **({"steps": options.steps} if options.steps else {}))
+    learning = pouring_policy.Learning(seed=options.seed)
+    learning = replace(learning, steps=options.steps or learning.steps)
     say("learning from it")
     policy = pouring_policy.learn_frozen(encoder, shown, learning, stills=options.stills, sensor=sensor)
     return (pouring_tuning.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning

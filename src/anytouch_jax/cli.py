@@ -46,7 +46,12 @@ _POSITIONAL = (Bench, Index, Contact, Verify, Annotate, Pack, Parity, Convert, T
 
 
 def console() -> int:
-    """The `anytouch` command in a process of its own: `main` with large pages (`pages.restart`)."""
+    """The `anytouch` command in a process of its own: `main` with large pages (`pages.restart`).
+
+    XLA's own log is off, but for who sets its level: jaxlib 0.10.1 takes two of its tuning flags for features that the
+    machine lacks, an error for each program read from the cache. What really fails is raised in Python.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if len(sys.argv) > 2 and sys.argv[1] in _COMMANDS and not {"-h", "--help", "--help-all"} & set(sys.argv):
         pages.restart()
     return main()

@@ -74,7 +74,7 @@ class Pour:
     fine_tune: bool = False
     """Train the encoder too: minutes, for a third to a half less error in our table."""
     steps: int | None = None
-    """Steps of the policy's training (default 1500)."""
+    """Steps of the policy's training (default 3000)."""
     markers: bool = True
     """The gel has markers; without them shear is hardly to be seen."""
     seed: int = 0

@@ -142,7 +142,7 @@ def test_the_loss_is_that_of_demonstrations_held_out_at_their_best():
     runs = np.repeat(np.arange(10), 12)
     noise = rng.normal(size=(120, 40)).astype(np.float32)  # each run can be told by heart, and tells nothing of others
     choices = rng.integers(0, 3, 120)
-    learning = replace(FAST, steps=600, components=40)
+    learning = replace(FAST, steps=600, batch=256, components=40, dropout=0.0)
     head, loss = pouring_policy.imitate(noise, choices, runs, learning)
     logits = pouring_policy.forward(head, noise[runs >= 8])
     assert loss == pytest.approx(float(pouring_policy.imitation_loss(logits, choices[runs >= 8])), rel=1e-4)
@@ -152,6 +152,31 @@ def test_the_loss_is_that_of_demonstrations_held_out_at_their_best():
     assert head.basis.shape == (40, 3)
     spread = np.asarray((noise[runs < 8] - np.asarray(head.mean)) @ np.asarray(head.basis)).std(0)
     np.testing.assert_allclose(spread, 1, atol=0.02)
+
+
+def test_dropout_leaves_out_its_share_while_a_policy_learns_and_nothing_when_it_acts():
+    head = pouring_policy.Head(jnp.zeros(100), jnp.eye(100), ((jnp.eye(100), jnp.zeros(100)),))
+    x, key = jnp.ones((400, 100)), jax.random.key(0)
+    np.testing.assert_allclose(pouring_policy.forward(head, x, 0.3), 1)  # no key: it acts
+    found = np.asarray(pouring_policy.forward(head, x, 0.3, key))
+    assert (found == 0).mean() == pytest.approx(0.3, abs=0.01)
+    np.testing.assert_allclose(found[found != 0], 1 / 0.7, rtol=1e-6)  # so the mean stays
+
+
+def test_dropout_keeps_features_from_being_learned_by_heart_and_told_policies_have_none(late, monkeypatch):
+    rng = np.random.default_rng(0)
+    runs = np.repeat(np.arange(10), 12)
+    signal = rng.integers(0, 3, 120)
+    x = np.concatenate([np.eye(3)[signal] + rng.normal(0, 0.7, (120, 3)), rng.normal(size=(120, 40))], 1)
+    losses = [
+        pouring_policy.imitate(x.astype(np.float32), signal, runs, replace(FAST, components=43, dropout=dropout))[1]
+        for dropout in (0.0, 0.3)
+    ]
+    assert losses[1] < losses[0]
+    met = []
+    monkeypatch.setattr(pouring_bounds, "imitate", lambda *a: met.append(a[-1]) or (None, 0.0))
+    pouring_bounds.imitate_told(late, pouring_bounds.blind_inputs(late.actions)[START:], FAST)
+    assert met[0].dropout == 0 < FAST.dropout
 
 
 def test_the_load_alone_is_enough_to_pour_by():
@@ -184,13 +209,13 @@ def test_the_loss_by_hand():
 
 def test_features_of_demonstrations_are_those_of_the_encoder(shown, encoder):
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
-    assert z.shape == (7, 2, 12)
+    assert z.shape == (7, 2, 24)
     clip = shown.frames[2:5, 1][None]
-    np.testing.assert_allclose(z[2, 1], encoder.embed(clip, "gelsight_mini", pooling="mean")[0], atol=1e-5)
-    still = pouring_policy.features(encoder, shown, stills=True, pooling="both", batch=8)
-    frame = encoder.embed(shown.frames[4, 1], "gelsight_mini", pooling="both")
+    np.testing.assert_allclose(z[2, 1], encoder.embed(clip, "gelsight_mini", pooling="both")[0], atol=1e-5)
+    still = pouring_policy.features(encoder, shown, stills=True, pooling="mean", batch=8)
+    frame = encoder.embed(shown.frames[4, 1], "gelsight_mini", pooling="mean")
     np.testing.assert_allclose(still[2, 1], frame[0], atol=1e-5)
-    assert np.abs(still[..., 12:] - z).max() > 1e-4
+    assert np.abs(z[..., 12:] - still).max() > 1e-4
 
 
 def test_moments_that_are_learned_have_all_their_inputs(shown, encoder):
@@ -206,14 +231,31 @@ def test_moments_that_are_learned_have_all_their_inputs(shown, encoder):
 
 
 def test_touch_sees_in_a_run_what_it_learned_from(shown, encoder):
-    """The closed loop feeds the MLP the same inputs as the table of the demonstrations."""
-    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
+    """The closed loop feeds the MLP the same inputs as the table of the demonstrations; its last moments vote."""
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5, votes=3), stills=False)
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
-    logits = pouring_policy.forward(policy.head, pouring_policy.input_table(z).reshape(8, -1))
+    said = pouring_policy.log_probabilities(policy.head, pouring_policy.input_table(z).reshape(8, -1)).reshape(4, 2, 3)
     policy.begin(2)
     acted = [policy.act(frames, None) for frames in shown.frames]
     assert (np.stack(acted[:5]) == WAIT).all()
-    np.testing.assert_array_equal(np.stack(acted[5:]), np.asarray(logits).argmax(-1).reshape(4, 2))
+    voted = np.stack([said[max(0, moment - 2) : moment + 1].mean(0) for moment in range(4)])
+    np.testing.assert_array_equal(np.stack(acted[5:]), voted.argmax(-1))
+
+
+def test_a_moment_astray_is_outvoted_and_two_are_not(encoder, monkeypatch):
+    quiet, astray = np.log([[0.9, 0.09, 0.01]]), np.log([[0.05, 0.05, 0.9]])
+    for moments, wanted in (
+        ([quiet, quiet, astray, quiet], [POUR] * 4),
+        ([quiet, astray, astray], [POUR, POUR, RETRACT]),
+    ):
+        said = iter(moments)
+        monkeypatch.setattr(pouring_policy, "log_probabilities", lambda head, x, said=said: next(said))
+        policy = pouring_policy.Touch(encoder, None, stills=True, votes=3)
+        policy.begin(1)
+        frames = np.zeros((1, SIDE, SIDE, 3), np.uint8)
+        acted = [int(policy.act(frames)[0]) for _ in range(START + len(moments))]
+        assert acted == [WAIT] * START + wanted
+    assert pouring_policy.Touch(encoder, None, stills=True).votes == 1
 
 
 def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encoder):
@@ -243,7 +285,7 @@ def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
     clips = pouring_policy.segments(encoder, shown.frames, where.reshape(-1, 2), 3).reshape(6, 6, 3, SIDE, SIDE, 3)
     params = {"encoder": encoder.params, "head": {"basis": policy.head.basis, "layers": policy.head.layers}}
     row = encoder.sensor_row(policy.sensor)
-    found = pouring_tuning.logits_of(params, clips, net=encoder.net, pooling="mean", mean=policy.head.mean, sensor=row)
+    found = pouring_tuning.logits_of(params, clips, net=encoder.net, pooling="both", mean=policy.head.mean, sensor=row)
     moment = chains.numbers[:, 3:] - pouring_policy.LIFTED
     runs = np.broadcast_to(chains.runs[:, None], moment.shape)
     expected = wanted.reshape(4, 2, 3)[moment, runs]
@@ -282,6 +324,8 @@ def test_mistakes_are_one_sentence(told, encoder):
         pouring_policy.imitate(np.full((4, 2), np.nan), np.zeros(4, int), np.arange(4), FAST)
     with pytest.raises(UserError, match="tune_steps"):
         Learning(tune_steps=0)
+    with pytest.raises(UserError, match=r"dropout .*below 1, not 1"):
+        Learning(dropout=1.0)
 
 
 def test_the_film_shows_every_page(shown, tmp_path):

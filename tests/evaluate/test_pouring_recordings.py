@@ -116,16 +116,18 @@ def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_p
     assert pouring_recordings.load_policy(tmp_path).encoder.seen == ("digit", "gelsight_mini")
 
 
-def test_a_policy_on_disk_knows_how_its_features_are_pooled(shown, encoder, tmp_path):
-    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, pooling="both"), stills=True)
+def test_a_policy_on_disk_knows_how_its_features_are_pooled_and_its_votes(shown, encoder, tmp_path):
+    policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, pooling="both", votes=5), stills=True)
     pouring_recordings.save_policy(tmp_path, policy)
-    assert pouring_recordings.load_policy(tmp_path).pooling == "both"
+    again = pouring_recordings.load_policy(tmp_path)
+    assert (again.pooling, again.votes) == ("both", 5)
     with np.load(tmp_path / "policy.npz") as file:
         arrays = dict(file)
     told = json.loads(str(arrays["about"]))
-    del told["pooling"]  # as written before policies could choose
+    del told["pooling"], told["votes"]  # as written before policies could choose
     np.savez(tmp_path / "policy.npz", **(arrays | {"about": np.asarray(json.dumps(told))}))
-    assert pouring_recordings.load_policy(tmp_path).pooling == "class"
+    again = pouring_recordings.load_policy(tmp_path)
+    assert (again.pooling, again.votes) == ("class", 1)
 
 
 def test_a_policy_takes_frames_of_the_camera(shown, encoder):

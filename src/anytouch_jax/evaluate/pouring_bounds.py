@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from ..sim import pouring as physics
 from ..sim.pouring import ACTIONS, WAIT, Setup, State, Task
-from .pouring import FRAMES, START, Controller, Expert, draw_runs, run
+from .pouring import FRAMES, START, Controller, Expert, Trials, draw_runs, run
 from .pouring_policy import (
     LAG,
     LIFTED,
@@ -23,8 +24,8 @@ from .pouring_policy import (
     input_table,
     inputs,
     late_hands,
+    log_probabilities,
     moments,
-    predict,
 )
 
 Array = npt.NDArray[Any]
@@ -52,7 +53,7 @@ class Blind:
 
     def act(self, frames: Array | None, state: State) -> Array:
         """Actions (B,) from the time and the counts of its actions."""
-        chosen = predict(self._head, self._x)
+        chosen = log_probabilities(self._head, self._x).argmax(-1)
         chosen = np.where(self._x[:, 0] * 100 < START - 0.5, WAIT, chosen)
         self._x = self._x + np.concatenate([np.ones((len(chosen), 1)), np.eye(len(ACTIONS))[chosen]], 1) / 100
         self._x = self._x.astype(np.float32)
@@ -66,7 +67,12 @@ def learn_blind(task: Task, seed: int, count: int, learning: Learning) -> Blind:
     waited.
     """
     trials = demonstrate(task, seed, count, side=None, patient=False, chunk=count)
-    return Blind(imitate(*moments(trials, blind_inputs(trials.actions)[START:]), learning)[0])
+    return Blind(imitate_told(trials, blind_inputs(trials.actions)[START:], learning))
+
+
+def imitate_told(trials: Trials, x: Array, learning: Learning) -> Head:
+    """The MLP over inputs x (S - START, B, d) that a policy is told: few and without noise, so none is left out."""
+    return imitate(*moments(trials, x), replace(learning, dropout=0.0))[0]
 
 
 @partial(jax.jit, static_argnames=("task",))
@@ -109,7 +115,8 @@ class Scales:
         if len(self.loads) <= START:
             return np.full(len(state.mass), WAIT)
         z = self.segments()
-        return predict(self._inner, inputs(z[-1], z[max(len(z) - 1 - LAG, LIFTED)], z[LIFTED], z[0]))
+        x = inputs(z[-1], z[max(len(z) - 1 - LAG, LIFTED)], z[LIFTED], z[0])
+        return log_probabilities(self._inner, x).argmax(-1)
 
 
 def learn_loads(task: Task, seed: int, count: int, learning: Learning) -> Head:
@@ -117,4 +124,4 @@ def learn_loads(task: Task, seed: int, count: int, learning: Learning) -> Head:
     setups, keys = draw_runs(task, seed, count)
     noting = Scales(task, setups, Expert(task))
     trials = run(task, setups, keys, noting, late=late_hands(seed, count))
-    return imitate(*moments(trials, input_table(noting.segments())), learning)[0]
+    return imitate_told(trials, input_table(noting.segments()), learning)

@@ -24,7 +24,7 @@ from .pouring import FRAMES, SENSOR, START, Expert, Replay, Trials, draw_runs, r
 
 Array = npt.NDArray[Any]
 UNSEEN = 20_000  # added to a seed: runs that no demonstration met
-VERSION = 4  # of how a policy learns from the same demonstrations
+VERSION = 5  # of how a policy learns from the same demonstrations
 LATEST = 80  # moments, 20 degrees
 LOOKS = 30  # times that the held-out demonstrations are looked at while a policy learns
 LAG = 3  # moments from the segment before to the last one
@@ -35,20 +35,23 @@ LIFTED = START - FRAMES + 1  # the number of the first segment of the lifted cyl
 class Learning:
     """How a policy learns: `steps` of AdamW at `rate` on batches of `batch` moments, `width` hidden units.
 
-    Features (`pooling` as in `Encoder.embed`; the class token holds less of the load than the mean of the patches) are
-    many and demonstrations few: the MLP is given the first `components` principal components of its inputs, and the
-    weights are kept that did best on a share `held_out` of the demonstrations. Fine-tuning goes on for
-    `tune_steps` on `tune_moments` of each of `tune_runs` runs, at `tune_rate` (the encoder's; the MLP's is twice
-    `rate`), which rises for a tenth of the steps and then falls.
+    Features (`pooling` as in `Encoder.embed`) are many and gels few, which an MLP soon knows by heart: it is given the
+    first `components` principal components of its inputs, leaves out a share `dropout` of them and of its hidden
+    units at every step (Srivastava et al. 2014), and the weights are kept that did best on a share `held_out` of the
+    demonstrations. The policy acts on the mean of the log-probabilities of the last `votes` moments: one that retracts
+    by mistake cannot go back. Fine-tuning goes on for `tune_steps` on `tune_moments` of each of `tune_runs` runs, at
+    `tune_rate` (the encoder's; the MLP's is twice `rate`), which rises for a tenth of the steps and then falls.
     """
 
-    steps: int = 1500
+    steps: int = 3000
     rate: float = 1e-3
-    batch: int = 256
+    batch: int = 1024
     width: int = 128
     decay: float = 1e-2
-    components: int = 32
-    pooling: Pooling = "mean"
+    components: int = 128
+    dropout: float = 0.3
+    votes: int = 5
+    pooling: Pooling = "both"
     held_out: float = 0.2
     tune_steps: int = 400
     tune_runs: int = 16
@@ -57,9 +60,11 @@ class Learning:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "width", "components", "tune_steps", "tune_runs", "tune_moments"):
+        for name in ("steps", "batch", "width", "components", "votes", "tune_steps", "tune_runs", "tune_moments"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} of the policy's learning must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.dropout < 1:
+            raise UserError(f"dropout of the policy's learning must be from 0 to below 1, not {self.dropout:g}")
 
 
 class Head(NamedTuple):
@@ -107,7 +112,7 @@ def features(
     trials: Trials,
     *,
     stills: bool,
-    pooling: Pooling = "mean",
+    pooling: Pooling = "both",
     sensor: str = SENSOR,
     batch: int = 64,
     sides: Array | None = None,
@@ -173,21 +178,30 @@ def input_table(z: Array) -> Array:
     return np.asarray(inputs(now, before, *(np.broadcast_to(z[i], now.shape) for i in (LIFTED, 0))))
 
 
-def forward(head: Head, x: Any) -> jax.Array:
-    """Logits (n, 3) of the actions."""
+def forward(head: Head, x: Any, dropout: float = 0.0, key: jax.Array | None = None) -> jax.Array:
+    """Logits (n, 3) of the actions; with a `key`, a share `dropout` of what each layer is given is left out."""
+
+    def layer(number: int, x: jax.Array) -> jax.Array:
+        weight, bias = head.layers[number]
+        if dropout and key is not None:
+            kept = jax.random.bernoulli(jax.random.fold_in(key, number), 1 - dropout, x.shape)
+            x = jnp.where(kept, x / (1 - dropout), 0)
+        return x @ weight + bias[None]
+
     x = (x - head.mean[None]) @ head.basis
-    for weight, bias in head.layers[:-1]:
-        x = jax.nn.gelu(x @ weight + bias[None], approximate=False)
-    weight, bias = head.layers[-1]
-    return x @ weight + bias[None]
+    for number in range(len(head.layers) - 1):
+        x = jax.nn.gelu(layer(number, x), approximate=False)
+    return layer(len(head.layers) - 1, x)
 
 
-_forward = jax.jit(forward)
+@jax.jit
+def _log_probabilities(head: Head, x: Any) -> jax.Array:
+    return jax.nn.log_softmax(forward(head, x))
 
 
-def predict(head: Head, x: Array) -> Array:
-    """The likeliest actions (n,)."""
-    return np.asarray(_forward(head, x)).argmax(-1)
+def log_probabilities(head: Head, x: Array) -> Array:
+    """Log-probabilities (n, 3) of the actions."""
+    return np.asarray(_log_probabilities(head, x))
 
 
 def new_head(x: Array, learning: Learning) -> Head:
@@ -228,13 +242,14 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
     def train(layers: Any, head: Head, data: Any) -> tuple[Any, jax.Array]:  # (constants would be compiled anew)
         (x, actions), unseen = data
 
-        def loss(layers: Any, x: jax.Array, actions: jax.Array) -> jax.Array:
-            return imitation_loss(forward(head._replace(layers=layers), x), actions)
+        def loss(layers: Any, x: jax.Array, actions: jax.Array, key: jax.Array | None = None) -> jax.Array:
+            return imitation_loss(forward(head._replace(layers=layers), x, learning.dropout, key), actions)
 
         def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
             layers, state = carry
-            ids = jax.random.randint(key, (learning.batch,), 0, len(x))
-            change, state = optimiser.update(jax.grad(loss)(layers, x[ids], actions[ids]), state, layers)
+            drawn, left_out = jax.random.split(key)
+            ids = jax.random.randint(drawn, (learning.batch,), 0, len(x))
+            change, state = optimiser.update(jax.grad(loss)(layers, x[ids], actions[ids], left_out), state, layers)
             return (optax.apply_updates(layers, change), state), None
 
         def look(carry: Any, keys: jax.Array) -> tuple[Any, None]:
@@ -257,8 +272,8 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
 class Touch:
     """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features.
 
-    `pooling`: of its features. `loss`: of imitation, on the demonstrations held out (of a fine-tuned one: of its last
-    steps).
+    `pooling`: of its features. `votes`: moments that have a say in an action (`Learning`). `loss`: of imitation, on the
+    demonstrations held out (of a fine-tuned one: of its last steps).
     """
 
     looks = True
@@ -269,18 +284,20 @@ class Touch:
         head: Head,
         *,
         stills: bool,
-        pooling: Pooling = "mean",
+        pooling: Pooling = "both",
         sensor: str = SENSOR,
+        votes: int = 1,
         loss: float = math.nan,
     ) -> None:
         self.encoder, self.head, self.sensor, self.loss = encoder, head, sensor, loss
-        self.stills, self.pooling = stills, pooling
+        self.stills, self.pooling, self.votes = stills, pooling, votes
 
     def begin(self, count: int) -> None:
         """Forget the frames and features of the last runs."""
         self._first: Array | None = None
         self._frames: list[Array] = []
         self._z: list[Array] = []
+        self._said: list[Array] = []
 
     def act(self, frames: Array | None, state: State | None = None) -> Array:
         """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has seen a segment."""
@@ -297,7 +314,8 @@ class Touch:
             return np.full(len(frames), WAIT)
         before = self._z[max(len(self._z) - 1 - LAG, LIFTED)]
         x = inputs(self._z[-1], before, self._z[LIFTED], self._z[0])
-        return predict(self.head, x)
+        self._said = [*self._said, log_probabilities(self.head, x)][-self.votes :]
+        return np.asarray(np.mean(self._said, 0).argmax(-1))
 
 
 def moments(trials: Trials, x: Array, learned: Array | None = None) -> tuple[Array, Array, Array]:
@@ -324,4 +342,4 @@ def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills
     found = [moments(trials, input_table(z), learned) for z in views]
     x, actions, runs = (np.concatenate(both) for both in zip(*found, strict=True))
     head, loss = imitate(x, actions, runs, learning)
-    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, loss=loss)
+    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=learning.votes, loss=loss)

@@ -28,8 +28,8 @@ from ..data.transforms import touch_evaluation
 from ..sim.pouring import ACTIONS, STAND, Task
 from .features import load_encoder, text_column
 from .pouring import SENSOR, START, Controller, Trials
-from .pouring_bounds import blind_inputs
-from .pouring_policy import Head, Learning, Touch, forward, imitate, moments
+from .pouring_bounds import blind_inputs, imitate_told
+from .pouring_policy import Head, Learning, Touch, forward
 
 Array = npt.NDArray[Any]
 LEARNING = ("train", "val", "test")  # splits that are read; the others take no part
@@ -169,7 +169,7 @@ def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
 
 def agreement_blind(shown: Trials, unseen: Trials, learning: Learning, rate: float) -> Agreement:
     """The agreement of the same MLP that is told the time and the hand's actions so far, not the touch."""
-    head, _ = imitate(*moments(shown, blind_inputs(shown.actions)[START:]), learning)
+    head = imitate_told(shown, blind_inputs(shown.actions)[START:], learning)
     said = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
     return compare(np.stack(said), unseen, rate)
 
@@ -200,12 +200,10 @@ def save_policy(folder: Path, policy: Touch) -> None:
     checkpoint.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
-    told = json.dumps(
-        {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "encoder": encoder.mark}
-    )
+    told = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}
     data = io.BytesIO()
     arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
-    np.savez(data, about=np.asarray(told), **arrays)
+    np.savez(data, about=np.asarray(json.dumps(told | {"encoder": encoder.mark})), **arrays)
     write_whole(folder / POLICY, data.getvalue())
 
 
@@ -218,7 +216,7 @@ def load_policy(folder: Path | str) -> Touch:
         with np.load(io.BytesIO((folder / POLICY).read_bytes()), allow_pickle=False) as file:
             arrays, told = dict(file), json.loads(str(file["about"]))
         stills, sensor, mark = bool(told["stills"]), str(told["sensor"]), told["encoder"]
-        pooling = told.get("pooling", "class")  # of earlier policies
+        pooling, votes = told.get("pooling", "class"), int(told.get("votes", 1))  # of earlier policies
         count = sum(name.startswith("w/") for name in arrays)
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
         head = Head(arrays["mean"], arrays["basis"], layers)
@@ -226,4 +224,4 @@ def load_policy(folder: Path | str) -> Touch:
         raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
     if mark != encoder.mark:
         raise UserError(f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}; pour again")
-    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor)
+    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=votes)

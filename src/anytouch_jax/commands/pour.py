@@ -75,7 +75,9 @@ def _policy(options: Pour, encoder: Encoder, shown: Trials, sensor: str) -> tupl
     from anytouch_jax.evaluate import pouring_policy, pouring_tuning
 
     learning = pouring_policy.Learning(seed=options.seed)
-    learning = replace(learning, steps=options.steps or learning.steps)
+    learning = replace(
+        learning, steps=options.steps or learning.steps, tune_steps=max(learning.tune_steps, len(shown.steps))
+    )
     say("learning from it")
     policy = pouring_policy.learn_frozen(encoder, shown, learning, stills=options.stills, sensor=sensor)
     return (pouring_tuning.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning

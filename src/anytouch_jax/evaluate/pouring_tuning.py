@@ -76,7 +76,9 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     late = float(np.mean(jax.device_get(losses[-max(1, learning.tune_steps // 10) :])))
     if not math.isfinite(late):
         raise UserError(f"fine-tuning went astray (its loss is {late}); lower tune_rate, {learning.tune_rate:g} now")
-    return Touch(tuned, head, stills=stills, pooling=policy.pooling, sensor=policy.sensor, votes=policy.votes, loss=late)
+    return Touch(
+        tuned, head, stills=stills, pooling=policy.pooling, sensor=policy.sensor, votes=policy.votes, loss=late
+    )
 
 
 def _tuner(policy: Touch, learning: Learning) -> tuple[Callable[..., tuple[Params, Any, jax.Array]], Any, Params]:

@@ -19,7 +19,7 @@ import pytest
 from runs import read_rows, write_manifest
 from tiny_models import touch_model
 
-from anytouch_jax.cli import _COMMANDS, main
+from anytouch_jax.cli import _COMMANDS, _at_home, main
 from anytouch_jax.config import SENSORS, to_json
 from anytouch_jax.evaluate.features import load_encoder
 from anytouch_jax.io import release
@@ -120,6 +120,14 @@ def test_help_all_lists_the_configuration_with_the_defaults_of_the_preset(capsys
     assert len(fields) > 70 and not [
         line for line, after in fields if after.startswith("(default")
     ]  # all are explained
+
+
+def test_the_home_folder_is_meant_behind_an_equals_sign_too(monkeypatch, capsys, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(["probe", "--data=~/none.csv", "--run", "x", "--label", "object"]) == 1
+    assert f"{tmp_path}/none.csv" in capsys.readouterr().err.replace("\n", "")
+    assert _at_home("a=~/x") == "a=~/x" and _at_home("--note") == "--note"
 
 
 def test_help_needs_no_heavy_imports():

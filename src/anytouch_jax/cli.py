@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    args = list(sys.argv[1:] if argv is None else argv)
+    args = [_at_home(arg) for arg in (sys.argv[1:] if argv is None else argv)]
     if not args or args[0] in ("-h", "--help"):
         print(_usage())
         return 0 if args else 2
@@ -104,6 +104,12 @@ def _main(argv: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def _at_home(arg: str) -> str:
+    """--out=~/x as it is meant: shells put the home folder in place of a ~ only where a word begins with it."""
+    name, equals, value = arg.partition("=")
+    return name + equals + os.path.expanduser(value) if name.startswith("--") else arg
 
 
 def _tell(otherwise: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import pytest
 
@@ -60,6 +62,7 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
     [
         (["--out", "touch.parquet"], "is the manifest that was read"),
         (["--out", "m.json"], "ends in .csv or .parquet"),
+        (["--out", "mine.csv"], "mine.csv is there and is no manifest; name another file with --out"),
         (["--threads", "0"], "--threads (workers) must be at least 1"),
         (["--drop", "--threshold", "digit", "999"], "every frame is without contact"),
         (["--check", "--reference", "label.depth"], "no column label.depth"),
@@ -72,6 +75,7 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
 )
 def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, told):
     monkeypatch.chdir(pressed.parent)
+    Path("mine.csv").write_text("place,contact\na,1\n")  # a table of the user's
     before = pressed.read_bytes()
     if "999" in words:  # nothing but frames that the filter judges
         table = manifests.read(pressed).table.slice(2)

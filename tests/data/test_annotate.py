@@ -592,12 +592,43 @@ def test_what_failed_the_last_time_is_asked_last(make, tmp_path):
     with serve(lambda *_: refuse) as server, pytest.raises(AnnotateError, match="in a row failed"):
         _run(loose, server, folder, threads=1)
     assert len((folder / "failures.jsonl").read_text().splitlines()) == 25
-    good = lambda number, _: (200, {}, chat(GOOD)) if number < 15 else refuse  # noqa: E731
-    with serve(good) as server, pytest.raises(AnnotateError, match="in a row failed"):
-        _run(loose, server, folder, threads=1)
+    good = lambda number, _: (200, {}, chat(GOOD)) if number < 10 else refuse  # noqa: E731
+    with serve(good) as server:
+        assert len(_run(loose, server, folder, threads=1, limit=35).captions) == 10
     with serve() as server:
         assert len(_run(loose, server, folder).captions) == 40
-    assert len(server.asked) == 25
+    assert len(server.asked) == 30
+
+
+def test_many_questions_that_are_always_refused_do_not_keep_back_the_answers(make, tmp_path):
+    loose, folder = make(_rows(60)), tmp_path / "answers"
+    answered = []
+
+    def never(number, body):  # all but ten
+        answered.append(number)
+        return (200, {}, chat(GOOD)) if len(answered) <= 10 else (400, {}, {"error": "no"})
+
+    with serve(never) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)
+    with serve(never) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)  # these 25 are new
+    with serve(never) as server:
+        done = _run(loose, server, folder, threads=1)
+    assert len(done.captions) == 10 and len(done.failures) == 50
+    assert done.failures[-1].reason == "not asked again: 25 before it failed, all in the last run too"
+    assert done.manifest.present("text").sum() == 30  # three rows a touch
+
+
+def test_two_processes_do_not_pay_for_the_same_answers(make, tmp_path):
+    from anytouch_jax.whole import alone
+
+    loose, folder = make(_rows(3)), tmp_path / "answers"
+    folder.mkdir()
+    with serve() as server, alone(folder / ".lock"), pytest.raises(AnnotateError, match="another process asks for"):
+        _run(loose, server, folder)
+    assert not server.asked
+    with serve() as server:
+        assert len(_run(loose, server, folder).captions) == 3
 
 
 def test_a_key_that_an_error_cuts_in_two_is_not_shown():

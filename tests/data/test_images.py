@@ -197,13 +197,17 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     }  # fmt: skip
     order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_order)
     assert order == ["1689.9.png", "1690.4666.png", "1690.5.png"]
+    stamps = ["0.8.bmp", "0.9.bmp", "1.bmp", "1.1.bmp", "2.bmp", "1690000000000000001.bmp", "1690000000000000002.bmp"]
+    turned = stamps[::-1]
+    assert sorted(turned, key=images.frame_order) == stamps  # whole seconds are written without a point
+    assert sorted(["b.png", "img10.png", "img9.png", "3.png"], key=images.frame_order)[:2] == ["3.png", "b.png"]
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):
             images.pictures_in(folder)
 
 
-def test_a_video_gives_its_frames_in_rgb(tmp_path):
+def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
     path = tmp_path / "v.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 24))
     for level in (0, 100, 200):
@@ -213,6 +217,12 @@ def test_a_video_gives_its_frames_in_rgb(tmp_path):
     assert [frame.shape for frame in frames] == [(24, 32, 3)] * 3
     assert [round(float(frame[..., 0].mean()) / 100) for frame in frames] == [0, 1, 2]
     assert max(frame[..., 2].mean() for frame in frames) < 10
+    monkeypatch.chdir(tmp_path)
+    timed = cv2.VideoWriter(str(tmp_path / "10:30.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (32, 24))
+    for _ in range(3):
+        timed.write(np.zeros((24, 32, 3), np.uint8))
+    timed.release()
+    assert len(list(images.frames_from_video("10:30.mp4"))) == images.frames_told("10:30.mp4") == 3  # no protocol
     (tmp_path / "bad.avi").write_bytes(b"not a video")
     for name, words in (("bad.avi", "not a video"), ("none.avi", "there is no video")):
         with pytest.raises(images.ImageError, match=words):

@@ -270,3 +270,20 @@ def test_columns_of_any_kind_are_carried_along(tmp_path):
     with pytest.raises(m.ManifestError, match="cannot be written"):
         m.write(one, tmp_path / "m.csv")
     assert not (tmp_path / "m.csv").exists()
+
+
+def test_labels_of_a_csv_keep_what_they_say(tmp_path):
+    head = "path,sensor,sequence,frame_index,split,label.object,label.force,label.stable,label.word"
+    rows = ["a.png,digit,s,0,train,001, 1.5 ,True,True", "b.png,digit,s,1,train,007, ,false,maybe"]
+    got = m.read(_file(tmp_path, "\n".join([head, *rows, "c.png,digit,s,2,train,100,2,,"]) + "\n"))
+    assert got.column("label.object").to_pylist() == ["001", "007", "100"]  # names, whose zeros no number keeps
+    assert got.column("label.force").to_pylist() == [1.5, None, 2]
+    assert got.column("label.stable").to_pylist() == [True, False, None]  # as a Parquet manifest has it
+    assert got.column("label.word").to_pylist() == ["True", "maybe", None]
+    m.write(got, tmp_path / "again.csv")
+    again = m.read(tmp_path / "again.csv")
+    assert again.table.equals(got.table) and again.content_hash == got.content_hash
+    m.write(got, tmp_path / "other.parquet")
+    both = m.read([tmp_path / "again.csv", tmp_path / "other.parquet"])
+    assert both.column("label.object").to_pylist() == ["001", "007", "100"] * 2
+    assert both.column("label.stable").to_pylist() == [True, False, None] * 2

@@ -275,7 +275,9 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
         pack(loose, tmp_path / "out")
     assert "\n" not in str(error.value)
     assert not list((tmp_path / "out").rglob("*.parquet")) or harm in ("empty", "folder")  # told before the packing
-    assert not list((tmp_path / "out").rglob("*.part")) and not list((tmp_path / "out").rglob(".*"))
+    assert {file.name for file in (tmp_path / "out").rglob("*.part")} | {
+        f.name for f in (tmp_path / "out").rglob(".*")
+    } <= {".lock"}
 
 
 # Damage -----------------------------------------------------------------------------------------------------------
@@ -445,6 +447,39 @@ def test_two_processes_do_not_pack_into_one_folder(make, tmp_path):
     source, out = make(_rows()), tmp_path / "packed"
     pack(source, out)
     (out / "README.md").unlink()  # as if it were still under way
-    with alone(out / "pack.json"), pytest.raises(PackError, match=r"another process packs into .*: wait for it"):
+    with alone(out / ".lock"), pytest.raises(PackError, match=r"another process packs into .*: wait for it"):
         pack(source, out)
     assert pack(source, out).is_file()
+    assert not (out / ".lock").exists()
+
+
+def test_a_pack_under_way_is_not_taken_over_before_its_first_shard(make, tmp_path, monkeypatch):
+    source, out = make(_rows()), tmp_path / "packed"
+    first, other = [], []
+
+    def fetched(*args):
+        first.append(args)
+        if len(first) == 1:  # while the first file is read, another plan wants the folder
+            with pytest.raises(PackError, match="another process packs into"):
+                pack(source, out, shard_bytes=100)
+            other.append(args)
+        return packed.read_file(*args)
+
+    monkeypatch.setattr("anytouch_jax.data.pack.read_file", fetched)
+    pack(source, out, threads=1)
+    assert other
+    for line in (out / "SHA256SUMS").read_text().splitlines():
+        digest, name = line.split("  ")
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
+
+
+@pytest.mark.parametrize("left", [b"", b"\x93NUMPY\x01"])
+def test_a_shard_whose_index_was_cut_is_packed_again(make, tmp_path, left):
+    source, out = make(_rows()), tmp_path / "packed"
+    pack(source, out)
+    (out / "README.md").unlink()
+    index = out / "touch/00000.index"
+    whole = index.read_bytes()
+    index.write_bytes(left)
+    pack(source, out)
+    assert index.read_bytes() == whole

@@ -427,6 +427,10 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
     assert more.column("text").to_pylist() == ['soft, "very" and round'] * 3 + ["new", "one", None]
     assert notes == ["2 rows got a caption by 'frame_index'", "2 rows kept the caption they had"]
+    nested = replace_column(got, "extra", pa.array([[0]] * len(got)))
+    pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
+    with pytest.raises(UserError, match="column 'extra' of the manifest is no key: it is list"):
+        attach_text(nested, tmp_path / "e.parquet")
     over, _ = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
     assert over.column("text").to_pylist() == ["new", "one", 'soft, "very" and round', "new", "one", None]
 

@@ -26,6 +26,8 @@ def check_new(manifest: Manifest, path: Path) -> Path:
     target = path.expanduser().resolve()
     if target in manifest.files:
         raise UserError(f"{target} is the manifest that was read; name another file")
+    if target.is_file() and not manifests.is_manifest(target):
+        raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
     manifests.check_target(manifest, target)
     check_folder(target)
     return target

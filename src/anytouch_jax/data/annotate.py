@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from anytouch_jax.data.endpoint import AnswerError, Client, Endpoint, EndpointEr
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.prompts import Nonsense, caption_of
 from anytouch_jax.data.questions import PHRASE, SECOND_IMAGE, Job, data_url, find_jobs, picture_bytes, small_jpeg
-from anytouch_jax.whole import write_whole
+from anytouch_jax.whole import alone, write_whole
 
 _NONSENSE_TRIES = 3
 _STREAK = 25  # failures in a row after which the run stops instead of paying on
@@ -129,11 +129,15 @@ def annotate(
     if not confirm(estimate):
         raise AnnotateError("not confirmed: nothing was asked")
     lacking.sort(key=lambda one: one[1] in store.failed)  # what failed the last time bars no other question
-    try:
-        if lacking:
-            run.ask(Client(endpoint), lacking, threads, say)
-    finally:
-        store.write_failures(run.failures)
+    if lacking:
+        with store.alone():
+            lacking = [one for one in lacking if one[1] not in store.answers]  # another process may have been faster
+            try:
+                run.ask(Client(endpoint), lacking, threads, say)
+            finally:
+                store.write_failures(run.failures, keys)
+    elif run.failures or store.failed:
+        store.write_failures(run.failures, keys)
     captions = tuple(
         Caption(job, store.answers[key]["caption"], store.answers[key]["object"])
         for job, key in zip(jobs, keys, strict=True) if key in store.answers
@@ -188,20 +192,29 @@ class _Run:
     def ask(
         self, client: Client, lacking: list[tuple[Job, str]], threads: int, say: Callable[[str], None] | None
     ) -> None:
-        """Ask all questions; stops at an endpoint that is of no use. In the end no thread is left."""
-        streak = 0
+        """Ask all questions; stops at an endpoint that is of no use. In the end no thread is left.
+
+        A row of questions that had failed in the last run too says nothing of the endpoint: those behind it are left.
+        """
+        streak, left = 0, lacking[:0]
         with closing(bounded_map(partial(self._ask_one, client), lacking, threads)) as reasons:
             try:
                 for count, ((job, key), reason) in enumerate(zip(lacking, reasons, strict=True), 1):
                     streak = streak + 1 if reason else 0
                     if reason:
                         self._fail(job, key, client.redact(reason))
+                    if streak >= _STREAK and key in self.store.failed and self.store.answers:
+                        left = lacking[count:]
+                        break
                     if streak >= _STREAK:
                         raise AnnotateError(f"{streak} questions in a row failed, the last one: {reason}")
                     if say and (count % 100 == 0 or count == len(lacking)):
                         say(f"{count} of {len(lacking)} questions, {len(self.failures)} failed")
             finally:
                 client.stop.set()  # before the threads are waited for: none goes on waiting for a server
+        for job, key in left:
+            if key not in self.store.answers:
+                self._fail(job, key, f"not asked again: {_STREAK} before it failed, all in the last run too")
 
     def _ask_one(self, client: Client, item: tuple[Job, str]) -> str:
         """Get one answer and keep it; why there is none, or ""."""
@@ -250,9 +263,21 @@ class _Store:
         self.folder, self.lock = folder, threading.Lock()
         self.answers: dict[str, dict[str, Any]] = {}
         self._path, self._begin = folder / "answers.jsonl", ""
-        self.failed: set[str] = set()
-        folder.mkdir(parents=True, exist_ok=True)
+        self.failed: dict[str, str] = {}
         self._read_failures()
+        self._read_answers()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from asking the same while the block runs. Raises AnnotateError when one does."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with alone(self.folder / ".lock") as mine:
+            if not mine:
+                raise AnnotateError(f"another process asks for {self.folder}: wait for it, or name another --answers")
+            self._read_answers()
+            yield
+
+    def _read_answers(self) -> None:
         if self._path.is_file():
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in file:
@@ -268,11 +293,11 @@ class _Store:
             return
 
     def _read_failures(self) -> None:
-        """The questions that the last run could not get an answer to."""
+        """The questions that earlier runs could not get an answer to: the line of each by its key."""
         path = self.folder / "failures.jsonl"
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
             with suppress(ValueError, KeyError, TypeError, RecursionError):
-                self.failed.add(str(json.loads(line)["key"]))
+                self.failed[str(json.loads(line)["key"])] = line
 
     def keep(self, key: str, entry: dict[str, Any]) -> None:
         """Add an answer, from any thread: what was paid for is on the disk when this returns."""
@@ -282,10 +307,13 @@ class _Store:
             self._begin = ""
             self.answers[key] = entry
 
-    def write_failures(self, failures: list[Failure]) -> None:
-        """failures.jsonl: what this run could not get."""
-        lines = "".join(json.dumps(failure._asdict(), ensure_ascii=False) + "\n" for failure in failures)
-        write_whole(self.folder / "failures.jsonl", lines)
+    def write_failures(self, failures: list[Failure], keys: list[str]) -> None:
+        """failures.jsonl: what this run could not get, and of its `keys` what an earlier one could not and it did not
+        come to."""
+        met = {failure.key for failure in failures} | self.answers.keys() | {""}
+        lines = [json.dumps(failure._asdict(), ensure_ascii=False) for failure in failures]
+        lines += [self.failed[key] for key in dict.fromkeys(keys) if key in self.failed and key not in met]
+        write_whole(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
 
 
 def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:

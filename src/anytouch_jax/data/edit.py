@@ -51,7 +51,10 @@ def attach_text(
     if key not in others:
         raise UserError(f"{path} has no column {key!r}; it has {', '.join(table.column_names)}")
     found = _captions(table, key, text, path)
-    keys = manifest.column(key).cast(pa.string())
+    try:
+        keys = manifest.column(key).cast(pa.string())
+    except pa.ArrowException:
+        raise UserError(f"column {key!r} of the manifest is no key: it is {manifest.column(key).type}") from None
     at = pc.index_in(keys, value_set=pa.array(list(found), pa.string()))
     new = pa.chunked_array([pa.array(list(found.values()), pa.string())]).take(at.combine_chunks())
     matched = pc.sum(pc.is_valid(new)).as_py()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
+import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -232,7 +233,7 @@ def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
     path = Path(path)
     if not path.is_file():
         raise ImageError(f"there is no video {path}")
-    video = cv2.VideoCapture(str(path))
+    video = _opened(path)
     try:
         count = 0
         while True:
@@ -247,9 +248,13 @@ def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
         video.release()
 
 
+def _opened(path: str | Path) -> cv2.VideoCapture:
+    return cv2.VideoCapture(os.path.abspath(path))  # FFmpeg takes what is before a name's colon for a protocol
+
+
 def frames_told(path: str | Path) -> int:
     """The number of frames that a video's header tells of, 0 where it tells nothing."""
-    video = cv2.VideoCapture(str(path))
+    video = _opened(path)
     try:
         return max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     finally:
@@ -280,10 +285,12 @@ def frame_numbers(names: Sequence[str]) -> list[int]:
     return numbers if counts else list(range(len(names)))
 
 
-def frame_order(name: str) -> tuple[float, list[tuple[int, str]]]:
-    """A sort key of frames: time stamps with a point as the numbers that they are, all else with 2 before 10."""
+def frame_order(name: str) -> tuple[int | float, list[tuple[int, str]]]:
+    """A sort key of frames: numbers and time stamps as the numbers that they are, then the others, 2 before 10."""
     stem = Path(name).stem
-    return (float(stem), []) if re.fullmatch(r"\d+\.\d+", stem) else (0.0, natural(name))
+    if re.fullmatch(r"\d+", stem):  # a whole second is often written without its point
+        return int(stem), natural(name)
+    return (float(stem), []) if re.fullmatch(r"\d+\.\d+", stem) else (math.inf, natural(name))
 
 
 def natural(name: str) -> list[tuple[int, str]]:

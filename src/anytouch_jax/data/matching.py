@@ -44,7 +44,14 @@ class Matches:
         self._sorted = touch[self._order]
         # With one place only, a row of an unknown place may be it; a usable partner's sensor felt another one.
         known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(self._sorted, touch.max(initial=-1))
-        self.anchors = anchors if known else anchors[[self._negatives(int(a)).size > 0 for a in anchors]]
+        self.anchors = anchors if known else anchors[self._with_negatives(anchors)]
+
+    def _with_negatives(self, anchors: np.ndarray) -> np.ndarray:
+        """Which of these anchors, all at one place, have a negative: looked up once for each object and data set."""
+        rows = self.pool[anchors]
+        things = np.stack([self._keys.object[rows], self._keys.dataset[rows]], 1)
+        _, first, thing = np.unique(things, axis=0, return_index=True, return_inverse=True)
+        return np.array([self._negatives(int(anchors[one])).size > 0 for one in first], bool)[thing.ravel()]
 
     def place(self, anchor: int) -> int:
         """The code of the place that `anchor` felt."""

@@ -28,7 +28,7 @@ from anytouch_jax.data.bounded import bounded_map
 from anytouch_jax.data.files import Files, distinct_files
 from anytouch_jax.data.licences import card
 from anytouch_jax.data.manifest import Manifest, with_own_keys
-from anytouch_jax.data.packed import INDEX, forget, read_file, split_packed
+from anytouch_jax.data.packed import INDEX, ShardError, forget, read_file, read_index, split_packed
 from anytouch_jax.data.table import PATHS
 from anytouch_jax.whole import alone, replacing, write_whole
 
@@ -80,21 +80,26 @@ def pack(
         if not finished:
             raise  # before hours of packing the others
         stamp = None
-    _claim(folder, plan, stamp, finished)
+    _is_ours(folder, plan, stamp, finished)  # before a lock is left in a folder of something else
     if finished:
         if say:
             say(f"{folder} was finished before: left as it is")
         return target
-    with alone(folder / "pack.json") as mine:
+    folder.mkdir(parents=True, exist_ok=True)
+    with alone(folder / ".lock") as mine:
         if not mine:
             raise PackError(f"another process packs into {folder}: wait for it, or choose another folder")
-        return _pack(manifest, files, folder, shard_bytes, threads, say)
+        if not _is_ours(folder, plan, stamp, finished):
+            write_whole(folder / "pack.json", json.dumps(plan | {"files": stamp}))
+        _pack(manifest, files, folder, shard_bytes, threads, say)
+        (folder / ".lock").unlink(missing_ok=True)
+    return target
 
 
 def _pack(
     manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, say: Callable[[str], None] | None
-) -> Path:
-    """Write the shards, the manifest and, last, the card; gives back the manifest's path."""
+) -> None:
+    """Write the shards, the manifest and, last, the card."""
     target, orders = folder / "manifest.parquet", _orders(manifest, files)
     sums: dict[str, str] = _read_sums(folder)
     shard_of, row_of = np.empty(len(files), np.int64), np.empty(len(files), np.int64)
@@ -113,7 +118,6 @@ def _pack(
     packed = _repoint(manifest, target, files, names, shard_of, row_of)
     manifests.write(packed, target)
     write_whole(folder / "README.md", card(packed, orders))
-    return target
 
 
 def _stamp(manifest: Manifest, files: Files) -> str:
@@ -139,11 +143,9 @@ def _cannot(manifest: Manifest, row: int, column: str, reason: str) -> PackError
     )
 
 
-def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: bool) -> None:
-    """Take the folder for this plan, or find that it is its own from an earlier run.
-
-    One in which another plan failed before its first shard, as for a missing file, is taken over.
-    """
+def _is_ours(folder: Path, plan: dict[str, object], stamp: str | None, finished: bool) -> bool:
+    """Whether the folder is this plan's from an earlier run; False where it may be taken, as after another plan that
+    failed before its first shard. Raises PackError otherwise."""
     mark = folder / "pack.json"
     if mark.is_file():
         try:
@@ -152,15 +154,14 @@ def _claim(folder: Path, plan: dict[str, object], stamp: str | None, finished: b
             raise PackError(f"{mark} is not of a pack; choose another folder") from None
         files = old.pop("files", None)
         if old == plan and (files in (stamp, None) or (finished and stamp is None)):
-            return
+            return True
         if any(folder.rglob("*.parquet")):
             if old != plan:
                 raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")
             raise PackError(f"the files of the manifest are others than when {folder} was begun; choose another folder")
     elif folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
         raise PackError(f"{folder} is not an empty folder; choose another one")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(mark, json.dumps(plan | {"files": stamp}))
+    return False
 
 
 def _orders(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
@@ -182,8 +183,8 @@ class _Group:
     def __init__(self, manifest: Manifest, files: Files, group: str, folder: Path, sums: dict[str, str]) -> None:
         self.manifest, self.files, self.group, self.folder, self.sums = manifest, files, group, folder, sums
         table = manifest.table
-        kept = [c.name for c in table.schema if c.type in _FEATURES and c.name not in PATHS] if group == "touch" else []
-        self.extra = kept
+        schema = table.schema if group == "touch" else ()
+        self.extra = kept = [c.name for c in schema if c.type in _FEATURES and c.name not in (*PATHS, "image")]
         features = {"image": {"_type": "Image"}} if group != "field" else {}
         features |= {name: {"dtype": _FEATURES[table.schema.field(name).type], "_type": "Value"} for name in kept}
         about = {"huggingface": json.dumps({"info": {"features": features}})} if group != "field" else None
@@ -212,7 +213,10 @@ class _Group:
         """Rows of a shard that is whole: its index is written last."""
         shard = self.folder / self._name(number)
         index = shard.with_suffix(".index")
-        return len(np.load(index, mmap_mode="r")) if index.is_file() and shard.is_file() else None
+        try:
+            return len(read_index(index)) if shard.is_file() else None
+        except ShardError:
+            return None
 
     def _fetch(self, file: int) -> _Piece:
         row, name = int(self.files.row[file]), str(self.files.column[file])

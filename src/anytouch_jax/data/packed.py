@@ -73,7 +73,7 @@ class _Shard:
 
     def __init__(self, path: Path) -> None:
         self._file = -1
-        self._index = _read_index(path.with_suffix(".index"))
+        self._index = read_index(path.with_suffix(".index"))
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError:
@@ -99,7 +99,8 @@ class _Shard:
         return data
 
 
-def _read_index(path: Path) -> np.ndarray:
+def read_index(path: Path) -> np.ndarray:
+    """Where the files of a shard lie in it, INDEX (n,). Raises ShardError where none can be read."""
     try:
         with HEADER_LOCK:
             index = np.load(path, allow_pickle=False)

@@ -97,7 +97,7 @@ def _asked(
     phrase = family == "phrase"
     for reason, bad in (
         ("no phrase to expand", phrase & ~text),
-        ("expanded before", phrase & expanded),
+        ("expanded before", phrase & expanded & (not overwrite)),
         ("has a caption", ~phrase & text & (not overwrite)),
     ):
         left[reason] += int((asked & bad).sum())
@@ -122,7 +122,10 @@ def _job(manifest: Manifest, rows: np.ndarray, family: Family, second_image: str
     with_photograph = [int(row) for row in rows if manifest.value(row, "image_path") is not None]
     if not with_photograph and family != "phrase":
         return None
-    phrase = str(manifest.value(rows[0], "text")) if family == "phrase" else None
+    phrase = None
+    if family == "phrase":  # one that was expanded stands in a column of its own
+        before = manifest.value(rows[0], PHRASE) if PHRASE in manifest.table.column_names else None
+        phrase = str(before or manifest.value(rows[0], "text"))
     pictures: list[tuple[int, str]] = []
     if with_photograph:
         row = with_photograph[len(with_photograph) // 2]

@@ -135,7 +135,7 @@ def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
 
 
 def _read_csv(path: Path) -> pa.Table:
-    """A CSV file as text columns (an empty cell is null), `label.*` columns as numbers where all of them are."""
+    """A CSV file as text columns (an empty cell is null), `label.*` as numbers or truths where all cells are."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         names = next(csv.reader(file), [])
     convert = pa.csv.ConvertOptions(
@@ -144,12 +144,17 @@ def _read_csv(path: Path) -> pa.Table:
     table = pa.csv.read_csv(path, convert_options=convert, parse_options=pa.csv.ParseOptions(newlines_in_values=True))
     for position, name in enumerate(table.column_names):
         if name.startswith("label."):
-            table = table.set_column(position, name, _numbers(table[name]))
+            table = table.set_column(position, name, _typed_label(table[name]))
     return table
 
 
-def _numbers(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    for kind in (pa.int64(), pa.float64()):
+def _typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """A column of text as numbers or truths where all of it are; 007 is a name, of which a number would lose the 0s."""
+    column = pc.utf8_trim_whitespace(column)
+    column = pc.if_else(pc.equal(column, ""), pa.scalar(None, _TEXT), column)
+    if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py():
+        return column
+    for kind in (pa.int64(), pa.float64(), pa.bool_()):
         try:
             return column.cast(kind)
         except pa.ArrowInvalid:
@@ -165,7 +170,7 @@ def _convert(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
         return column
     if pa.types.is_null(column.type):
         return column.cast(wanted)
-    is_text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
+    is_text = any(kind(column.type) for kind in (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view))
     if is_text:
         column = column.cast(_TEXT)
         if wanted != _TEXT:

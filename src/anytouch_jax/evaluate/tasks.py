@@ -162,7 +162,7 @@ def _labels(table: Manifest, task: Task) -> Array:
 
 
 def _text(value: Any, task: Task) -> str:
-    if isinstance(value, float) and not np.isnan(value) and value != int(value):
+    if isinstance(value, float) and not np.isnan(value) and not value.is_integer():
         raise UserError(f"task {task.name}: column {task.label!r} holds {value:g}, a measured quantity and no class")
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return ""

@@ -49,7 +49,7 @@ def simulate(
     `progress(touches done, touches)` is called as parts are finished. The files are the same byte for byte for a seed
     and a machine. Raises UserError when `out` holds something else, or cannot be written.
     """
-    out = Path(out)
+    out = Path(out).expanduser().resolve()  # pyarrow reads a leading ~ and a colon in its own way
     if threads < 1:
         raise UserError(f"threads must be at least 1, not {threads}")
     things, splits = scene.cast(scenes)  # before the folder is taken: what cannot be simulated leaves nothing

@@ -216,6 +216,8 @@ def test_phrases_are_expanded_once_and_kept(make, tmp_path):
         assert done.left_out == {"no phrase to expand": 1}
         with pytest.raises(UserError, match=r"nothing to annotate.*5 rows: expanded before"):
             _run(done.manifest, server, tmp_path / "answers")
+        again = find_jobs(done.manifest, overwrite=True).jobs  # of the phrases, not of what became of them
+        assert sorted(str(job.phrase) for job in again) == ["hard", 'soft, {fuzzy} "wool"']
 
 
 def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):

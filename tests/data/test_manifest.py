@@ -114,6 +114,17 @@ def test_other_ways_to_give_no_manifest(tmp_path):
             m.read(path)
 
 
+def test_a_link_into_the_cache_of_the_hub_is_told(tmp_path):
+    real = _file(tmp_path, GOOD)
+    link, cached = tmp_path / "link.csv", tmp_path / "cached.csv"
+    link.symlink_to(real)
+    assert len(m.read(link)) == 3
+    (tmp_path / "3f2a").write_text(GOOD)
+    cached.symlink_to(tmp_path / "3f2a")
+    with pytest.raises(m.ManifestError, match=r"cached.csv is a link into a cache.*--local-dir"):
+        m.read(cached)
+
+
 def test_types_in_memory_are_enforced(tmp_path):
     good = {"path": ["a"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
     gaps = m.from_columns({**good, "stride": [3.0], "sensor": pa.array(["digit"]).dictionary_encode()}, tmp_path / "x")

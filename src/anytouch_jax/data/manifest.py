@@ -175,10 +175,21 @@ def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
     several = [paths] if isinstance(paths, str | Path) else list(paths)
     if not several:
         raise ManifestError("no manifest is given; name a .csv or .parquet file")
-    files = tuple(Path(path).expanduser().resolve() for path in several)
+    files = tuple(_real(Path(path).expanduser()) for path in several)
     if len(set(files)) != len(files):
         raise ManifestError(f"a manifest is given twice: {', '.join(map(str, files))}")
     return _join([load_table(file) for file in files], files)
+
+
+def _real(path: Path) -> Path:
+    """The file of a name. Raises ManifestError for a link as the Hub's cache has them, to a name without an ending."""
+    file = path.resolve()
+    if path.is_symlink() and path.suffix and not file.suffix:
+        raise ManifestError(
+            f"{path} is a link into a cache, as its pictures may be; download the data into a folder of their own "
+            "(hf download --local-dir)"
+        )
+    return file
 
 
 def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:

@@ -36,7 +36,7 @@ from anytouch_jax.evaluate.generator import (
 from anytouch_jax.io.tensors import write_safetensors
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import Part
-from anytouch_jax.nn.translation import Conv, Translation, UNet, doubled, halved, thumbnail_side
+from anytouch_jax.nn.translation import DEPTHS, Conv, Translation, UNet, doubled, halved, thumbnail_side
 from anytouch_jax.objectives import normalise_touch
 
 X, Y, FIELDS = arrays(24)
@@ -219,6 +219,18 @@ def test_a_field_that_is_linear_in_the_features_is_found_again():
     assert ours < 0.1 * generation.mean_errors(found, targets[1500:]).mean()
     away = found(images[1500:]) - targets[1500:]  # in the field's own units
     assert np.sqrt((away**2).mean()) < 0.25 * targets.std()
+
+
+def test_up_to_four_blocks_of_an_encoder_are_read():
+    shapes = [generation._design(ENCODER, X, y, "digit", "duragel", Fit(), None).shape for y in (Y, FIELDS)]
+    assert [one.depths for one in shapes] == [MODEL.touch.depth] * 2 and MODEL.touch.depth < DEPTHS == 4
+    deep = replace(MODEL, touch=replace(MODEL.touch, depth=9))
+    many = replace(ENCODER, config=replace(ENCODER.config, model=deep))
+    assert generation._design(many, X, Y, "digit", "duragel", Fit(), None).shape.depths == DEPTHS
+    seen = np.asarray(features(design(shapes[0]), ENCODER.params, X[:2]))
+    assert seen.shape == (2, IMAGE.special + MODEL.patches, shapes[0].read)
+    last = np.asarray(features(design(), ENCODER.params, X[:2]))
+    np.testing.assert_allclose(seen[..., -last.shape[-1] :], last, atol=1e-6)
 
 
 def test_a_target_that_never_changes_is_copied():

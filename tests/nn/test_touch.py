@@ -1,11 +1,14 @@
 """The touch encoder and decoder: what they see, what they cannot see, what they cost."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_models import touch_model
 
+from anytouch_jax.config import Stack
 from anytouch_jax.nn.functional import build
 from anytouch_jax.ops.masking import random_mask
 
@@ -42,6 +45,20 @@ def test_a_still_is_a_clip_of_equal_frames():
     np.testing.assert_allclose(
         encode(PARAMS, still, SENSOR), encode(PARAMS, jnp.repeat(still, 3, axis=1), SENSOR), atol=2e-5
     )
+
+
+def test_depths_are_the_hidden_states_of_blocks_evenly_spaced():
+    """The last is `hidden`; each hangs on the blocks before it alone."""
+    model = touch_model(touch=Stack(8, 5, 2, 16))
+    net, clip = build(model), clips(1)
+    params = net.init(jax.random.key(0))
+    found = np.asarray(net.apply(params, "touch.depths", clip, SENSOR, 2))
+    assert found.shape == (2, 1 + 5 + 16, 2 * 8)
+    np.testing.assert_allclose(found[..., 8:], net.apply(params, "touch.hidden", clip, SENSOR), atol=1e-6)
+    early = replace(model, touch=replace(model.touch, depth=2))  # two and a half of five blocks, rounded to even
+    cut = jax.tree.map(lambda x: x, params)
+    cut["touch"]["blocks"] = jax.tree.map(lambda x: x[:2], params["touch"]["blocks"])
+    np.testing.assert_allclose(found[..., :8], build(early).apply(cut, "touch.hidden", clip, SENSOR), atol=1e-6)
 
 
 def test_hidden_patches_have_exactly_no_influence():

@@ -104,15 +104,15 @@ def features(design: Design, encoder: Params | None, images: Array) -> Array:
         side = pixels.shape[1]
         times = side // thumbnail_side(side)
         return halved(pixels, times).reshape(len(pixels), -1) if design.shape.field else pixels
-    return encoded(design, encoder, pixels, design.source)
+    return encoded(design, encoder, pixels, design.source, design.shape.depths)
 
 
-def encoded(design: Design, encoder: Params, pixels: Array, sensor: str) -> Array:
-    """Tokens f32 (B, 1 + S + N, D) of normalised images, with the tokens of `sensor`, or the universal ones."""
+def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, depths: int = 1) -> Array:
+    """Tokens f32 (B, 1 + S + N, depths * D) of normalised images, with the tokens of `sensor`, or the universal ones."""
     model = design.shape.model
     row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
     rows = jnp.full(len(pixels), row, jnp.int32)
-    hidden: Array = build(model).apply(encoder, "touch.hidden", pixels[:, None], rows)
+    hidden: Array = build(model).apply(encoder, "touch.depths", pixels[:, None], rows, depths)
     return hidden.astype(jnp.float32)
 
 

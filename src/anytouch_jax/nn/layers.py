@@ -168,3 +168,8 @@ def run_blocks(blocks: Block, x: Array, *, remat: bool, causal: bool = False, ma
 
     body = nnx.remat(body) if remat else body
     return nnx.scan(body, in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)(x, blocks)
+
+
+def blocks_between(blocks: Block, first: int, last: int) -> Block:
+    """The stacked blocks `first` up to `last`, which is not among them, as a stack of their own."""
+    return jax.tree.map(lambda values: values[first:last], blocks)

@@ -9,7 +9,16 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import Model
-from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.layers import (
+    Dense,
+    LayerNorm,
+    activation,
+    blocks_between,
+    rows_of,
+    run_blocks,
+    stacked_blocks,
+    table,
+)
 from anytouch_jax.nn.product import product, stored
 from anytouch_jax.ops import masking, tokens
 
@@ -51,7 +60,7 @@ class TouchEncoder(nnx.Module):
         self.blocks = stacked_blocks(model.touch, model, model.norm_eps, activation(model.activation))
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
-        self.patch_size, self.remat = model.patch, model.remat
+        self.patch_size, self.depth, self.remat = model.patch, model.touch.depth, model.remat
 
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """The input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
@@ -70,6 +79,19 @@ class TouchEncoder(nnx.Module):
         """Last hidden states (B, 1 + S + K, D), without the final norm (golden Q5)."""
         x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
         return run_blocks(self.blocks, x, remat=self.remat)
+
+    def depths(self, clip: Array, sensor: Array, count: int) -> Array:
+        """Hidden states of `count` blocks, evenly spaced, the last among them, beside each other:
+        (B, 1 + S + N, count * D). What paints or measures reads them (as DPT does, Ranftl et al. 2021): an encoder's
+        last block holds what it was last asked for."""
+        x = self.pre_norm(self.tokens(clip, sensor))
+        found, before = [], 0
+        for number in range(1, count + 1):
+            last = round(number * self.depth / count)
+            x = run_blocks(blocks_between(self.blocks, before, last), x, remat=self.remat)
+            found.append(x)
+            before = last
+        return jnp.concatenate(found, axis=-1)
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Touch embedding (B, E) from the class token, of all patches or those to keep (B, K); not normalised."""

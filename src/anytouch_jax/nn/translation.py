@@ -18,18 +18,21 @@ from anytouch_jax.nn.product import stored
 from anytouch_jax.ops import tokens
 
 DECODER = Stack(128, 2, 4, 512)
+DEPTHS = 4  # blocks of an encoder that are read, as many as DPT reads (Ranftl et al., 2021)
 
 
 @dataclass(frozen=True)
 class Translation:
     """What decides the shapes: the encoder's `model`, the ViT `decoder`, `hidden` channels of the MLPs, and the shape
-    of the `field` to regress; () for an image of the encoder's size. `few`: channels of a patch that a field's MLP
-    reads; `channels`: of the U-Net, from its finest level to its coarsest."""
+    of the `field` to regress; () for an image of the encoder's size. `depths`: blocks of the encoder whose tokens are
+    read. `few`: channels of a patch that a field's MLP reads; `channels`: of the U-Net, from its finest level to its
+    coarsest."""
 
     model: Model
     decoder: Stack = DECODER
     hidden: int = 256
     field: tuple[int, ...] = ()
+    depths: int = 1
     few: int = 16
     channels: tuple[int, ...] = (16, 32, 48, 64)
 
@@ -37,6 +40,11 @@ class Translation:
     def special(self) -> int:
         """Tokens before the patches: the class token and the sensor's."""
         return 1 + self.model.sensor_tokens
+
+    @property
+    def read(self) -> int:
+        """Channels of a token that is read."""
+        return self.depths * self.model.touch.width
 
 
 class Painter(nnx.Module):
@@ -47,7 +55,7 @@ class Painter(nnx.Module):
 
     def __init__(self, options: Translation) -> None:
         model, width = options.model, options.decoder.width
-        self.embed = Dense(model.touch.width, width, model)
+        self.embed = Dense(options.read, width, model)
         self.position = table(options.special + model.patches, width)
         self.blocks = stacked_blocks(options.decoder, model, model.norm_eps, gelu)
         self.norm = LayerNorm(width, model.norm_eps, model.dtype)
@@ -77,7 +85,7 @@ class FeatureField(FieldHead):
 
     def __init__(self, options: Translation) -> None:
         super().__init__(options, options.model.patches * options.few)
-        self.embed = Dense(options.model.touch.width, options.few, options.model)
+        self.embed = Dense(options.read, options.few, options.model)
         self.special = options.special
 
     def __call__(self, x: Array) -> Array:

@@ -74,7 +74,7 @@ class AnyTouch(nnx.Module):
 
         def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
             hidden = self.touch.hidden(clip, sensor)
-            return self.touch.embedding(hidden), jnp.mean(self.touch.projection(hidden[:, special:]), axis=1)
+            return self.touch.embedding(hidden[:, 0]), jnp.mean(self.touch.projection(hidden[:, special:]), axis=1)
 
         return self._over_segments(both, clip, sensor, join)
 
@@ -110,7 +110,7 @@ class AnyTouch(nnx.Module):
         if hasattr(self.decoder, "sensor_projection"):
             own = rows_of(self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor)
         pixels = self.decoder(self.touch.projection(hidden), restore_ids, frames, own)
-        return pixels, self.force(self.touch.embedding(hidden)) if force else None
+        return pixels, self.force(self.touch.embedding(hidden[:, 0])) if force else None
 
     def embed_image(self, image: Array) -> Array:
         """Image embeddings (V, E), not normalised."""

@@ -15,12 +15,13 @@ CACHE = 1_700_000  # bytes of logits at a time: what stays in a core's cache; si
 
 
 def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, mask: Array | None = None) -> Array:
-    """softmax(q k^T / sqrt(D)) v for q, k, v (B, S, H, D); `mask` (B, S) bool marks the keys that may be read.
+    """softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool marks the keys to be read.
 
     `how` is "xla", "cudnn", "mapped", or "auto": mapped where one CPU does the work, XLA's own form elsewhere. A causal
-    or masked call is never mapped: text is short. cuDNN does what it can: 16 bits, an even S, no mask; XLA the rest.
+    or masked call is never mapped (text is short), nor one of few queries. cuDNN does what it can: 16 bits, an even Q,
+    no mask; XLA the rest.
     """
-    free = mask is None and not causal
+    free = mask is None and not causal and q.shape == k.shape
     if how == "auto":
         how = "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
     if how == "mapped" and free:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -100,18 +102,20 @@ class LayerNorm(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """Multi-head self-attention: `project` (B, S, D) to q, k, v (B, S, H, D / H), `attend`, then `out`."""
+    """Multi-head attention of (B, Q, D) over (B, S, D): `project` to q (B, Q, H, D / H) and k, v (B, S, H, D / H),
+    `attend`, then `out`."""
 
     def __init__(self, stack: Stack, model: Model) -> None:
         self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
         self.heads, self.how = stack.heads, model.attention
 
-    def project(self, x: Array) -> tuple[Array, Array, Array]:
-        heads = (*x.shape[:2], self.heads, -1)
-        return self.query(x).reshape(heads), self.key(x).reshape(heads), self.value(x).reshape(heads)
+    def project(self, asks: Array, x: Array) -> tuple[Array, Array, Array]:
+        parts = (self.query(asks), self.key(x), self.value(x))
+        q, k, v = (part.reshape(*part.shape[:2], self.heads, -1) for part in parts)
+        return q, k, v
 
     def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:
-        """(B, S, H, D / H); `mask` (B, S) bool marks the keys that may be read."""
+        """(B, Q, H, D / H); `mask` (B, S) bool marks the keys that may be read."""
         return attention(q, k, v, how=self.how, causal=causal, mask=mask)
 
 
@@ -145,9 +149,19 @@ class Block(nnx.Module):
         heads = self.attention.attend(*self._before(x), causal=causal, mask=mask)
         return self._after(x, heads)
 
+    def at(self, x: Array, positions: Array, *, causal: bool = False, mask: Array | None = None) -> Array:
+        """What `__call__` gives at one position (B,) of each row, (B, D): of all others keys and values alone."""
+        one = jnp.take_along_axis(x, positions[:, None, None], axis=1)
+        if causal:
+            before = jnp.arange(x.shape[1])[None] <= positions[:, None]
+            mask = before if mask is None else before & mask
+        heads = self.attention.attend(*self._before(x, one), causal=False, mask=mask)
+        return self._after(one, heads)[:, 0]
+
     @lean
-    def _before(self, x: Array) -> tuple[Array, Array, Array]:
-        return self.attention.project(self.norm1(x))
+    def _before(self, x: Array, asks: Array | None = None) -> tuple[Array, Array, Array]:
+        normed = self.norm1(x)
+        return self.attention.project(normed if asks is None else self.norm1(asks), normed)
 
     @lean
     def _after(self, x: Array, heads: Array) -> Array:
@@ -168,6 +182,53 @@ def run_blocks(blocks: Block, x: Array, *, remat: bool, causal: bool = False, ma
 
     body = nnx.remat(body) if remat else body
     return nnx.scan(body, in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)(x, blocks)
+
+
+def read_blocks(
+    blocks: Block, x: Array, positions: Array, *, remat: bool, causal: bool = False, mask: Array | None = None
+) -> Array:
+    """What `run_blocks` gives at one position (B,) of each row, (B, D): the last block does nothing for the others."""
+
+    def end(x: Array, block: Block) -> Array:
+        return block.at(x, positions, causal=causal, mask=mask)
+
+    x = _but_last(blocks, x, mask, causal, remat) if _depth(blocks) > 1 else x
+    return (nnx.remat(end) if remat else end)(x, jax.tree.map(lambda values: values[-1], blocks))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _but_last(blocks: Block, x: Array, mask: Array | None, causal: bool, remat: bool) -> Array:
+    """Send `x` through all blocks but the last one.
+
+    Each takes its values out of the stack where it runs: blocks cut off before a scan are copied, which costs more than
+    the last block does for a batch of one. Gradients are those of a scan over blocks cut off: those of a stack that is
+    closed over would be added up whole, block by block.
+    """
+
+    def body(x: Array, number: Array) -> tuple[Array, None]:
+        block = jax.tree.map(lambda values: jax.lax.dynamic_index_in_dim(values, number, keepdims=False), blocks)
+        return block(x, causal=causal, mask=mask), None
+
+    return jax.lax.scan(body, x, jnp.arange(_depth(blocks) - 1))[0]
+
+
+def _but_last_forward(blocks: Block, x: Array, mask: Array | None, causal: bool, remat: bool) -> Any:
+    def cut(blocks: Block, x: Array) -> Array:
+        kept = blocks_between(blocks, 0, _depth(blocks) - 1)
+        return run_blocks(kept, x, remat=remat, causal=causal, mask=mask)
+
+    return jax.vjp(cut, blocks, x)
+
+
+def _but_last_backward(causal: bool, remat: bool, back: Any, gradient: Array) -> Any:
+    return (*back(gradient), None)
+
+
+_but_last.defvjp(_but_last_forward, _but_last_backward)
+
+
+def _depth(blocks: Block) -> int:
+    return len(blocks.norm1.scale[...])
 
 
 def blocks_between(blocks: Block, first: int, last: int) -> Block:

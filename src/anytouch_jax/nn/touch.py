@@ -14,6 +14,7 @@ from anytouch_jax.nn.layers import (
     LayerNorm,
     activation,
     blocks_between,
+    read_blocks,
     rows_of,
     run_blocks,
     stacked_blocks,
@@ -95,11 +96,13 @@ class TouchEncoder(nnx.Module):
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Touch embedding (B, E) from the class token, of all patches or those to keep (B, K); not normalised."""
-        return self.embedding(self.hidden(clip, sensor, keep_ids))
+        x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
+        first = jnp.zeros(len(x), jnp.int32)
+        return self.embedding(read_blocks(self.blocks, x, first, remat=self.remat))
 
-    def embedding(self, hidden: Array) -> Array:
-        """Touch embedding (B, E) from the class token of the last hidden states (B, 1 + S + K, D)."""
-        return self.projection(self.post_norm(hidden[:, 0]))
+    def embedding(self, token: Array) -> Array:
+        """Touch embedding (B, E) from the last hidden state of the class token (B, D)."""
+        return self.projection(self.post_norm(token))
 
 
 class TouchDecoder(nnx.Module):

@@ -3,7 +3,7 @@
 A product of (m, k) and (k, n) is 2 m k n operations, and twice as many again in the backward pass, once where its
 input needs no gradient (pixels). Norms, softmax, activations, masks and the optimiser are left out: they are not what
 a matmul peak measures. So are recomputation (remat), empty slots and hidden patches: a variant that does more work
-for the same result is not thereby faster. Counted as useful although a class token alone is read: the whole last block.
+for the same result is not thereby faster. So is what the last block would do for tokens that nobody reads.
 """
 
 from __future__ import annotations
@@ -18,11 +18,19 @@ def _dense(rows: int, inputs: int, outputs: int) -> float:
     return 2.0 * rows * inputs * outputs
 
 
-def _blocks(stack: Stack, sequences: int, length: int) -> float:
-    """Forward operations of a stack over `sequences` of `length` tokens: projections, scores and sums, MLP."""
-    rows = sequences * length
-    attention = 4 * _dense(rows, stack.width, stack.width) + 2 * _dense(rows, length, stack.width)
-    return stack.depth * (attention + 2 * _dense(rows, stack.width, stack.mlp))
+def _block(stack: Stack, sequences: int, length: int, read: int) -> float:
+    """Forward operations of a block over `sequences` of `length` tokens of which `read` are wanted: keys and values of
+    all; queries, scores and sums, MLP of these."""
+    rows = sequences * read
+    attention = 2 * _dense(rows, stack.width, stack.width) + 2 * _dense(rows, length, stack.width)
+    keys = 2 * _dense(sequences * length, stack.width, stack.width)
+    return keys + attention + 2 * _dense(rows, stack.width, stack.mlp)
+
+
+def _blocks(stack: Stack, sequences: int, length: int, read: int | None = None) -> float:
+    """Forward operations of a stack; of the last block `read` tokens of each sequence are wanted, or all."""
+    last = _block(stack, sequences, length, length if read is None else read)
+    return (stack.depth - 1) * _block(stack, sequences, length, length) + last
 
 
 def _special(model: Model) -> int:
@@ -33,10 +41,12 @@ def _patches(model: Model, width: int, rows: int, frames: int = 1) -> float:
     return _dense(rows * frames, model.patch**2 * 3, width)
 
 
-def encoder(model: Model, batch: int, frames: int, patches: int, *, train: bool = True) -> float:
+def encoder(
+    model: Model, batch: int, frames: int, patches: int, *, train: bool = True, read: int | None = None
+) -> float:
     """The touch encoder over `patches` positions of `batch` touches, projection apart; 1 frame is a still."""
     kernels = 1 if frames == 1 else model.frames
-    blocks = _blocks(model.touch, batch, _special(model) + patches)
+    blocks = _blocks(model.touch, batch, _special(model) + patches, read)
     first = _patches(model, model.touch.width, batch * patches, kernels)
     return first * (_FIRST if train else 1) + blocks * (_TRAINED if train else 1)
 
@@ -56,14 +66,14 @@ def stage1(config: Config, batch: int, frames: int) -> float:
 def embedding(model: Model, batch: int, frames: int, *, train: bool = False) -> float:
     """Touch embeddings of whole frames: forward only, or with the backward pass."""
     last = _dense(batch, model.touch.width, model.embed) * (_TRAINED if train else 1)
-    return encoder(model, batch, frames, model.patches, train=train) + last
+    return encoder(model, batch, frames, model.patches, train=train, read=1) + last
 
 
 def image_tower(model: Model, images: int) -> float:
     """The image tower over so many images, forward and backward, trained whole."""
     if model.image is None or not images:
         return 0.0
-    rest = _blocks(model.image, images, 1 + model.patches) + _dense(images, model.image.width, model.embed)
+    rest = _blocks(model.image, images, 1 + model.patches, 1) + _dense(images, model.image.width, model.embed)
     return _FIRST * _patches(model, model.image.width, images * model.patches) + _TRAINED * rest
 
 
@@ -72,7 +82,7 @@ def text_tower(model: Model, texts: int, length: int) -> float:
     if model.text is None or not texts:
         return 0.0
     stack = model.text.stack
-    return _TRAINED * (_blocks(stack, texts, length) + _dense(texts, stack.width, model.embed))
+    return _TRAINED * (_blocks(stack, texts, length, 1) + _dense(texts, stack.width, model.embed))
 
 
 def align(config: Config, batch: int, frames: int, images: int, texts: int, length: int) -> float:
@@ -91,7 +101,7 @@ def match(config: Config, batch: int, frames: int) -> float:
     if model.match_head == "cosine":
         kept = masking.kept(model.patches, config.objective.match_keep)
         last = _dense(2 * batch, model.touch.width, model.embed) + 2 * _dense(batch, model.embed, batch)
-        return encoder(model, 2 * batch, frames, kept, train=True) + _TRAINED * last
+        return encoder(model, 2 * batch, frames, kept, train=True, read=1) + _TRAINED * last
     head = _dense(2 * batch, model.embed, 1)
     if model.match_head == "mlp":
         head += _dense(2 * batch, model.embed, model.embed)

@@ -108,7 +108,7 @@ def features(design: Design, encoder: Params | None, images: Array) -> Array:
 
 
 def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, depths: int = 1) -> Array:
-    """Tokens f32 (B, 1 + S + N, depths * D) of normalised images, with the tokens of `sensor`, or the universal ones."""
+    """Tokens f32 (B, 1 + S + N, depths * D) of normalised images, with those of `sensor`, or the universal ones."""
     model = design.shape.model
     row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
     rows = jnp.full(len(pixels), row, jnp.int32)

@@ -61,3 +61,13 @@ def test_packs_of_one_table_with_other_gels_share_no_features(tmp_path, encoder)
     before = pictures(one)
     os.utime(shards[0], ns=(2, 2))  # a pack that was written anew
     assert pictures(one) != before
+
+
+def test_another_picture_of_the_gel_is_seen_in_the_same_process(tmp_path, encoder):
+    table = world(tmp_path / "world", 100)
+    first = encoded(encoder, table, pooling="class", join="mean").get(ROWS, 1)
+    paint(tmp_path / "world" / "background.bmp", 40)
+    again = encoded(encoder, table, pooling="class", join="mean").get(ROWS, 1)
+    assert np.abs(again - first).max() > 1e-3
+    second = encoded(encoder, world(tmp_path / "new", 40), pooling="class", join="mean").get(ROWS, 1)
+    np.testing.assert_array_equal(again, second)

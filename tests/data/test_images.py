@@ -276,3 +276,6 @@ def test_frames_are_numbered_by_what_counts_them():
     assert images.frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
     assert images.frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
     assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []
+    assert images.frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
+    stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
+    assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))

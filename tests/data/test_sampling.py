@@ -93,6 +93,12 @@ def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend
         assert now[s.TEXT] + now[s.BOTH] == alone.texts
 
 
+def test_a_rare_stratum_is_visited_at_even_distances():
+    strata = s.Strata((0, 90000, 0, 110), 64)
+    visits = np.flatnonzero([strata.at(k)[1][s.NEITHER] for k in range(3000)])
+    assert np.diff([-1, *visits, 3000]).max() <= 21
+
+
 def test_shares_that_are_whole_numbers_are_met_exactly():
     strata = s.Strata((2, 2, 2, 2), 8)
     assert (strata.images, strata.texts) == (4, 4)

@@ -33,6 +33,14 @@ def test_shrinking_averages_and_does_not_alias():
     assert np.abs(t.vision_evaluation(frame, 16).astype(int) - 127).max() <= 12
 
 
+def test_a_frame_is_smooth_where_it_is_enlarged_on_one_side_alone():
+    ramp = np.repeat(16 * np.arange(8, dtype=np.uint8), 64 * 3).reshape(8, 64, 3)
+    out = t.touch_evaluation([ramp], 16)[0].astype(int)
+    assert (np.diff(out[1:-1], axis=0) == 8).all()  # no steps of two rows
+    turned = t.touch_evaluation([ramp.transpose(1, 0, 2).copy()], 16)[0].astype(int)
+    assert (np.diff(turned[:, 1:-1], axis=1) == 8).all()
+
+
 def test_frames_of_different_sizes_make_one_clip():
     out = t.touch_evaluation([CLIP[0], CLIP[1, :12, :12]], 16)
     assert out.shape == (2, 16, 16, 3)
@@ -168,6 +176,15 @@ def test_vision_keeps_a_flat_picture_flat_at_any_size(shape):
     out = t.vision_evaluation(np.full((*shape, 3), (10, 130, 250), np.uint8), 20)
     assert out.shape == (20, 20, 3) and out.dtype == np.uint8
     np.testing.assert_array_equal(out, np.broadcast_to(np.array([10, 130, 250]), out.shape))
+
+
+@pytest.mark.parametrize(("excess", "start"), [(3, 2), (5, 2), (7, 4)])
+def test_an_odd_excess_is_cropped_as_clip_crops_it(excess, start):
+    """torchvision's CenterCrop, round((n - size) / 2): a half goes to the even number."""
+    picture = RNG.integers(0, 256, (20, 20 + excess, 3), np.uint8)
+    np.testing.assert_array_equal(t.vision_evaluation(picture, 20), picture[:, start : start + 20])
+    upright = picture.transpose(1, 0, 2).copy()
+    np.testing.assert_array_equal(t.vision_evaluation(upright, 20), upright[start : start + 20])
 
 
 def test_vision_takes_the_centre_of_the_long_side():

@@ -34,6 +34,10 @@ def table(data):
     return manifests.read(data)
 
 
+def column(table, name):
+    return np.array(table.column(name).to_pylist())
+
+
 def stored(folder, config, params, **metadata):
     saver = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=to_json(config), metadata=metadata)
     saver.save(3, {"trainable": params}, {"loss": 1.0})
@@ -139,6 +143,17 @@ def test_frames_come_from_as_many_recordings_as_there_are(table):
     assert not np.array_equal(choose(table, "gelslim", "train", 5), choose(table, "gelslim", "train", 5, seed=1))
     with pytest.raises(UserError, match=r"30 frames of gelslim are wanted, but split 'train' has 24"):
         choose(table, "gelslim", "train", 30)
+
+
+def test_rows_without_a_label_are_never_chosen(table):
+    train = np.flatnonzero((column(table, "sensor") == "gelslim") & (column(table, "split") == "train"))
+    classes = np.full(len(table), -1, np.int32)
+    classes[train[::2]] = 0
+    for seed in range(3):
+        assert np.isin(choose(table, "gelslim", "train", 6, classes, seed), train[::2]).all()
+    np.testing.assert_array_equal(choose(table, "gelslim", "train", len(train[::2]), classes), train[::2])
+    with pytest.raises(UserError, match=r"split 'train' has 12 that can be used"):
+        choose(table, "gelslim", "train", 13, classes)
 
 
 # With labels ---------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.readers import Options, index
-from anytouch_jax.evaluate import battery, battery_features, heads
+from anytouch_jax.evaluate import battery, battery_features, deals, heads
 from anytouch_jax.evaluate.battery_features import Store, digest, encoded, ordered
 from anytouch_jax.evaluate.benchmarks import BENCHMARKS, benchmark_of
 from anytouch_jax.evaluate.features import Encoder, random_encoder
@@ -343,6 +343,17 @@ def test_raw_pixels_see_the_force_and_their_own_cache(pictures, tmp_path):
     assert (still["frames"], still["test"]) == (1, one["test"])
     store = battery_features.raw(pictures)
     assert store.get(np.array([[2]]), 1).shape == (1, 2 * 2304) and store.get(np.array([[2]]), 3).shape == (1, 4 * 2304)
+
+
+def test_components_of_pixels_do_not_hang_on_the_rows_that_are_tested():
+    rng, train = np.random.default_rng(0), np.arange(90) < 60
+    x, everything = rng.random((90, 40)).astype(np.float32), np.ones(90, bool)
+    groups = np.array([f"g{row // 3}" for row in range(90)])
+    rows = deals.Rows(np.arange(90) % 2, groups, train, ~train, everything, everything)
+    other = np.where(train[:, None], x, 10 * x**2)
+    first, second = (battery._components(pixels, rows) for pixels in (x, other))
+    np.testing.assert_array_equal(first[train], second[train])
+    assert first.shape == (90, 40) and np.abs(first - second)[~train].min() > 0
 
 
 # The public benchmarks, on trees laid out like the originals.

@@ -137,6 +137,13 @@ def test_seeds_that_differ_widen_the_interval():
     assert wide[1] - wide[0] > 2 * (narrow[1] - narrow[0])
 
 
+def test_seeds_and_groups_are_drawn_independently():
+    """Seed k is right on group k alone: drawn alike, seeds and groups would meet in every draw, 0.2 at least."""
+    group = np.arange(50) // 10
+    low, high = interval([sums_of(group == k, group) for k in range(5)], deals.accuracy_of)
+    assert low < 0.1 and 0.2 < high < 0.5
+
+
 def test_values_from_sums():
     truth, said = np.array([1.0, 2.0, 3.0, 6.0]), np.array([1.0, 2.5, 3.0, 5.0])
     error = said - truth

@@ -56,6 +56,9 @@ def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, en
     np.testing.assert_allclose(run(CLIPS, "digit"), encoder.embed(CLIPS, "digit"), atol=1e-5)
     np.testing.assert_allclose(run(CLIPS), encoder.embed(CLIPS), atol=1e-5)  # the universal tokens
     assert np.abs(run(CLIPS) - run(CLIPS, "digit")).max() > 1e-4
+    names = list(encoder.config.model.sensors)
+    for each in ([names[row] for row in ROWS], np.array(names, object)[ROWS]):  # as `Encoder.embed` takes them
+        np.testing.assert_array_equal(run(CLIPS, each), run(CLIPS, ROWS))
     assert 0 <= about["worst_difference"] < 1e-4
 
 
@@ -122,7 +125,10 @@ def test_wrong_touches_and_sensors_are_one_sentence(artefact):
         (CLIPS[:, :2], ROWS, r"\(B, 3, 28, 28, 3\)"),
         (CLIPS[:, :, :27], ROWS, r"\(B, 3, 28, 28, 3\)"),
         (CLIPS[:0], ROWS[:0], "at least one"),
-        (CLIPS, ROWS[:4], "one for each of the 5"),
+        (CLIPS, ROWS[:4], "one integer for each of the 5 touches"),
+        (CLIPS, ROWS.astype(float), r"one integer for each of the 5 touches, not float64 \(5,\)"),
+        (CLIPS, ["digit"] * 4, "one integer for each of the 5 touches"),
+        (CLIPS, ["digit"] * 4 + ["nobody"], "sensor 'nobody' is not one of .*; universal serves any other"),
         (CLIPS, ROWS - 1, "0 to 9"),
         (CLIPS, ROWS + 1, "0 to 9"),
         (CLIPS, "nobody", "universal serves any other"),

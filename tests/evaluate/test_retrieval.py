@@ -109,6 +109,12 @@ def test_a_score_by_hand() -> None:
     assert score(np.array([[0.9, 0.2]]), gallery, drawn, metric="euclidean")[0] == [0.0]
 
 
+def test_distractors_by_chance_are_any_touches_and_others_for_each_seed() -> None:
+    drawn = draw_galleries(NAMES, NAMES, seeds=2, gallery_size=20)
+    assert (drawn.items[0] != drawn.items[1]).any()
+    assert len(np.unique(drawn.items[:, :, 1:])) == COUNT
+
+
 def test_matching_takes_away_what_place_and_force_tell() -> None:
     """Features that hold a contact's covariates alone, with the error that another sensor makes."""
     rng = np.random.default_rng(3)

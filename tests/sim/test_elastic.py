@@ -122,3 +122,26 @@ def test_a_thick_layer_is_a_half_space_and_share_zero_too():
         deep = build(plan, 1.0, POISSON, float("inf"), 1.0, jnp.float32)
         np.testing.assert_allclose(build(plan, 1.0, POISSON, 3000.0, 1.0, jnp.float32), deep, rtol=0.02, atol=2e-4)
         np.testing.assert_allclose(build(plan, 1.0, POISSON, 2.0, 0.0, jnp.float32), deep, atol=1e-6)
+
+
+def test_the_tangential_kernels_of_a_layer_are_those_of_its_symbols():
+    """A smooth traction along x moves a layer by the sum over waves of what each wave is moved by."""
+    n, pitch, poisson, thickness = 64, 0.2, 0.48, 2.0
+    x, y = np.meshgrid(*[(np.arange(n) - (n - 1) / 2) * pitch] * 2)
+    load = np.exp(-(x**2 + y**2) / (2 * 0.5**2))
+    wave = 2 * np.pi * np.fft.fftfreq(8 * n, pitch)
+    wave_x, wave_y = np.meshgrid(wave, wave)
+    wave = np.hypot(wave_x, wave_y)
+    wave[0, 0] = 1e-9
+    _, along, across = (2 / wave * one for one in elastic.layer_symbols(np.minimum(wave * thickness, 300), poisson))
+    across /= 1 - poisson
+    cosine, sine = np.cos(np.arctan2(wave_y, wave_x)), np.sin(np.arctan2(wave_y, wave_x))
+    plan = Plan(n, n)
+    with jax.enable_x64(True):
+        xx, xy, _ = elastic.tangential_spectra(plan, pitch, poisson, thickness, 1.0, jnp.float64)
+        forward = plan.forward(jnp.asarray(load))
+        found = [np.asarray(plan.inverse(one)) * pitch for one in (plan.even(forward, xx), plan.odd(forward, xy))]
+    symbols = along * cosine**2 + across * sine**2, (along - across) * cosine * sine
+    for one, symbol, tolerance in zip(found, symbols, (0.01, 0.02), strict=True):
+        moved = np.fft.ifft2(np.fft.fft2(load, wave.shape) * symbol).real[:n, :n]
+        np.testing.assert_allclose(one, moved, atol=tolerance * np.abs(moved).max())

@@ -73,6 +73,14 @@ def test_objects_take_turns_and_a_seed_decides():
     assert not np.array_equal(other.place, again.place)
 
 
+def test_places_lie_evenly_within_three_millimetres():
+    """Of a disc of radius r a share of (r / 3)^2 lies within r: they do not crowd in its middle."""
+    within = np.array([np.sum(scene.draw_touch(SCENES, number, SPLITS).place ** 2) / 9 for number in range(600)])
+    assert within.max() <= 1
+    for share in (0.1, 0.25, 0.5, 0.75):
+        assert abs((within < share).mean() - share) < 0.06
+
+
 def test_one_device_of_each_sensor_mounted_straight():
     one = replace(SCENES, units="one")
     several = [recordings(one, number) for number in range(4)]

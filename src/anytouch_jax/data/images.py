@@ -277,11 +277,12 @@ def pictures_in(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
 
 
 def frame_numbers(names: Sequence[str]) -> list[int]:
-    """The numbers of frames in order: those at the end of their names where these count frames (some neighbours are one
-    apart), so that a frame left out is a gap; else 0, 1, 2, ..."""
+    """The numbers of frames in order: those at the end of their names where these count frames (a third of the steps or
+    more are one), so that a frame left out is a gap; else 0, 1, 2, ... (time stamps, of which two may be one apart)."""
     ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
     numbers = [int(end[1]) for end in ends if end]
-    counts = len(numbers) == len(names) and min((b - a for a, b in itertools.pairwise(numbers)), default=0) == 1
+    steps = [b - a for a, b in itertools.pairwise(numbers)]
+    counts = len(numbers) == len(names) and min(steps, default=0) == 1 and 3 * steps.count(1) >= len(steps)
     return numbers if counts else list(range(len(names)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from anytouch_jax.data.transforms import (
     vision_transform,
 )
 
-_gel = lru_cache(256)(decode)  # one for many frames; nobody writes into it
 TRIES = 20  # bad samples in a row before a slot gives up
 _REPLACE = 51
 
@@ -56,7 +55,7 @@ class Reader:
         # Nothing but the size: frames are resized once, unless the gel is to be taken off frames as they are.
         how = None if epoch is None or (plain and data.background == "subtract") else self._resized
         frames = [read_picture(self.manifest, row, how=how) for row in rows]
-        gel = self._background(int(rows[-1]), how or _gel) if data.background == "subtract" else None
+        gel = self._background(int(rows[-1]), how or self._gel) if data.background == "subtract" else None
         if epoch is None or plain:
             return touch_evaluation(frames if gel is None else subtract_background(frames, gel), size, out)
         rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
@@ -77,6 +76,12 @@ class Reader:
     def caption(self, row: int) -> str:
         """The caption of a row."""
         return str(self.manifest.value(row, "text"))
+
+    @cached_property
+    def _gel(self) -> Callable[[Path], np.ndarray]:
+        """Reads the untouched gel, one for many frames; nobody writes into it. Not kept longer than the reader: the
+        file may be replaced."""
+        return lru_cache(256)(decode)
 
     def _resized(self, file: Path) -> np.ndarray:
         """The picture of a file at the model's size, read-only; `touch_transform` finds nothing to resize any more."""

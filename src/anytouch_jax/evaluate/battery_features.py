@@ -19,7 +19,7 @@ from ..config import UserError
 from ..data.evaluation import evaluation
 from ..data.files import distinct_files
 from ..data.manifest import Manifest
-from ..data.packed import read_file
+from ..data.packed import read_file, split_packed
 from ..io.tree import flatten
 from . import baseline
 from .features import Encoder, Features, Join, Pooling, check_backgrounds, save_npz
@@ -28,7 +28,7 @@ Array = npt.NDArray[Any]
 Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
 
-VERSION = 2  # of what is computed; a change raises it
+VERSION = 3  # of what is computed; a change raises it
 BATCH = 64
 
 
@@ -177,16 +177,20 @@ def digest(encoder: Encoder) -> str:
 
 
 def pictures(table: Manifest, count: int = 32) -> str:
-    """SHA-256 over what tells other pictures under an equal table: the size and the time of change of every frame, the
-    bytes of every background and of some frames, evenly spaced. A copy of the folder is the same with its times."""
+    """SHA-256 over what tells other pictures under an equal table: the size and the time of change of every frame (of
+    its shard, where it is packed), the bytes of every background and of some frames, evenly spaced. A copy of the
+    folder is the same with its times."""
     found = hashlib.sha256()
     files = distinct_files(table, ("path", "background_path"))
     for row, column in zip(files.row, files.column, strict=True):
         with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
             file = table.file(int(row), column)
-            about = os.stat(file)
-            plain = f"{about.st_size} {about.st_mtime_ns} ".encode()
-            found.update(read_file(file) if column == "background_path" else plain)
+            if column == "background_path":
+                found.update(read_file(file))
+                continue
+            packed = split_packed(file)
+            about = os.stat(packed[0] if packed else file)
+            found.update(f"{about.st_size} {about.st_mtime_ns} ".encode())
     for row in np.unique(np.linspace(0, len(table) - 1, count).astype(int)):
         with contextlib.suppress(OSError, ValueError):  # one that cannot be read says so when it is wanted
             found.update(read_file(table.file(int(row))))

@@ -42,25 +42,33 @@ class Exported:
     about: dict[str, Any]
     _run: Any = field(repr=False)
 
-    def __call__(self, frames: Any, sensor: str | np.ndarray = UNIVERSAL) -> np.ndarray:
-        """Features f32 (B, E) of touches u8 RGB (B, T, H, W, 3); `sensor` is a name for all, or rows i32 (B,).
+    def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
+        """Features f32 (B, E) of touches u8 RGB (B, T, H, W, 3); `sensor` is a name for all, names (B,), or rows i32
+        (B,).
 
         Raises UserError for another shape or type, and for a sensor that the model does not know.
         """
-        frames, sensors = np.asarray(frames), self.about["sensors"]
+        frames = np.asarray(frames)
         wanted = (self.about["frames"], self.about["image_size"], self.about["image_size"], 3)
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(f"touches must be uint8 RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
-        if isinstance(sensor, str):
-            if sensor not in sensors:
-                raise UserError(f"sensor {sensor!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other")
-            rows = np.full(len(frames), sensors[sensor], np.int32)
-        else:
-            rows = np.asarray(sensor, np.int32)
-        if rows.shape != (len(frames),) or rows.min() < 0 or rows.max() >= len(sensors):
-            raise UserError(f"sensor rows must be 0 to {len(sensors) - 1}, one for each of the {len(frames)} touches")
-        return np.asarray(self._run(frames, rows))
+        rows = np.full(len(frames), sensor) if isinstance(sensor, str) else np.asarray(sensor)
+        if rows.dtype.kind in "UO":
+            rows = np.array([self._row(name) for name in rows.reshape(-1)], np.int32).reshape(rows.shape)
+        if rows.shape != (len(frames),) or rows.dtype.kind not in "iu":
+            raise UserError(
+                f"sensor rows must be one integer for each of the {len(frames)} touches, not {rows.dtype} {rows.shape}"
+            )
+        if rows.min() < 0 or rows.max() >= len(self.about["sensors"]):
+            raise UserError(f"sensor rows must be 0 to {len(self.about['sensors']) - 1}")
+        return np.asarray(self._run(frames, rows.astype(np.int32)))
+
+    def _row(self, name: Any) -> int:
+        sensors: dict[str, int] = self.about["sensors"]
+        if str(name) not in sensors:
+            raise UserError(f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other")
+        return sensors[str(name)]
 
 
 def load(path: str | Path) -> Exported:

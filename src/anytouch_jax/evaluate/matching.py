@@ -36,7 +36,7 @@ class MatchScore:
 
     `accuracy`: logits on the right side of 0, positives and negatives alike; `low`, `high`: its 95 % interval when the
     anchors' objects are drawn anew, None with fewer than two. `auc`: chance that a positive's logit is above a
-    negative's. `sensors_alone`: accuracy of the best rule that sees the two sensors only.
+    negative's. `sensors_alone`: accuracy of the best rule that sees the two sensors only (`best_rule`).
     """
 
     negatives: Negatives
@@ -62,7 +62,8 @@ def score_matching(run: str | Path, manifest: Manifest, rows: Array, features: A
         right, wrong = logits(features[anchor], features[positive]), logits(features[anchor], features[negative])
         correct = np.mean([right > 0, wrong <= 0], axis=0)
         sensor = manifest.codes("sensor")[rows]
-        guess = best_rule(*(sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)))
+        codes = [sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)]
+        guess = best_rule(codes[0], codes[1], anchor)
         low, high = mean_interval(correct, objects[anchor])
         count = len(np.unique(anchor))
         shares = (float(correct.mean()), low, high, auc(right, wrong), guess)
@@ -113,11 +114,20 @@ def auc(right: Array, wrong: Array) -> float:
     return float((below + upto).mean() / (2 * len(values)))
 
 
-def best_rule(right: Array, wrong: Array) -> float:
-    """Accuracy of the best rule that sees a code only: i64 (n,) of positives, (m,) of negatives, each class half."""
-    codes, place = np.unique(np.concatenate([right, wrong]), return_inverse=True)
-    shares = [np.bincount(part, minlength=len(codes)) / len(part) for part in np.split(place, [len(right)])]
-    return float(np.maximum(*shares).sum() / 2)
+def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
+    """Accuracy of the best rule that sees a code only: codes i64 (n,) of positives and of negatives, each class half.
+
+    It is learned on half of the anchors (`anchor` i64 (n,)) and scored on the other, then the halves change places:
+    scored where it was learned, it would find something in codes that say nothing. It guesses where it learned nothing.
+    """
+    names, place = np.unique(anchor, return_inverse=True)
+    half = (np.random.default_rng(0).permutation(len(names)) % 2)[place]
+    codes, code = np.unique(np.stack([right, wrong]), return_inverse=True)
+    code, yes = code.reshape(2, -1), np.empty((2, len(place)))
+    for side in (0, 1):
+        seen = [np.bincount(one[half != side], minlength=len(codes)) for one in code]
+        yes[:, half == side] = (0.5 + 0.5 * np.sign(seen[0] - seen[1]))[code[:, half == side]]
+    return float((yes[0].mean() + 1 - yes[1].mean()) / 2)
 
 
 def table(found: Sequence[MatchScore]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

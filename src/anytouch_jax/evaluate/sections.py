@@ -222,7 +222,8 @@ def matching_section(found: Sequence[matching.MatchScore], notes: Sequence[str])
     text = (
         "Did two touches, by two sensors, come from the same place (Eq. 5)? Positives and negatives count alike. "
         "Negatives are drawn from any sensor, which the two sensors alone partly give away, and from the positive's, "
-        "where they give away nothing. In brackets: 95 % over objects drawn anew."
+        "where they give away nothing. What the sensors alone give is learned on half of the touches and scored on the "
+        "other. In brackets: 95 % over objects drawn anew."
     )
     listed = "\n".join(f"- {note}" for note in notes)
     table = results.markdown(*matching.table(found)) if found else ""

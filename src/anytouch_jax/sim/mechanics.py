@@ -1,7 +1,8 @@
 """Frictionless normal contact of a gel with an object pressed in to a given depth: pressure, displacement, force.
 
 mm, kPa, N. The gel is a linear elastic half-space, or a layer bonded to a rigid plate where its thickness is finite;
-friction does not change the pressure (exact for an incompressible gel on a rigid object).
+friction does not change the pressure (exact for an incompressible half-space under a rigid object; on a bonded layer
+what pressing moves sideways, up to about a fifth of the dent, is left out).
 """
 
 from __future__ import annotations

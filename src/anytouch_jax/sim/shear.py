@@ -1,7 +1,8 @@
 """Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial slip, full slip).
 
-The pressure is given; the coupling of normal and tangential motion (zero for an incompressible gel) is left out, as in
-Cattaneo's and Mindlin's solutions. mm, kPa, N, rad; x to the right, y down, twist positive from x to y.
+The pressure is given; the coupling of normal and tangential motion is left out, as in Cattaneo's and Mindlin's
+solutions: on an incompressible half-space it is zero, but pressing alone moves the surface of a bonded layer sideways,
+by up to about a fifth of the dent. mm, kPa, N, rad; x to the right, y down, twist positive from x to y.
 """
 
 from __future__ import annotations

@@ -52,6 +52,26 @@ def test_contact_photographs_captions_and_backgrounds(tmp_path, read):
     assert len([c for c in table.clips(3) if table.rows[c[0]]["split"] == "train"]) == 2
 
 
+def test_a_background_is_any_frame_of_a_recording_and_one_that_is_not_there_is_counted(tmp_path, read):
+    _recording(tmp_path, count=60)
+    late, lost = _names(60)[55], "0-9.000001.jpg"
+    keys = [f"{REC}/tactile/{name}" for name in _names(3)]
+    contact = {
+        "tactile": keys,
+        "background": [f"{REC}/tactile/{late}", f"{REC}/tactile/{lost}", "digit_background.png"],
+    }
+    (tmp_path / "hct/data1/contact.json").write_text(json.dumps(contact))
+    table = read("tvl")
+    behind = [table.rows[f"hct/data1/{key}"]["background_path"] for key in keys]
+    assert behind == [f"hct/data1/{REC}/tactile/{late}", None, None]
+    assert table.reasons["background named and not on disk (kept without)"] == 2
+    fill(tmp_path, ["hct/data1/digit_background.png"])
+    table = read("tvl")
+    behind = [table.rows[f"hct/data1/{key}"]["background_path"] for key in keys]
+    assert behind[1:] == ["hct/data1/digit_background.png"] * 2
+    assert table.reasons["background named and not on disk (digit_background.png instead)"] == 1
+
+
 def test_frames_are_matched_by_their_number_not_by_a_prefix(tmp_path, read):
     _recording(tmp_path, count=21)
     _contact(tmp_path, [1, 11, 12])

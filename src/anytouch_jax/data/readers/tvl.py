@@ -20,7 +20,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -85,6 +84,10 @@ def _part(rows: Rows, notes: Notes, folder: Path, prefix: str, pairs: dict[str, 
     spare = folder / "digit_background.png"
     common = f"{prefix}{folder.name}/{spare.name}" if spare.is_file() else None
     found = 0
+    held = {
+        place: {name for _, name in pair.get("vision" if place in turned else "tactile", [])}
+        for place, pair in pairs.items()
+    }
     for place, pair in pairs.items():
         touch, sight = ("vision", "tactile") if place in turned else ("tactile", "vision")
         frames, photos = pair.get(touch, []), {name for _, name in pair.get(sight, [])}
@@ -96,7 +99,15 @@ def _part(rows: Rows, notes: Notes, folder: Path, prefix: str, pairs: dict[str, 
         parts = ["test" if key in tests else "train" for key in keys] if tests or captions else [
             hash_split("tvl", place, options)] * len(keys)  # fmt: skip
         split = ["background" if one is False else part for one, part in zip(hit, parts, strict=True)]
-        behind: list[Any] = [backgrounds.get(key) for key in keys]
+        named = [backgrounds.get(key) for key in keys]
+        behind = [_known(one, held, turned, folder.name, prefix) for one in named]
+        lost = [
+            one
+            for one, file in zip(named, behind, strict=True)
+            if one and file is None and not (common and Path(one).name == spare.name)
+        ]
+        instead = f"{spare.name} instead" if common else "kept without"
+        notes.skip(f"background named and not on disk ({instead})", f"{folder.name}/{next(iter(lost), '')}", len(lost))
         rows.add(
             [f"{prefix}{place}/{touch}/{name}" for _, name in frames],
             sensor="digit",
@@ -104,23 +115,22 @@ def _part(rows: Rows, notes: Notes, folder: Path, prefix: str, pairs: dict[str, 
             frame_index=[number for number, _ in frames],
             split=split,
             image_path=[f"{prefix}{place}/{sight}/{name}" if name in photos else None for _, name in frames],
-            background_path=[_known(one, pairs, turned, folder.name, prefix) or common for one in behind],
+            background_path=[one or common for one in behind],
             text=[captions.get(key) for key in keys],
             **{"label.contact": [None if one is None else int(one) for one in hit]},
         )
     notes.skip("listed contact frame that is not on disk", str(folder), len(contact) - found if contact else 0)
 
 
-def _known(path: str | None, pairs: dict[str, dict[str, Frames]], turned: set[str], part: str,
-           prefix: str) -> str | None:  # fmt: skip
-    """The background named in contact.json, where it is a frame on disk, in the folder that holds the touch."""
+def _known(path: str | None, held: dict[str, set[str]], turned: set[str], part: str, prefix: str) -> str | None:
+    """The background named in contact.json, where it is a frame on disk, in the folder that holds the touch; `held`:
+    names of the touch frames by recording."""
     match = re.fullmatch(r"([^/]+)/(?:tactile|vision)/([^/]+)", path or "")
     if not match:
         return None
     place = f"{part}/{match[1]}"
     side = "vision" if place in turned else "tactile"
-    there = place in pairs and any(name == match[2] for _, name in pairs[place].get(side, [])[:50])
-    return f"{prefix}{place}/{side}/{match[2]}" if there else None
+    return f"{prefix}{place}/{side}/{match[2]}" if match[2] in held.get(place, ()) else None
 
 
 def _key(path: str) -> str:

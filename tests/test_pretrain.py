@@ -459,6 +459,21 @@ def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path
     assert json.loads((tmp_path / "r" / "config.json").read_text())["model"]["sensors"] == list(names)
 
 
+def test_the_authors_weights_start_sensors_that_they_never_saw_from_the_universal_tokens(world, tmp_path):
+    config, init = run_config(world), tmp_path / "authors.safetensors"
+    params = build(config.model).init(jax.random.key(5))
+    release.write_safetensors(init, release.to_release(params, config.model), {"format": "pt"})
+    first = train(config, tmp_path / "r", init=init, stop_after=1).params["touch"]["sensor_tokens"]  # at a rate of 0
+    stored = np.asarray(params["touch"]["sensor_tokens"])
+    for row in range(len(SENSORS)):
+        np.testing.assert_array_equal(first[row], stored[row if row < 5 else -1], err_msg=SENSORS[row])
+    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == list(SENSORS[:5])
+    said: list[str] = []
+    train(run_config(world, model={"sensors": ("digit", "gelsight_mini", "universal")}), tmp_path / "few", said,
+          init=init, stop_after=0)  # fmt: skip
+    assert any(line.startswith(f"the tokens of gelsight, gelslim, duragel in {init} are left behind") for line in said)
+
+
 def test_tokens_of_a_sensor_that_are_left_behind_are_told_of(world, tmp_path):
     config = run_config(world)
     wide = replace(config.model, sensors=(*config.model.sensors[:-1], "my_gel", config.model.sensors[-1]))

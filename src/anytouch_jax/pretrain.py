@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, SENSORS, Config, UserError, from_json
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, UserError, from_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import sources
 from anytouch_jax.data import text as texts
@@ -34,7 +34,6 @@ from anytouch_jax.train.watch import silent
 Params = dict[str, Any]
 Say = Callable[[str], None]
 SCRATCH_VOCABULARY, TOKENIZER = 2048, "tokenizer.json"
-RELEASED = SENSORS[:5]  # what the authors' weights were trained on
 _NO_CLIP = "towers=pretrained needs CLIP weights: --clip <folder or file>, with tokenizer.json beside them"
 
 
@@ -188,7 +187,7 @@ def _seen_by(before: Path) -> set[str]:
             return set(checkpoint.read_metadata(before).get("seen", ()))
         return set()
     told = release.read_metadata(_weights_file(before)).get(release.SEEN_KEY)
-    return set(RELEASED if told is None else told.split(","))
+    return set(release.RELEASED if told is None else told.split(","))
 
 
 def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tuple[Config, Any]:
@@ -304,8 +303,10 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
         weights = release.read_weights(file)
         detected = release.model_of(file, weights)
         about = release.read_metadata(file)
-        shown, seen = about.get(release.BACKGROUND_KEY, "keep"), about.get(release.SEEN_KEY, "").split(",")
-        params, stored = release.to_params(weights, detected), detected.sensors
+        shown, known = about.get(release.BACKGROUND_KEY, "keep"), release.seen_by_file(about, detected)
+        params, stored, seen = release.to_params(weights, detected), detected.sensors, known or ()
+        if known is not None and "touch" in params:
+            params |= {"touch": release.serve_unseen(params["touch"], detected, known, universal_drawn=True)}
         if "decoder" in params:  # else it is refused below
             guessed = release.MODEL_KEY not in about  # its heads are, where it does not tell
             _same_form(file, detected, config, _SHAPES if guessed else (*_SHAPES, *_UNSEEN))

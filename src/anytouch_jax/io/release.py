@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, UNIVERSAL, Config, Model
+from anytouch_jax.config import SENSORS, UNIVERSAL, Model
 from anytouch_jax.io.detect import (
     BACKGROUND_KEY,
     MODEL_KEY,
@@ -26,6 +26,7 @@ from anytouch_jax.io.detect import (
 )
 from anytouch_jax.io.names import Entry, Layout, entries, is_left_out, unused
 from anytouch_jax.io.resize import resize_position
+from anytouch_jax.io.sensors import RELEASED, match_sensors, seen_by_file, serve_unseen, served
 from anytouch_jax.io.shapes import Shape, param_shapes
 from anytouch_jax.io.tensors import (
     WeightsError,
@@ -42,6 +43,7 @@ from anytouch_jax.io.tree import flatten, nest
 __all__ = [
     "BACKGROUND_KEY",
     "MODEL_KEY",
+    "RELEASED",
     "SEEN_KEY",
     "WeightsError",
     "clip_to_touch",
@@ -55,7 +57,9 @@ __all__ = [
     "read_weights",
     "release_names",
     "release_shapes",
+    "seen_by_file",
     "serve_unseen",
+    "served",
     "to_params",
     "to_release",
     "told_activation",
@@ -191,44 +195,6 @@ def first_params(params: Params, model: Model, *, stage1: Params | None = None, 
     if stage1 is not None:
         merged = _grafted(merged, {part: stage1[part] for part in ("touch", "decoder")})
     return merged
-
-
-def match_sensors(tokens: np.ndarray, stored: Sequence[str], wanted: Sequence[str]) -> np.ndarray:
-    """Sensor tokens (R, 5, D) of the table `stored`, rearranged by name for `wanted`.
-
-    A sensor that is not stored starts from the universal tokens, which were trained to serve it.
-    """
-    return np.stack([tokens[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
-
-
-def serve_unseen(touch: Params, model: Model, seen: Sequence[str], *, universal_drawn: bool) -> Params:
-    """A touch encoder whose rows of sensors never `seen` in training are the universal ones (Sec. 3.5: at inference).
-
-    Where training never drew the universal row either (`universal_drawn`), that row is the mean of those seen. Covers
-    the sensor tokens, and the patch kernels where each sensor has its own.
-    """
-    rows = [row for row, name in enumerate(model.sensors) if name in seen and name != UNIVERSAL]
-    unseen = [row for row in range(len(model.sensors)) if row not in rows]
-    if not rows:
-        return touch
-
-    def served(table: np.ndarray) -> np.ndarray:
-        table = np.array(table)
-        table[unseen] = table[model.universal_row] if universal_drawn else table[rows].mean(axis=0)
-        return table
-
-    touch = touch | {"sensor_tokens": served(touch["sensor_tokens"])}
-    if model.patch_encoder == "sensor":
-        touch |= {"patch": {"kernel": served(touch["patch"]["kernel"])}}
-    return touch
-
-
-def served(params: Params, config: Config, told: Mapping[str, Any]) -> Params:
-    """The parameters of a run as they are used: sensors that it never saw (its metadata `told`) by `serve_unseen`."""
-    if "touch" not in params or "seen" not in told:
-        return params
-    drawn = config.objective.universal_start + config.objective.universal_end > 0
-    return params | {"touch": serve_unseen(params["touch"], config.model, told["seen"], universal_drawn=drawn)}
 
 
 def resized(params: Params, patches: int) -> Params:

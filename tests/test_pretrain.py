@@ -264,6 +264,22 @@ def test_clip_weights_of_another_activation_are_refused(world, tmp_path, file, t
         assert "model.safetensors was trained with quick_gelu" in message and "--model.activation quick_gelu" in message
 
 
+def test_clip_weights_of_another_size_are_one_short_sentence(world, tmp_path):
+    config, _ = clip_folder(tmp_path / "clip", run_config(world, 2, towers="pretrained"))
+    stack = replace(config.model.touch, width=32)
+    wide = replace(config, model=replace(config.model, touch=stack, image=stack))
+    stage1 = run_config(world, model={"touch": replace(config.model.touch, depth=1), "patch": 14})
+    for name, one, told in (
+        ("image tower", wide, "width 32, depth 2 and patches of 7"),
+        ("touch encoder", stage1, "width 16, depth 1 and patches of 14"),
+    ):
+        message = refused(one, tmp_path / "r", clip=tmp_path / "clip")
+        assert (
+            f"model.safetensors has width 16, depth 2 and patches of 7, this run's {name} {told}: --preset" in message
+        )
+        assert "large is for ViT-L/14, --preset base for ViT-B/16" in message and len(message) < 400
+
+
 # Mistakes -----------------------------------------------------------------------------------------------------------
 
 

@@ -1,7 +1,7 @@
 """Weights of PyTorch projects in and out, without importing torch: the authors' AnyTouch, HF CLIP, OpenCLIP.
 
 `read_weights` gives the arrays of a file by its own names, `to_params` a parameter tree, `to_release` the way back.
-Every key is accounted for: one error lists all that are unknown, missing or of another shape.
+Every key is accounted for: one error tells how many are unknown, missing or of another shape, and names the first ones.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ __all__ = [
 Params = dict[str, Any]
 Weights = Mapping[str, np.ndarray]
 
+_SHOWN = 6  # names listed in one error message
 _HEAD = frozenset(("head.weight", "head.bias"))
 
 
@@ -97,8 +98,8 @@ def to_params(weights: Weights, model: Model, *, ignore: Collection[str] = ()) -
 
     The file's layout is detected. Towers and heads that `model` does not have, buffers, the authors' unused arrays
     (golden Q2) and the keys in `ignore` are left out. Position tables of another image size are resized (bicubic, the
-    grid only). A probe file gives its classifier as `head`. Raises WeightsError that lists every key that is
-    unknown, missing or of another shape.
+    grid only). A probe file gives its classifier as `head`. Raises WeightsError that counts the keys that
+    are unknown, missing or of another shape, and names the first of each.
     """
     layout = detect_layout(weights)
     shapes = param_shapes(model)
@@ -260,11 +261,17 @@ def _account(
         if tuple(array.shape) != wanted[key]
     ]
     lists = {"unknown keys": unknown, "missing keys": missing, "other shapes": shapes}
-    problems = [f"{title} ({len(rows)}): {', '.join(rows)}" for title, rows in lists.items() if rows]
+    problems = [f"{title} ({len(rows)}): {_few(rows)}" for title, rows in lists.items() if rows]
     if problems:
         raise WeightsError(
             f"the {layout} weights do not fit this model; {'; '.join(problems)}{_hint(unknown, missing)}"
         )
+
+
+def _few(rows: Sequence[str]) -> str:
+    """The first rows; other sizes alone can be of hundreds of keys."""
+    more = len(rows) - _SHOWN
+    return ", ".join(rows) if more <= 0 else f"{', '.join(rows[:_SHOWN])} and {more} more"
 
 
 def _hint(unknown: Sequence[str], missing: Sequence[str]) -> str:
@@ -282,7 +289,7 @@ def _hint(unknown: Sequence[str], missing: Sequence[str]) -> str:
 
 
 def _compare(what: str, flat: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
-    """Raise WeightsError that lists every parameter that is missing, unknown or of another shape."""
+    """Raise WeightsError that names the first parameters that are missing, unknown or of another shape."""
     problems = [f"{name} is missing" for name in wanted if name not in flat]
     problems += [f"{name} is unknown" for name in flat if name not in wanted]
     problems += [
@@ -291,7 +298,7 @@ def _compare(what: str, flat: Mapping[str, Any], wanted: Mapping[str, Shape]) ->
         if name in flat and tuple(flat[name].shape) != tuple(shape)
     ]
     if problems:
-        raise WeightsError(f"the {what} do not fit this model: {', '.join(problems)}")
+        raise WeightsError(f"the {what} do not fit this model: {_few(problems)}")
 
 
 def _grafted(params: Params, parts: Params) -> Params:

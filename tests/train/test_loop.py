@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -197,14 +198,22 @@ def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
     def batches(start, stop):
         return toy_batches(start, stop, bad=range(2, 100))
 
-    config = toy_config(save_every=2, max_skipped=4)
-    with pytest.raises(UserError, match="4 steps in a row, up to step 5"):
+    config = toy_config(save_every=2, max_skipped=3)
+    with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* in another run folder$"):
         run(tmp_path, config, batches=batches)
     assert [row["step"] for row in rows(tmp_path)] == list(range(6))
     with pytest.raises(UserError, match="4 steps in a row, up to step 5"):  # going on recalls those before
         run(tmp_path, config, batches=batches)
     good = run(tmp_path, config, stop_after=8)
     assert good.step == 8 and good.resumed == 4
+
+
+def test_as_many_skipped_in_a_row_as_may_be_go_on(tmp_path):
+    for most, bad in ((3, range(2, 5)), (0, ())):
+        config = toy_config(save_every=0, max_skipped=most)
+        assert run(tmp_path / str(most), config, batches=partial(toy_batches, bad=bad), stop_after=6).step == 6
+    with pytest.raises(UserError, match="1 steps in a row, up to step 2"):
+        run(tmp_path / "none", config, batches=partial(toy_batches, bad=range(2, 3)))
 
 
 def test_metrics_are_fetched_while_the_next_step_runs(tmp_path, monkeypatch):

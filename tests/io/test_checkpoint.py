@@ -154,6 +154,33 @@ def test_a_save_that_failed_or_was_given_up_keeps_nobody_from_reading(tmp_path, 
             other.shutdown(wait=False)
 
 
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("when", ["checked", "_load"])
+def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatch, when, times):
+    """The one after it is read; where that happens again and again the user is told that, not of damage."""
+    filled(tmp_path, 1).close()
+    real, read = getattr(checkpoint, when), []
+
+    def pruned(folder, *more):
+        read.append(int(folder.name))
+        if len(read) <= times:
+            shutil.copytree(folder, tmp_path / f"{read[-1] + 1:08d}")
+            shutil.rmtree(folder)
+        return real(folder, *more)
+
+    monkeypatch.setattr(checkpoint, when, pruned)
+    if times == 2:
+        np.testing.assert_array_equal(load_params(tmp_path)[0]["half"], state_of(1).trainable["half"])
+    else:
+        with pytest.raises(CheckpointError, match=r"00000003 was removed while it was read; read the latest"):
+            load_params(tmp_path)
+    assert read == [1, 2, 3]
+    read.clear()
+    monkeypatch.setattr(checkpoint, when, lambda folder, *more: (shutil.rmtree(folder), real(folder, *more)))
+    with pytest.raises(CheckpointError, match=r"was removed while it was read"):
+        load_params(tmp_path, steps(tmp_path)[0])
+
+
 def test_state_may_be_donated_or_changed_at_once(tmp_path):
     start = {"trainable": {"big": jnp.arange(1 << 21, dtype=jnp.float32)}}
     numbers = np.arange(1 << 16)

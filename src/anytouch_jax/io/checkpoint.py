@@ -44,6 +44,7 @@ Tree = Any
 _UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")  # being written or removed, by us or by Orbax
 _AVERAGE = "opt_state/ema/"
 _SHOWN = 5  # names listed in one error message
+_TRIES = 3  # to read the latest checkpoint of a run that goes on
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost
 
 
@@ -219,9 +220,19 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
 
     `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen`
     of the state together, their average where the run keeps one (optim.ema); the optimiser's other arrays are not read.
-    Raises CheckpointError.
+    Where the run goes on meanwhile and removes the latest, that after it is read. Raises CheckpointError.
     """
-    target = resolve(Path(folder), step)
+    for _ in range(_TRIES if step is None else 1):
+        target = resolve(Path(folder), step)
+        try:
+            return _params_of(target)
+        except (CheckpointError, OSError):
+            if target.is_dir():
+                raise
+    raise CheckpointError(f"checkpoint {target} was removed while it was read; read the latest one, or another step")
+
+
+def _params_of(target: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     record = checked(target)
     chosen = {
         name: np.zeros(like.shape, like.dtype)

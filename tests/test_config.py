@@ -129,6 +129,7 @@ def test_wrong_json_is_an_error_that_names_the_key():
     assert "config.model.patch must be int, not '14'" in spoilt(put("model", "patch", "14"))
     assert "config.run.steps must be int, not True" in spoilt(put("run", "steps", True))
     assert "config.run.steps must be int" in spoilt(put("run", "steps", 1.5))
+    assert "config.optim.learning_rate must be float, not True" in spoilt(put("optim", "learning_rate", True))
     assert "config.objective.norm_pix_loss must be bool" in spoilt(put("objective", "norm_pix_loss", 1))
     assert "config.recipe must be one of paper, release, not 'papr'" in spoilt(put("recipe", "papr"))
     assert "config.data.jitter must have 4 entries, not 3" in spoilt(put("data", "jitter", [0.1, 0.2, 0.3]))

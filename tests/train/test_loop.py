@@ -372,6 +372,9 @@ def test_reports_come_every_so_often_and_at_the_end_and_cannot_end_the_run(tmp_p
     run(tmp_path, toy_config(steps=8, figure_every=3), on_report=report, said=said)
     assert seen == [(step, ROWS, ["clip_head", "position", "still_head"]) for step in (3, 6, 8)]
     assert "no figures at step 3: RuntimeError: no display" in said
+    seen.clear()
+    run(tmp_path / "even", toy_config(steps=8, figure_every=4), on_report=report)
+    assert [step for step, *_ in seen] == [4, 8]  # the last one once, although it is the end too
 
 
 def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, monkeypatch):

@@ -190,6 +190,14 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert source == {"init": str(init), "clip": None}
 
 
+def test_the_tokenizer_made_of_the_captions_is_no_larger_than_was_asked_for(world, tmp_path):
+    config = clips_only(run_config(world, 2))
+    config = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=262)))
+    params = train(config, tmp_path / "r", stop_after=0).params
+    assert params["text"]["token"].shape == (262, 16)
+    assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == 262
+
+
 def test_stage_two_of_the_release(straight, world, tmp_path):
     run, _ = straight
     config = clips_only(run_config(world, 2, "release"))

@@ -204,7 +204,7 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
         captions = sources.captions(manifest, rows, aligned_text=config.data.aligned_text)
         if not captions:
             return config, None
-        tokenizer = texts.train(captions, SCRATCH_VOCABULARY)
+        tokenizer = texts.train(captions, min(SCRATCH_VOCABULARY, config.model.text.vocab))
     if config.towers == "pretrained":
         return config, tokenizer
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))

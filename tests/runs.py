@@ -69,6 +69,8 @@ def run_config(
     config = tiny_config(stage, recipe, towers, **(model or {}))
     data = replace(config.data, manifests=(str(manifest),), batch_size=batch)
     settings: dict[str, Any] = {"steps": steps, "save_every": steps, "figure_every": 0} | run
+    if config.model.text:  # room for the tokenizer that is trained on the captions
+        config = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=2048)))
     return replace(config, data=data, run=replace(config.run, **settings))
 
 

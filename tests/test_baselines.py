@@ -146,6 +146,12 @@ def test_train_refuses_a_baseline_that_does_not_fit(capsys: pytest.CaptureFixtur
     assert "t3 has no stage 2" in told("--baseline", "t3", "--stage", "2")
     init = ("--stage", "2", "--init", str(tmp_path))
     assert "--objective.match-keep does nothing in stage 1; leave it out" in told("--objective.match-keep", "0.5")
+    for option, value in (("match-head", "cosine"), ("lora-rank", "4"), ("temperature", "0.2")):
+        assert f"--model.{option} does nothing in stage 1; leave it out" in told(f"--model.{option}", value)
+    assert "--loader.negatives does nothing in stage 1" in told("--loader.negatives", "same_sensor")
+    clip = ("--stage", "2", "--towers", "pretrained", "--clip", str(tmp_path), "--model.temperature")
+    assert "--model.temperature does nothing with --clip, whose temperature is taken" in told(*clip, "0.2")
+    assert "there is no manifest" in told(*clip, "0.07")
     masked = ("--objective.mask-ratio", "0.5", *init)
     assert "--objective.mask-ratio does nothing in stage 2 without --objective.reconstruct" in told(*masked)
     for kept in (("--objective.reconstruct", *masked), ("--recipe", "release", *masked), ("--baseline", "t3")):

@@ -129,6 +129,7 @@ def test_wrong_json_is_an_error_that_names_the_key():
     assert "config.model.patch must be int, not '14'" in spoilt(put("model", "patch", "14"))
     assert "config.run.steps must be int, not True" in spoilt(put("run", "steps", True))
     assert "config.run.steps must be int" in spoilt(put("run", "steps", 1.5))
+    assert "config.optim.learning_rate must be float, not True" in spoilt(put("optim", "learning_rate", True))
     assert "config.objective.norm_pix_loss must be bool" in spoilt(put("objective", "norm_pix_loss", 1))
     assert "config.recipe must be one of paper, release, not 'papr'" in spoilt(put("recipe", "papr"))
     assert "config.data.jitter must have 4 entries, not 3" in spoilt(put("data", "jitter", [0.1, 0.2, 0.3]))
@@ -204,6 +205,32 @@ def test_numbers_out_of_range_are_errors(kind, options, message):
         replace(sound.get(kind) or kind(), **options)
 
 
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (Model, {"match_head": "cosin"}, "--model.match-head must be one of mlp, linear, cosine, none, not 'cosin'"),
+        (Model, {"dtype": "float16"}, "--model.dtype must be one of float32, bfloat16, float64, not 'float16'"),
+        (Optim, {"decay": "cosin"}, "--optim.decay must be one of linear, cosine, not 'cosin'"),
+        (Data, {"order": "alternating"}, "--loader.order must be one of alternate, random, not 'alternating'"),
+        (Data, {"background": "substract"}, "--loader.background must be one of keep, subtract, not 'substract'"),
+        (Data, {"require": ("image", "txt")}, r"--loader.require\[1\] must be one of image, text, not 'txt'"),
+        (Data, {"require": "image"}, "--loader.require must be a list, not 'image'"),
+        (Config, {"towers": "pretraned"}, "towers must be one of none, scratch, pretrained, not 'pretraned'"),
+        (Config, {"stage": 3}, "stage must be one of 1, 2, not 3"),
+        (Config, {"stage": "2"}, "stage must be one of 1, 2, not '2'"),
+    ],
+)
+def test_choices_that_there_are_not_are_errors(kind, options, message):
+    """From Python nothing else reads them: a slip would train something else."""
+    sound = {Model: preset("tiny").model, Config: preset("tiny")}
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        replace(sound.get(kind) or kind(), **options)
+    if kind is Config:
+        for stage in (1, 2):
+            with pytest.raises(ConfigError, match=f"^{message}$"):
+                preset("tiny", **{"stage": stage, **options})
+
+
 def test_numbers_that_mean_nothing_of_it_are_not():
     Objective(mask_ratio=0.0, universal_end=0.0, match_weight=0.0)
     Optim(learning_rate=0.0, warmup=0, clip_norm=None, ema=None)
@@ -215,7 +242,7 @@ def test_numbers_that_mean_nothing_of_it_are_not():
 def test_wrong_presets_are_errors():
     with pytest.raises(ConfigError, match="unknown preset 'huge'; choose one of tiny, small, base, large"):
         preset("huge")
-    with pytest.raises(ConfigError, match="unknown recipe"):
+    with pytest.raises(ConfigError, match="recipe must be one of paper, release, not 'papr'"):
         preset("tiny", recipe="papr")
     with pytest.raises(ConfigError, match="needs towers"):
         preset("tiny", stage=2, towers="none")

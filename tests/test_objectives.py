@@ -286,8 +286,9 @@ def test_cosine_matching_has_the_other_places_of_the_batch_as_negatives():
     assert float(metrics["match_accuracy"]) >= (logits.argmax(1) == np.arange(4)).mean()
 
 
-def test_patches_that_matching_drops_have_no_influence():
-    config = changed(CONFIG2, match_keep=0.25)
+@pytest.mark.parametrize(("share", "count"), [(0.25, 4), (0.01, 1)])  # one patch stays, however small the share
+def test_patches_that_matching_drops_have_no_influence(share, count):
+    config = changed(CONFIG2, match_keep=share)
     noise = jnp.asarray(RNG.random((3, 4, 16)), jnp.float32)
     match = MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR, floats(4, 1), SENSOR)
 
@@ -297,8 +298,8 @@ def test_patches_that_matching_drops_have_no_influence():
 
     slope = np.asarray(jax.grad(loss)(match.positive)).reshape(4, 4, 7, 4, 7, 3).transpose(0, 1, 3, 2, 4, 5)
     felt = np.abs(slope.reshape(4, 16, -1)).max(-1) > 0
-    kept = np.asarray(noise[1]).argsort(1)[:, :4]
-    np.testing.assert_array_equal(np.sort(np.nonzero(felt)[1].reshape(4, 4), 1), np.sort(kept, 1))
+    kept = np.asarray(noise[1]).argsort(1)[:, :count]
+    np.testing.assert_array_equal(np.sort(np.nonzero(felt)[1].reshape(4, count), 1), np.sort(kept, 1))
 
 
 @pytest.mark.parametrize("stage", [1, 2])

@@ -190,6 +190,14 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert source == {"init": str(init), "clip": None}
 
 
+def test_the_tokenizer_made_of_the_captions_is_no_larger_than_was_asked_for(world, tmp_path):
+    config = clips_only(run_config(world, 2))
+    config = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=262)))
+    params = train(config, tmp_path / "r", stop_after=0).params
+    assert params["text"]["token"].shape == (262, 16)
+    assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == 262
+
+
 def test_stage_two_of_the_release(straight, world, tmp_path):
     run, _ = straight
     config = clips_only(run_config(world, 2, "release"))
@@ -262,6 +270,22 @@ def test_clip_weights_of_another_activation_are_refused(world, tmp_path, file, t
     for path in (tmp_path / "clip", tmp_path / "clip" / "model.safetensors"):
         message = refused(run_config(world, stage, towers=towers), tmp_path / "r", clip=path)
         assert "model.safetensors was trained with quick_gelu" in message and "--model.activation quick_gelu" in message
+
+
+def test_clip_weights_of_another_size_are_one_short_sentence(world, tmp_path):
+    config, _ = clip_folder(tmp_path / "clip", run_config(world, 2, towers="pretrained"))
+    stack = replace(config.model.touch, width=32)
+    wide = replace(config, model=replace(config.model, touch=stack, image=stack))
+    stage1 = run_config(world, model={"touch": replace(config.model.touch, depth=1), "patch": 14})
+    for name, one, told in (
+        ("image tower", wide, "width 32, depth 2 and patches of 7"),
+        ("touch encoder", stage1, "width 16, depth 1 and patches of 14"),
+    ):
+        message = refused(one, tmp_path / "r", clip=tmp_path / "clip")
+        assert (
+            f"model.safetensors has width 16, depth 2 and patches of 7, this run's {name} {told}: --preset" in message
+        )
+        assert "large is for ViT-L/14, --preset base for ViT-B/16" in message and len(message) < 400
 
 
 # Mistakes -----------------------------------------------------------------------------------------------------------
@@ -457,6 +481,21 @@ def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path
     np.testing.assert_array_equal(new["allsight"], old["universal"])
     assert not np.array_equal(named, old["universal"])
     assert json.loads((tmp_path / "r" / "config.json").read_text())["model"]["sensors"] == list(names)
+
+
+def test_the_authors_weights_start_sensors_that_they_never_saw_from_the_universal_tokens(world, tmp_path):
+    config, init = run_config(world), tmp_path / "authors.safetensors"
+    params = build(config.model).init(jax.random.key(5))
+    release.write_safetensors(init, release.to_release(params, config.model), {"format": "pt"})
+    first = train(config, tmp_path / "r", init=init, stop_after=1).params["touch"]["sensor_tokens"]  # at a rate of 0
+    stored = np.asarray(params["touch"]["sensor_tokens"])
+    for row in range(len(SENSORS)):
+        np.testing.assert_array_equal(first[row], stored[row if row < 5 else -1], err_msg=SENSORS[row])
+    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == list(SENSORS[:5])
+    said: list[str] = []
+    train(run_config(world, model={"sensors": ("digit", "gelsight_mini", "universal")}), tmp_path / "few", said,
+          init=init, stop_after=0)  # fmt: skip
+    assert any(line.startswith(f"the tokens of gelsight, gelslim, duragel in {init} are left behind") for line in said)
 
 
 def test_tokens_of_a_sensor_that_are_left_behind_are_told_of(world, tmp_path):

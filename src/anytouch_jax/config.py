@@ -15,7 +15,7 @@ from anytouch_jax.model import FIELD_SENSORS as FIELD_SENSORS
 from anytouch_jax.model import SENSORS as SENSORS
 from anytouch_jax.model import UNIVERSAL as UNIVERSAL
 from anytouch_jax.model import Model, Stack, TextTower
-from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NORMAL, NOT_NEGATIVE, SEED, SHARE, build, in_range
+from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NORMAL, NOT_NEGATIVE, SEED, SHARE, build, chosen, in_range
 from anytouch_jax.strict_json import ConfigError as ConfigError
 from anytouch_jax.strict_json import UserError as UserError
 
@@ -86,6 +86,7 @@ class Optim:
     accumulate: int = 1  # batches whose gradients make one update
 
     def __post_init__(self) -> None:
+        chosen("--optim.", self)
         in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=BELOW_1, accumulate=COUNT)
         in_range("--optim.", self, eps=NORMAL)  # without it a gradient of 0 is divided by 0
         others = ("learning_rate", "min_rate", "warmup", "weight_decay")
@@ -125,6 +126,7 @@ class Data:
     on_bad_sample: Literal["error", "skip"] = "error"  # a file that cannot be read: stop, or replace and count it
 
     def __post_init__(self) -> None:
+        chosen("--loader.", self)
         in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE)
         others = ("affine", "jitter", "rotation", "threads", "prefetch", "cache")
         in_range("--loader.", self, **dict.fromkeys(others, NOT_NEGATIVE))
@@ -161,6 +163,9 @@ class Config:
     optim: Optim = field(default_factory=Optim)
     data: Data = field(default_factory=Data)
     run: Run = field(default_factory=Run)
+
+    def __post_init__(self) -> None:
+        chosen("", self)
 
     @property
     def warmup(self) -> int:
@@ -227,6 +232,7 @@ def preset(
     """
     if name not in _PRESETS:
         raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(_PRESETS)}")
+    build(Towers, towers, "towers")  # stage 1 has none, but a slip is a slip
     full, image, batch = _PRESETS[name]
     config = Config(
         model=replace(full, text=None),
@@ -254,8 +260,6 @@ def preset(
             optim=replace(config.optim, decay="cosine"),
             data=replace(config.data, order="random", split_steps=stage == 2),
         )
-    elif recipe != "paper":
-        raise ConfigError(f"unknown recipe {recipe!r}; choose paper or release")
     return config
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from anytouch_jax.strict_json import ABOVE_0, COUNT, NOT_NEGATIVE, ConfigError, in_range
+from anytouch_jax.strict_json import ABOVE_0, COUNT, NOT_NEGATIVE, ConfigError, chosen, in_range
 
 UNIVERSAL = "universal"
 SENSORS = (
@@ -74,6 +74,7 @@ class Model:
     remat: bool = False  # activations are computed again, not kept: less memory, slower
 
     def __post_init__(self) -> None:
+        chosen("--model.", self)
         in_range("--model.", self, image_size=COUNT, patch=COUNT, embed=COUNT, frames=COUNT, temperature=ABOVE_0)
         in_range("--model.", self, sensor_tokens=NOT_NEGATIVE, lora_rank=NOT_NEGATIVE)
         in_range("--model.", self, norm_eps=NOT_NEGATIVE, decoder_norm_eps=NOT_NEGATIVE)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,14 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, SENSORS, Config, UserError, from_json
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, UserError, from_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data import sources
 from anytouch_jax.data import text as texts
 from anytouch_jax.data.loader import Loader
 from anytouch_jax.evaluate import figures
-from anytouch_jax.io import checkpoint, release
+from anytouch_jax.io import checkpoint, fits, release
 from anytouch_jax.io.record import steps
-from anytouch_jax.model import Model
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
@@ -34,7 +32,6 @@ from anytouch_jax.train.watch import silent
 Params = dict[str, Any]
 Say = Callable[[str], None]
 SCRATCH_VOCABULARY, TOKENIZER = 2048, "tokenizer.json"
-RELEASED = SENSORS[:5]  # what the authors' weights were trained on
 _NO_CLIP = "towers=pretrained needs CLIP weights: --clip <folder or file>, with tokenizer.json beside them"
 
 
@@ -188,7 +185,7 @@ def _seen_by(before: Path) -> set[str]:
             return set(checkpoint.read_metadata(before).get("seen", ()))
         return set()
     told = release.read_metadata(_weights_file(before)).get(release.SEEN_KEY)
-    return set(RELEASED if told is None else told.split(","))
+    return set(release.RELEASED if told is None else told.split(","))
 
 
 def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tuple[Config, Any]:
@@ -207,7 +204,7 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
         captions = sources.captions(manifest, rows, aligned_text=config.data.aligned_text)
         if not captions:
             return config, None
-        tokenizer = texts.train(captions, SCRATCH_VOCABULARY)
+        tokenizer = texts.train(captions, min(SCRATCH_VOCABULARY, config.model.text.vocab))
     if config.towers == "pretrained":
         return config, tokenizer
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
@@ -238,49 +235,19 @@ def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say
         raise UserError(_NO_CLIP)
     fresh = set(params) - ({"image", "text"} if clip else set())
     first = None if init is None else _load(Path(init), config, say, fresh)
-    weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config)
+    weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config, touch=init is None)
     if config.stage == 2 and init is None:
         say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
     return release.first_params(params, config.model, stage1=first, clip=weights)
 
 
-def _read_clip(file: Path, config: Config) -> dict[str, np.ndarray]:
-    """The arrays of CLIP weights."""
-    _same_activation(file, release.told_activation(file), config)
-    return release.read_weights(file)
-
-
-def _same_activation(path: Path, told: str | None, config: Config) -> None:
-    """Raise UserError where weights were trained with another activation than the run's; None: nothing tells."""
-    ours = config.model.activation
-    if told not in (None, ours):
-        raise UserError(f"{path} was trained with {told}, this run would use {ours}: add --model.activation {told}")
-
-
-def _same_size(path: Path, before: Config, config: Config) -> None:
-    """Raise UserError where a run is of another preset than this one, and of towers of another size."""
-    theirs, ours = ((model.touch.width, model.touch.depth) for model in (before.model, config.model))
-    if theirs != ours and before.preset not in (config.preset, "custom"):
-        raise UserError(
-            f"{path} is of preset {before.preset} and this run would be of preset {config.preset}: add --preset "
-            f"{before.preset}"
-        )
-
-
-_SHAPES: tuple[str, ...] = ("patch", "embed", "frames", "sensor_tokens")
-_SHAPES += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
-_UNSEEN = ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")  # no shape hangs on them
-
-
-def _same_form(path: Path, before: Model, config: Config, names: Sequence[str] = (*_SHAPES, *_UNSEEN)) -> None:
-    """Raise UserError, with all the options that are missing, where weights are of a network of another form."""
-    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in names}
-    other = {name: (theirs, ours) for name, (theirs, ours) in pairs.items() if theirs != ours}
-    if other:
-        told = ", ".join(f"{name} {theirs}" for name, (theirs, _) in other.items())
-        used = ", ".join(str(ours) for _, ours in other.values())
-        options = " ".join(f"--model.{name.replace('_', '-')} {theirs}" for name, (theirs, _) in other.items())
-        raise UserError(f"{path} was trained with {told}, this run would use {used}: add {options}")
+def _read_clip(file: Path, config: Config, *, touch: bool) -> dict[str, np.ndarray]:
+    """The arrays of CLIP weights, for the towers and, where asked for, the touch encoder."""
+    fits.same_activation(file, release.told_activation(file), config)
+    weights = release.read_weights(file)
+    if release.detect_layout(weights) in ("clip", "openclip"):
+        fits.same_towers(file, release.detect_model(weights), config, touch=touch)
+    return weights
 
 
 def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
@@ -293,22 +260,24 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
     if path.is_dir() and not any(path.glob("*.pth")):
         params, text, told = checkpoint.load_params(path)
         before = from_json(text)
-        _same_size(path, before, config)
-        _same_activation(path, before.model.activation, config)
-        _same_form(path, before.model, config)
+        fits.same_size(path, before, config)
+        fits.same_activation(path, before.model.activation, config)
+        fits.same_form(path, before.model, config)
         params = release.served(params, before, told)
         stored, shown, seen = before.model.sensors, before.data.background, told.get("seen", ())
     else:
         file = _weights_file(path)
-        _same_activation(file, release.told_activation(file), config)
+        fits.same_activation(file, release.told_activation(file), config)
         weights = release.read_weights(file)
         detected = release.model_of(file, weights)
         about = release.read_metadata(file)
-        shown, seen = about.get(release.BACKGROUND_KEY, "keep"), about.get(release.SEEN_KEY, "").split(",")
-        params, stored = release.to_params(weights, detected), detected.sensors
+        shown, known = about.get(release.BACKGROUND_KEY, "keep"), release.seen_by_file(about, detected)
+        params, stored, seen = release.to_params(weights, detected), detected.sensors, known or ()
+        if known is not None and "touch" in params:
+            params |= {"touch": release.serve_unseen(params["touch"], detected, known, universal_drawn=True)}
         if "decoder" in params:  # else it is refused below
             guessed = release.MODEL_KEY not in about  # its heads are, where it does not tell
-            _same_form(file, detected, config, _SHAPES if guessed else (*_SHAPES, *_UNSEEN))
+            fits.same_form(file, detected, config, fits.SHAPES if guessed else (*fits.SHAPES, *fits.UNSEEN))
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
     if shown != config.data.background:

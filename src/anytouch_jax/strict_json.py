@@ -1,9 +1,9 @@
-"""Reading dataclasses from JSON strictly, ranges of numbers, and the errors that every room raises for a user's
-mistake."""
+"""Reading dataclasses from JSON strictly, ranges, choices, and the errors that all rooms raise for a user's mistake."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
@@ -45,8 +45,29 @@ def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
         value = getattr(settings, name)
         for number in value if isinstance(value, tuple) else (value,):
             if number is not None and not (low <= number <= high and number < FLOAT32):
-                spelled = f"{prefix}{name.replace('_', '-')}" if prefix else name
-                raise ConfigError(f"{spelled} must be {words}, not {number}")
+                raise ConfigError(f"{_spelled(prefix, name)} must be {words}, not {number}")
+
+
+def chosen(prefix: str, settings: Any) -> None:
+    """Raise ConfigError for a field of `settings` that is none of the choices (Literal) of its annotation; `prefix` as
+    for `in_range`. Of a tuple every entry counts."""
+    kind: Any = type(settings)
+    for name, hint in _choices(kind).items():
+        build(hint, getattr(settings, name), _spelled(prefix, name))
+
+
+@functools.cache
+def _choices(kind: type) -> dict[str, Any]:
+    """The annotations of those fields of a dataclass that have choices, by name."""
+
+    def has_some(hint: Any) -> bool:
+        return typing.get_origin(hint) is Literal or any(map(has_some, typing.get_args(hint)))
+
+    return {name: hint for name, hint in typing.get_type_hints(kind).items() if has_some(hint)}
+
+
+def _spelled(prefix: str, name: str) -> str:
+    return f"{prefix}{name.replace('_', '-')}" if prefix else name
 
 
 def build(kind: Any, value: Any, where: str) -> Any:

@@ -404,7 +404,7 @@ def test_no_vision_and_no_text_give_no_slots(make, settings):
     assert batch.image.shape == (0, 28, 28, 3) and batch.image_row.shape == (0,)
     assert batch.text.shape == batch.text_mask.shape == (0, 0) and batch.text_row.shape == (0,)
     assert loader.tokenizer is None
-    rows = [{"image_path": f"v{i}.png", "text": "words"} for i in range(8)]
+    rows = [{"image_path": f"v{i}.png", "text": "words", "touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
     config = settings(2)
     towerless = replace(config, model=replace(config.model, image=None, text=None))
     batch = Loader(make(rows), towerless).batch(0).align  # what has no tower is not read
@@ -483,7 +483,9 @@ def test_matching_triples_in_both_recipes(make, settings, read_back, rich):
 
 
 def test_joined_manifests_share_no_touch_by_accident(make, settings):
-    one, two = make([{"touch": "1"}], "one"), make([{"touch": "1", "sensor": "gelslim"}, {"touch": "2"}], "two")
+    seen = {"text": "a caption"}
+    one = make([{"touch": "1"} | seen], "one")
+    two = make([{"touch": "1", "sensor": "gelslim"} | seen, {"touch": "2"}], "two")
     for manifest in (one, two):
         write(manifest, manifest.files[0])
     loader = Loader(read([one.files[0], two.files[0]]), settings(2))
@@ -492,10 +494,27 @@ def test_joined_manifests_share_no_touch_by_accident(make, settings):
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
 def test_without_pairs_there_is_no_matching_and_it_is_said(make, settings, recipe):
-    loader = Loader(make([{"touch": f"p{i}"} for i in range(8)]), settings(2, recipe))
+    loader = Loader(make([{"touch": f"p{i}", "text": "words"} for i in range(8)]), settings(2, recipe))
     assert any("no cross-sensor matching" in note for note in loader.notes)
     for _, batch, _ in loader.stream(0, 6):
         assert batch.match is None and batch.align is not None
+
+
+def test_stage_two_with_nothing_to_learn_is_refused(make, settings):
+    """Its loss would be 0 at every step, and the run would end well."""
+    bare = [{"touch": f"p{i}"} for i in range(8)]
+    twice = [{"touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
+    seen, told = [{"image_path": f"v{i}.png"} for i in range(8)], [{"text": "words"} for _ in range(8)]
+    config = settings(2)
+    no_matching = replace(config, model=replace(config.model, match_head="none"))
+    no_vision = replace(config, model=replace(config.model, image=None))
+    no_text = replace(config, model=replace(config.model, text=None))
+    for rows, one in ((bare, config), (twice, no_matching), (seen, no_vision), (told, no_text)):
+        with pytest.raises(UserError, match="stage 2 has nothing to learn from split 'train': no photograph"):
+            Loader(make(rows), one)
+    for rows, one in ((twice, config), (seen, no_matching), (told, no_vision), (bare, settings(2, "release"))):
+        assert Loader(make(rows), one).steps_per_epoch
+    assert Loader(make(bare), settings(1)).steps_per_epoch
 
 
 def test_pairs_of_stills_only_match_stills_in_clip_steps(make, settings, read_back):

@@ -101,7 +101,7 @@ def test_weight_zero_leaves_a_dataset_out_of_stills_clips_and_matching(make, set
 
 
 def test_the_release_has_weights_of_its_own_where_its_datasets_are(make, settings):
-    there = make(_sets({"touch_and_go": 4, "octopi": 4, "x": 4}))
+    there = make(_sets({"touch_and_go": 4, "octopi": 4, "x": 4}, image_path="v.png"))
     release, paper = Loader(there, settings(2, "release")), Loader(there, settings(2))
     assert Loader(there, settings(1, "release")).steps_per_epoch == 3  # its stage 1 draws every row once
     assert release.steps_per_epoch == (8 + 12 + 4) // 4 and paper.steps_per_epoch == 3
@@ -205,7 +205,8 @@ def test_where_the_batch_is_the_negatives_they_are_of_one_sensor(make, settings,
 
 
 def test_without_such_negatives_there_is_no_matching_and_it_is_said(make, settings):
-    rows = [{"touch": "p", "sensor": name, "object": "o"} for name in ("digit", "gelslim")]
+    seen = {"text": "words"}
+    rows = [{"touch": "p", "sensor": name, "object": "o", **seen} for name in ("digit", "gelslim")]
     loader = Loader(make([*rows, {"touch": "q", "object": "r", "sensor": "duragel"}] * 2), settings(2))
     assert loader.batch(0).match is not None
     loader = Loader(loader.manifest, settings(2, negatives="same_sensor"))
@@ -243,5 +244,5 @@ def test_what_counts_as_set(make, values, set_):
 
 
 def test_all_text_withheld_means_no_text_slots(make, settings):
-    loader = Loader(make([{"text": "x", "downstream_test": "a"}] * 4), settings(2))
+    loader = Loader(make([{"text": "x", "downstream_test": "a", "image_path": "v.png"}] * 4), settings(2))
     assert len(loader.batch(0).align.text) == 0 and loader.tokenizer is None

@@ -9,6 +9,7 @@ import pytest
 from runs import run_config
 from tiny_models import touch_model
 
+from anytouch_jax.cli import main
 from anytouch_jax.config import Config, Data, UserError, from_json, to_json
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.images import decode
@@ -145,6 +146,30 @@ def test_an_encoder_of_a_weights_file(tmp_path):
         assert found.config.model.touch == here.touch
         wanted = Encoder(made.config, {"touch": params["touch"]}, "").embed(CLIPS[:, 0], "digit")
         np.testing.assert_allclose(found.embed(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
+
+
+def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_tokens(tmp_path):
+    """The release trained rows 0 to 4 of its table and the universal one; 5 to 8 are as they were drawn."""
+    params = build(touch_model()).init(jax.random.key(1))
+    stored = np.asarray(params["touch"]["sensor_tokens"])
+    authors, ours = release.to_release(params, touch_model()), {release.MODEL_KEY: to_json(touch_model())}
+    release.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
+    release.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
+    encoder, untold = (load_encoder(tmp_path / f"{name}.safetensors") for name in ("authors", "untold"))
+    assert encoder.seen == ("gelsight", "digit", "gelslim", "gelsight_mini", "duragel") and untold.seen is None
+    tokens = encoder.params["touch"]["sensor_tokens"]
+    for row in range(10):
+        np.testing.assert_array_equal(tokens[row], stored[row if row < 5 else 9])
+    np.testing.assert_array_equal(untold.params["touch"]["sensor_tokens"], stored)
+    said: list[str] = []
+    assert encoder.sensor_row("9dtact", said.append) == 5 and "was not drawn in training" in said[0]
+    # through `convert` the numbers of the file stay, and what they are of is told
+    assert main(["convert", str(tmp_path / "authors.safetensors"), str(tmp_path / "again.safetensors")]) == 0
+    again = release.read_weights(tmp_path / "again.safetensors")
+    np.testing.assert_array_equal(again["sensor_token"], stored)
+    found = load_encoder(tmp_path / "again.safetensors")
+    assert found.seen == encoder.seen
+    np.testing.assert_array_equal(found.params["touch"]["sensor_tokens"], tokens)
 
 
 def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):

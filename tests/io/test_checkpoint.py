@@ -10,6 +10,8 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +32,7 @@ from anytouch_jax.io.checkpoint import (
     read_metadata,
     steps,
 )
+from anytouch_jax.io.echoes import without_echoes
 from anytouch_jax.io.tensors import read_safetensors
 from anytouch_jax.io.tree import flatten, nest
 
@@ -97,6 +100,85 @@ def test_every_type_comes_back_bit_equal(tmp_path):
     saver.close()
     same(saver.restore(jax.eval_shape(lambda: with_nan)), with_nan)
     assert opened(tmp_path).latest() == 12
+
+
+def test_one_thread_saves_while_another_loads(tmp_path):
+    """Orbax runs one operation a process: each waits for the other's."""
+    filled(tmp_path / "read", 1).close()
+    saver, done, seen = opened(tmp_path / "written", keep=20), [], []
+
+    def load() -> None:
+        while not done:
+            seen.append(load_params(tmp_path / "read")[0]["logit_scale"])
+
+    with ThreadPoolExecutor(1) as other:
+        loading = other.submit(load)
+        try:
+            for step in range(1, 11):
+                saver.save(step, state_of(step), {"loss": 1.0})
+                if step % 3 == 0:  # the same thread, while its own save may run
+                    same(saver.restore(jax.eval_shape(state_of)), state_of(step))
+                    load_params(tmp_path / "read")
+            saver.close()
+        finally:
+            done.append(True)
+        loading.result()
+    assert steps(tmp_path / "written") == list(range(1, 11)) and len(seen) > 1
+    assert all(one == state_of(1).trainable["logit_scale"] for one in seen)
+
+
+def test_a_save_that_failed_or_was_given_up_keeps_nobody_from_reading(tmp_path, monkeypatch):
+    saver = filled(tmp_path, 1)
+    monkeypatch.setattr(checkpoint.ocp, "save_async", lambda *_: 1 / 0)
+    with pytest.raises(CheckpointError, match="division"):
+        saver.save(2, state_of(2), {})
+    load_params(tmp_path)
+
+    class _Never:
+        def result(self) -> None:
+            never.wait()
+
+    never = threading.Event()
+    monkeypatch.setattr(checkpoint.ocp, "save_async", lambda *_: _Never())
+    saver.save(3, state_of(3), {})
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.jax, "process_count", lambda: 2)
+        patch.setattr(checkpoint, "_PATIENCE", 0.1)
+        saver.leave(ValueError, ValueError("another process"), None)
+    with ThreadPoolExecutor(1) as other:
+        found = other.submit(load_params, tmp_path)
+        try:
+            found.result(timeout=60)
+        finally:
+            never.set()
+            other.shutdown(wait=False)
+
+
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("when", ["checked", "_load"])
+def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatch, when, times):
+    """The one after it is read; where that happens again and again the user is told that, not of damage."""
+    filled(tmp_path, 1).close()
+    real, read = getattr(checkpoint, when), []
+
+    def pruned(folder, *more):
+        read.append(int(folder.name))
+        if len(read) <= times:
+            shutil.copytree(folder, tmp_path / f"{read[-1] + 1:08d}")
+            shutil.rmtree(folder)
+        return real(folder, *more)
+
+    monkeypatch.setattr(checkpoint, when, pruned)
+    if times == 2:
+        np.testing.assert_array_equal(load_params(tmp_path)[0]["half"], state_of(1).trainable["half"])
+    else:
+        with pytest.raises(CheckpointError, match=r"00000003 was removed while it was read; read the latest"):
+            load_params(tmp_path)
+    assert read == [1, 2, 3]
+    read.clear()
+    monkeypatch.setattr(checkpoint, when, lambda folder, *more: (shutil.rmtree(folder), real(folder, *more)))
+    with pytest.raises(CheckpointError, match=r"was removed while it was read"):
+        load_params(tmp_path, steps(tmp_path)[0])
 
 
 def test_state_may_be_donated_or_changed_at_once(tmp_path):
@@ -419,7 +501,7 @@ def test_names_and_trees():
 
 def test_the_writes_after_the_one_that_failed_are_not_told_of():
     told: list[str] = []
-    hook = checkpoint._without_echoes(lambda kind, error, trace: told.append(str(error)))
+    hook = without_echoes(lambda kind, error, trace: told.append(str(error)))
     for error in (RuntimeError("Event loop is closed"), RuntimeError("no such thing"), OSError("Event loop is closed")):
         hook(type(error), error, None)
     assert told == ["no such thing", "Event loop is closed"]

@@ -159,6 +159,13 @@ def test_every_wrong_key_is_listed_at_once():
     assert "touch_projection.weight has (16, 12) instead of (12, 16)" in message
 
 
+def test_of_many_wrong_keys_a_handful_is_named():
+    wide = dataclasses.replace(STAGE1, touch=Stack(32, 4, 4, 24))
+    with pytest.raises(UserError, match=r"missing keys \(\d+\): .* and \d+ more; other shapes \(\d+\): ") as caught:
+        to_params(weights_of(STAGE1), wide)
+    assert str(caught.value).count(" and ") == 2 and len(str(caught.value)) < 1500
+
+
 @pytest.mark.parametrize(
     ("file", "wanted", "setting"),
     [

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -197,14 +198,22 @@ def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
     def batches(start, stop):
         return toy_batches(start, stop, bad=range(2, 100))
 
-    config = toy_config(save_every=2, max_skipped=4)
-    with pytest.raises(UserError, match="4 steps in a row, up to step 5"):
+    config = toy_config(save_every=2, max_skipped=3)
+    with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* in another run folder$"):
         run(tmp_path, config, batches=batches)
     assert [row["step"] for row in rows(tmp_path)] == list(range(6))
     with pytest.raises(UserError, match="4 steps in a row, up to step 5"):  # going on recalls those before
         run(tmp_path, config, batches=batches)
     good = run(tmp_path, config, stop_after=8)
     assert good.step == 8 and good.resumed == 4
+
+
+def test_as_many_skipped_in_a_row_as_may_be_go_on(tmp_path):
+    for most, bad in ((3, range(2, 5)), (0, ())):
+        config = toy_config(save_every=0, max_skipped=most)
+        assert run(tmp_path / str(most), config, batches=partial(toy_batches, bad=bad), stop_after=6).step == 6
+    with pytest.raises(UserError, match="1 steps in a row, up to step 2"):
+        run(tmp_path / "none", config, batches=partial(toy_batches, bad=range(2, 3)))
 
 
 def test_metrics_are_fetched_while_the_next_step_runs(tmp_path, monkeypatch):
@@ -363,6 +372,9 @@ def test_reports_come_every_so_often_and_at_the_end_and_cannot_end_the_run(tmp_p
     run(tmp_path, toy_config(steps=8, figure_every=3), on_report=report, said=said)
     assert seen == [(step, ROWS, ["clip_head", "position", "still_head"]) for step in (3, 6, 8)]
     assert "no figures at step 3: RuntimeError: no display" in said
+    seen.clear()
+    run(tmp_path / "even", toy_config(steps=8, figure_every=4), on_report=report)
+    assert [step for step, *_ in seen] == [4, 8]  # the last one once, although it is the end too
 
 
 def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, monkeypatch):

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import json
+import re
 import resource
 import signal
 
@@ -9,8 +12,8 @@ import numpy as np
 import pytest
 from train_toy import toy_config
 
-from anytouch_jax.config import UserError, from_json
-from anytouch_jax.train.record import Record, open_run
+from anytouch_jax.config import ConfigError, UserError, from_json, preset
+from anytouch_jax.train.record import Record, _flat, goes_on, open_run
 
 
 def lines(run_dir):
@@ -123,6 +126,59 @@ def test_other_settings_are_all_named_with_both_values(tmp_path):
         assert part in message
     assert message.count(" was ") == 3 + 1  # "the run was started"
     assert "choose another run folder" in message
+
+
+# What may change between the parts of a run: it decides where and how fast the run goes, not what it computes.
+MAY_CHANGE = (
+    "data.cache", "data.manifests", "data.on_bad_sample", "data.prefetch", "data.threads", "data.tokenizer",
+    "run.figure_every", "run.fsdp", "run.keep", "run.max_skipped", "run.save_every", "run.tensorboard",
+)  # fmt: skip
+WORDS = (
+    "release", "scratch", "quick_gelu", "sensor", "linear", "cosine", "bfloat16", "mapped", "random", "same_sensor",
+    "subtract", "skip", "another",
+)  # fmt: skip
+
+
+def others(value):
+    """Other values for a field of a configuration, one of which it can have."""
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, 2 * value, value - 1]
+    if isinstance(value, float):
+        return [value / 2 + 0.01]
+    if isinstance(value, str):
+        return WORDS
+    if value is None:
+        return [1, "another", [["a", 1.0]], 0.5]
+    return [[*value, "another"], [*value, "image"], [one / 2 + 0.01 for one in value if isinstance(one, float)]]
+
+
+def changed(config, path):
+    """JSON of `config` with another value of the field at a dotted path."""
+    *parts, last = path.split(".")
+    data = dataclasses.asdict(config)
+    place = functools.reduce(lambda tree, name: tree[name], parts, data)
+    for value in others(place[last]):
+        place[last] = value
+        with contextlib.suppress(ConfigError):
+            if from_json(json.dumps(data)) != config:
+                return json.dumps(data)
+    raise AssertionError(f"no other value of {path} is known here")
+
+
+def test_a_run_goes_on_with_no_other_setting_than_these(tmp_path):
+    config = preset("tiny", stage=2, towers="pretrained")
+    begun(tmp_path)
+    paths = list(_flat(dataclasses.asdict(config)))
+    assert set(MAY_CHANGE) < set(paths) and len(paths) > 80
+    for path in paths:
+        (tmp_path / "config.json").write_text(changed(config, path))
+        if path in MAY_CHANGE:
+            assert goes_on(tmp_path, config), path
+        else:
+            with pytest.raises(UserError, match=rf"settings: {re.escape(path)} was [^;]*\. Use the same"):
+                goes_on(tmp_path, config)
 
 
 def test_a_broken_config_is_named(tmp_path):

@@ -34,10 +34,12 @@ def run(options: Convert) -> int:
             about |= {release.SEEN_KEY: ",".join(told["seen"])}
     else:
         kept = release.read_metadata(source)
-        about |= {key: kept[key] for key in (release.BACKGROUND_KEY, release.SEEN_KEY) if key in kept}
+        about |= {key: kept[key] for key in (release.BACKGROUND_KEY,) if key in kept}
         weights = release.read_weights(source)
         model = release.model_of(source, weights)
         params = release.to_params(weights, model)
+        seen = release.seen_by_file(kept, model) if "touch" in params else None
+        about |= {} if seen is None else {release.SEEN_KEY: ",".join(seen)}
     if options.names == "release" and not {"touch", "decoder"} <= params.keys():
         raise UserError(f"{source} lacks a touch encoder or a decoder, which the authors' files hold: add --names own")
     if options.names == "release" and model.sensors[-1] != UNIVERSAL:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,7 @@ def _model(model: Model) -> str:
     )
 
 
-def _sensors(model: Model, seen: list[str] | None) -> str:
+def _sensors(model: Model, seen: Sequence[str] | None) -> str:
     named = [name for name in model.sensors if name != UNIVERSAL]
     if seen is None:
         return f"sensors: {', '.join(named)}; which of them it was trained on is not told"
@@ -128,7 +129,7 @@ def _weights(path: Path) -> list[str]:
     names = {"own": "our own", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
     layout = detect_layout(weights)
     model = release.model_of(path, weights)
-    seen = told[release.SEEN_KEY].split(",") if release.SEEN_KEY in told else None
+    seen = release.seen_by_file(told, model)
     count = sum(array.size for array in weights.values())
     finite = all(np.isfinite(array).all() for array in weights.values() if array.dtype.kind == "f")
     return [
@@ -198,5 +199,5 @@ def _policy(path: Path) -> list[str]:
         f"{path}: a policy of `anytouch pour` over {'stills' if policy.stills else 'clips'} of {policy.sensor}",
         f"an MLP of {' - '.join(map(str, sizes))} numbers, the last of them the actions",
         _model(policy.encoder.config.model),
-        _sensors(policy.encoder.config.model, None if policy.encoder.seen is None else list(policy.encoder.seen)),
+        _sensors(policy.encoder.config.model, policy.encoder.seen),
     ]

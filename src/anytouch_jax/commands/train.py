@@ -10,9 +10,10 @@ from anytouch_jax.config import Config, UserError, preset
 from anytouch_jax.options import Train
 from anytouch_jax.train.watch import Terminated, terminating
 
-# Fields of `config.Objective` that only one stage reads.
+# Fields of `config.Objective`, and of other sections, that only one stage reads.
 _ALIGNING: tuple[str, ...] = ("alpha_tv", "alpha_tl", "alpha_vl", "touch_text_sum", "match_weight", "match_keep")
 _ALIGNING += ("reconstruct", "groups", "centre")
+_TOWERS = {"model": ("match_head", "lora_rank", "lora_alpha", "temperature"), "loader": ("negatives",)}
 _MASKING: tuple[str, ...] = ("mask_ratio", "norm_pix_loss", "next_frame")
 
 
@@ -27,7 +28,7 @@ def run(options: Train, config: Config) -> int:
         raise UserError("--clip gives stage 2 the towers of CLIP: add --towers pretrained, or leave --clip out")
     if options.stop_after is not None and options.stop_after < 0:
         raise UserError(f"--stop-after must be 0 or more, not {options.stop_after}")
-    _refuse_objectives(options, config)
+    _refuse_unread(options, config)
     try:
         with terminating():
             return _train(options, config)
@@ -36,16 +37,21 @@ def run(options: Train, config: Config) -> int:
         return 0
 
 
-def _refuse_objectives(options: Train, config: Config) -> None:
-    """Raise UserError for settings of a loss that this stage does not have: they would do nothing."""
+def _refuse_unread(options: Train, config: Config) -> None:
+    """Raise UserError for settings that this stage, or these weights, do not read: they would do nothing."""
     usual = preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
-    usual, objective = baselines.apply(options.baseline, usual), config.objective
-    where, names = "in stage 1", _ALIGNING
+    usual = baselines.apply(options.baseline, usual)
+    where, unread = "in stage 1", {"objective": _ALIGNING, **_TOWERS}
     if options.stage == 2:
-        where, names = "in stage 2 without --objective.reconstruct", () if objective.reconstruct else _MASKING
-    for name in names:
-        if getattr(objective, name) != getattr(usual.objective, name):
-            raise UserError(f"--objective.{name.replace('_', '-')} does nothing {where}; leave it out")
+        where = "in stage 2 without --objective.reconstruct"
+        unread = {"objective": () if config.objective.reconstruct else _MASKING}
+        if options.clip and config.model.temperature != usual.model.temperature:
+            raise UserError("--model.temperature does nothing with --clip, whose temperature is taken; leave it out")
+    for section, names in unread.items():
+        ours, theirs = (getattr(one, {"loader": "data"}.get(section, section)) for one in (config, usual))
+        for name in names:
+            if getattr(ours, name) != getattr(theirs, name):
+                raise UserError(f"--{section}.{name.replace('_', '-')} does nothing {where}; leave it out")
 
 
 def _train(options: Train, config: Config) -> int:

@@ -17,6 +17,7 @@ from anytouch_jax.data.matching import Keys, Matches, felt_twice
 from anytouch_jax.data.sampling import Strata, Stream
 
 STILL, CLIP = 0, 1
+_BARE = 3  # stratum of windows without picture and caption, the last (`_Finder.pool`)
 _ALIGN, _ANCHOR = 100, 200  # tags that keep the random streams of one seed apart
 _WITHHELD = "downstream_test"  # column of frames in a test split of a downstream task (paper, appendix: fairness)
 _NOT_SET = ("", "0", "0.0", "false", "no", "none")
@@ -60,7 +61,8 @@ class Sources(NamedTuple):
 
 
 def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer | None, devices: int) -> Sources:
-    """Look through the split `config.data.split`. Raises UserError: an empty split, an unknown sensor, no tokenizer."""
+    """Look through the split `config.data.split`. Raises UserError: an empty split, nothing to learn, an unknown
+    sensor, no tokenizer."""
     rows, sensor, notes = _usable(manifest, config)
     weights, note = _weights(manifest, config, rows)
     notes += note
@@ -89,8 +91,21 @@ def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer 
     if config.stage == 2 and config.model.match_head != "none":
         pairs, note = finder.both_pairs(len(pools) > 1)
         notes += note
+    if config.stage == 2:
+        _something_to_learn(config, pools, pairs)
     force = find_force(manifest, config, rows, pools[CLIP].windows if len(pools) > 1 else None)
     return Sources(pools, pairs, sensor, tokenizer, notes, force)
+
+
+def _something_to_learn(config: Config, pools: tuple[Pool, ...], pairs: tuple[Pairs | None, ...]) -> None:
+    """Raise UserError where stage 2 would have a loss of 0 at every step."""
+    shown = any(len(ids) for pool in pools for ids in pool.members[:_BARE])
+    if not shown and not any(pairs) and not config.objective.reconstruct:
+        raise UserError(
+            f"stage 2 has nothing to learn from split {config.data.split!r}: no photograph (image_path), no caption "
+            "(text) that this run has a tower for, and no touch felt twice (touch) that this run matches; add one, or "
+            "train stage 1"
+        )
 
 
 def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray, list[str]]:

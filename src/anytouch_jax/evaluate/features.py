@@ -175,9 +175,9 @@ def touch_features(
 def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     """The encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
 
-    Only the touch encoder is kept. A sensor that a run was not trained on is served by the universal tokens (Sec. 3.5),
-    whether or not the table has its name. A bad sample stops what it embeds, whatever training did with such. Raises
-    UserError when there is no touch encoder, or weights that are not finite.
+    Only the touch encoder is kept. A sensor that a run, or the authors' weights, was not trained on is served by the
+    universal tokens (Sec. 3.5), whether or not the table has its name. A bad sample stops what it embeds, whatever
+    training did with such. Raises UserError when there is no touch encoder, or weights that are not finite.
     """
     path = Path(path)
     if not path.exists():
@@ -190,10 +190,14 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     else:
         weights = release.read_weights(path)
         model = release.model_of(path, weights)
-        told = release.read_metadata(path)  # written by `anytouch convert`, which has served the sensors not seen
-        seen, drawn = told[release.SEEN_KEY].split(",") if release.SEEN_KEY in told else None, True
+        told = release.read_metadata(
+            path
+        )  # of a run without universal tokens `anytouch convert` wrote their mean there
+        seen, drawn = release.seen_by_file(told, model), True
         shown: Any = told.get(release.BACKGROUND_KEY, "keep")
         params, config = release.to_params(weights, model), Config(model, data=Data(background=shown))
+        if seen is not None and "touch" in params:
+            params |= {"touch": release.serve_unseen(params["touch"], model, seen, universal_drawn=True)}
     if "touch" not in params:
         raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
     if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(params["touch"])):

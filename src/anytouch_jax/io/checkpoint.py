@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import errno
 import json
-import logging
 import math
 import re
 import shutil
-import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,6 +25,7 @@ import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
+from anytouch_jax.io.echoes import echo_less
 from anytouch_jax.io.record import CheckpointError, checked, read_record, resolve, steps, write_record
 from anytouch_jax.io.tensors import write_safetensors
 from anytouch_jax.io.tree import flatten, nest
@@ -44,30 +44,13 @@ Tree = Any
 _UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")  # being written or removed, by us or by Orbax
 _AVERAGE = "opt_state/ema/"
 _SHOWN = 5  # names listed in one error message
+_TRIES = 3  # to read the latest checkpoint of a run that goes on
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost
 
 
-def _is_news(record: logging.LogRecord) -> bool:
-    return "_SignalingThread" not in record.getMessage()
-
-
-# Orbax logs the traceback of every error of its threads although it also raises it; a full disk is one sentence here.
-logging.getLogger("absl").addFilter(_is_news)
-
-
-def _without_echoes(hook: Callable[..., Any]) -> Callable[..., Any]:
-    """An exception hook that leaves out what Tensorstore's threads say after the write that failed first: the other
-    writes of a checkpoint find nobody to tell any more, and each would print a traceback."""
-
-    def told(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        if kind is not RuntimeError or str(error) != "Event loop is closed":
-            hook(kind, error, trace)
-
-    return told
-
-
 PARTIAL = "partial"  # among a checkpoint's metrics: its loss is of fewer steps than those of others
-sys.excepthook = _without_echoes(sys.excepthook)
+_ONE = threading.Lock()  # Orbax keeps one running operation a process: a load beside a save ends the save
+echo_less()
 
 
 class Checkpoints:
@@ -88,7 +71,7 @@ class Checkpoints:
             raise CheckpointError(f"the metadata of a checkpoint must be plain JSON values: {error}") from None
         self._described = {"config": config_json, "metadata": metadata}
         self._worker = ThreadPoolExecutor(1, "checkpoint")
-        self._pending: tuple[Path, Future[None]] | None = None
+        self._pending: tuple[Path, Future[None], Callable[[], None]] | None = None
         self._saved: set[int] = set()
         self._losses: dict[int, float] = {}
         with self._sentence(self.folder):
@@ -116,15 +99,20 @@ class Checkpoints:
         arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
         context = ocp.Context()
         context.array.saving.use_compression = False  # trained weights do not shrink, and a save takes twice as long
-        with self._sentence(target), context:
-            response = ocp.save_async(_writing(target), nest(arrays))
-        self._pending = target, self._worker.submit(self._finish, target, response, content)
+        end_turn = _turn()
+        try:
+            with self._sentence(target), context:
+                response = ocp.save_async(_writing(target), nest(arrays))
+            self._pending = target, self._worker.submit(self._finish, target, response, content, end_turn), end_turn
+        except BaseException:
+            end_turn()
+            raise
 
     def wait(self) -> None:
         """Block until the running save is on disk. Raises CheckpointError when it failed (a full disk)."""
         if self._pending is None:
             return
-        (target, future), self._pending = self._pending, None
+        (target, future, _), self._pending = self._pending, None
         with self._sentence(target):
             try:
                 future.result()
@@ -172,10 +160,15 @@ class Checkpoints:
             with suppress(Exception):
                 self._pending[1].result(timeout=_PATIENCE)
         self._worker.shutdown(wait=False, cancel_futures=True)
+        if self._pending is not None:
+            self._pending[2]()  # what never ends, or was cancelled, keeps nobody from reading
 
-    def _finish(self, target: Path, response: Any, content: dict[str, Any]) -> None:
+    def _finish(self, target: Path, response: Any, content: dict[str, Any], end_turn: Callable[[], None]) -> None:
         """On the worker thread: when the arrays are on disk, write the record, rename, remove what is not kept."""
-        response.result()
+        try:
+            response.result()
+        finally:
+            end_turn()
         if jax.process_index() != 0:
             return
         writing = _writing(target)
@@ -227,9 +220,19 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
 
     `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen`
     of the state together, their average where the run keeps one (optim.ema); the optimiser's other arrays are not read.
-    Raises CheckpointError.
+    Where the run goes on meanwhile and removes the latest, that after it is read. Raises CheckpointError.
     """
-    target = resolve(Path(folder), step)
+    for _ in range(_TRIES if step is None else 1):
+        target = resolve(Path(folder), step)
+        try:
+            return _params_of(target)
+        except (CheckpointError, OSError):
+            if target.is_dir():
+                raise
+    raise CheckpointError(f"checkpoint {target} was removed while it was read; read the latest one, or another step")
+
+
+def _params_of(target: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     record = checked(target)
     chosen = {
         name: np.zeros(like.shape, like.dtype)
@@ -247,6 +250,15 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
 def export_safetensors(path: str | Path, params: Tree, metadata: Mapping[str, str]) -> None:
     """Write a parameter tree to one safetensors file, names joined with "/"; whole or not at all."""
     write_safetensors(path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata)
+
+
+def _turn() -> Callable[[], None]:
+    """Wait until no other operation of Orbax runs; gives what ends this one's turn, on any thread, and may be called
+    again."""
+    _ONE.acquire()
+    turn = ExitStack()
+    turn.callback(_ONE.release)
+    return turn.close
 
 
 def _owned(leaf: Any) -> Any:
@@ -281,7 +293,7 @@ def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     try:
-        with context:
+        with _ONE, context:
             return flatten(ocp.load(folder, nest(abstract)))
     except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
         reason = " ".join(str(error).split())[:300]

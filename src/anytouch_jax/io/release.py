@@ -1,7 +1,7 @@
 """Weights of PyTorch projects in and out, without importing torch: the authors' AnyTouch, HF CLIP, OpenCLIP.
 
 `read_weights` gives the arrays of a file by its own names, `to_params` a parameter tree, `to_release` the way back.
-Every key is accounted for: one error lists all that are unknown, missing or of another shape.
+Every key is accounted for: one error tells how many are unknown, missing or of another shape, and names the first ones.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, UNIVERSAL, Config, Model
+from anytouch_jax.config import SENSORS, UNIVERSAL, Model
 from anytouch_jax.io.detect import (
     BACKGROUND_KEY,
     MODEL_KEY,
@@ -26,6 +26,7 @@ from anytouch_jax.io.detect import (
 )
 from anytouch_jax.io.names import Entry, Layout, entries, is_left_out, unused
 from anytouch_jax.io.resize import resize_position
+from anytouch_jax.io.sensors import RELEASED, match_sensors, seen_by_file, serve_unseen, served
 from anytouch_jax.io.shapes import Shape, param_shapes
 from anytouch_jax.io.tensors import (
     WeightsError,
@@ -42,6 +43,7 @@ from anytouch_jax.io.tree import flatten, nest
 __all__ = [
     "BACKGROUND_KEY",
     "MODEL_KEY",
+    "RELEASED",
     "SEEN_KEY",
     "WeightsError",
     "clip_to_touch",
@@ -55,7 +57,9 @@ __all__ = [
     "read_weights",
     "release_names",
     "release_shapes",
+    "seen_by_file",
     "serve_unseen",
+    "served",
     "to_params",
     "to_release",
     "told_activation",
@@ -65,6 +69,7 @@ __all__ = [
 Params = dict[str, Any]
 Weights = Mapping[str, np.ndarray]
 
+_SHOWN = 6  # names listed in one error message
 _HEAD = frozenset(("head.weight", "head.bias"))
 
 
@@ -93,8 +98,8 @@ def to_params(weights: Weights, model: Model, *, ignore: Collection[str] = ()) -
 
     The file's layout is detected. Towers and heads that `model` does not have, buffers, the authors' unused arrays
     (golden Q2) and the keys in `ignore` are left out. Position tables of another image size are resized (bicubic, the
-    grid only). A probe file gives its classifier as `head`. Raises WeightsError that lists every key that is
-    unknown, missing or of another shape.
+    grid only). A probe file gives its classifier as `head`. Raises WeightsError that counts the keys that
+    are unknown, missing or of another shape, and names the first of each.
     """
     layout = detect_layout(weights)
     shapes = param_shapes(model)
@@ -193,44 +198,6 @@ def first_params(params: Params, model: Model, *, stage1: Params | None = None, 
     return merged
 
 
-def match_sensors(tokens: np.ndarray, stored: Sequence[str], wanted: Sequence[str]) -> np.ndarray:
-    """Sensor tokens (R, 5, D) of the table `stored`, rearranged by name for `wanted`.
-
-    A sensor that is not stored starts from the universal tokens, which were trained to serve it.
-    """
-    return np.stack([tokens[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
-
-
-def serve_unseen(touch: Params, model: Model, seen: Sequence[str], *, universal_drawn: bool) -> Params:
-    """A touch encoder whose rows of sensors never `seen` in training are the universal ones (Sec. 3.5: at inference).
-
-    Where training never drew the universal row either (`universal_drawn`), that row is the mean of those seen. Covers
-    the sensor tokens, and the patch kernels where each sensor has its own.
-    """
-    rows = [row for row, name in enumerate(model.sensors) if name in seen and name != UNIVERSAL]
-    unseen = [row for row in range(len(model.sensors)) if row not in rows]
-    if not rows:
-        return touch
-
-    def served(table: np.ndarray) -> np.ndarray:
-        table = np.array(table)
-        table[unseen] = table[model.universal_row] if universal_drawn else table[rows].mean(axis=0)
-        return table
-
-    touch = touch | {"sensor_tokens": served(touch["sensor_tokens"])}
-    if model.patch_encoder == "sensor":
-        touch |= {"patch": {"kernel": served(touch["patch"]["kernel"])}}
-    return touch
-
-
-def served(params: Params, config: Config, told: Mapping[str, Any]) -> Params:
-    """The parameters of a run as they are used: sensors that it never saw (its metadata `told`) by `serve_unseen`."""
-    if "touch" not in params or "seen" not in told:
-        return params
-    drawn = config.objective.universal_start + config.objective.universal_end > 0
-    return params | {"touch": serve_unseen(params["touch"], config.model, told["seen"], universal_drawn=drawn)}
-
-
 def resized(params: Params, patches: int) -> Params:
     """The parameters for pictures of another number of patches: bicubic resize of all tables of positions."""
 
@@ -294,11 +261,17 @@ def _account(
         if tuple(array.shape) != wanted[key]
     ]
     lists = {"unknown keys": unknown, "missing keys": missing, "other shapes": shapes}
-    problems = [f"{title} ({len(rows)}): {', '.join(rows)}" for title, rows in lists.items() if rows]
+    problems = [f"{title} ({len(rows)}): {_few(rows)}" for title, rows in lists.items() if rows]
     if problems:
         raise WeightsError(
             f"the {layout} weights do not fit this model; {'; '.join(problems)}{_hint(unknown, missing)}"
         )
+
+
+def _few(rows: Sequence[str]) -> str:
+    """The first rows; other sizes alone can be of hundreds of keys."""
+    more = len(rows) - _SHOWN
+    return ", ".join(rows) if more <= 0 else f"{', '.join(rows[:_SHOWN])} and {more} more"
 
 
 def _hint(unknown: Sequence[str], missing: Sequence[str]) -> str:
@@ -316,7 +289,7 @@ def _hint(unknown: Sequence[str], missing: Sequence[str]) -> str:
 
 
 def _compare(what: str, flat: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
-    """Raise WeightsError that lists every parameter that is missing, unknown or of another shape."""
+    """Raise WeightsError that names the first parameters that are missing, unknown or of another shape."""
     problems = [f"{name} is missing" for name in wanted if name not in flat]
     problems += [f"{name} is unknown" for name in flat if name not in wanted]
     problems += [
@@ -325,7 +298,7 @@ def _compare(what: str, flat: Mapping[str, Any], wanted: Mapping[str, Shape]) ->
         if name in flat and tuple(flat[name].shape) != tuple(shape)
     ]
     if problems:
-        raise WeightsError(f"the {what} do not fit this model: {', '.join(problems)}")
+        raise WeightsError(f"the {what} do not fit this model: {_few(problems)}")
 
 
 def _grafted(params: Params, parts: Params) -> Params:

@@ -239,11 +239,12 @@ class _Loop:
         if self.row["loss"] is not None:
             self.losses.append(self.row["loss"])
         self.bar.advance(self.row)
-        skipped, most = self.record.in_a_row, max(1, self.config.run.max_skipped)
-        if skipped >= most:
+        skipped = self.record.in_a_row
+        if skipped > self.config.run.max_skipped:
             raise UserError(
                 f"{skipped} steps in a row, up to step {step}, had a loss or a gradient that is not finite and were "
-                "skipped; lower optim.learning_rate, set optim.clip_norm, or look for NaN in the data"
+                "skipped; lower optim.learning_rate, set optim.clip_norm, or look for NaN in the data, in another run "
+                "folder"
             )
 
     def save(self, done: int, state: TrainState, since: int) -> int:

@@ -18,6 +18,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import pouring, pouring_policy, pouring_recordings, pouring_tuning
 from anytouch_jax.evaluate.features import random_encoder
 from anytouch_jax.evaluate.pouring_policy import Learning
+from anytouch_jax.io.sensors import serve_unseen
 from anytouch_jax.sim.pouring import POUR, RETRACT, WAIT, Task
 
 SIDE, COUNT = 28, 4
@@ -111,9 +112,11 @@ def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder,
 
 
 def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_path):
-    policy = pouring_policy.learn_frozen(replace(encoder, seen=("digit", "gelsight_mini")), shown, FAST, stills=True)
-    pouring_recordings.save_policy(tmp_path, policy)
-    assert pouring_recordings.load_policy(tmp_path).encoder.seen == ("digit", "gelsight_mini")
+    seen = ("digit", "gelsight_mini")
+    touch = serve_unseen(encoder.params["touch"], encoder.config.model, seen, universal_drawn=True)  # as it is loaded
+    encoder = replace(encoder, seen=seen, params={"touch": touch})
+    pouring_recordings.save_policy(tmp_path, pouring_policy.learn_frozen(encoder, shown, FAST, stills=True))
+    assert pouring_recordings.load_policy(tmp_path).encoder.seen == seen
 
 
 def test_a_policy_on_disk_knows_how_its_features_are_pooled_and_its_votes(shown, encoder, tmp_path):

@@ -127,7 +127,7 @@ def settings(
     return {
         "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
-        "pairs": data,
+        "pairs": data, "version": generation.VERSION,
     }  # fmt: skip
 
 
@@ -176,7 +176,8 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
 def one_table(several: Sequence[dict[str, Any]]) -> None:
     """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
     (errors of pictures of another size are no rivals), two encoders of one name and seed."""
-    ways = {(one["touches"], one["pairs"], one["fit"]["steps"], one["size"], one["subtracts"]) for one in several}
+    kinds = ("touches", "pairs", "size", "subtracts", "version")
+    ways = {(*(one.get(kind, 1) for kind in kinds), one["fit"]["steps"]) for one in several}
     known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
     if len(ways) > 1 or len(known) > len({one[:2] for one in known}):
         raise UserError(
@@ -318,7 +319,12 @@ lines = [
     f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
     f"{len({r['settings']['fit']['seed'] for r in records})} seeds, each over "
     f"{'encoders of its own' if own else 'the same encoders'}. By "
-    f"`{'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`.",
+    f"`{'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`."
+    + (
+        ""
+        if first["settings"].get("version", 1) == generation.VERSION
+        else " Translations of today's code learn otherwise."
+    ),
     "",
     markdown(head, cells),
     "",

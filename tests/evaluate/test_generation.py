@@ -233,6 +233,23 @@ def test_up_to_four_blocks_of_an_encoder_are_read():
     np.testing.assert_allclose(seen[..., -last.shape[-1] :], last, atol=1e-6)
 
 
+def test_tokens_are_whitened_and_faint_directions_stay_faint():
+    rng = np.random.default_rng(0)
+    mixed = rng.standard_normal((6, 6)) * np.array([10, 3, 1, 0.3, 0.1, 1e-4])[:, None]
+    tokens = (rng.standard_normal((40, 50, 6)) @ mixed + 7).astype(np.float32)
+    matrix = generation.whitening(tokens)
+    white = np.cov((tokens.reshape(-1, 6) - tokens.reshape(-1, 6).mean(0)) @ matrix, rowvar=False)
+    values = np.linalg.eigvalsh(white)
+    np.testing.assert_allclose(values[-3:], 1, atol=0.1)
+    assert values[0] < 0.01 and np.isfinite(matrix).all()
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-4 * np.abs(matrix).max())
+    assert np.isfinite(generation.whitening(np.zeros((4, 3, 6), np.float32))).all()
+    params = generation.start(design(), ENCODER, X, Y)  # and a translation is given them so
+    seen = np.asarray(features(design(), ENCODER.params, X)).reshape(-1, MODEL.touch.width)
+    given = (seen - params["fixed"]["mean"]) @ params["fixed"]["whiten"]
+    assert np.abs(np.linalg.eigvalsh(np.cov(given, rowvar=False))[-3:] - 1).max() < 0.1
+
+
 def test_a_target_that_never_changes_is_copied():
     same = np.repeat(Y[:1], len(X), axis=0)
     options = Fit(steps=1, batch=8, learning_rate=1e-9)

@@ -38,6 +38,8 @@ from anytouch_jax.train.optim import learning_rate
 Say = Callable[[str], None]
 _SAMPLE = 512  # images that the features' mean and deviation are taken from
 _CHUNK = 64
+_FAINT = 1e-4
+VERSION = 2  # of how a translation learns from the same pairs
 
 
 class Batch(NamedTuple):
@@ -179,7 +181,7 @@ def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: 
     every = max(1, len(images) // _SAMPLE)
     seen = in_batches(_features(nameless(design)), params.get("encoder"), images[::every][:_SAMPLE])
     mean, scale = _moments(seen)
-    fixed = {"mean": mean, "scale": scale}
+    fixed = {"mean": mean, "scale": scale} if encoder is None else {"mean": mean, "whiten": whitening(seen)}
     if design.shape.field:
         fixed["unit_mean"], fixed["unit_scale"] = _moments(targets)
     if design.has_critic and design.subtracts:
@@ -193,6 +195,19 @@ def _moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flat = values.reshape(-1, values.shape[-1]).astype(np.float64)
     mean, scale = flat.mean(0), flat.std(0)
     return mean.astype(np.float32), np.where(scale > 1e-9, scale, 1).astype(np.float32)
+
+
+def whitening(tokens: np.ndarray) -> np.ndarray:
+    """The matrix (D, D) that gives centred tokens (..., D) equal variances in all directions, but for those of less
+    than `_FAINT` of the largest (ZCA).
+
+    An encoder's channels go together: ten of a hundred directions hold nearly all of their variance, and what a picture
+    needs beside them is learned late or never where each channel is divided by its own deviation.
+    """
+    flat = tokens.reshape(-1, tokens.shape[-1]).astype(np.float64)
+    variance, axes = np.linalg.eigh(np.cov(flat, rowvar=False))
+    variance = np.maximum(variance, 0) + max(_FAINT * variance[-1], 1e-12)
+    return np.asarray(axes / np.sqrt(variance) @ axes.T, np.float32)
 
 
 def untouched(targets: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -133,7 +133,8 @@ def predict(design: Design, params: Params, x: Array) -> Array:
     """The normalised target f32 from features: the mean target plus the head's answer in units of its spread."""
     fixed = params["fixed"]
     wide = lambda value, to: jnp.expand_dims(value, range(to.ndim - value.ndim))  # noqa: E731
-    x = (x - wide(fixed["mean"], x)) / wide(fixed["scale"], x)
+    x = x - wide(fixed["mean"], x)
+    x = x @ fixed["whiten"] if "whiten" in fixed else x / wide(fixed["scale"], x)
     out = design.head.apply(params["head"], x).astype(jnp.float32)
     return fixed["target"][None] + out * wide(fixed["spread"], out)
 

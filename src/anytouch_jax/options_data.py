@@ -27,6 +27,9 @@ class Index:
     """Folder that holds it, as it was unpacked."""
     out: Path | None = None
     """Manifest to write, .parquet or .csv, in ROOT or a folder above it (default: ROOT/NAME.parquet)."""
+    keep: bool = False
+    """Carry what you edited in the manifest OUT over by path: columns, splits, text, labels. Without it, an edited OUT
+    is refused."""
     val: float = 0.05
     """Share of the objects or recordings for the split val, where the dataset has no split of its own."""
     test: float = 0.05

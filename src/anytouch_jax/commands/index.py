@@ -13,6 +13,6 @@ def run(options: Index) -> int:
         val=options.val, test=options.test, lists=options.lists, task=options.task, fold=options.fold,
         export=options.export, sensor=options.sensor,
     )  # fmt: skip
-    report = readers.index(options.name, options.root, options.out, options=told)
+    report = readers.index(options.name, options.root, options.out, options=told, keep=options.keep)
     print("\n".join(report.lines()))
     return 0

@@ -7,6 +7,9 @@ import pytest
 from reader_world import fill
 
 from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.edit import replace_column
+from anytouch_jax.data.readers import Options, index
 
 
 def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
@@ -99,3 +102,55 @@ def test_what_is_no_recording(tmp_path, read):
     assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
     assert table.reasons == {"folder called background or photo, of which one picture is wanted": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}
+
+
+@pytest.fixture
+def edited(tmp_path, read):
+    """edited(ending): the manifest of two objects, to which somebody added label.material and changed a split."""
+
+    def make(ending):
+        fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
+        out = tmp_path / f"hand{ending}"
+        table = read("recordings", out=out, sensor="digit", val=0, test=0).manifest
+        split = ["test" if path.startswith("mug") else "train" for path in table.column("path").to_pylist()]
+        material = [None, *["clay"] * 5]
+        manifests.write(replace_column(replace_column(table, "split", split), "label.material", material), out)
+        return out
+
+    return make
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_an_edited_manifest_is_never_replaced_unasked(tmp_path, read, edited, ending):
+    out = edited(ending)
+    before = out.read_bytes()
+    options = Options(sensor="digit", val=0, test=0)
+    says = rf"hand{ending} has other values of split \(3 rows\), label.material, which index does not write: .*--keep"
+    with pytest.raises(UserError, match=says):
+        index("recordings", tmp_path, out, options=options)
+    assert out.read_bytes() == before
+    fill(tmp_path, ["mug/3.png", "mug/more/0.png", "cup/0.png"])
+    (tmp_path / "ball" / "2.png").unlink()
+    report = index("recordings", tmp_path, out, options=options, keep=True)
+    rows = {row["path"]: row for row in manifests.read(out).table.to_pylist()}
+    assert {path: row["split"] for path, row in rows.items() if row["split"] == "test"}.keys() == {
+        "mug/0.png",
+        "mug/1.png",
+        "mug/2.png",
+        "mug/3.png",
+        "mug/more/0.png",
+    }  # fmt: skip - new frames and recordings stand where their object does
+    assert sum(row["label.material"] == "clay" for row in rows.values()) == 4 and len(rows) == 8
+    assert rows["mug/3.png"]["label.material"] is None and "kept from hand" in " ".join(report.notes)
+
+
+def test_what_index_wrote_itself_is_replaced(tmp_path, read):
+    fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
+    for out in (tmp_path / "a.csv", tmp_path / "a.parquet"):
+        read("recordings", out=out, sensor="digit", val=0, test=0)
+        (tmp_path / "ball" / "2.png").unlink(missing_ok=True)
+        fill(tmp_path, ["cup/0.png"])
+        assert "cup/0.png" in read("recordings", out=out, sensor="digit", val=0, test=0).rows
+    assert set(read("recordings", out=out, sensor="digit", val=0, test=1)["split"]) == {"test"}  # Parquet tells
+    with pytest.raises(UserError, match="other values of split"):
+        read("recordings", out=tmp_path / "a.csv", sensor="digit", val=0, test=1)

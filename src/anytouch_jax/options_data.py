@@ -44,6 +44,8 @@ class Index:
     """Let the reader write pictures into ROOT, where the dataset comes as arrays."""
     sensor: str | None = None
     """recordings: the sensor that made them, as in the configuration's table, or a new name."""
+    split_by: Literal["object", "recording"] = "object"
+    """recordings: hold out whole objects, or recordings of each object, for a classifier of objects."""
 
 
 @dataclass(frozen=True)

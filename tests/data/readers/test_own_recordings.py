@@ -10,6 +10,7 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.edit import replace_column
 from anytouch_jax.data.readers import Options, index
+from anytouch_jax.data.readers.recordings import ranked_split
 
 
 def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
@@ -53,7 +54,7 @@ def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
     fill(tmp_path / "mine", ["0.png", "1.png"])
     table = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0)
     assert list(table.rows) == ["0.png", "1.png"] and set(table["sequence"]) == {"."}
-    assert "no object or recording fell to split test" in " ".join(
+    assert "too few objects or recordings for split test" in " ".join(
         read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0.001).report.notes
     )
 
@@ -65,6 +66,38 @@ def test_an_object_is_never_on_two_sides(tmp_path, read):
     for row in table.rows.values():
         sides.setdefault(row["object"], set()).add(row["split"])
     assert all(len(one) == 1 for one in sides.values()) and set.union(*sides.values()) == {"train", "val", "test"}
+
+
+def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, read):
+    splits = []
+    for name in ("mine", "renamed"):
+        fill(tmp_path / name, [f"thing {n}/{take}/0.png" for n in range(3) for take in (0, 1)])
+        table = read("recordings", tmp_path / name, sensor="digit")
+        splits.append({row["object"]: row["split"] for row in table.rows.values()})
+    assert splits[0] == splits[1] and sorted(splits[0].values()) == ["test", "train", "val"]
+    assert any("--split-by recording" in note for note in table.report.notes)
+
+
+def test_ranked_splits_have_their_shares_and_hardly_move():
+    names = [f"o{n}" for n in range(40)]
+    before = ranked_split(names, Options(0.2, 0.3))
+    assert [list(before.values()).count(split) for split in ("val", "train", "test")] == [8, 20, 12]
+    for new in (f"new {n}" for n in range(20)):
+        after = ranked_split([*names, new], Options(0.2, 0.3))
+        assert sum(after[name] != before[name] for name in names) <= 2
+    few = {n: sorted(ranked_split(names[:n], Options(0.05, 0.05)).values()) for n in (1, 2, 3)}
+    assert few == {1: ["train"], 2: ["test", "train"], 3: ["test", "train", "val"]}
+    assert sorted(ranked_split(names[:3], Options(0.05, 0.9)).values()) == ["test", "train", "val"]
+    assert set(ranked_split(names, Options(0, 1)).values()) == {"test"}
+    assert set(ranked_split(names, Options(0, 0)).values()) == {"train"}
+
+
+def test_by_recording_every_object_is_in_every_split(tmp_path, read):
+    fill(tmp_path, [f"thing {n}/{take}/{k}.png" for n in range(5) for take in range(4) for k in (0, 1)])
+    table = read("recordings", sensor="digit", split_by="recording")
+    for n in range(5):
+        of = {row["sequence"]: row["split"] for row in table.rows.values() if row["object"] == f"thing {n}"}
+        assert sorted(of.values()) == ["test", "train", "train", "val"]
 
 
 def test_mistakes(tmp_path, read):

@@ -132,7 +132,8 @@ def index(
     manifest = manifests.from_columns(_below(columns, base, target.parent), target)
     manifest.clips(2)  # raises for a frame that is there twice
     _refuse_links(manifest, base)
-    manifest = before.carry(manifest, target, notes, keep=keep, groups=("sequence", "object"))
+    whole = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
+    manifest = before.carry(manifest, target, notes, keep=keep, groups=whole)
     try:
         manifests.write(before.marked(manifest), target)
     except OSError as error:

@@ -6,12 +6,14 @@
     mine/mug/caption.txt                words for what is felt, likewise
 
 Frames are taken in natural order (2 before 10). Their numbers are those at the end of their names where these count
-frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. The object, or the
-recording where there is none, is the group of the hash split.
+frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. Whole objects, or
+recordings where there are none, are held out; with `--split-by recording` some recordings of each object.
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +22,12 @@ from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers,
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    Frames,
     Notes,
     Options,
     Reader,
     Rows,
     add_recording,
-    hash_split,
     walk,
 )
 
@@ -40,7 +42,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         raise UserError(f"say by --sensor what made these pictures: {', '.join(known)}, or the name of a new sensor")
     if options.sensor not in known and options.sensor.lower() in known:
         raise UserError(f"--sensor {options.sensor}: the sensor is called {options.sensor.lower()}")
-    rows = Rows("object", "background_path", "image_path", "text", "dataset")
+    found: list[tuple[str, Frames]] = []
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
     for folder, _, files in walk(root, notes):
         beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
@@ -48,18 +50,53 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
             notes.skip(f"folder called {BACKGROUND} or {PHOTO}, of which one picture is wanted", folder)
             continue
         frames = _frames(files, notes, folder)
-        if not frames:
-            continue
-        obj = folder.split("/")[0] or None
-        split = hash_split(root.name, obj or folder, options)
-        add_recording(rows, frames, folder, split=split, sensor=options.sensor, sequence=folder or ".",
-                      object=obj, dataset=root.name, **beside[folder])  # fmt: skip
+        if frames:
+            found.append((folder, frames))
+    rows = Rows("object", "background_path", "image_path", "text", "dataset")
+    splits = _splits([folder for folder, _ in found], options, notes)
+    for folder, frames in found:
+        add_recording(rows, frames, folder, split=splits[folder], sensor=options.sensor, sequence=folder or ".",
+                      object=_object(folder) or None, dataset=root.name, **beside[folder])  # fmt: skip
     columns = rows.columns()
     columns["path"] = [path.lstrip("/") for path in columns["path"]]
     for split in ("val", "test"):
         if columns["path"] and split not in columns["split"] and getattr(options, split):
-            notes.say(f"no object or recording fell to split {split}; with few of them give a larger --{split}")
+            notes.say(f"there are too few objects or recordings for split {split}")
     return columns
+
+
+def _object(folder: str) -> str:
+    return folder.split("/")[0]
+
+
+def ranked_split(groups: Iterable[str], options: Options) -> dict[str, str]:
+    """The split of every group: sorted by SHA-256 of its name, the first round(val n) are val, the last round(test n)
+    test, the others train.
+
+    A share above 0 gets at least one group, and a share left for train too; where groups are too few, train goes first,
+    then test. A group that is added or lost moves no other but at the two cuts, one at each.
+    """
+    order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
+    most = max(0, len(order) - (options.val + options.test < 1))
+    test = min(most, max(round(options.test * len(order)), options.test > 0))
+    val = min(most - test, max(round(options.val * len(order)), options.val > 0))
+    if options.val and not val and test > 1:
+        test, val = test - 1, 1
+    parts = ["val"] * val + ["train"] * (len(order) - val - test) + ["test"] * test
+    return dict(zip(order, parts, strict=True))
+
+
+def _splits(folders: list[str], options: Options, notes: Notes) -> dict[str, str]:
+    """The split of every recording: that of its object, or, by recording, a part of each object's."""
+    objects: dict[str, list[str]] = {}
+    for folder in folders:
+        objects.setdefault(_object(folder), []).append(folder)
+    if options.split_by == "recording":
+        return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
+    if len(objects) > 1 and options.val + options.test > 0:
+        notes.say("whole objects are held out; for a classifier of objects: --split-by recording")
+    split = ranked_split(objects, options)
+    return {folder: split[_object(folder)] for folder in folders}
 
 
 def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
@@ -104,5 +141,5 @@ READER = Reader(
     about="folders of pictures, a recording each",
     url="",
     citation="nothing, unless their owner says so",
-    uses=("val", "test", "sensor"),
+    uses=("val", "test", "split_by", "sensor"),
 )

@@ -46,6 +46,9 @@ class Index:
     """recordings: the sensor that made them, as in the configuration's table, or a new name."""
     split_by: Literal["object", "recording"] = "object"
     """recordings: hold out whole objects, or recordings of each object, for a classifier of objects."""
+    labels: Path | None = None
+    """recordings: CSV table with a column object or sequence (or both); every other column becomes label.NAME (unit,
+    touch and text stay as they are)."""
 
 
 @dataclass(frozen=True)

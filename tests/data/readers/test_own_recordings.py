@@ -100,6 +100,47 @@ def test_by_recording_every_object_is_in_every_split(tmp_path, read):
         assert sorted(of.values()) == ["test", "train", "train", "val"]
 
 
+def test_labels_are_joined_by_object_and_sequence(tmp_path, read):
+    fill(tmp_path, [f"{name}/0.png" for name in ("mug/one", "mug/two", "ball/one", "cup/one")])
+    labels = tmp_path / "labels.csv"
+    labels.write_text(
+        "object,sequence,material,label.hardness,code,unit\nmug,,clay,9,007,\n,mug/two,glass,,,left\nball,ball/one,,2.5,1,\n"
+        "vase,,clay,1,1,\n"
+    )
+    table = read("recordings", sensor="digit", val=0, test=0, labels=labels)
+    of = {row["sequence"]: row for row in table.rows.values()}
+    names = ("label.material", "label.hardness", "label.code", "unit")
+    assert {name: tuple(row[one] for one in names) for name, row in of.items()} == {
+        "mug/one": ("clay", 9.0, "007", None), "mug/two": ("glass", 9.0, "007", "left"),
+        "ball/one": (None, 2.5, "1", None), "cup/one": (None, None, None, None),
+    }  # fmt: skip
+    skipped = {reason: example for reason, (_, example) in table.report.skipped.items()}
+    assert skipped == {
+        "key of labels.csv that no recording has": "vase", "recording without a line in labels.csv": "cup/one"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "name,material\nmug,clay\n",
+            "no column object or sequence, by which labels are joined; it has name, material",
+        ),
+        ("object,a,a\nmug,1,2\n", "has the column 'a' twice"),
+        ("object,a\nmug,1\nmug,2\n", "row 1: mug is there twice"),
+        ("object,a\n,1\n", "row 0: there is neither an object nor a sequence"),
+    ],
+)
+def test_tables_of_labels_that_cannot_be_joined(tmp_path, read, text, says):
+    fill(tmp_path, ["mug/0.png"])
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(UserError, match=says):
+        read("recordings", sensor="digit", labels=tmp_path / "labels.csv")
+    with pytest.raises(UserError, match="cannot be read"):
+        read("recordings", sensor="digit", labels=tmp_path / "none.csv")
+
+
 def test_mistakes(tmp_path, read):
     fill(tmp_path, ["a/0.png"])
     with pytest.raises(UserError, match="--sensor DIGIT: the sensor is called digit"):

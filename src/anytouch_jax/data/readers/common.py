@@ -35,6 +35,7 @@ class Options:
     split of its own. `lists`: a folder with list files, looked into before ROOT. `task`: which lists of Touch and Go
     decide the split. `fold`: which `split_<k>.npy` of Feel. `export`: let a reader write pictures into ROOT where the
     dataset comes as arrays. `sensor`: what made one's own recordings. `split_by`: what of these is held out whole.
+    `labels`: a table of labels for these, by object or sequence.
     """
 
     val: float = 0.05
@@ -45,6 +46,7 @@ class Options:
     export: bool = False
     sensor: str | None = None
     split_by: Literal["object", "recording"] = "object"
+    labels: Path | None = None
 
     def __post_init__(self) -> None:
         if not (0 <= self.val <= 1 and 0 <= self.test <= 1 and self.val + self.test <= 1):

@@ -19,6 +19,7 @@ from typing import Any
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers, frame_order
+from anytouch_jax.data.readers import label_table
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
@@ -59,6 +60,8 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
                       object=_object(folder) or None, dataset=root.name, **beside[folder])  # fmt: skip
     columns = rows.columns()
     columns["path"] = [path.lstrip("/") for path in columns["path"]]
+    if options.labels is not None:
+        columns = label_table.join(columns, options.labels.expanduser(), notes)
     for split in ("val", "test"):
         if columns["path"] and split not in columns["split"] and getattr(options, split):
             notes.say(f"there are too few objects or recordings for split {split}")
@@ -141,5 +144,5 @@ READER = Reader(
     about="folders of pictures, a recording each",
     url="",
     citation="nothing, unless their owner says so",
-    uses=("val", "test", "split_by", "sensor"),
+    uses=("val", "test", "split_by", "sensor", "labels"),
 )

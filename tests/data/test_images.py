@@ -276,3 +276,20 @@ def test_frames_are_numbered_by_what_counts_them():
     assert images.frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
     assert images.frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
     assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []
+
+
+@pytest.mark.parametrize(
+    ("names", "series"),
+    [
+        (["left_0.png", "left_1.png", "right_0.png"], {"left": ["left_0.png", "left_1.png"], "right": ["right_0.png"]}),
+        (["cam0_1.png", "cam1_1.png"], {"cam0": ["cam0_1.png"], "cam1": ["cam1_1.png"]}),
+        (["0.png", "right 0.png"], {"": ["0.png"], "right": ["right 0.png"]}),
+        (["left_0.png", "right_1.png"], None),  # no number twice: it may be one series
+        (["1.5.png", "2.5.png", "10.5.png"], None),  # seconds
+        (["at_12-00-05.png", "at_12-01-05.png"], None),
+        (["2024_05.png", "2025_05.png"], None),
+        (["1.png", "1.jpg"], None),
+    ],
+)
+def test_series_that_share_numbers_are_apart(names, series):
+    assert images.by_stem(names) == (series or {"": names})

@@ -194,7 +194,15 @@ def _say_cut(video: Path, count: int) -> None:
 def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Number, name and RGB pixels u8 of a picture, of a folder's pictures in natural order, or of a video's frames,
     which have no names. A picture that cannot be read is None where bad samples are skipped."""
-    from anytouch_jax.data.images import SUFFIXES, ImageError, decode, frame_numbers, frames_from_video, pictures_in
+    from anytouch_jax.data.images import (
+        SUFFIXES,
+        ImageError,
+        by_stem,
+        decode,
+        frame_numbers,
+        frames_from_video,
+        pictures_in,
+    )
 
     if options.input.suffix.lower() in SUFFIXES and options.input.is_file():
         yield 0, options.input.name, decode(options.input)
@@ -205,13 +213,17 @@ def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | No
     files, beside = pictures_in(options.input)
     if beside:
         say(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
-    for number, file in zip(frame_numbers([file.name for file in files]), files, strict=True):
-        try:
-            yield number, file.name, decode(file)
-        except ImageError:
-            if options.on_bad_sample == "error":
-                raise
-            yield number, file.name, None
+    start = 0  # of the numbers of a finger's frames: no clip reaches from one finger to the next
+    for names in by_stem([file.name for file in files]).values():
+        numbers = [start + number for number in frame_numbers(names)]
+        start = numbers[-1] + 2
+        for number, name in zip(numbers, names, strict=True):
+            try:
+                yield number, name, decode(options.input / name)
+            except ImageError:
+                if options.on_bad_sample == "error":
+                    raise
+                yield number, name, None
 
 
 def _refuse_unused(options: Embed) -> None:

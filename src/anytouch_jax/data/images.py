@@ -285,6 +285,22 @@ def frame_numbers(names: Sequence[str]) -> list[int]:
     return numbers if counts else list(range(len(names)))
 
 
+def by_stem(names: Sequence[str]) -> dict[str, list[str]]:
+    """Names of one folder in order by what stands before their numbers, where two series share a number (left_0 and
+    right_0 of two fingers); else all of them under "". Series differ by more than numbers: 12-00-05 is a time."""
+    series: dict[str, list[str]] = {}
+    numbers: dict[int, set[str]] = {}
+    for name in names:
+        stem = Path(name).stem
+        end = None if re.fullmatch(r"\d+\.\d+", stem) else re.search(r"\d{1,18}$", stem)
+        key = stem[: end.start()].rstrip(" ._-") if end else ""
+        series.setdefault(key, []).append(name)
+        if end:
+            numbers.setdefault(int(end[0]), set()).add(re.sub(r"(?<![^\W\d_])(?<!\d)\d+", "", key))
+    shared = any(len(of) > 1 for of in numbers.values())
+    return series if shared else {"": list(names)}
+
+
 def frame_order(name: str) -> tuple[int | float, list[tuple[int, str]]]:
     """A sort key of frames: numbers and time stamps as the numbers that they are, then the others, 2 before 10."""
     stem = Path(name).stem

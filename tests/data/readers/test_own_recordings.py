@@ -141,6 +141,17 @@ def test_tables_of_labels_that_cannot_be_joined(tmp_path, read, text, says):
         read("recordings", sensor="digit", labels=tmp_path / "none.csv")
 
 
+def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
+    fill(tmp_path, [f"mug/one/{finger}_{n}.png" for finger in ("left", "right") for n in range(4)])
+    fill(tmp_path, [f"{finger}{n}.png" for finger in ("a", "b") for n in range(2)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    units = {row["sequence"]: (row["unit"], row["object"]) for row in table.rows.values()}
+    assert units == {"mug/one/left": ("left", "mug"), "mug/one/right": ("right", "mug"), "a": ("a", None),
+                     "b": ("b", None)}  # fmt: skip
+    assert sum("mug" in clip[0] for clip in table.clips(3)) == 4
+    assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
+
+
 def test_mistakes(tmp_path, read):
     fill(tmp_path, ["a/0.png"])
     with pytest.raises(UserError, match="--sensor DIGIT: the sensor is called digit"):

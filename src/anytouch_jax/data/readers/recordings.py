@@ -6,8 +6,9 @@
     mine/mug/caption.txt                words for what is felt, likewise
 
 Frames are taken in natural order (2 before 10). Their numbers are those at the end of their names where these count
-frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. Whole objects, or
-recordings where there are none, are held out; with `--split-by recording` some recordings of each object.
+frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. Where numbers repeat
+behind different stems (left_0.png, right_0.png: two fingers), each stem is a sequence and a unit of its own. Whole
+objects, or recordings where there are none, are held out; with `--split-by recording` some recordings of each object.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
-from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers, frame_order
+from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, by_stem, frame_numbers, frame_order
 from anytouch_jax.data.readers import label_table
 from anytouch_jax.data.readers.common import (
     Columns,
@@ -43,21 +44,23 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         raise UserError(f"say by --sensor what made these pictures: {', '.join(known)}, or the name of a new sensor")
     if options.sensor not in known and options.sensor.lower() in known:
         raise UserError(f"--sensor {options.sensor}: the sensor is called {options.sensor.lower()}")
-    found: list[tuple[str, Frames]] = []
+    found: list[tuple[str, dict[str, Frames]]] = []
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
     for folder, _, files in walk(root, notes):
         beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             notes.skip(f"folder called {BACKGROUND} or {PHOTO}, of which one picture is wanted", folder)
             continue
-        frames = _frames(files, notes, folder)
-        if frames:
-            found.append((folder, frames))
-    rows = Rows("object", "background_path", "image_path", "text", "dataset")
+        if fingers := _frames(files, notes, folder):
+            found.append((folder, fingers))
+    rows = Rows("object", "unit", "background_path", "image_path", "text", "dataset")
     splits = _splits([folder for folder, _ in found], options, notes)
-    for folder, frames in found:
-        add_recording(rows, frames, folder, split=splits[folder], sensor=options.sensor, sequence=folder or ".",
-                      object=_object(folder) or None, dataset=root.name, **beside[folder])  # fmt: skip
+    for folder, fingers in found:
+        for unit, frames in fingers.items():
+            sequence = f"{folder}/{unit}".strip("/") or "."
+            add_recording(rows, frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
+                          unit=unit or None, object=_object(folder) or None, dataset=root.name,
+                          **beside[folder])  # fmt: skip
     columns = rows.columns()
     columns["path"] = [path.lstrip("/") for path in columns["path"]]
     if options.labels is not None:
@@ -118,8 +121,8 @@ def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
     return found
 
 
-def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]]:
-    """The pictures of a folder in order with their numbers; arrays count where there is nothing else."""
+def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
+    """The pictures of a folder in order with their numbers, by finger; arrays count where there is nothing else."""
     names = []
     for name in sorted(files, key=frame_order):
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
@@ -132,7 +135,9 @@ def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]
         arrays = [name for name in names if name not in pictures]
         notes.skip("array beside pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = pictures
-    return list(zip(frame_numbers(names), names, strict=True))
+    if not names:
+        return {}
+    return {unit: list(zip(frame_numbers(one), one, strict=True)) for unit, one in by_stem(names).items()}
 
 
 READER = Reader(

@@ -12,7 +12,7 @@ import numpy as np
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse, refuse_join
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import FIELD_SENSORS, UserError
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, UserError
 from anytouch_jax.options import Embed
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         source,
         _sight(encoder, options),
         live=live,
-        sensor=encoder.sensor_row(options.sensor, say),
+        sensor=_sensor_row(encoder, options),
         frames=options.frames,
         stride=options.stride,
         pooling=options.pooling,
@@ -100,6 +100,13 @@ def _stream(encoder: Encoder, options: Embed) -> int:
 def _print_line(one: Embedded) -> None:
     values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
     print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
+
+
+def _sensor_row(encoder: Encoder, options: Embed) -> int:
+    if options.sensor is None:
+        names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
+        say(f"no --sensor is given: the universal tokens are used; name it where it is one of {names}")
+    return encoder.sensor_row(options.sensor or UNIVERSAL, say)
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
@@ -145,7 +152,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     over a frame that is missing or cannot be read."""
     from anytouch_jax.evaluate import features
 
-    row, see = encoder.sensor_row(options.sensor, say), _sight(encoder, options)
+    row, see = _sensor_row(encoder, options), _sight(encoder, options)
     ring: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     values: list[np.ndarray] = []

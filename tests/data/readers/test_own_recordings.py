@@ -154,7 +154,7 @@ def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
 
 def test_mistakes(tmp_path, read):
     fill(tmp_path, ["a/0.png"])
-    with pytest.raises(UserError, match="--sensor DIGIT: the sensor is called digit"):
+    with pytest.raises(UserError, match="sensor 'DIGIT': it is called digit"):
         read("recordings", sensor="DIGIT")
     for sensor in (None, "tac3d", "universal"):
         with pytest.raises(UserError, match="say by --sensor what made these pictures: gelsight"):

@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError, check_spelling
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, by_stem, frame_numbers, frame_order
 from anytouch_jax.data.readers import label_table
 from anytouch_jax.data.readers.common import (
@@ -42,8 +42,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
     if options.sensor is None or options.sensor in (*FIELD_SENSORS, UNIVERSAL):
         raise UserError(f"say by --sensor what made these pictures: {', '.join(known)}, or the name of a new sensor")
-    if options.sensor not in known and options.sensor.lower() in known:
-        raise UserError(f"--sensor {options.sensor}: the sensor is called {options.sensor.lower()}")
+    check_spelling(options.sensor)
     found: list[tuple[str, dict[str, Frames]]] = []
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
     for folder, _, files in walk(root, notes):

@@ -22,6 +22,6 @@ def test_no_clip_reaches_from_one_finger_to_the_next(tmp_path, world, tiny_run, 
 def test_the_sensor_of_a_folder_is_asked_for_by_its_name(tmp_path, world, tiny_run, anytouch, mistake):
     words = ("--run", tiny_run, "--input", world.parent, "--out", tmp_path / "features.npz", "--batch", 4)
     said = anytouch("embed", *words)
-    assert said.status == 0 and said.err.count("no --sensor is given: the universal tokens are used") == 1
+    assert said.status == 0 and said.err.count("no --sensor was given: the universal tokens were used") == 1
     assert "--sensor" not in anytouch("embed", *words, "--sensor", "universal").err
     assert "sensor 'DIGIT': it is called digit" in mistake("embed", *words, "--sensor", "DIGIT")

@@ -47,6 +47,7 @@ def run(options: Embed) -> int:
         found = _embed_manifest(encoder, options)
     else:
         found = _embed_frames(encoder, options)
+        _say_universal(encoder, options)
     features.save_npz(options.out, found, _about(encoder, options))
     left = f", {found.skipped} skipped" if found.skipped else ""
     print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
@@ -75,7 +76,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         source,
         _sight(encoder, options),
         live=live,
-        sensor=_sensor_row(encoder, options),
+        sensor=encoder.sensor_row(options.sensor or UNIVERSAL, say),
         frames=options.frames,
         stride=options.stride,
         pooling=options.pooling,
@@ -90,6 +91,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         keys = {"frame_index": result.numbers, "time": result.at}
         about = _about(encoder, options) | {"stride": str(options.stride)}
         features.save_npz(options.out, features.Features(result.values, result.numbers, keys), about)
+    _say_universal(encoder, options)
     for line in stream.budget(result):
         say(line)
     if not lines:
@@ -102,11 +104,11 @@ def _print_line(one: Embedded) -> None:
     print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
 
 
-def _sensor_row(encoder: Encoder, options: Embed) -> int:
+def _say_universal(encoder: Encoder, options: Embed) -> None:
+    """Tell of a sensor that was not named; once there are features, since a mistake is answered by one sentence."""
     if options.sensor is None:
         names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
-        say(f"no --sensor is given: the universal tokens are used; name it where it is one of {names}")
-    return encoder.sensor_row(options.sensor or UNIVERSAL, say)
+        say(f"no --sensor was given: the universal tokens were used; name it where it is one of {names}")
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
@@ -152,7 +154,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     over a frame that is missing or cannot be read."""
     from anytouch_jax.evaluate import features
 
-    row, see = _sensor_row(encoder, options), _sight(encoder, options)
+    row, see = encoder.sensor_row(options.sensor or UNIVERSAL, say), _sight(encoder, options)
     ring: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     values: list[np.ndarray] = []

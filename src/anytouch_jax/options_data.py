@@ -41,7 +41,7 @@ class Index:
     fold: int = 0
     """feel: which of its split_<k>.npy decides the split."""
     export: bool = False
-    """Let the reader write pictures into ROOT, where the dataset comes as arrays."""
+    """Let the reader write pictures into ROOT, where the dataset comes as arrays or films."""
     sensor: str | None = None
     """recordings: the sensor that made them, as in the configuration's table, or a new name."""
     split_by: Literal["object", "recording"] = "object"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from reader_world import fill
@@ -9,6 +10,7 @@ from reader_world import fill
 from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.edit import replace_column
+from anytouch_jax.data.images import decode
 from anytouch_jax.data.readers import Options, index
 from anytouch_jax.data.readers.recordings import ranked_split
 
@@ -47,7 +49,7 @@ def test_what_lies_beside_or_above_belongs_to_a_recording(tmp_path, read):
     )
     assert (two["background_path"], two["image_path"]) == ("mug/two/Background.png", "mug/photo.jpg")
     assert (ball["background_path"], ball["image_path"], ball["text"]) == ("background.png", None, None)
-    assert table.reasons == {"file that is no picture (a film is to be cut into pictures first)": 1}
+    assert table.reasons == {"film (--export writes its frames as pictures)": 1}
 
 
 def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
@@ -152,6 +154,35 @@ def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
     assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
 
 
+def _film(path, frames=5):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
+    for number in range(frames):
+        writer.write(np.full((32, 32, 3), (200, 20 * number, 10), np.uint8))  # blue first
+    writer.release()
+
+
+def test_films_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):
+    root = tmp_path / "mine"
+    _film(root / "mug" / "one.avi")
+    _film(root / "mug" / "two.avi")
+    (root / "mug" / "broken.mp4").write_bytes(b"no film")
+    fill(root, ["ball/0.png"])
+    table = read("recordings", root, sensor="digit", val=0, test=0)
+    assert len(table.rows) == 1 and table.reasons == {"film (--export writes its frames as pictures)": 3}
+    encode, count = cv2.imencode, []
+    monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1] if len(count) < 7 else 1 / 0)
+    with pytest.raises(ZeroDivisionError):  # in the second film
+        index("recordings", root, options=Options(sensor="digit", export=True))
+    assert sorted(path.name for path in (root / "mug").iterdir()) == ["broken.mp4", "one", "one.avi", "two.avi"]
+    monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1])
+    table = read("recordings", root, sensor="digit", val=0, test=0, export=True)
+    assert len(count) == 7 + 5 and len(table.clips(5)) == 2  # the first film is not written again
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
+    assert decode(root / "mug" / "two" / "000004.png")[0, 0] == pytest.approx([10, 80, 200], abs=6)  # red first
+    assert table.reasons["film that cannot be read"] == 1
+
+
 def test_mistakes(tmp_path, read):
     fill(tmp_path, ["a/0.png"])
     with pytest.raises(UserError, match="sensor 'DIGIT': it is called digit"):
@@ -164,7 +195,7 @@ def test_mistakes(tmp_path, read):
         read("recordings", sensor="digit")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "film.mp4").write_bytes(b"")
-    with pytest.raises(UserError, match=r"no frame of recordings .*a film is to be cut into pictures first"):
+    with pytest.raises(UserError, match=r"no frame of recordings .*--export writes its frames"):
         read("recordings", tmp_path / "empty", sensor="digit")
 
 

@@ -1,6 +1,7 @@
 """Recordings of one's own: a folder of pictures is a recording, in ROOT or at any depth below it.
 
     mine/mug/pour_1/000.png ...         the object is the first folder; the recording is the folder itself
+    mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its name
     mine/mug/background.png             the untouched gel of every recording in or below this folder
     mine/mug/photo.jpg                  a photograph of what is touched, likewise
     mine/mug/caption.txt                words for what is felt, likewise
@@ -20,7 +21,7 @@ from typing import Any
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError, check_spelling
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, by_stem, frame_numbers, frame_order
-from anytouch_jax.data.readers import label_table
+from anytouch_jax.data.readers import films, label_table
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
@@ -45,11 +46,14 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     check_spelling(options.sensor)
     found: list[tuple[str, dict[str, Frames]]] = []
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
-    for folder, _, files in walk(root, notes):
+    if options.export:
+        films.export(root, notes)
+    for folder, folders, files in walk(root, notes):
         beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             notes.skip(f"folder called {BACKGROUND} or {PHOTO}, of which one picture is wanted", folder)
             continue
+        files = [name for name in files if not _is_cut(name, folders)]
         if fingers := _frames(files, notes, folder):
             found.append((folder, fingers))
     rows = Rows("object", "unit", "background_path", "image_path", "text", "dataset")
@@ -120,6 +124,11 @@ def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
     return found
 
 
+def _is_cut(name: str, folders: list[str]) -> bool:
+    """Whether it is a film whose frames lie in a folder of its name."""
+    return Path(name).suffix.lower() in films.SUFFIXES and Path(name).stem in folders
+
+
 def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
     """The pictures of a folder in order with their numbers, by finger; arrays count where there is nothing else."""
     names = []
@@ -127,8 +136,10 @@ def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
+        elif suffix in films.SUFFIXES:
+            notes.skip("film (--export writes its frames as pictures)", f"{folder}/{name}".lstrip("/"))
         elif suffix not in (*SUFFIXES, *MANIFESTS) and name.lower() != CAPTION:
-            notes.skip("file that is no picture (a film is to be cut into pictures first)", f"{folder}/{name}")
+            notes.skip("file that is no picture", f"{folder}/{name}".lstrip("/"))
     pictures = [name for name in names if Path(name).suffix.lower() != ".npy"]
     if pictures and len(pictures) < len(names):
         arrays = [name for name in names if name not in pictures]
@@ -148,5 +159,5 @@ READER = Reader(
     about="folders of pictures, a recording each",
     url="",
     citation="nothing, unless their owner says so",
-    uses=("val", "test", "split_by", "sensor", "labels"),
+    uses=("val", "test", "split_by", "sensor", "labels", "export"),
 )

@@ -15,6 +15,8 @@ from anytouch_jax.model import FIELD_SENSORS as FIELD_SENSORS
 from anytouch_jax.model import SENSORS as SENSORS
 from anytouch_jax.model import UNIVERSAL as UNIVERSAL
 from anytouch_jax.model import Model, Stack, TextTower
+from anytouch_jax.model import SpellingError as SpellingError
+from anytouch_jax.model import check_spelling as check_spelling
 from anytouch_jax.strict_json import ABOVE_0, BELOW_1, COUNT, NORMAL, NOT_NEGATIVE, SEED, SHARE, build, chosen, in_range
 from anytouch_jax.strict_json import ConfigError as ConfigError
 from anytouch_jax.strict_json import UserError as UserError

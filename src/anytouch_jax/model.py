@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,23 @@ SENSORS = (
     "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
 )  # fmt: skip
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+
+
+class SpellingError(ConfigError):
+    """The name of a known sensor, spelled otherwise."""
+
+
+def check_spelling(name: str, known: Iterable[str] = ()) -> None:
+    """Raise SpellingError for a name that differs from a known one (SENSORS, FIELD_SENSORS, `known`) by case, or - or a
+    blank for _, alone."""
+    names = {one: _plain(one) for one in (*SENSORS, *FIELD_SENSORS, *known)}
+    right = next((one for one, plain in names.items() if plain == _plain(name)), None)
+    if name not in names and right is not None:
+        raise SpellingError(f"sensor {name!r}: it is called {right}")
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("-", "_").replace(" ", "_")
 
 
 @dataclass(frozen=True)
@@ -104,6 +122,7 @@ class Model:
         """Row of the sensor called `name`. Raises ConfigError when the table does not have it."""
         if name in FIELD_SENSORS:
             raise ConfigError(f"sensor {name!r} measures a force field and has no images; leave it out of training")
+        check_spelling(name, self.sensors)
         if name not in self.sensors:
             known, table = ", ".join(self.sensors), " ".join(self.sensors)
             raise ConfigError(

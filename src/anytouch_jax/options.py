@@ -87,8 +87,8 @@ class Embed:
     """The .npz to write: features (n, d), rows (n,), key/* (n,). With --stream also - for JSON lines on stdout."""
     split: str | None = None
     """Only this split of a manifest."""
-    sensor: str = "universal"
-    """Sensor of a folder, a video or a camera; one that the model does not know gets the universal tokens."""
+    sensor: str | None = None
+    """Sensor of a folder, a video or a camera; without it, or for an unknown one, the universal tokens."""
     background: Path | None = None
     """Picture of the untouched gel of a folder, a video or a camera, for an encoder trained on differences from it."""
     frames: int = 1

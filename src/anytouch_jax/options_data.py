@@ -27,6 +27,9 @@ class Index:
     """Folder that holds it, as it was unpacked."""
     out: Path | None = None
     """Manifest to write, .parquet or .csv, in ROOT or a folder above it (default: ROOT/NAME.parquet)."""
+    keep: bool = False
+    """Carry what you edited in the manifest OUT over by path: columns, splits, text, labels. Without it, an edited OUT
+    is refused."""
     val: float = 0.05
     """Share of the objects or recordings for the split val, where the dataset has no split of its own."""
     test: float = 0.05
@@ -38,9 +41,14 @@ class Index:
     fold: int = 0
     """feel: which of its split_<k>.npy decides the split."""
     export: bool = False
-    """Let the reader write pictures into ROOT, where the dataset comes as arrays."""
+    """Let the reader write pictures into ROOT, where the dataset comes as arrays or films."""
     sensor: str | None = None
     """recordings: the sensor that made them, as in the configuration's table, or a new name."""
+    split_by: Literal["object", "recording"] = "object"
+    """recordings: hold out whole objects, or recordings of each object, for a classifier of objects."""
+    labels: Path | None = None
+    """recordings: CSV table with a column object or sequence (or both); every other column becomes label.NAME (unit,
+    touch and text stay as they are)."""
 
 
 @dataclass(frozen=True)

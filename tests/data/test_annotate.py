@@ -230,7 +230,12 @@ def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
     found = find_jobs(loose)
     assert [job.rows.tolist() for job in found.jobs] == [[12, 13, 14]]
     assert sorted(found.left_out.values()) == [3, 3, 3, 3]
-    assert any("'mine' has no prompt" in why for why in found.left_out)
+    assert any("'mine' has no prompt: give it one, such as --family mine photograph; known" in why
+               for why in found.left_out)  # fmt: skip
+    several = make([row | {"dataset": f"mine {i % 3}"} for i, row in enumerate(_rows(2))])
+    with pytest.raises(UserError, match=r"--family 'mine 2' photograph") as told:
+        find_jobs(several)
+    assert str(told.value).count("touch_and_go") == 1
     assert len(find_jobs(loose, families={"mine": "photograph"}, overwrite=True).jobs) == 3
     assert len(find_jobs(loose, split="train").jobs) == 1
     with pytest.raises(UserError, match="no family of prompts 'photo'"):

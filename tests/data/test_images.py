@@ -279,3 +279,20 @@ def test_frames_are_numbered_by_what_counts_them():
     assert images.frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
     assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
+
+
+@pytest.mark.parametrize(
+    ("names", "series"),
+    [
+        (["left_0.png", "left_1.png", "right_0.png"], {"left": ["left_0.png", "left_1.png"], "right": ["right_0.png"]}),
+        (["cam0_1.png", "cam1_1.png"], {"cam0": ["cam0_1.png"], "cam1": ["cam1_1.png"]}),
+        (["0.png", "right 0.png"], {"": ["0.png"], "right": ["right 0.png"]}),
+        (["left_0.png", "right_1.png"], None),  # no number twice: it may be one series
+        (["1.5.png", "2.5.png", "10.5.png"], None),  # seconds
+        (["at_12-00-05.png", "at_12-01-05.png"], None),
+        (["2024_05.png", "2025_05.png"], None),
+        (["1.png", "1.jpg"], None),
+    ],
+)
+def test_series_that_share_numbers_are_apart(names, series):
+    assert images.by_stem(names) == (series or {"": names})

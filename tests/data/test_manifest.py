@@ -196,6 +196,10 @@ def test_sensor_rows(tmp_path):
     assert any("1 rows of tac3d" in note for note in notes) and any("newfinger" in note for note in notes)
     ids, notes = m.sensor_rows(got, model, unknown="universal")
     assert ids.tolist() == [1, -1, 9, 6] and any("universal" in note for note in notes)
+    other = m.read(_file(tmp_path, text.replace("digit", "DIGIT")))
+    for unknown in ("error", "skip", "universal"):
+        with pytest.raises(m.ManifestError, match=r"row 0 of .*column 'sensor': sensor 'DIGIT': it is called digit"):
+            m.sensor_rows(other, model, unknown=unknown)
     ids, notes = m.sensor_rows(got, model, np.array([0, 3]))
     assert ids.tolist() == [1, -1, -1, 6] and notes == []
 

@@ -235,6 +235,17 @@ def test_a_slip_in_the_name_of_a_sensor_is_told(make):
     assert told[0].sentence == "2 rows are of sensor 'dgit', which is not known: did you mean digit?"
 
 
+def test_another_spelling_of_a_known_sensor_is_an_error(make):
+    names = ["DIGIT", "GelSight-Mini", "Tac3D", "digit"]
+    report = verify(make([{"sensor": name, "sequence": f"s{i}"} for i, name in enumerate(names)]))
+    told = {finding.sentence: finding.level for finding in report.findings if finding.kind == "unknown_sensor"}
+    assert set(told.values()) == {"error"} and told.keys() == {
+        "1 rows are of sensor 'DIGIT': it is called digit",
+        "1 rows are of sensor 'GelSight-Mini': it is called gelsight_mini",
+        "1 rows are of sensor 'Tac3D': it is called tac3d",
+    }
+
+
 def test_frames_out_of_order_and_frames_twice(make):
     frames = [0, 2, 1, 3, 3, 0]
     rows = [{"sequence": "s" if i < 5 else "r", "frame_index": frame} for i, frame in enumerate(frames)]

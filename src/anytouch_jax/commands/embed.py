@@ -12,7 +12,7 @@ import numpy as np
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse, refuse_join
 from anytouch_jax.commands.words import say
-from anytouch_jax.config import FIELD_SENSORS, UserError
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, UserError
 from anytouch_jax.options import Embed
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def run(options: Embed) -> int:
         found = _embed_manifest(encoder, options)
     else:
         found = _embed_frames(encoder, options)
+        _say_universal(encoder, options)
     features.save_npz(options.out, found, _about(encoder, options))
     left = f", {found.skipped} skipped" if found.skipped else ""
     print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
@@ -75,7 +76,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         source,
         _sight(encoder, options),
         live=live,
-        sensor=encoder.sensor_row(options.sensor, say),
+        sensor=encoder.sensor_row(options.sensor or UNIVERSAL, say),
         frames=options.frames,
         stride=options.stride,
         pooling=options.pooling,
@@ -90,6 +91,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         keys = {"frame_index": result.numbers, "time": result.at}
         about = _about(encoder, options) | {"stride": str(options.stride)}
         features.save_npz(options.out, features.Features(result.values, result.numbers, keys), about)
+    _say_universal(encoder, options)
     for line in stream.budget(result):
         say(line)
     if not lines:
@@ -100,6 +102,13 @@ def _stream(encoder: Encoder, options: Embed) -> int:
 def _print_line(one: Embedded) -> None:
     values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
     print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
+
+
+def _say_universal(encoder: Encoder, options: Embed) -> None:
+    """Tell of a sensor that was not named; once there are features, since a mistake is answered by one sentence."""
+    if options.sensor is None:
+        names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
+        say(f"no --sensor was given: the universal tokens were used; name it where it is one of {names}")
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
@@ -145,7 +154,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     over a frame that is missing or cannot be read."""
     from anytouch_jax.evaluate import features
 
-    row, see = encoder.sensor_row(options.sensor, say), _sight(encoder, options)
+    row, see = encoder.sensor_row(options.sensor or UNIVERSAL, say), _sight(encoder, options)
     ring: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     values: list[np.ndarray] = []
@@ -194,7 +203,15 @@ def _say_cut(video: Path, count: int) -> None:
 def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Number, name and RGB pixels u8 of a picture, of a folder's pictures in natural order, or of a video's frames,
     which have no names. A picture that cannot be read is None where bad samples are skipped."""
-    from anytouch_jax.data.images import SUFFIXES, ImageError, decode, frame_numbers, frames_from_video, pictures_in
+    from anytouch_jax.data.images import (
+        SUFFIXES,
+        ImageError,
+        by_stem,
+        decode,
+        frame_numbers,
+        frames_from_video,
+        pictures_in,
+    )
 
     if options.input.suffix.lower() in SUFFIXES and options.input.is_file():
         yield 0, options.input.name, decode(options.input)
@@ -205,13 +222,17 @@ def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | No
     files, beside = pictures_in(options.input)
     if beside:
         say(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
-    for number, file in zip(frame_numbers([file.name for file in files]), files, strict=True):
-        try:
-            yield number, file.name, decode(file)
-        except ImageError:
-            if options.on_bad_sample == "error":
-                raise
-            yield number, file.name, None
+    start = 0  # of the numbers of a finger's frames: no clip reaches from one finger to the next
+    for names in by_stem([file.name for file in files]).values():
+        numbers = [start + number for number in frame_numbers(names)]
+        start = numbers[-1] + 2
+        for number, name in zip(numbers, names, strict=True):
+            try:
+                yield number, name, decode(options.input / name)
+            except ImageError:
+                if options.on_bad_sample == "error":
+                    raise
+                yield number, name, None
 
 
 def _refuse_unused(options: Embed) -> None:

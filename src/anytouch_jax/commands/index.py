@@ -11,8 +11,8 @@ def run(options: Index) -> int:
 
     told = readers.Options(
         val=options.val, test=options.test, lists=options.lists, task=options.task, fold=options.fold,
-        export=options.export, sensor=options.sensor,
+        export=options.export, sensor=options.sensor, split_by=options.split_by, labels=options.labels,
     )  # fmt: skip
-    report = readers.index(options.name, options.root, options.out, options=told)
+    report = readers.index(options.name, options.root, options.out, options=told, keep=options.keep)
     print("\n".join(report.lines()))
     return 0

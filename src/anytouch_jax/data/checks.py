@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, SpellingError, check_spelling
 from anytouch_jax.data.licences import NO, commercial_use
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.data.scan import OK, STATES, Scan
@@ -196,8 +196,13 @@ def misspelt_sensors(manifest: Manifest) -> Iterator[Finding]:
     names = np.array(manifest.column("sensor").to_pylist(), str)
     known = (*(name for name in SENSORS if name != UNIVERSAL), *FIELD_SENSORS)
     for name in sorted(set(names.tolist()) - set(known)):
+        rows = np.flatnonzero(names == name)
+        try:
+            check_spelling(name)
+        except SpellingError as error:
+            yield Finding("unknown_sensor", "error", f"{rows.size} rows are of {error}", rows, (), "sensor")
+            continue
         if near := difflib.get_close_matches(name.lower(), known, 1, 0.8):
-            rows = np.flatnonzero(names == name)
             sentence = f"{rows.size} rows are of sensor {name!r}, which is not known: did you mean {near[0]}?"
             yield Finding("unknown_sensor", "warning", sentence, rows, (), "sensor")
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from anytouch_jax.config import UserError
 from anytouch_jax.data.packed import HEADER_LOCK, read_file
+from anytouch_jax.data.table import is_manifest
 
 MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
 MOST_TIMES = (
@@ -272,8 +273,22 @@ def pictures_in(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     files = [file for file in files if file.stem.lower() not in beside]
     files = [file for file in files if file.suffix.lower() != ".npy"] or files
     if not files:
-        raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)})")
+        raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)}){_instead(folder)}")
     return sorted(files, key=lambda file: frame_order(file.name)), beside
+
+
+def _instead(folder: Path) -> str:
+    """What to give in the place of a folder without pictures: the manifest that it holds, or one to be made."""
+    inside = sorted(folder.iterdir())
+    for file in inside:
+        if file.suffix.lower() in (".csv", ".parquet") and is_manifest(file):
+            return f"; give its manifest {file}"
+    below = (file for one in inside if one.is_dir() and not one.name.startswith(".") for file in one.rglob("*"))
+    if any(file.suffix.lower() in SUFFIXES for file in below):
+        return (
+            f"; they lie in its sub-folders: anytouch index recordings {folder} --sensor NAME makes a manifest of them"
+        )
+    return ""
 
 
 def frame_numbers(names: Sequence[str]) -> list[int]:
@@ -284,6 +299,22 @@ def frame_numbers(names: Sequence[str]) -> list[int]:
     steps = [b - a for a, b in itertools.pairwise(numbers)]
     counts = len(numbers) == len(names) and min(steps, default=0) == 1 and 3 * steps.count(1) >= len(steps)
     return numbers if counts else list(range(len(names)))
+
+
+def by_stem(names: Sequence[str]) -> dict[str, list[str]]:
+    """Names of one folder in order by what stands before their numbers, where two series share a number (left_0 and
+    right_0 of two fingers); else all of them under "". Series differ by more than numbers: 12-00-05 is a time."""
+    series: dict[str, list[str]] = {}
+    numbers: dict[int, set[str]] = {}
+    for name in names:
+        stem = Path(name).stem
+        end = None if re.fullmatch(r"\d+\.\d+", stem) else re.search(r"\d{1,18}$", stem)
+        key = stem[: end.start()].rstrip(" ._-") if end else ""
+        series.setdefault(key, []).append(name)
+        if end:
+            numbers.setdefault(int(end[0]), set()).add(re.sub(r"(?<![^\W\d_])(?<!\d)\d+", "", key))
+    shared = any(len(of) > 1 for of in numbers.values())
+    return series if shared else {"": list(names)}
 
 
 def frame_order(name: str) -> tuple[int | float, list[tuple[int, str]]]:

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model
+from anytouch_jax.config import FIELD_SENSORS, ConfigError, Model, SpellingError
 from anytouch_jax.data.paths import resolve
 from anytouch_jax.data.table import PATHS, REQUIRED, SCHEMA, SPLITS, ManifestError, is_manifest, load_table, typed
 from anytouch_jax.data.windows import windows
@@ -339,7 +339,7 @@ def sensor_rows(
         except ConfigError as error:
             if name in FIELD_SENSORS:
                 notes.append(f"left out {len(here)} rows of {name}: it measures a force field and has no images")
-            elif unknown == "error":
+            elif unknown == "error" or isinstance(error, SpellingError):
                 raise ManifestError(f"{manifest.where(here[0])}, column 'sensor': {error}") from None
             elif unknown == "skip":
                 notes.append(f"left out {len(here)} rows of the unknown sensor {name!r}")

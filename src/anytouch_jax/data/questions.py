@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -89,7 +90,12 @@ def _asked(
         name = manifest.value(rows[0], "dataset")
         family[rows] = chosen = family_of(name, families)
         if chosen is None and asked[rows].any():
-            left[f"dataset {name!r} has no prompt (known: {', '.join(FAMILIES)})"] = int(asked[rows].sum())
+            known, remedy = "", "the manifest has no column dataset that names it"
+            if name is not None:
+                remedy = f"give it one, such as --family {shlex.quote(name)} photograph"
+            if not any("has no prompt" in reason for reason in left):
+                known = f"; known: {', '.join(FAMILIES)}"
+            left[f"dataset {name!r} has no prompt: {remedy}{known}"] = int(asked[rows].sum())
     asked &= family != None  # noqa: E711 - elementwise
     text, expanded = manifest.present("text"), np.zeros(len(manifest), bool)
     if PHRASE in manifest.table.column_names:

@@ -144,11 +144,11 @@ def _read_csv(path: Path) -> pa.Table:
     table = pa.csv.read_csv(path, convert_options=convert, parse_options=pa.csv.ParseOptions(newlines_in_values=True))
     for position, name in enumerate(table.column_names):
         if name.startswith("label."):
-            table = table.set_column(position, name, _typed_label(table[name]))
+            table = table.set_column(position, name, typed_label(table[name]))
     return table
 
 
-def _typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
+def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """A column of text as numbers or truths where all of it are; 007 is a name, of which a number would lose the 0s."""
     column = pc.utf8_trim_whitespace(column)
     column = pc.if_else(pc.equal(column, ""), pa.scalar(None, _TEXT), column)

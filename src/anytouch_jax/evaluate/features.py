@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, from_json
+from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, check_spelling, from_json
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.manifest import Manifest
@@ -55,11 +55,12 @@ class Encoder:
 
     def sensor_row(self, name: str, say: Say = _warn) -> int:
         """Row of a sensor's tokens. For one that training has not seen, or that the table does not have, these are the
-        universal ones, said aloud."""
+        universal ones, said aloud. Raises SpellingError for a known name that is spelled otherwise."""
         model, name = self.config.model, str(name)
         drawn, known = self.universal_drawn or not self.seen, name in model.sensors
         if known and (drawn if name == UNIVERSAL else self.seen is None or name in self.seen):
             return model.sensors.index(name)
+        check_spelling(name, model.sensors)
         why = f"is not in this model's table ({', '.join(model.sensors)})"
         if known:
             why = f"was not drawn in training (that saw {', '.join(self.seen or ())})"

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from reader_world import fill
 
 from anytouch_jax.config import UserError
+from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.edit import replace_column
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.readers import Options, index
+from anytouch_jax.data.readers.recordings import ranked_split
 
 
 def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
@@ -43,14 +49,14 @@ def test_what_lies_beside_or_above_belongs_to_a_recording(tmp_path, read):
     )
     assert (two["background_path"], two["image_path"]) == ("mug/two/Background.png", "mug/photo.jpg")
     assert (ball["background_path"], ball["image_path"], ball["text"]) == ("background.png", None, None)
-    assert table.reasons == {"file that is no picture (a film is to be cut into pictures first)": 1}
+    assert table.reasons == {"film (--export writes its frames as pictures)": 1}
 
 
 def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
     fill(tmp_path / "mine", ["0.png", "1.png"])
     table = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0)
     assert list(table.rows) == ["0.png", "1.png"] and set(table["sequence"]) == {"."}
-    assert "no object or recording fell to split test" in " ".join(
+    assert "too few objects or recordings for split test" in " ".join(
         read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0.001).report.notes
     )
 
@@ -64,9 +70,122 @@ def test_an_object_is_never_on_two_sides(tmp_path, read):
     assert all(len(one) == 1 for one in sides.values()) and set.union(*sides.values()) == {"train", "val", "test"}
 
 
+def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, read):
+    splits = []
+    for name in ("mine", "renamed"):
+        fill(tmp_path / name, [f"thing {n}/{take}/0.png" for n in range(3) for take in (0, 1)])
+        table = read("recordings", tmp_path / name, sensor="digit")
+        splits.append({row["object"]: row["split"] for row in table.rows.values()})
+    assert splits[0] == splits[1] and sorted(splits[0].values()) == ["test", "train", "val"]
+    assert any("--split-by recording" in note for note in table.report.notes)
+
+
+def test_ranked_splits_have_their_shares_and_hardly_move():
+    names = [f"o{n}" for n in range(40)]
+    before = ranked_split(names, Options(0.2, 0.3))
+    assert [list(before.values()).count(split) for split in ("val", "train", "test")] == [8, 20, 12]
+    for new in (f"new {n}" for n in range(20)):
+        after = ranked_split([*names, new], Options(0.2, 0.3))
+        assert sum(after[name] != before[name] for name in names) <= 2
+    few = {n: sorted(ranked_split(names[:n], Options(0.05, 0.05)).values()) for n in (1, 2, 3)}
+    assert few == {1: ["train"], 2: ["test", "train"], 3: ["test", "train", "val"]}
+    assert sorted(ranked_split(names[:3], Options(0.05, 0.9)).values()) == ["test", "train", "val"]
+    assert set(ranked_split(names, Options(0, 1)).values()) == {"test"}
+    assert set(ranked_split(names, Options(0, 0)).values()) == {"train"}
+
+
+def test_by_recording_every_object_is_in_every_split(tmp_path, read):
+    fill(tmp_path, [f"thing {n}/{take}/{k}.png" for n in range(5) for take in range(4) for k in (0, 1)])
+    table = read("recordings", sensor="digit", split_by="recording")
+    for n in range(5):
+        of = {row["sequence"]: row["split"] for row in table.rows.values() if row["object"] == f"thing {n}"}
+        assert sorted(of.values()) == ["test", "train", "train", "val"]
+
+
+def test_labels_are_joined_by_object_and_sequence(tmp_path, read):
+    fill(tmp_path, [f"{name}/0.png" for name in ("mug/one", "mug/two", "ball/one", "cup/one")])
+    labels = tmp_path / "labels.csv"
+    labels.write_text(
+        "object,sequence,material,label.hardness,code,unit\nmug,,clay,9,007,\n,mug/two,glass,,,left\nball,ball/one,,2.5,1,\n"
+        "vase,,clay,1,1,\n"
+    )
+    table = read("recordings", sensor="digit", val=0, test=0, labels=labels)
+    of = {row["sequence"]: row for row in table.rows.values()}
+    names = ("label.material", "label.hardness", "label.code", "unit")
+    assert {name: tuple(row[one] for one in names) for name, row in of.items()} == {
+        "mug/one": ("clay", 9.0, "007", None), "mug/two": ("glass", 9.0, "007", "left"),
+        "ball/one": (None, 2.5, "1", None), "cup/one": (None, None, None, None),
+    }  # fmt: skip
+    skipped = {reason: example for reason, (_, example) in table.report.skipped.items()}
+    assert skipped == {
+        "key of labels.csv that no recording has": "vase", "recording without a line in labels.csv": "cup/one"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "name,material\nmug,clay\n",
+            "no column object or sequence, by which labels are joined; it has name, material",
+        ),
+        ("object,a,a\nmug,1,2\n", "has the column 'a' twice"),
+        ("object,a\nmug,1\nmug,2\n", "row 1: mug is there twice"),
+        ("object,a\n,1\n", "row 0: there is neither an object nor a sequence"),
+    ],
+)
+def test_tables_of_labels_that_cannot_be_joined(tmp_path, read, text, says):
+    fill(tmp_path, ["mug/0.png"])
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(UserError, match=says):
+        read("recordings", sensor="digit", labels=tmp_path / "labels.csv")
+    with pytest.raises(UserError, match="cannot be read"):
+        read("recordings", sensor="digit", labels=tmp_path / "none.csv")
+
+
+def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
+    fill(tmp_path, [f"mug/one/{finger}_{n}.png" for finger in ("left", "right") for n in range(4)])
+    fill(tmp_path, [f"{finger}{n}.png" for finger in ("a", "b") for n in range(2)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    units = {row["sequence"]: (row["unit"], row["object"]) for row in table.rows.values()}
+    assert units == {"mug/one/left": ("left", "mug"), "mug/one/right": ("right", "mug"), "a": ("a", None),
+                     "b": ("b", None)}  # fmt: skip
+    assert sum("mug" in clip[0] for clip in table.clips(3)) == 4
+    assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
+
+
+def _film(path, frames=5):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
+    for number in range(frames):
+        writer.write(np.full((32, 32, 3), (200, 20 * number, 10), np.uint8))  # blue first
+    writer.release()
+
+
+def test_films_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):
+    root = tmp_path / "mine"
+    _film(root / "mug" / "one.avi")
+    _film(root / "mug" / "two.avi")
+    (root / "mug" / "broken.mp4").write_bytes(b"no film")
+    fill(root, ["ball/0.png"])
+    table = read("recordings", root, sensor="digit", val=0, test=0)
+    assert len(table.rows) == 1 and table.reasons == {"film (--export writes its frames as pictures)": 3}
+    encode, count = cv2.imencode, []
+    monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1] if len(count) < 7 else 1 / 0)
+    with pytest.raises(ZeroDivisionError):  # in the second film
+        index("recordings", root, options=Options(sensor="digit", export=True))
+    assert sorted(path.name for path in (root / "mug").iterdir()) == ["broken.mp4", "one", "one.avi", "two.avi"]
+    monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1])
+    table = read("recordings", root, sensor="digit", val=0, test=0, export=True)
+    assert len(count) == 7 + 5 and len(table.clips(5)) == 2  # the first film is not written again
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
+    assert decode(root / "mug" / "two" / "000004.png")[0, 0] == pytest.approx([10, 80, 200], abs=6)  # red first
+    assert table.reasons["film that cannot be read"] == 1
+
+
 def test_mistakes(tmp_path, read):
     fill(tmp_path, ["a/0.png"])
-    with pytest.raises(UserError, match="--sensor DIGIT: the sensor is called digit"):
+    with pytest.raises(UserError, match="sensor 'DIGIT': it is called digit"):
         read("recordings", sensor="DIGIT")
     for sensor in (None, "tac3d", "universal"):
         with pytest.raises(UserError, match="say by --sensor what made these pictures: gelsight"):
@@ -76,7 +195,7 @@ def test_mistakes(tmp_path, read):
         read("recordings", sensor="digit")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "film.mp4").write_bytes(b"")
-    with pytest.raises(UserError, match=r"no frame of recordings .*a film is to be cut into pictures first"):
+    with pytest.raises(UserError, match=r"no frame of recordings .*--export writes its frames"):
         read("recordings", tmp_path / "empty", sensor="digit")
 
 
@@ -99,3 +218,55 @@ def test_what_is_no_recording(tmp_path, read):
     assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
     assert table.reasons == {"folder called background or photo, of which one picture is wanted": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}
+
+
+@pytest.fixture
+def edited(tmp_path, read):
+    """edited(ending): the manifest of two objects, to which somebody added label.material and changed a split."""
+
+    def make(ending):
+        fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
+        out = tmp_path / f"hand{ending}"
+        table = read("recordings", out=out, sensor="digit", val=0, test=0).manifest
+        split = ["test" if path.startswith("mug") else "train" for path in table.column("path").to_pylist()]
+        material = [None, *["clay"] * 5]
+        manifests.write(replace_column(replace_column(table, "split", split), "label.material", material), out)
+        return out
+
+    return make
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_an_edited_manifest_is_never_replaced_unasked(tmp_path, read, edited, ending):
+    out = edited(ending)
+    before = out.read_bytes()
+    options = Options(sensor="digit", val=0, test=0)
+    says = rf"hand{ending} has other values of split \(3 rows\), label.material, which index does not write: .*--keep"
+    with pytest.raises(UserError, match=says):
+        index("recordings", tmp_path, out, options=options)
+    assert out.read_bytes() == before
+    fill(tmp_path, ["mug/3.png", "mug/more/0.png", "cup/0.png"])
+    (tmp_path / "ball" / "2.png").unlink()
+    report = index("recordings", tmp_path, out, options=options, keep=True)
+    rows = {row["path"]: row for row in manifests.read(out).table.to_pylist()}
+    assert {path: row["split"] for path, row in rows.items() if row["split"] == "test"}.keys() == {
+        "mug/0.png",
+        "mug/1.png",
+        "mug/2.png",
+        "mug/3.png",
+        "mug/more/0.png",
+    }  # fmt: skip - new frames and recordings stand where their object does
+    assert sum(row["label.material"] == "clay" for row in rows.values()) == 4 and len(rows) == 8
+    assert rows["mug/3.png"]["label.material"] is None and "kept from hand" in " ".join(report.notes)
+
+
+def test_what_index_wrote_itself_is_replaced(tmp_path, read):
+    fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
+    for out in (tmp_path / "a.csv", tmp_path / "a.parquet"):
+        read("recordings", out=out, sensor="digit", val=0, test=0)
+        (tmp_path / "ball" / "2.png").unlink(missing_ok=True)
+        fill(tmp_path, ["cup/0.png"])
+        assert "cup/0.png" in read("recordings", out=out, sensor="digit", val=0, test=0).rows
+    assert set(read("recordings", out=out, sensor="digit", val=0, test=1)["split"]) == {"test"}  # Parquet tells
+    with pytest.raises(UserError, match="other values of split"):
+        read("recordings", out=tmp_path / "a.csv", sensor="digit", val=0, test=1)

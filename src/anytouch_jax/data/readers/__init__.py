@@ -12,6 +12,7 @@ from anytouch_jax.config import UserError
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.checks import misspelt_sensors
 from anytouch_jax.data.readers import (
+    before,
     cloth,
     feel,
     objectfolder,
@@ -101,11 +102,14 @@ def reader(name: str) -> Reader:
     return READERS[name]
 
 
-def index(name: str, root: str | Path, out: str | Path | None = None, *, options: Options | None = None) -> IndexReport:
+def index(
+    name: str, root: str | Path, out: str | Path | None = None, *, options: Options | None = None, keep: bool = False
+) -> IndexReport:
     """Read the dataset `name` in the folder `root` and write its manifest to `out` (default: ROOT/<name>.parquet).
 
-    `out` lies in `root` or above it: a manifest's paths may not leave its folder. Raises UserError for a folder that
-    is not the dataset, an option the reader does not heed, and a manifest that cannot be written there.
+    `out` lies in `root` or above it: a manifest's paths may not leave its folder. `keep`: an edited manifest there
+    keeps its columns and values (see before.py). Raises UserError for a folder that is not the dataset, an option the
+    reader does not heed, a manifest that cannot be written there, and an edited one that would be lost.
     """
     one, options = reader(name), options or Options()
     base = Path(root).expanduser().resolve()
@@ -128,8 +132,10 @@ def index(name: str, root: str | Path, out: str | Path | None = None, *, options
     manifest = manifests.from_columns(_below(columns, base, target.parent), target)
     manifest.clips(2)  # raises for a frame that is there twice
     _refuse_links(manifest, base)
+    whole = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
+    manifest = before.carry(manifest, target, notes, keep=keep, groups=whole)
     try:
-        manifests.write(manifest, target)
+        manifests.write(before.marked(manifest), target)
     except OSError as error:
         raise UserError(
             f"the manifest {target} cannot be written: {error.strerror}; name another file with --out, in a folder "

@@ -1,31 +1,36 @@
 """Recordings of one's own: a folder of pictures is a recording, in ROOT or at any depth below it.
 
     mine/mug/pour_1/000.png ...         the object is the first folder; the recording is the folder itself
+    mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its name
     mine/mug/background.png             the untouched gel of every recording in or below this folder
     mine/mug/photo.jpg                  a photograph of what is touched, likewise
     mine/mug/caption.txt                words for what is felt, likewise
 
 Frames are taken in natural order (2 before 10). Their numbers are those at the end of their names where these count
-frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. The object, or the
-recording where there is none, is the group of the hash split.
+frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. Where numbers repeat
+behind different stems (left_0.png, right_0.png: two fingers), each stem is a sequence and a unit of its own. Whole
+objects, or recordings where there are none, are held out; with `--split-by recording` some recordings of each object.
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError
-from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers, frame_order
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError, check_spelling
+from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, by_stem, frame_numbers, frame_order
+from anytouch_jax.data.readers import films, label_table
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    Frames,
     Notes,
     Options,
     Reader,
     Rows,
     add_recording,
-    hash_split,
     walk,
 )
 
@@ -38,28 +43,69 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
     if options.sensor is None or options.sensor in (*FIELD_SENSORS, UNIVERSAL):
         raise UserError(f"say by --sensor what made these pictures: {', '.join(known)}, or the name of a new sensor")
-    if options.sensor not in known and options.sensor.lower() in known:
-        raise UserError(f"--sensor {options.sensor}: the sensor is called {options.sensor.lower()}")
-    rows = Rows("object", "background_path", "image_path", "text", "dataset")
+    check_spelling(options.sensor)
+    found: list[tuple[str, dict[str, Frames]]] = []
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
-    for folder, _, files in walk(root, notes):
+    if options.export:
+        films.export(root, notes)
+    for folder, folders, files in walk(root, notes):
         beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             notes.skip(f"folder called {BACKGROUND} or {PHOTO}, of which one picture is wanted", folder)
             continue
-        frames = _frames(files, notes, folder)
-        if not frames:
-            continue
-        obj = folder.split("/")[0] or None
-        split = hash_split(root.name, obj or folder, options)
-        add_recording(rows, frames, folder, split=split, sensor=options.sensor, sequence=folder or ".",
-                      object=obj, dataset=root.name, **beside[folder])  # fmt: skip
+        files = [name for name in files if not _is_cut(name, folders)]
+        if fingers := _frames(files, notes, folder):
+            found.append((folder, fingers))
+    rows = Rows("object", "unit", "background_path", "image_path", "text", "dataset")
+    splits = _splits([folder for folder, _ in found], options, notes)
+    for folder, fingers in found:
+        for unit, frames in fingers.items():
+            sequence = f"{folder}/{unit}".strip("/") or "."
+            add_recording(rows, frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
+                          unit=unit or None, object=_object(folder) or None, dataset=root.name,
+                          **beside[folder])  # fmt: skip
     columns = rows.columns()
     columns["path"] = [path.lstrip("/") for path in columns["path"]]
+    if options.labels is not None:
+        columns = label_table.join(columns, options.labels.expanduser(), notes)
     for split in ("val", "test"):
         if columns["path"] and split not in columns["split"] and getattr(options, split):
-            notes.say(f"no object or recording fell to split {split}; with few of them give a larger --{split}")
+            notes.say(f"there are too few objects or recordings for split {split}")
     return columns
+
+
+def _object(folder: str) -> str:
+    return folder.split("/")[0]
+
+
+def ranked_split(groups: Iterable[str], options: Options) -> dict[str, str]:
+    """The split of every group: sorted by SHA-256 of its name, the first round(val n) are val, the last round(test n)
+    test, the others train.
+
+    A share above 0 gets at least one group, and a share left for train too; where groups are too few, train goes first,
+    then test. A group that is added or lost moves no other but at the two cuts, one at each.
+    """
+    order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
+    most = max(0, len(order) - (options.val + options.test < 1))
+    test = min(most, max(round(options.test * len(order)), options.test > 0))
+    val = min(most - test, max(round(options.val * len(order)), options.val > 0))
+    if options.val and not val and test > 1:
+        test, val = test - 1, 1
+    parts = ["val"] * val + ["train"] * (len(order) - val - test) + ["test"] * test
+    return dict(zip(order, parts, strict=True))
+
+
+def _splits(folders: list[str], options: Options, notes: Notes) -> dict[str, str]:
+    """The split of every recording: that of its object, or, by recording, a part of each object's."""
+    objects: dict[str, list[str]] = {}
+    for folder in folders:
+        objects.setdefault(_object(folder), []).append(folder)
+    if options.split_by == "recording":
+        return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
+    if len(objects) > 1 and options.val + options.test > 0:
+        notes.say("whole objects are held out; for a classifier of objects: --split-by recording")
+    split = ranked_split(objects, options)
+    return {folder: split[_object(folder)] for folder in folders}
 
 
 def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
@@ -78,21 +124,30 @@ def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
     return found
 
 
-def _frames(files: list[str], notes: Notes, folder: str) -> list[tuple[int, str]]:
-    """The pictures of a folder in order with their numbers; arrays count where there is nothing else."""
+def _is_cut(name: str, folders: list[str]) -> bool:
+    """Whether it is a film whose frames lie in a folder of its name."""
+    return Path(name).suffix.lower() in films.SUFFIXES and Path(name).stem in folders
+
+
+def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
+    """The pictures of a folder in order with their numbers, by finger; arrays count where there is nothing else."""
     names = []
     for name in sorted(files, key=frame_order):
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
+        elif suffix in films.SUFFIXES:
+            notes.skip("film (--export writes its frames as pictures)", f"{folder}/{name}".lstrip("/"))
         elif suffix not in (*SUFFIXES, *MANIFESTS) and name.lower() != CAPTION:
-            notes.skip("file that is no picture (a film is to be cut into pictures first)", f"{folder}/{name}")
+            notes.skip("file that is no picture", f"{folder}/{name}".lstrip("/"))
     pictures = [name for name in names if Path(name).suffix.lower() != ".npy"]
     if pictures and len(pictures) < len(names):
         arrays = [name for name in names if name not in pictures]
         notes.skip("array beside pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = pictures
-    return list(zip(frame_numbers(names), names, strict=True))
+    if not names:
+        return {}
+    return {unit: list(zip(frame_numbers(one), one, strict=True)) for unit, one in by_stem(names).items()}
 
 
 READER = Reader(
@@ -104,5 +159,5 @@ READER = Reader(
     about="folders of pictures, a recording each",
     url="",
     citation="nothing, unless their owner says so",
-    uses=("val", "test", "sensor"),
+    uses=("val", "test", "split_by", "sensor", "labels", "export"),
 )

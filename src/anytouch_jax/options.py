@@ -105,6 +105,8 @@ class Embed:
     """One frame at a time, the newest of a camera; prints where the time went."""
     stride: int = 1
     """Frames from one frame of a streamed clip to its next: what the clips of the training data have."""
+    head: Path | None = None
+    """Name the class too by a head of probe --save: label and its probability p, arrays or in each line of JSON."""
     on_bad_sample: Literal["error", "skip"] = "error"
     """A row or a picture of a folder that cannot be read stops the command, or is left out and counted."""
 
@@ -173,6 +175,8 @@ class Probe:
     """Also probe raw pixels and a random encoder."""
     out: Path | None = None
     """Write the results as JSON."""
+    save: Path | None = None
+    """Keep the linear head of one --run as .npz, for embed --head."""
 
 
 @dataclass(frozen=True)

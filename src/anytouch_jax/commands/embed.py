@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,8 @@ from anytouch_jax.config import FIELD_SENSORS, UserError
 from anytouch_jax.options import Embed
 
 if TYPE_CHECKING:
-    from anytouch_jax.evaluate.features import Encoder
+    from anytouch_jax.evaluate.features import Encoder, Features
+    from anytouch_jax.evaluate.saved_heads import Head
     from anytouch_jax.evaluate.stream import Embedded
 
 _MANIFESTS = (".csv", ".parquet")
@@ -26,6 +29,7 @@ def run(options: Embed) -> int:
     """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
     _refuse_unused(options)
     from anytouch_jax.evaluate import features
+    from anytouch_jax.evaluate.saved_heads import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     if not (options.stream and str(options.out) == "-"):
@@ -33,21 +37,24 @@ def run(options: Embed) -> int:
         check_folder(options.out, read=(options.run, options.input))
         if options.out.suffix.lower() != ".npz":
             raise UserError(f"{options.out}: features are written as .npz; name such a file with --out")
+    head = None if options.head is None else load_head(options.head)
     enable_compilation_cache()
     encoder = features.load_encoder(options.run).computed_in(options.dtype)
     features.check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
+    if head is not None:
+        head.check(encoder.source, encoder.mark, options.pooling, options.frames, options.join)
     if options.batch < 1:
         raise UserError(f"--batch must be 1 or more, not {options.batch}")
     if options.stream:
-        return _stream(encoder, options)
+        return _stream(encoder, options, head)
     if not options.input.exists():
         raise UserError(f"no manifest, folder or video at {options.input}")
     if options.input.suffix.lower() in _MANIFESTS:
         found = _embed_manifest(encoder, options)
     else:
         found = _embed_frames(encoder, options)
-    features.save_npz(options.out, found, _about(encoder, options))
+    features.save_npz(options.out, _named(found, head), _about(encoder, options))
     left = f", {found.skipped} skipped" if found.skipped else ""
     print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
     return 0
@@ -64,7 +71,15 @@ def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
     }
 
 
-def _stream(encoder: Encoder, options: Embed) -> int:
+def _named(found: Features, head: Head | None) -> Features:
+    """Features with what a head says of them: `label` (n,) and its probability `p` (n,)."""
+    if head is None:
+        return found
+    label, p = head(found.values)
+    return replace(found, said={"label": label, "p": p.max(1)})
+
+
+def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
     """Embed a camera or a video frame by frame: features to an .npz, or as JSON lines; then the latency budget."""
     from anytouch_jax.evaluate import features, stream
 
@@ -81,7 +96,7 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         pooling=options.pooling,
         join=options.join,
     )
-    result = stream.collect(embedded, _print_line if lines else None)
+    result = stream.collect(embedded, partial(_print_line, head=head) if lines else None)
     if not live and not result.interrupted and len(result.numbers):
         _say_cut(options.input, int(result.numbers[-1]) + 1)
     if not len(result.numbers) and not result.interrupted:
@@ -89,7 +104,8 @@ def _stream(encoder: Encoder, options: Embed) -> int:
     if not lines:
         keys = {"frame_index": result.numbers, "time": result.at}
         about = _about(encoder, options) | {"stride": str(options.stride)}
-        features.save_npz(options.out, features.Features(result.values, result.numbers, keys), about)
+        found = features.Features(result.values, result.numbers, keys)
+        features.save_npz(options.out, _named(found, head if len(result.numbers) else None), about)
     for line in stream.budget(result):
         say(line)
     if not lines:
@@ -97,9 +113,13 @@ def _stream(encoder: Encoder, options: Embed) -> int:
     return 0
 
 
-def _print_line(one: Embedded) -> None:
+def _print_line(one: Embedded, head: Head | None = None) -> None:
     values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
-    print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
+    line: dict[str, Any] = {"frame": one.number, "time": round(one.at, 6)}
+    if head is not None:
+        (label,), p = head(one.values[None])
+        line |= {"label": str(label), "p": round(float(p.max()), 6)}
+    print(json.dumps(line | {"features": values}), flush=True)
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:

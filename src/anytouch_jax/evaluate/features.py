@@ -215,12 +215,16 @@ def _touch_only(config: Config) -> Config:
 
 @dataclass(frozen=True)
 class Features:
-    """Features (n, d) f32 with the keys of their rows: manifest row numbers, or frame numbers of a video or folder."""
+    """Features (n, d) f32 with the keys of their rows: manifest row numbers, or frame numbers of a video or folder.
+
+    `said`: more arrays (n, ...), what a head says of them.
+    """
 
     values: np.ndarray
     rows: np.ndarray
     keys: dict[str, np.ndarray]
     skipped: int = 0
+    said: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def embed_rows(
@@ -277,6 +281,6 @@ def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> Non
     """Write features, row numbers, keys and a description as one `.npz`, whole or not at all. Raises OSError."""
     described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
     keys = {f"key/{k}": v for k, v in features.keys.items()}
-    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **keys, **described}
+    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **features.said, **keys, **described}
     with replacing(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)

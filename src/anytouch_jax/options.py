@@ -91,6 +91,10 @@ class Embed:
     """Sensor of a folder, a video or a camera; one that the model does not know gets the universal tokens."""
     background: Path | None = None
     """Picture of the untouched gel of a folder, a video or a camera, for an encoder trained on differences from it."""
+    rotate: Literal[0, 90, 180, 270] = 0
+    """Turn the frames of a folder, a video or a camera by so many degrees, clockwise, before anything else."""
+    flip: Literal["none", "across", "down"] = "none"
+    """Mirror them after that: left and right exchanged, or top and bottom."""
     frames: int = 1
     """Frames of a clip that ends at each row: 1 (stills), 3, or more (segments of three)."""
     pooling: Literal["class", "mean", "both"] = "class"

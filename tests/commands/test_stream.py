@@ -90,3 +90,30 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
         assert (
             len(file["features"]) <= 1 and file["features"].ndim == 2
         )  # the signal may come before the encoder is done
+
+
+def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
+    """A folder, and a video frame by frame: as if the camera had been held upright."""
+    rng = np.random.default_rng(0)
+    upright = [cv2.resize(rng.integers(0, 256, (4, 3, 3), np.uint8), (24, 32)) for _ in range(3)]
+    lying = [cv2.rotate(one[:, ::-1], cv2.ROTATE_90_COUNTERCLOCKWISE) for one in upright]
+    found = {}
+    for name, frames in (("upright", upright), ("lying", lying)):
+        (tmp_path / name).mkdir()
+        for number, frame in enumerate(frames):
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), frame)
+        writer = cv2.VideoWriter(
+            str(tmp_path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 10, frames[0].shape[1::-1]
+        )
+        for frame in frames:
+            writer.write(frame)
+        writer.release()
+        turn = ("--rotate", 90, "--flip", "across") if name == "lying" else ()
+        for form, more in ((name, ()), (f"{name}.avi", ("--stream",))):
+            out = tmp_path / "f.npz"
+            said = anytouch("embed", "--run", tiny_run, "--input", tmp_path / form, "--out", out, *turn, *more)
+            assert said.status == 0, said
+            with np.load(out) as file:
+                found[form] = file["features"]
+    np.testing.assert_array_equal(found["lying"], found["upright"])
+    np.testing.assert_allclose(found["lying.avi"], found["upright.avi"], atol=1e-2 * np.abs(found["upright"]).max())

@@ -133,7 +133,7 @@ def _sight(encoder: Encoder, options: Embed) -> Any:
         gel = pictures_in(options.input)[1].get(BACKGROUND) if options.input.is_dir() else None
         what = "the first frame" if gel is None else str(gel)
         say(f"this encoder sees touches less the untouched gel: {what} is taken for that (else --background)")
-    return Sight(encoder, None if gel is None else decode(gel))
+    return Sight(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
 
 
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
@@ -242,6 +242,9 @@ def _refuse_unused(options: Embed) -> None:
             refuse(options, ("stride",), "for single frames", "; or ask for clips with --frames")
     elif options.input.suffix.lower() in _MANIFESTS:
         refuse(options, ("sensor", "stride"), "with a manifest, whose rows name their sensor and stride")
+        refuse(
+            options, ("rotate", "flip"), "with a manifest, whose pictures are those of the training: turn their files"
+        )
     else:
         refuse(options, ("split",), "with a folder or a video: only a manifest has splits")
         refuse(options, ("stride",), "without --stream: clips of a folder or a video are of frames in a row")

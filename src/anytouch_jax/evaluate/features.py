@@ -19,7 +19,7 @@ from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, from_
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.manifest import Manifest
-from anytouch_jax.data.transforms import subtract_background, touch_evaluation
+from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation, turned
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -136,16 +136,21 @@ class Encoder:
 
 class Sight:
     """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
-    (a frame), the picture of the untouched gel; the first frame serves where none is given."""
+    (a frame), the picture of the untouched gel; the first frame serves where none is given. `rotate` and `flip` turn
+    both before (`data.transforms.turned`)."""
 
-    def __init__(self, encoder: Encoder, background: npt.ArrayLike | None = None) -> None:
-        self._encoder = encoder
-        self._background = None if background is None else to_rgb(np.asarray(background), "the background")
+    def __init__(
+        self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
+    ) -> None:
+        self._encoder, self._turned = encoder, partial(turned, rotate=rotate, flip=flip)
+        self._background = None
+        if background is not None:
+            self._background = self._turned(to_rgb(np.asarray(background), "the background"))
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
         """A frame (h, w, 3), or another form of picture that `data.images.decode` reads (grey, RGBA, u16, floats of
         0..1), as RGB u8 (size, size, 3). Raises ImageError for any other."""
-        frame = to_rgb(np.asarray(frame), "the frame")
+        frame = np.ascontiguousarray(self._turned(to_rgb(np.asarray(frame), "the frame")))
         if self._encoder.subtracts:
             self._background = frame if self._background is None else self._background
             frame = subtract_background([frame], self._background)[0]

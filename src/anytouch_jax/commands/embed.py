@@ -85,6 +85,7 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
 
     lines = str(options.out) == "-"
     source, live = stream.open_source(options.input)
+    rate = 0.0 if live else stream.rate_of(options.input)
     embedded = stream.stream(
         encoder,
         source,
@@ -96,14 +97,15 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
         pooling=options.pooling,
         join=options.join,
     )
-    result = stream.collect(embedded, partial(_print_line, head=head) if lines else None)
+    result = stream.collect(embedded, partial(_print_line, rate=rate, head=head) if lines else None)
     if not live and not result.interrupted and len(result.numbers):
         _say_cut(options.input, int(result.numbers[-1]) + 1)
     if not len(result.numbers) and not result.interrupted:
         raise UserError(f"{options.input} has too few frames for a clip of {options.frames} at stride {options.stride}")
     if not lines:
-        keys = {"frame_index": result.numbers, "time": result.at}
+        keys = {"frame_index": result.numbers, "time": result.numbers / rate if rate else result.at}
         about = _about(encoder, options) | {"stride": str(options.stride)}
+        about |= {"started": f"{result.started:.6f}"} if live and len(result.numbers) else {}
         found = features.Features(result.values, result.numbers, keys)
         features.save_npz(options.out, _named(found, head if len(result.numbers) else None), about)
     for line in stream.budget(result):
@@ -113,9 +115,9 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
     return 0
 
 
-def _print_line(one: Embedded, head: Head | None = None) -> None:
+def _print_line(one: Embedded, rate: float, head: Head | None) -> None:
     values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
-    line: dict[str, Any] = {"frame": one.number, "time": round(one.at, 6)}
+    line: dict[str, Any] = {"frame": one.number, "time": round(one.number / rate if rate else one.at, 6)}
     if head is not None:
         (label,), p = head(one.values[None])
         line |= {"label": str(label), "p": round(float(p.max()), 6)}

@@ -61,14 +61,22 @@ def run(options: Embed) -> int:
 
 
 def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
+    gel, shown = _gel(encoder, options), options.input.suffix.lower() not in _MANIFESTS
+    of_frames = {
+        "sensor": options.sensor,
+        "background": ("the first frame" if gel is None else str(gel)) if encoder.subtracts else "not taken off",
+        "rotate": str(options.rotate),
+        "flip": options.flip,
+    }
     return {
         "encoder": encoder.source,
+        "weights": encoder.mark,
         "input": str(options.input),
         "pooling": options.pooling,
         "frames": str(options.frames),
         "join": options.join,
         "dtype": encoder.config.model.dtype,
-    }
+    } | (of_frames if shown else {})
 
 
 def _named(found: Features, head: Head | None) -> Features:
@@ -124,15 +132,23 @@ def _print_line(one: Embedded, rate: float, head: Head | None) -> None:
     print(json.dumps(line | {"features": values}), flush=True)
 
 
+def _gel(encoder: Encoder, options: Embed) -> Path | None:
+    """The picture of the untouched gel: that of --background, or that of the folder where the encoder wants one."""
+    from anytouch_jax.data.images import BACKGROUND, pictures_in
+
+    if options.background is None and encoder.subtracts and options.input.is_dir():
+        return pictures_in(options.input)[1].get(BACKGROUND)
+    return options.background
+
+
 def _sight(encoder: Encoder, options: Embed) -> Any:
-    from anytouch_jax.data.images import BACKGROUND, decode, pictures_in
+    from anytouch_jax.data.images import decode
     from anytouch_jax.evaluate.features import Sight
 
-    gel = options.background
+    gel = _gel(encoder, options)
     if gel is not None and not encoder.subtracts:
         say("--background is not used: this encoder sees touches as the camera gives them")
-    if gel is None and encoder.subtracts:
-        gel = pictures_in(options.input)[1].get(BACKGROUND) if options.input.is_dir() else None
+    if options.background is None and encoder.subtracts:
         what = "the first frame" if gel is None else str(gel)
         say(f"this encoder sees touches less the untouched gel: {what} is taken for that (else --background)")
     return Sight(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
@@ -159,6 +175,8 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     )  # fmt: skip
     keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
+    more = [name for name in manifest.table.column_names if name in ("object", "unit") or name.startswith("label.")]
+    keys |= {name: features.plain_column(manifest, name)[rows] for name in more}
     return features.Features(values, rows, keys, len(usable) - len(rows))
 
 

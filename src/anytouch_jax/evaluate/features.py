@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, from_json
 from anytouch_jax.data.evaluation import evaluation
@@ -280,6 +281,14 @@ def check_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray) ->
 def text_column(manifest: Manifest, name: str) -> np.ndarray:
     """A column of a manifest as strings, "" where it is null."""
     return np.array(["" if value is None else str(value) for value in manifest.column(name).to_pylist()])
+
+
+def plain_column(manifest: Manifest, name: str) -> np.ndarray:
+    """A column of a manifest as an array without objects: numbers as they are, NaN where null; all else as text."""
+    kind = manifest.column(name).type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return text_column(manifest, name)
+    return np.asarray([np.nan if value is None else value for value in manifest.column(name).to_pylist()])
 
 
 def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:

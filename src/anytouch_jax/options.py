@@ -132,6 +132,8 @@ class Probe:
     """Manifests with the label column."""
     run: Paths = ()
     """Run folders or weights files to compare."""
+    features: Paths = ()
+    """Features of other encoders, beside them: .npz as embed writes it, arrays features (n, d) and rows (n,)."""
     label: str = "object"
     """Label column, with or without "label."."""
     group: str = ""

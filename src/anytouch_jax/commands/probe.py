@@ -28,9 +28,9 @@ def run(options: Probe) -> int:
     check_options(options)
     if options.out is not None:
         own = (run / name for run in options.run for name in ("config.json", "metrics.jsonl", "tokenizer.json"))
-        check_folder(options.out, read=(*options.data, *options.run, *own))
+        check_folder(options.out, read=(*options.data, *options.run, *options.features, *own))
     if options.save is not None:
-        check_folder(options.save, "--save", read=(*options.data, *options.run))
+        check_folder(options.save, "--save", read=(*options.data, *options.run, *options.features))
         if options.save.suffix.lower() != ".npz":
             raise UserError(f"{options.save}: a head is written as .npz; name such a file with --save")
     check_apart(out=options.out, save=options.save)

@@ -33,7 +33,7 @@ COMPONENTS = 200  # principal components of raw pixels
 
 
 def run(
-    encoder: Encoder | None,
+    encoder: Encoder | Store | None,
     table: Manifest,
     tasks: Sequence[str | Task],
     *,
@@ -56,8 +56,8 @@ def run(
     """Probe frozen features of `encoder` on `tasks` (names of `tasks.TASKS`) of a manifest.
 
     `encoder` None: pixels and their difference from the background, reduced to 200 principal components (fitted,
-    without labels, on the rows that are never tested; on all where the test is in folds), for which `pooling`, `join`
-    and `universal` mean nothing.
+    without labels, on the rows that are never tested; on all where the test is in folds). For these, and for a `Store`
+    (features that are there: `given`), `pooling`, `join` and `universal` mean nothing.
 
     One JSON-ready dict for each task, head and protocol: task, protocol, metric ("accuracy" in 0..1, or "r2"), mean
     (over seeds), low, high (95 % over seeds and test groups; None with fewer than two groups), values (one a seed),
@@ -75,6 +75,8 @@ def run(
     setting = Setting(seeds, frames, recipe, sides, order, max_rows, "common", None)
     if encoder is None:
         store = raw(table, order=order, folder=cache)
+    elif isinstance(encoder, Store):
+        store, setting = encoder, setting._replace(scaling="column")
     else:
         store = encoded(encoder, table, pooling=pooling, join=join, order=order, universal=universal, folder=cache)
         setting = setting._replace(

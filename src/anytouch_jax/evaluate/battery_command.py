@@ -12,6 +12,7 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery
 from anytouch_jax.evaluate.benchmarks import benchmark_of
 from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
+from anytouch_jax.evaluate.given import given
 from anytouch_jax.evaluate.heads import HeadName
 from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.tasks import available, task_of
@@ -37,17 +38,25 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
     if options.controls:
         first = next(iter(encoders.values()), None)
         encoders["random encoder"] = random_encoder(first.config if first else preset("tiny"))
-    if not encoders:
-        raise UserError("nothing to probe: give --run, or keep the controls")
+    files = {str(path): given(path, table) for path in options.features}
+    if not encoders and not files:
+        raise UserError("nothing to probe: give --run or --features, or keep the controls")
+    if files and options.order != "right":
+        raise UserError("--order does nothing for --features, whose frames are encoded already; leave one of them out")
     names = ("train_sensors", "test_sensors", "train_units", "test_units")
     sides = {name: _names(getattr(options, name)) for name in names}
     shared: dict[str, Any] = {name: getattr(options, name) for name in ("cache", "seeds", "order", "max_rows")} | sides
+    plain = {name: settings[name] for name in ("protocols", "frames", "head_names", "recipe") if name in settings}
+    mine: list[dict[str, Any]] = []
+    for name, store in files.items():  # first: a file that lacks rows is told before the work
+        mine += [{"features": name} | one for one in battery.run(store, table, tasks, **shared, **plain)]
+        say(f"probed {name}")
     found: list[dict[str, Any]] = []
     for name, encoder in encoders.items():
         found += [{"features": name} | one for one in battery.run(encoder, table, tasks, **shared, **settings)]
         say(f"probed {name}")
+    found += mine
     if options.controls:
-        plain = {name: settings[name] for name in ("protocols", "frames", "head_names", "recipe") if name in settings}
         found += [{"features": RAW} | one for one in battery.run(None, table, tasks, **shared, **plain)]
         say(f"probed {RAW}")
     runs = {name: dataclasses.asdict(encoder.config) for name, encoder in encoders.items()}

@@ -194,6 +194,7 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
         seen, params = about.get("seen"), release.served(params, config, about)
         drawn = config.objective.universal_start + config.objective.universal_end > 0
     else:
+        _refuse_features(path)
         weights = release.read_weights(path)
         model = release.model_of(path, weights)
         told = release.read_metadata(path)  # written by `anytouch convert`, which has served the sensors not seen
@@ -206,6 +207,17 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
         raise UserError(f"{path} holds weights that are not finite: its training diverged; take an earlier checkpoint")
     known = None if seen is None else tuple(seen)
     return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path), known, drawn)
+
+
+def _refuse_features(path: Path) -> None:
+    """Raise UserError for what `anytouch embed` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {"features", "rows"} <= set(file.files)
+    except Exception:  # weights of any kind: who reads them says what is wrong
+        return
+    if found:
+        raise UserError(f"{path} is a features file, no encoder: `anytouch probe` takes it as --features")
 
 
 def random_encoder(config: Config, seed: int = 0) -> Encoder:

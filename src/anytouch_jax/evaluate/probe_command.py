@@ -14,6 +14,7 @@ from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import baseline, probe
 from anytouch_jax.evaluate.features import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate.given import given
 from anytouch_jax.evaluate.probe_rows import prepare
 from anytouch_jax.evaluate.saved_heads import head_of, save_head
 
@@ -60,7 +61,7 @@ def run_probes(options: Probe, say: Say) -> list[Any]:
         found += results
         say(f"probed {name}")
     if not found:
-        raise UserError("nothing to probe: give --run, or keep the controls")
+        raise UserError("nothing to probe: give --run or --features, or keep the controls")
     if options.leave_out is None:
         found.append(probe.majority(task.labels, task.groups, task.split, subsets=task.subsets))
     return found
@@ -184,7 +185,10 @@ def _subsets(manifest: Any, names: list[Any], split: np.ndarray, rows: np.ndarra
 
 
 def _features(options: Probe, task: Task, say: Say) -> Any:
-    """(name, features, encoder or None) of every encoder asked for, then of the controls."""
+    """(name, features, encoder or None) of every encoder and file asked for, then of the controls."""
+    files = {str(path): given(path, task.manifest) for path in options.features}
+    for store in files.values():
+        store.add(task.rows, options.frames or 1)
     encoders: list[tuple[str, Encoder]] = [(str(path), load_encoder(path)) for path in options.run]
     if options.controls:
         config: Config = encoders[0][1].config if encoders else preset("tiny")
@@ -196,6 +200,8 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
         if not np.array_equal(rows, task.rows):
             raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
         yield name, values, encoder
+    for path, store in files.items():
+        yield path, store.get(task.rows[:, None], options.frames or 1), None
     if options.controls:
         yield RAW, raw_features(task), None
 

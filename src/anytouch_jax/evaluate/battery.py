@@ -85,6 +85,19 @@ def run(
     return _probe(store, table, tasks, setting, head_names, protocols)
 
 
+def left_out(
+    table: Manifest, tasks: Sequence[str], frames: int | None, sides: Sides, max_rows: int | None
+) -> dict[str, str]:
+    """Why a task cannot be probed on this manifest, by the name of each such one. Raises UserError: unknown names."""
+    setting, found = Setting(1, frames, None, sides, "right", max_rows, "common", None), dict[str, str]()
+    for task in map(task_of, tasks):
+        try:
+            _selected(table, task, setting)
+        except UserError as error:
+            found[task.name] = str(error).removeprefix(f"task {task.name}: ")
+    return found
+
+
 class Sides(NamedTuple):
     """Sensors and units (patterns) to learn from and to test on; None: all."""
 

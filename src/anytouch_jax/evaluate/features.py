@@ -102,7 +102,7 @@ class Encoder:
         if clips.dtype != np.uint8 or clips.ndim != 5 or clips.shape[2:] != (side, side, 3):
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {clips.dtype} "
-                f"{clips.shape}; data.transforms.touch_evaluation resizes them"
+                f"{clips.shape}; `see = Sight(encoder)`, then `see(frame)`, resizes a frame"
             )
         check_frames(self.config.model, clips.shape[1])
         rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)

@@ -107,6 +107,8 @@ def test_a_sight_takes_its_first_frame_for_the_background_unless_told(encoder):
     assert [int(np.median(told(one))) for one in frames] == [108, 128]
     plain = Sight(replace(encoder, config=replace(encoder.config, data=Data())))
     np.testing.assert_array_equal(plain(GEL), GEL)
+    lying = Sight(encoder, np.rot90(GEL), rotate=90)  # the background lies on its side as the frames do
+    np.testing.assert_array_equal(lying(np.rot90(frames[1])), Sight(encoder, GEL)(frames[1]))
 
 
 def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(

@@ -327,6 +327,8 @@ def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
         assert file["features"].shape == (2, 12)
         assert file["rows"].tolist() == [10, 11]
         assert file["key/path"].tolist() == ["c2.png", "c3.png"] and set(file["key/split"]) == {"test"}
+        assert file["key/object"].tolist() == file["key/label.object"].tolist() == ["ball", "cube"]
+        assert len(str(file["about/weights"])) == 8 and "about/sensor" not in file
         from_manifest = file["features"]
 
     folder = tmp_path / "frames"
@@ -339,6 +341,7 @@ def test_embed_a_manifest_and_a_folder(tmp_path, world, tiny_run, capsys):
         np.testing.assert_allclose(file["features"], from_manifest, atol=1e-6)
         assert file["key/frame_index"].tolist() == [0, 1] and str(file["about/input"]) == str(folder)
         assert file["key/path"].tolist() == ["c2.png", "c3.png"]
+        assert str(file["about/sensor"]) == "digit" and str(file["about/background"]) == "not taken off"
     capsys.readouterr()
     assert run(*args, "--sensor", "new_sensor") == 0
     assert "'new_sensor'" in (error := capsys.readouterr().err) and "universal tokens" in error

@@ -188,11 +188,13 @@ def _parse_train(args: list[str]) -> tuple[Train, Config]:
         return _parse(Train, "train", args)
     sections = [a for a in args if a.startswith(("--model.", "--objective.", "--optim.", "--loader.", "--loop."))]
     if not sections and "--help-all" not in args:
+        _suggest_section(args)
         options = _parse(Train, "train", args)
         return options, _configure(options)
 
     asked = "--help-all" in args
     first, rest = _split_sections([arg for arg in args if arg != "--help-all"])
+    _suggest_section(first)
     options = _parse(Train, "train", first, Train((), Path("runs/stage1")) if asked else None)
     config = _configure(options)
     closing = "For every field of the configuration, run anytouch train --help-all"
@@ -201,6 +203,16 @@ def _parse_train(args: list[str]) -> tuple[Train, Config]:
     default = Sections(config.model, config.objective, config.optim, config.data, config.run)
     s = _parse(_told() if asked else Sections, "train [the options of --help]", rest, default, closing)
     return options, replace(config, model=s.model, objective=s.objective, optim=s.optim, data=s.loader, run=s.loop)
+
+
+def _suggest_section(args: Sequence[str]) -> None:
+    """Raise UserError for an option that only a section has, under the section's name (--optim.learning-rate)."""
+    usual = set(get_type_hints(Train))
+    homes = {name: home for home, kind in get_type_hints(Sections).items() for name in get_type_hints(kind)}
+    for arg in args:
+        name = arg.split("=")[0].removeprefix("--").replace("-", "_")
+        if arg.startswith("--") and name in homes and name not in usual:
+            raise UserError(f"there is no --{(spelled := name.replace('_', '-'))}; use --{homes[name]}.{spelled}")
 
 
 def _told() -> type[Sections]:

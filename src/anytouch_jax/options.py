@@ -91,6 +91,10 @@ class Embed:
     """Sensor of a folder, a video or a camera; without it, or for an unknown one, the universal tokens."""
     background: Path | None = None
     """Picture of the untouched gel of a folder, a video or a camera, for an encoder trained on differences from it."""
+    rotate: Literal[0, 90, 180, 270] = 0
+    """Turn the frames of a folder, a video or a camera by so many degrees, clockwise, before anything else."""
+    flip: Literal["none", "across", "down"] = "none"
+    """Mirror them after that: left and right exchanged, or top and bottom."""
     frames: int = 1
     """Frames of a clip that ends at each row: 1 (stills), 3, or more (segments of three)."""
     pooling: Literal["class", "mean", "both"] = "class"
@@ -105,6 +109,8 @@ class Embed:
     """One frame at a time, the newest of a camera; prints where the time went."""
     stride: int = 1
     """Frames from one frame of a streamed clip to its next: what the clips of the training data have."""
+    head: Path | None = None
+    """Name the class too by a head of probe --save: label and its probability p, arrays or in each line of JSON."""
     on_bad_sample: Literal["error", "skip"] = "error"
     """A row or a picture of a folder that cannot be read stops the command, or is left out and counted."""
 
@@ -126,6 +132,8 @@ class Probe:
     """Manifests with the label column."""
     run: Paths = ()
     """Run folders or weights files to compare."""
+    features: Paths = ()
+    """Features of other encoders, beside them: .npz as embed writes it, arrays features (n, d) and rows (n,)."""
     label: str = "object"
     """Label column, with or without "label."."""
     group: str = ""
@@ -173,6 +181,8 @@ class Probe:
     """Also probe raw pixels and a random encoder."""
     out: Path | None = None
     """Write the results as JSON."""
+    save: Path | None = None
+    """Keep the linear head of one --run as .npz, for embed --head."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import pytest
     [
         (["m.csv", "--sensor", "digit"], "--sensor does nothing with a manifest, whose rows name their sensor"),
         (["m.parquet", "--sensor", "digit", "--stride", "2"], "--sensor, --stride do nothing with a manifest"),
+        (["m.csv", "--rotate", "90", "--flip", "across"], "--rotate, --flip do nothing with a manifest"),
         (["frames", "--split", "test"], "--split does nothing with a folder or a video: only a manifest has splits"),
         (["touch.mp4", "--stride", "5"], "--stride does nothing without --stream"),
         (["0", "--stream", "--on-bad-sample", "skip"], "--on-bad-sample does nothing with --stream"),
@@ -30,7 +31,7 @@ def test_features_are_written_as_npz(mistake):
     "words",
     [
         ["m.csv", "--split", "test", "--frames", "3", "--batch", "8"],
-        ["frames", "--sensor", "digit", "--batch", "8"],
+        ["frames", "--sensor", "digit", "--batch", "8", "--rotate", "270", "--flip", "down"],
         ["0", "--stream", "--stride", "2", "--frames", "3", "--sensor", "digit"],
     ],
 )

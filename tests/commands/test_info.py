@@ -25,7 +25,9 @@ def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
     assert f"{world}: a manifest of 12 rows in 3 recordings, 4 clips of three frames" in manifest
     assert "splits: test 2, train 8, val 2" in manifest and "sensors: digit 8, gelsight_mini 4" in manifest
     assert "rows with image_path 1, text 4, touch 12, object 12" in manifest and "labels: object" in manifest
-    assert f"{features}: 12 features of 12, with path, sensor, sequence, split, frame_index" in found
+    assert (
+        f"{features}: 12 features of 12, with path, sensor, sequence, split, frame_index, object, label.object" in found
+    )
     assert f"encoder: {tiny_run}" in found and anytouch("info", world.parent).out.startswith(str(world))
 
 

@@ -124,3 +124,9 @@ def test_no_clip_of_a_folder_reaches_over_a_missing_number(anytouch, tiny_run, t
     assert anytouch("embed", *words, "--input", folder).status == 0
     with np.load(out) as every:
         np.testing.assert_allclose(alone, every["features"][3:4], rtol=1e-5, atol=1e-6)
+
+
+def test_an_option_of_a_section_is_named_in_full(mistake):
+    args = ("train", "--data", "nowhere.csv", "--run", "r")
+    assert "no --learning-rate; use --optim.learning-rate" in mistake(*args, "--learning-rate", "1e-3")
+    assert "use --optim.learning-rate" in mistake(*args, "--learning_rate=1e-3", "--model.patch", 16)

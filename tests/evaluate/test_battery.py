@@ -491,6 +491,31 @@ def test_tasks_from_the_command_line(pictures, tiny_run, tmp_path, capsys):
     assert "no task 'taste'" in capsys.readouterr().err
 
 
+def test_a_task_that_cannot_be_probed_leaves_the_others(monkeypatch, tmp_path, capsys):
+    planted(monkeypatch, noise)
+    monkeypatch.setattr(battery, "raw", battery.encoded)
+    columns = WORLD.table.to_pydict()
+    slides = zip(columns["label.slide"], columns["split"], strict=True)
+    columns["label.slide"] = [None if split == "test" else one for one, split in slides]
+    data, out = tmp_path / "m.parquet", tmp_path / "r.json"
+    manifests.write(manifests.from_columns(columns, data), data)
+    words = ["probe", "--data", str(data), "--seeds", "1", "--out", str(out), "--tasks"]
+    assert main([*words, "material,slide"]) == 0
+    assert "slide: not probed (no row is left to test" in capsys.readouterr().err
+    found = json.loads(out.read_text())
+    assert {one["task"] for one in found["results"]} == {"material"} and list(found["left_out"]) == ["slide"]
+    assert main([*words, "all"]) == 0
+    told = capsys.readouterr().err
+    assert "slide: not probed (no row is left" in told and "grasp: not probed (the manifest has no such label)" in told
+    assert main([*words, "slide"]) == 1
+    assert "task slide: no row is left to test" in capsys.readouterr().err
+
+
+def test_a_task_that_is_not_there(pictures, capsys):
+    assert main(["probe", "--tasks", "taste", "--data", str(pictures.files[0])]) == 1
+    assert "no task 'taste'" in capsys.readouterr().err
+
+
 def test_a_fit_that_does_not_converge_is_told_of(monkeypatch):
     planted(monkeypatch, telling(MANY, "material", noise=1.0))
     (one,) = battery.run(NOBODY, MANY, ["material"], seeds=2)

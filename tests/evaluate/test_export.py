@@ -68,6 +68,7 @@ def test_the_description_tells_how_to_call_it(artefact, encoder, monkeypatch):
     assert about["platforms"] == ["cpu", "cuda"] and about["frames"] == 3 and about["image_size"] == 28
     assert about["features"] == 12 and about["sensors"]["digit"] == 1 and about["sensors"]["universal"] == 9
     assert about["bytes"] == path.stat().st_size
+    assert "to 28 x 28, its shape not kept: OpenCV's INTER_AREA" in about["resize"] and "gel" not in about["resize"]
     monkeypatch.chdir(path.parent)
     space = {"frames": CLIPS, "sensor": ROWS}
     exec(about["example"], space)  # what a reader would copy

@@ -20,6 +20,7 @@ from anytouch_jax.evaluate.features import (
     Sight,
     embed_rows,
     load_encoder,
+    plain_column,
     random_encoder,
     save_npz,
     text_column,
@@ -68,7 +69,7 @@ def test_what_cannot_be_embedded_is_one_sentence(encoder):
     for clips, word in (
         (CLIPS.astype(np.float32), "float32"),
         (CLIPS[:, :, :27], "28 x 28"),
-        (CLIPS[..., :1], "28 x 28"),
+        (CLIPS[..., :1], r"see = Sight\(encoder\)"),
         (CLIPS[:, :0], "a clip needs 3 frames"),
         (CLIPS[:, :2], "a clip needs 3 frames"),
         (CLIPS[0, 0, 0], "28 x 28"),
@@ -365,3 +366,16 @@ def test_names_of_pooling_and_join_and_rows_are_checked(tiny_run):
         encoder.embed(CLIPS, "digit", join="max")
     with pytest.raises(UserError, match="one integer for each"):
         encoder.embed(CLIPS, np.full(len(CLIPS), 0.5))
+
+
+def test_a_column_of_a_manifest_becomes_an_array_without_objects(tmp_path):
+    columns = {
+        "path": ["a.png", "b.png"], "sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1],
+        "split": ["train"] * 2, "label.force": [1.5, None], "label.count": [3, 4], "label.slip": [True, None],
+        "label.pose": [[1.0, 2.0], [3.0]],
+    }  # fmt: skip
+    table = manifests.from_columns(columns, tmp_path / "m.parquet")
+    force, count = plain_column(table, "label.force"), plain_column(table, "label.count")
+    assert force[0] == 1.5 and np.isnan(force[1]) and count.tolist() == [3, 4] and count.dtype.kind == "i"
+    assert plain_column(table, "label.slip").tolist() == ["True", ""]
+    assert plain_column(table, "label.pose").tolist() == ["[1.0, 2.0]", "[3.0]"]

@@ -281,8 +281,11 @@ def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, later: Pat
     with pytest.raises(UserError, match=r"--stage2 .*w\.safetensors is a weights file"):
         (tmp_path / "w.safetensors").write_bytes(b"")
         demo_report(touched, tiny_run, tmp_path / "w.safetensors", tmp_path / "out")
-    with pytest.raises(UserError, match="split test gives 3 frames to look at; a report needs 4: more --touches"):
+    with pytest.raises(UserError, match="give 3 frames to look at; a report needs 4: more --touches"):
         demo_report(touched, tiny_run, later, tmp_path / "out", lambda _: None, touches=1)
+    few = make_touches(tmp_path / "few", touches={"train": 2, "test": 1})
+    with pytest.raises(UserError, match=r"test split has 1 touches, .* 3 frames .* needs 4: simulate or record more"):
+        demo_report(few, tmp_path / "none", later, tmp_path / "out", lambda _: None)  # before a run is looked at
     assert not (tmp_path / "out").exists()
 
 

@@ -81,8 +81,8 @@ def test_the_snippet_of_an_encoder_runs(tiny_run: Path, tmp_path: Path, monkeypa
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "stage2").symlink_to(tiny_run)
     monkeypatch.chdir(tmp_path)
-    frames = np.random.default_rng(0).integers(0, 256, (4, 28, 28, 3), np.uint8)
-    names: dict[str, Any] = {f"frame{i}": frame for i, frame in enumerate(frames[:3])} | {"gel": frames[3]}
+    frames = np.random.default_rng(0).integers(0, 256, (3, 40, 30, 3), np.uint8)  # a camera's, not the model's size
+    names: dict[str, Any] = {f"frame{i}": frame for i, frame in enumerate(frames)}
     with warnings.catch_warnings(record=True):  # of the sensor that is not in the table
         warnings.simplefilter("always")
         exec(PYTHON[0], names)

@@ -207,3 +207,14 @@ def test_a_missing_tensorboard_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "tensorboardX", None)
     with pytest.raises(UserError, match=r"pip install 'anytouch-jax\[tensorboard\]'"):
         Record(tmp_path, 0, tensorboard=True)
+
+
+def test_more_steps_of_a_run_are_told_of_init(tmp_path, monkeypatch):
+    config = toy_config()
+    longer = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=2 * config.run.steps))
+    monkeypatch.setattr("anytouch_jax.train.record.begun_with", lambda _: config)
+    with pytest.raises(UserError, match=r"run\.steps was .*; --init .* with another --run folder goes on from"):
+        goes_on(tmp_path, longer)
+    other = dataclasses.replace(config, run=dataclasses.replace(config.run, seed=7))
+    with pytest.raises(UserError, match=r"choose another run folder$"):
+        goes_on(tmp_path, other)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,8 @@ from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, UserError
 from anytouch_jax.options import Embed
 
 if TYPE_CHECKING:
-    from anytouch_jax.evaluate.features import Encoder
+    from anytouch_jax.evaluate.features import Encoder, Features
+    from anytouch_jax.evaluate.saved_heads import Head
     from anytouch_jax.evaluate.stream import Embedded
 
 _MANIFESTS = (".csv", ".parquet")
@@ -26,6 +29,7 @@ def run(options: Embed) -> int:
     """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
     _refuse_unused(options)
     from anytouch_jax.evaluate import features
+    from anytouch_jax.evaluate.saved_heads import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     if not (options.stream and str(options.out) == "-"):
@@ -33,14 +37,17 @@ def run(options: Embed) -> int:
         check_folder(options.out, read=(options.run, options.input))
         if options.out.suffix.lower() != ".npz":
             raise UserError(f"{options.out}: features are written as .npz; name such a file with --out")
+    head = None if options.head is None else load_head(options.head)
     enable_compilation_cache()
     encoder = features.load_encoder(options.run).computed_in(options.dtype)
     features.check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
+    if head is not None:
+        head.check(encoder.source, encoder.mark, options.pooling, options.frames, options.join)
     if options.batch < 1:
         raise UserError(f"--batch must be 1 or more, not {options.batch}")
     if options.stream:
-        return _stream(encoder, options)
+        return _stream(encoder, options, head)
     if not options.input.exists():
         raise UserError(f"no manifest, folder or video at {options.input}")
     if options.input.suffix.lower() in _MANIFESTS:
@@ -48,29 +55,46 @@ def run(options: Embed) -> int:
     else:
         found = _embed_frames(encoder, options)
         _say_universal(encoder, options)
-    features.save_npz(options.out, found, _about(encoder, options))
+    features.save_npz(options.out, _named(found, head), _about(encoder, options))
     left = f", {found.skipped} skipped" if found.skipped else ""
     print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
     return 0
 
 
 def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
+    gel, shown = _gel(encoder, options), options.input.suffix.lower() not in _MANIFESTS
+    of_frames = {
+        "sensor": options.sensor or UNIVERSAL,
+        "background": ("the first frame" if gel is None else str(gel)) if encoder.subtracts else "not taken off",
+        "rotate": str(options.rotate),
+        "flip": options.flip,
+    }
     return {
         "encoder": encoder.source,
+        "weights": encoder.mark,
         "input": str(options.input),
         "pooling": options.pooling,
         "frames": str(options.frames),
         "join": options.join,
         "dtype": encoder.config.model.dtype,
-    }
+    } | (of_frames if shown else {})
 
 
-def _stream(encoder: Encoder, options: Embed) -> int:
+def _named(found: Features, head: Head | None) -> Features:
+    """Features with what a head says of them: `label` (n,) and its probability `p` (n,)."""
+    if head is None:
+        return found
+    label, p = head(found.values)
+    return replace(found, said={"label": label, "p": p.max(1)})
+
+
+def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
     """Embed a camera or a video frame by frame: features to an .npz, or as JSON lines; then the latency budget."""
     from anytouch_jax.evaluate import features, stream
 
     lines = str(options.out) == "-"
     source, live = stream.open_source(options.input)
+    rate = 0.0 if live else stream.rate_of(options.input)
     embedded = stream.stream(
         encoder,
         source,
@@ -82,15 +106,17 @@ def _stream(encoder: Encoder, options: Embed) -> int:
         pooling=options.pooling,
         join=options.join,
     )
-    result = stream.collect(embedded, _print_line if lines else None)
+    result = stream.collect(embedded, partial(_print_line, rate=rate, head=head) if lines else None)
     if not live and not result.interrupted and len(result.numbers):
         _say_cut(options.input, int(result.numbers[-1]) + 1)
     if not len(result.numbers) and not result.interrupted:
         raise UserError(f"{options.input} has too few frames for a clip of {options.frames} at stride {options.stride}")
     if not lines:
-        keys = {"frame_index": result.numbers, "time": result.at}
+        keys = {"frame_index": result.numbers, "time": result.numbers / rate if rate else result.at}
         about = _about(encoder, options) | {"stride": str(options.stride)}
-        features.save_npz(options.out, features.Features(result.values, result.numbers, keys), about)
+        about |= {"started": f"{result.started:.6f}"} if live and len(result.numbers) else {}
+        found = features.Features(result.values, result.numbers, keys)
+        features.save_npz(options.out, _named(found, head if len(result.numbers) else None), about)
     _say_universal(encoder, options)
     for line in stream.budget(result):
         say(line)
@@ -99,9 +125,22 @@ def _stream(encoder: Encoder, options: Embed) -> int:
     return 0
 
 
-def _print_line(one: Embedded) -> None:
+def _print_line(one: Embedded, rate: float, head: Head | None) -> None:
     values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
-    print(json.dumps({"frame": one.number, "time": round(one.at, 6), "features": values}), flush=True)
+    line: dict[str, Any] = {"frame": one.number, "time": round(one.number / rate if rate else one.at, 6)}
+    if head is not None:
+        (label,), p = head(one.values[None])
+        line |= {"label": str(label), "p": round(float(p.max()), 6)}
+    print(json.dumps(line | {"features": values}), flush=True)
+
+
+def _gel(encoder: Encoder, options: Embed) -> Path | None:
+    """The picture of the untouched gel: that of --background, or that of the folder where the encoder wants one."""
+    from anytouch_jax.data.images import BACKGROUND, pictures_in
+
+    if options.background is None and encoder.subtracts and options.input.is_dir():
+        return pictures_in(options.input)[1].get(BACKGROUND)
+    return options.background
 
 
 def _say_universal(encoder: Encoder, options: Embed) -> None:
@@ -112,17 +151,16 @@ def _say_universal(encoder: Encoder, options: Embed) -> None:
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
-    from anytouch_jax.data.images import BACKGROUND, decode, pictures_in
+    from anytouch_jax.data.images import decode
     from anytouch_jax.evaluate.features import Sight
 
-    gel = options.background
+    gel = _gel(encoder, options)
     if gel is not None and not encoder.subtracts:
         say("--background is not used: this encoder sees touches as the camera gives them")
-    if gel is None and encoder.subtracts:
-        gel = pictures_in(options.input)[1].get(BACKGROUND) if options.input.is_dir() else None
+    if options.background is None and encoder.subtracts:
         what = "the first frame" if gel is None else str(gel)
         say(f"this encoder sees touches less the untouched gel: {what} is taken for that (else --background)")
-    return Sight(encoder, None if gel is None else decode(gel))
+    return Sight(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
 
 
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
@@ -146,6 +184,8 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     )  # fmt: skip
     keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
+    more = [name for name in manifest.table.column_names if name in ("object", "unit") or name.startswith("label.")]
+    keys |= {name: features.plain_column(manifest, name)[rows] for name in more}
     return features.Features(values, rows, keys, len(usable) - len(rows))
 
 
@@ -243,6 +283,9 @@ def _refuse_unused(options: Embed) -> None:
             refuse(options, ("stride",), "for single frames", "; or ask for clips with --frames")
     elif options.input.suffix.lower() in _MANIFESTS:
         refuse(options, ("sensor", "stride"), "with a manifest, whose rows name their sensor and stride")
+        refuse(
+            options, ("rotate", "flip"), "with a manifest, whose pictures are those of the training: turn their files"
+        )
     else:
         refuse(options, ("split",), "with a folder or a video: only a manifest has splits")
         refuse(options, ("stride",), "without --stream: clips of a folder or a video are of frames in a row")

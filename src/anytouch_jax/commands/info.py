@@ -41,6 +41,8 @@ def _lines(path: Path) -> list[str]:
         return _manifest(path)
     if path.suffix == ".npz" and (found := _features(path)):
         return found
+    if path.suffix == ".npz" and (head := _head(path)):
+        return head
     if path.suffix in _WEIGHTS:
         return _weights(path)
     raise UserError(f"{path} is none of a run, weights ({', '.join(_WEIGHTS)}), a manifest (.csv, .parquet), features")
@@ -176,6 +178,20 @@ def _features(path: Path) -> list[str]:
     keys = [name.removeprefix("key/") for name in arrays if name.startswith("key/")]
     told = [f"{name.removeprefix('about/')}: {arrays[name]}" for name in arrays if name.startswith("about/")]
     return [f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}", *told]
+
+
+def _head(path: Path) -> list[str]:
+    """What `anytouch probe --save` wrote; [] for another .npz."""
+    from anytouch_jax.evaluate.saved_heads import load_head
+
+    try:
+        head = load_head(path)
+    except UserError:
+        return []
+    return [
+        f"{path}: the linear head of a probe for {head.label}: {', '.join(head.classes)}",
+        f"of features of {len(head.mean)}: --pooling {head.pooling} --frames {head.frames}, encoder {head.mark}",
+    ]
 
 
 def _translation(path: Path) -> list[str]:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markdown import Markdown
 
-from anytouch_jax.commands.output import check_folder, check_home
+from anytouch_jax.commands.output import check_apart, check_folder, check_home
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
+from anytouch_jax.config import UserError
 from anytouch_jax.options import Probe
 from anytouch_jax.strict_json import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.whole import write_whole
 
-_OF_LABEL = ("label", "group", "leave_out", "where", "sensor")
-_OF_SPLITS = ("group", "seeds", "protocol")  # of a label; --leave-out has folds instead
+_OF_LABEL = ("label", "group", "leave_out", "where", "sensor", "save")
+_OF_SPLITS = ("group", "seeds", "protocol", "save")  # of a label; --leave-out has folds instead
 _OF_BATTERY = (
     "join", "heads", "order", "train_sensors", "test_sensors", "train_units", "test_units", "max_rows", "cache",
 )  # fmt: skip
@@ -27,7 +28,12 @@ def run(options: Probe) -> int:
     check_options(options)
     if options.out is not None:
         own = (run / name for run in options.run for name in ("config.json", "metrics.jsonl", "tokenizer.json"))
-        check_folder(options.out, read=(*options.data, *options.run, *own))
+        check_folder(options.out, read=(*options.data, *options.run, *options.features, *own))
+    if options.save is not None:
+        check_folder(options.save, "--save", read=(*options.data, *options.run, *options.features))
+        if options.save.suffix.lower() != ".npz":
+            raise UserError(f"{options.save}: a head is written as .npz; name such a file with --save")
+    check_apart(out=options.out, save=options.save)
     if options.cache is not None:
         check_home(options.cache, "--cache")
     enable_compilation_cache()
@@ -51,6 +57,8 @@ def run(options: Probe) -> int:
 def check_options(options: Probe) -> None:
     """Refuse what differs from its default and would do nothing. Raises UserError that names it and says why."""
     in_range("--", options, frames=COUNT, max_rows=COUNT, seeds=NOT_NEGATIVE)
+    if options.save is not None and len(options.run) != 1:
+        raise UserError(f"--save keeps the linear head of one encoder: give one --run, not {len(options.run)}")
     if options.tasks or options.benchmark:
         refuse(options, _OF_LABEL, "beside --tasks or --benchmark, which have labels and groups of their own")
         if options.frames == 1 or (options.benchmark and not options.tasks):

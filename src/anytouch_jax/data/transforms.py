@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -17,10 +18,11 @@ from anytouch_jax.data.images import ImageError, decode
 
 __all__ = [
     "ImageError", "augmentation_rng", "colour_jitter", "decode", "subtract_background",
-    "touch_evaluation", "touch_transform", "vision_evaluation", "vision_transform",
+    "touch_evaluation", "touch_transform", "turned", "vision_evaluation", "vision_transform",
 ]  # fmt: skip
 
 _GREY = (0.2989, 0.587, 0.114)  # torchvision's weights of red, green, blue
+Flip = Literal["none", "across", "down"]
 TOUCH, VISION = 0, 1  # the two streams of one row's augmentation
 
 
@@ -71,6 +73,13 @@ def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: 
     for target, frame in zip(out, frames, strict=True):
         _resize(frame, target)
     return out
+
+
+def turned(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
+    """A frame (h, w, c) turned clockwise by 0, 90, 180 or 270 degrees, then mirrored across (left and right exchanged)
+    or down (top and bottom)."""
+    frame = np.rot90(frame, -rotate // 90) if rotate else frame
+    return {"none": frame, "across": frame[:, ::-1], "down": frame[::-1]}[flip]
 
 
 def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:

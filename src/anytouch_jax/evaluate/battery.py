@@ -33,7 +33,7 @@ COMPONENTS = 200  # principal components of raw pixels
 
 
 def run(
-    encoder: Encoder | None,
+    encoder: Encoder | Store | None,
     table: Manifest,
     tasks: Sequence[str | Task],
     *,
@@ -56,8 +56,8 @@ def run(
     """Probe frozen features of `encoder` on `tasks` (names of `tasks.TASKS`) of a manifest.
 
     `encoder` None: pixels and their difference from the background, reduced to 200 principal components (fitted,
-    without labels, on the rows that are never tested; on all where the test is in folds), for which `pooling`, `join`
-    and `universal` mean nothing.
+    without labels, on the rows that are never tested; on all where the test is in folds). For these, and for a `Store`
+    (features that are there: `given`), `pooling`, `join` and `universal` mean nothing.
 
     One JSON-ready dict for each task, head and protocol: task, protocol, metric ("accuracy" in 0..1, or "r2"), mean
     (over seeds), low, high (95 % over seeds and test groups; None with fewer than two groups), values (one a seed),
@@ -75,12 +75,27 @@ def run(
     setting = Setting(seeds, frames, recipe, sides, order, max_rows, "common", None)
     if encoder is None:
         store = raw(table, order=order, folder=cache)
+    elif isinstance(encoder, Store):
+        store, setting = encoder, setting._replace(scaling="column")
     else:
         store = encoded(encoder, table, pooling=pooling, join=join, order=order, universal=universal, folder=cache)
         setting = setting._replace(
             scaling="column", known=frozenset(encoder.config.model.sensors if encoder.seen is None else encoder.seen)
         )
     return _probe(store, table, tasks, setting, head_names, protocols)
+
+
+def left_out(
+    table: Manifest, tasks: Sequence[str], frames: int | None, sides: Sides, max_rows: int | None
+) -> dict[str, str]:
+    """Why a task cannot be probed on this manifest, by the name of each such one. Raises UserError: unknown names."""
+    setting, found = Setting(1, frames, None, sides, "right", max_rows, "common", None), dict[str, str]()
+    for task in map(task_of, tasks):
+        try:
+            _selected(table, task, setting)
+        except UserError as error:
+            found[task.name] = str(error).removeprefix(f"task {task.name}: ")
+    return found
 
 
 class Sides(NamedTuple):

@@ -12,9 +12,10 @@ from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import battery
 from anytouch_jax.evaluate.benchmarks import benchmark_of
 from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
+from anytouch_jax.evaluate.given import given
 from anytouch_jax.evaluate.heads import HeadName
 from anytouch_jax.evaluate.results import markdown
-from anytouch_jax.evaluate.tasks import available, task_of
+from anytouch_jax.evaluate.tasks import TASKS, available, task_of
 
 if TYPE_CHECKING:
     from anytouch_jax.options import Probe
@@ -23,7 +24,8 @@ RAW = "raw pixels"
 
 
 def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
-    """Every run and control on every task: {"manifest": hash, "data", "runs": {name: config}, "results": [...]}.
+    """Every run and control on every task: {"manifest": hash, "data", "runs": {name: config}, "left_out": {task:
+    why}, "results": [...]}.
 
     Raises UserError: both a benchmark and tasks, nothing to probe, and as `battery.run`.
     """
@@ -37,22 +39,31 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
     if options.controls:
         first = next(iter(encoders.values()), None)
         encoders["random encoder"] = random_encoder(first.config if first else preset("tiny"))
-    if not encoders:
-        raise UserError("nothing to probe: give --run, or keep the controls")
+    files = {str(path): given(path, table) for path in options.features}
+    if not encoders and not files:
+        raise UserError("nothing to probe: give --run or --features, or keep the controls")
+    if files and options.order != "right":
+        raise UserError("--order does nothing for --features, whose frames are encoded already; leave one of them out")
     names = ("train_sensors", "test_sensors", "train_units", "test_units")
     sides = {name: _names(getattr(options, name)) for name in names}
+    tasks, unprobed = (tasks, {}) if options.benchmark else _possible(options, table, tasks, sides, say)
     shared: dict[str, Any] = {name: getattr(options, name) for name in ("cache", "seeds", "order", "max_rows")} | sides
+    plain = {name: settings[name] for name in ("protocols", "frames", "head_names", "recipe") if name in settings}
+    mine: list[dict[str, Any]] = []
+    for name, store in files.items():  # first: a file that lacks rows is told before the work
+        mine += [{"features": name} | one for one in battery.run(store, table, tasks, **shared, **plain)]
+        say(f"probed {name}")
     found: list[dict[str, Any]] = []
     for name, encoder in encoders.items():
         found += [{"features": name} | one for one in battery.run(encoder, table, tasks, **shared, **settings)]
         say(f"probed {name}")
+    found += mine
     if options.controls:
-        plain = {name: settings[name] for name in ("protocols", "frames", "head_names", "recipe") if name in settings}
         found += [{"features": RAW} | one for one in battery.run(None, table, tasks, **shared, **plain)]
         say(f"probed {RAW}")
     runs = {name: dataclasses.asdict(encoder.config) for name, encoder in encoders.items()}
     return {"manifest": table.content_hash, "data": [str(path) for path in options.data], "paper": paper,
-            "seeds": options.seeds, "sides": sides, "runs": runs, "results": found}  # fmt: skip
+            "seeds": options.seeds, "sides": sides, "runs": runs, "left_out": unprobed, "results": found}  # fmt: skip
 
 
 def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], float | None]:
@@ -73,6 +84,21 @@ def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], f
     if not names:
         raise UserError("the manifest has no label of any task; `anytouch probe --label COLUMN` takes any column")
     return names, settings | ({} if options.frames is None else {"frames": options.frames}), None
+
+
+def _possible(
+    options: Probe, table: Any, tasks: Sequence[str], sides: dict[str, Any], say: Callable[[str], None]
+) -> tuple[list[str], dict[str, str]]:
+    """The tasks that can be probed, and why each of the others cannot, said aloud. Raises UserError when none can."""
+    why = battery.left_out(table, tasks, options.frames, battery.Sides(**sides), options.max_rows)
+    rest = [one for one in tasks if one not in why]
+    if not rest:
+        raise UserError("; ".join(f"task {name}: {reason}" for name, reason in why.items()))
+    if options.tasks == "all":
+        why |= {name: "the manifest has no such label" for name in TASKS if name not in tasks}
+    for name, reason in why.items():
+        say(f"{name}: not probed ({reason})")
+    return rest, why
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:

@@ -139,6 +139,9 @@ def call_of(
         "source": encoder.source,
         "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){less}; sensor: int32 (B,)",
         "output": f"features: float32 (B, {width}), not normalised",
+        "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the shorter "
+        f"side is above {side} pixels, else INTER_LINEAR"
+        + ("; the gel is taken off before" if encoder.subtracts else ""),
         "frames": frames,
         "image_size": side,
         "features": width,

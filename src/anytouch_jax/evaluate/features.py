@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL, Config, Data, Model, UserError, check_spelling, from_json
 from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.manifest import Manifest
-from anytouch_jax.data.transforms import subtract_background, touch_evaluation
+from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation, turned
 from anytouch_jax.io import checkpoint, release
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -102,7 +103,7 @@ class Encoder:
         if clips.dtype != np.uint8 or clips.ndim != 5 or clips.shape[2:] != (side, side, 3):
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {clips.dtype} "
-                f"{clips.shape}; data.transforms.touch_evaluation resizes them"
+                f"{clips.shape}; `see = Sight(encoder)`, then `see(frame)`, resizes a frame"
             )
         check_frames(self.config.model, clips.shape[1])
         rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
@@ -137,16 +138,21 @@ class Encoder:
 
 class Sight:
     """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
-    (a frame), the picture of the untouched gel; the first frame serves where none is given."""
+    (a frame), the picture of the untouched gel; the first frame serves where none is given. `rotate` and `flip` turn
+    both before (`data.transforms.turned`)."""
 
-    def __init__(self, encoder: Encoder, background: npt.ArrayLike | None = None) -> None:
-        self._encoder = encoder
-        self._background = None if background is None else to_rgb(np.asarray(background), "the background")
+    def __init__(
+        self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
+    ) -> None:
+        self._encoder, self._turned = encoder, partial(turned, rotate=rotate, flip=flip)
+        self._background = None
+        if background is not None:
+            self._background = self._turned(to_rgb(np.asarray(background), "the background"))
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
         """A frame (h, w, 3), or another form of picture that `data.images.decode` reads (grey, RGBA, u16, floats of
         0..1), as RGB u8 (size, size, 3). Raises ImageError for any other."""
-        frame = to_rgb(np.asarray(frame), "the frame")
+        frame = np.ascontiguousarray(self._turned(to_rgb(np.asarray(frame), "the frame")))
         if self._encoder.subtracts:
             self._background = frame if self._background is None else self._background
             frame = subtract_background([frame], self._background)[0]
@@ -189,6 +195,7 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
         seen, params = about.get("seen"), release.served(params, config, about)
         drawn = config.objective.universal_start + config.objective.universal_end > 0
     else:
+        _refuse_features(path)
         weights = release.read_weights(path)
         model = release.model_of(path, weights)
         told = release.read_metadata(
@@ -207,6 +214,17 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path), known, drawn)
 
 
+def _refuse_features(path: Path) -> None:
+    """Raise UserError for what `anytouch embed` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {"features", "rows"} <= set(file.files)
+    except Exception:  # weights of any kind: who reads them says what is wrong
+        return
+    if found:
+        raise UserError(f"{path} is a features file, no encoder: `anytouch probe` takes it as --features")
+
+
 def random_encoder(config: Config, seed: int = 0) -> Encoder:
     """An untrained encoder: the control of every probe."""
     config = _touch_only(config)
@@ -220,12 +238,16 @@ def _touch_only(config: Config) -> Config:
 
 @dataclass(frozen=True)
 class Features:
-    """Features (n, d) f32 with the keys of their rows: manifest row numbers, or frame numbers of a video or folder."""
+    """Features (n, d) f32 with the keys of their rows: manifest row numbers, or frame numbers of a video or folder.
+
+    `said`: more arrays (n, ...), what a head says of them.
+    """
 
     values: np.ndarray
     rows: np.ndarray
     keys: dict[str, np.ndarray]
     skipped: int = 0
+    said: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def embed_rows(
@@ -278,10 +300,18 @@ def text_column(manifest: Manifest, name: str) -> np.ndarray:
     return np.array(["" if value is None else str(value) for value in manifest.column(name).to_pylist()])
 
 
+def plain_column(manifest: Manifest, name: str) -> np.ndarray:
+    """A column of a manifest as an array without objects: numbers as they are, NaN where null; all else as text."""
+    kind = manifest.column(name).type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return text_column(manifest, name)
+    return np.asarray([np.nan if value is None else value for value in manifest.column(name).to_pylist()])
+
+
 def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:
     """Write features, row numbers, keys and a description as one `.npz`, whole or not at all. Raises OSError."""
     described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
     keys = {f"key/{k}": v for k, v in features.keys.items()}
-    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **keys, **described}
+    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **features.said, **keys, **described}
     with replacing(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)

@@ -12,6 +12,7 @@ label; `groups` (n,) names what belongs together (a recording, a grasp) and is n
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,9 @@ def linear_probe(
         refits.append(float(np.mean(model(rows.x[rows.test]) == rows.y[rows.test])))
     if not best.finished:
         notes += ("the fit stopped at its limit of iterations",)
-    return _result(name, protocol, rows, correct, refits, penalty, chosen_on, notes, subsets)
+    found = _result(name, protocol, rows, correct, refits, penalty, chosen_on, notes, subsets)
+    assert found.outcome is not None
+    return replace(found, outcome=replace(found.outcome, fitted=(best, rows.names)))
 
 
 def knn_probe(

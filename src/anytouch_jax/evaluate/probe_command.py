@@ -14,7 +14,9 @@ from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.evaluate import baseline, probe
 from anytouch_jax.evaluate.features import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate.given import given
 from anytouch_jax.evaluate.probe_rows import prepare
+from anytouch_jax.evaluate.saved_heads import head_of, save_head
 
 if TYPE_CHECKING:
     from anytouch_jax.options import Probe
@@ -50,15 +52,27 @@ def run_probes(options: Probe, say: Say) -> list[Any]:
     task = read_task(options, say)
     _check(options, task)  # mistakes are told before the work
     found: list[Any] = []
-    for name, values in _features(options, task, say):
+    for name, values, encoder in _features(options, task, say):
         # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.
-        found += probe_features(options, task, values, name, "common" if name == RAW else "column")
+        results = probe_features(options, task, values, name, "common" if name == RAW else "column")
+        if options.save is not None and encoder is not None and name == str(options.run[0]):
+            _save(options, results[0], encoder)
+            say(f"{options.save}: the linear head")
+        found += results
         say(f"probed {name}")
     if not found:
-        raise UserError("nothing to probe: give --run, or keep the controls")
+        raise UserError("nothing to probe: give --run or --features, or keep the controls")
     if options.leave_out is None:
         found.append(probe.majority(task.labels, task.groups, task.split, subsets=task.subsets))
     return found
+
+
+def _save(options: Probe, linear: Any, encoder: Encoder) -> None:
+    """Keep the linear head whose result this is."""
+    assert options.save is not None
+    model, names = linear.outcome.fitted
+    about: dict[str, Any] = {"label": options.label.removeprefix("label."), "pooling": options.pooling}
+    save_head(options.save, head_of(model, names, frames=options.frames or 1, mark=encoder.mark, **about))
 
 
 def _check(options: Probe, task: Task) -> None:
@@ -171,7 +185,10 @@ def _subsets(manifest: Any, names: list[Any], split: np.ndarray, rows: np.ndarra
 
 
 def _features(options: Probe, task: Task, say: Say) -> Any:
-    """(name, features) of every encoder asked for, then of the controls."""
+    """(name, features, encoder or None) of every encoder and file asked for, then of the controls."""
+    files = {str(path): given(path, task.manifest) for path in options.features}
+    for store in files.values():
+        store.add(task.rows, options.frames or 1)
     encoders: list[tuple[str, Encoder]] = [(str(path), load_encoder(path)) for path in options.run]
     if options.controls:
         config: Config = encoders[0][1].config if encoders else preset("tiny")
@@ -182,9 +199,11 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
         rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames or 1, options.pooling, say=say)
         if not np.array_equal(rows, task.rows):
             raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
-        yield name, values
+        yield name, values, encoder
+    for path, store in files.items():
+        yield path, store.get(task.rows[:, None], options.frames or 1), None
     if options.controls:
-        yield RAW, raw_features(task)
+        yield RAW, raw_features(task), None
 
 
 def raw_features(task: Task) -> np.ndarray:

@@ -117,6 +117,7 @@ def demo_report(
     """
     clock, out = time.perf_counter(), Path(out)
     table = manifests.read(manifest)
+    _check_touches(table, touches, seed)
     with tempfile.TemporaryDirectory(prefix="anytouch-report-") as drawn:
         sections, numbers = _contents(table, Path(stage1), Path(stage2), Path(drawn), say, touches, gallery_size, seed)
         numbers = {"manifest": str(manifest), **numbers, "seconds": round(time.perf_counter() - clock, 1)}
@@ -194,11 +195,22 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
     return Section("Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else "")
 
 
+def _check_touches(table: Manifest, touches: int, seed: int) -> None:
+    """Raise UserError where split test has too few touches for a report, or too few are asked for."""
+    there = len(_chosen(table, "test", touches, seed))
+    if there < FEWEST:
+        every = _chosen(table, "test", len(table), seed)
+        count = len(np.unique(table.codes("touch", own=True)[every]))
+        advice = "more --touches" if len(every) >= FEWEST else "simulate or record more"
+        raise UserError(
+            f"the manifest's test split has {count} touches, which give {there} frames to look at; a report needs "
+            f"{FEWEST}: {advice}"
+        )
+
+
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
     chosen = [_chosen(table, name, count, seed) for name, count in most.items()]
-    if (there := len(chosen[-1])) < FEWEST:  # before the work
-        raise UserError(f"split test gives {there} frames to look at; a report needs {FEWEST}: more --touches")
     rows = np.concatenate(chosen)
     classes, patches = {}, {}
     for name, encoder in encoders.items():

@@ -31,11 +31,15 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Test row by test row: number of the row, whether it was right, its group. What `difference` pairs."""
+    """Test row by test row: number of the row, whether it was right, its group. What `difference` pairs.
+
+    `fitted`: the linear model that was tested, and the names (K,) that its class numbers count.
+    """
 
     rows: Array
     correct: Array
     groups: Array
+    fitted: tuple[Any, Array] | None = None
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import cv2
 import jax
@@ -56,7 +56,7 @@ class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
     `at`: seconds from the start of the stream to the frame; `seconds`: of PARTS; `age`: from the grabbed frame to
-    having its features, decoding and all waiting included.
+    having its features, decoding and all waiting included; `started`: the start by the clock, in Unix seconds.
     """
 
     number: int
@@ -64,6 +64,7 @@ class Embedded(NamedTuple):
     values: np.ndarray
     seconds: tuple[float, float, float, float]
     age: float
+    started: float = 0.0
 
 
 class Mailbox:
@@ -114,6 +115,15 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
     return source, live
 
 
+def rate_of(video: str | Path) -> float:
+    """Frames a second of a video, 0 where its header does not tell."""
+    source, _ = open_source(video)
+    try:
+        return max(0.0, float(cast(cv2.VideoCapture, source).get(cv2.CAP_PROP_FPS)))
+    finally:
+        source.release()
+
+
 def stream(
     encoder: Encoder,
     source: Source,
@@ -156,7 +166,7 @@ def _stream(
     embed: Callable[[jax.Array], jax.Array], source: Source, live: bool, see: Sight, frames: int, stride: int
 ) -> Generator[Embedded]:
     mailbox = Mailbox(replace=live)
-    start = time.perf_counter()
+    started, start = time.time(), time.perf_counter()
     reader = threading.Thread(target=_read, args=(source, live, see, frames, stride, mailbox), daemon=True)
     reader.start()
     try:
@@ -167,7 +177,7 @@ def _stream(
             values = np.asarray(embed(there))[0]
             end = time.perf_counter()
             seconds = (clip.decode, clip.resize, copied - begin, end - copied)
-            yield Embedded(clip.number, clip.read - start, values, seconds, end - clip.read)
+            yield Embedded(clip.number, clip.read - start, values, seconds, end - clip.read, started)
     finally:
         mailbox.close()
         reader.join(_PATIENCE)
@@ -222,6 +232,7 @@ class Result(NamedTuple):
     age: np.ndarray
     total: int
     interrupted: bool
+    started: float = 0.0
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
@@ -247,6 +258,7 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         np.asarray([one.age for one in found]),
         total,
         interrupted,
+        found[-1].started if found else 0.0,
     )
 
 

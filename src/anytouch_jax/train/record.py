@@ -117,9 +117,11 @@ def goes_on(run_dir: Path, config: Config) -> bool:
         if name not in HARMLESS and before.get(name) != now.get(name)
     ]
     if changed:
+        longer = f"; --init {run_dir} with another --run folder goes on from what it learned"
         raise UserError(
             f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. "
             "Use the same settings to go on with it, or choose another run folder"
+            + (longer if before["run.steps"] != now["run.steps"] else "")
         )
     return True
 

@@ -1,4 +1,4 @@
-"""`experiments/pouring.py` and `translation.py` from top to bottom at a toy size, then again from their JSON alone."""
+"""`experiments/pouring.py`, `translation.py` and `named.py` at a toy size, and again from their JSON alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def visit(name, monkeypatch, **environment):
     return runpy.run_path(str(SCRIPTS / f"{name}.py"))
 
 
-@pytest.mark.parametrize("name", ["pouring", "translation"])
+@pytest.mark.parametrize("name", ["pouring", "translation", "named"])
 def test_the_committed_page_is_what_its_files_give(name, tmp_path, monkeypatch, capsys):
     shutil.copytree(SCRIPTS / "results" / name, tmp_path / name)
     visit(name, monkeypatch, TABLE=1, OUT=tmp_path)
@@ -80,3 +80,16 @@ def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp
     frozen = {f"{name}-frozen-0" for name in ("anytouch", "anytouch_release", "stage1", "t3")}
     assert names == frozen | {"anytouch-fine-0", "t3-fine-0", "pixels-scratch-0"}
     assert set(json.loads((folder / "overlap.json").read_text()).values()) == {"0"}
+
+
+@pytest.mark.slow
+def test_named(tmp_path, monkeypatch, capsys):
+    """What is trained with labels tells more of its own frames than the commonest answer does, and is not done again."""
+    size = {"QUICK": 1, "STEPS": 60, "OUT": tmp_path, "STUDY": tmp_path / "study"}
+    visit("named", monkeypatch, **size)
+    found = json.loads((tmp_path / "named_quick" / "0.json").read_text())
+    assert found["scores"]["indenter"]["train"] > 0.3 and set(found["probes"]) == {"labels", "untrained"}
+    page, before = (tmp_path / "named_quick.md").read_text(), (tmp_path / "named_quick" / "0.json").stat().st_mtime_ns
+    visit("named", monkeypatch, **size)
+    assert (tmp_path / "named_quick.md").read_text() == page
+    assert (tmp_path / "named_quick" / "0.json").stat().st_mtime_ns == before

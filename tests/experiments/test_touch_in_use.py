@@ -84,7 +84,7 @@ def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp
 
 @pytest.mark.slow
 def test_named(tmp_path, monkeypatch, capsys):
-    """What is trained with labels tells more of its own frames than the commonest answer does, and is not done again."""
+    """What is trained with labels tells its own frames better than the commonest answer does; it is done once."""
     size = {"QUICK": 1, "STEPS": 60, "OUT": tmp_path, "STUDY": tmp_path / "study"}
     visit("named", monkeypatch, **size)
     found = json.loads((tmp_path / "named_quick" / "0.json").read_text())

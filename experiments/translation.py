@@ -311,6 +311,9 @@ first = records[0]
 tunes = {r["settings"]["fit"]["tune"] for r in records if r["settings"]["name"] != PIXELS}
 ours = {(r["settings"]["name"], r["settings"]["encoder"]) for r in records if r["settings"]["name"] != PIXELS}
 own = len(ours) > len({name for name, _ in ours})
+other = (
+    "" if first["settings"].get("version") == generation.VERSION else " Translations of today's code learn otherwise."
+)
 steps = sorted({r["settings"]["fit"]["steps"] for r in records})  # more than one: some runs are of another size
 lines = [
     "# One sensor's touch as another would feel it",
@@ -319,12 +322,7 @@ lines = [
     f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
     f"{len({r['settings']['fit']['seed'] for r in records})} seeds, each over "
     f"{'encoders of its own' if own else 'the same encoders'}. By "
-    f"`{'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`."
-    + (
-        ""
-        if first["settings"].get("version", 1) == generation.VERSION
-        else " Translations of today's code learn otherwise."
-    ),
+    f"`{'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`." + other,
     "",
     markdown(head, cells),
     "",

@@ -36,10 +36,11 @@ from typing import Any
 
 import numpy as np
 from study import asked
+from study.by_object import ahead, by_object, gathered, probe_table, probed
 
 from anytouch_jax.cli import main
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.evaluate import baseline, machine, probe, results, retrieval
+from anytouch_jax.evaluate import baseline, machine, retrieval
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.results import markdown
@@ -157,13 +158,6 @@ def features(encoders: dict[str, Encoder], seed: int, table: Any, rows: np.ndarr
 
 
 # %%
-def by_object(groups: np.ndarray, right: dict[str, np.ndarray]) -> dict[str, Any]:
-    """How many rows each object has, and the sum over them of every array of `right`."""
-    names, ids = np.unique(groups, return_inverse=True)
-    sums = {name: np.round(np.bincount(ids, np.asarray(one, float)), 6).tolist() for name, one in right.items()}
-    return {"objects": dict(zip(names.tolist(), np.bincount(ids).tolist(), strict=True)), "right": sums}
-
-
 def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any]:
     table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
     rows = deepest_rows(table, table.rows_of("test"))
@@ -183,16 +177,8 @@ def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any
     split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
     found = features(encoders, seed, table, rows, "both")
     found["pixels"] = baseline.reduce(baseline.background_difference(table, rows), split == "train")
-    probed: dict[str, Any] = {"data": table.content_hash}
-    for label in (*NAMED, *UNNAMED):
-        values, right, tested = [table.value(int(row), f"label.{label}") for row in rows], {}, groups[:0]
-        for name, x in found.items():
-            scaling = "common" if name == "pixels" else "column"
-            outcome = probe.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling).outcome
-            assert outcome is not None
-            right[name], tested = outcome.correct, outcome.groups
-        probed[label] = by_object(tested, right)
-    return probed
+    labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in (*NAMED, *UNNAMED)}
+    return {"data": table.content_hash} | probed(found, labels, groups, split)
 
 
 # %% [markdown]
@@ -231,26 +217,6 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
 # %%
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
 RIVALS = ("untrained", "pixels")  # of the probes
-Right = dict[str, list[np.ndarray]]  # by name: for every seed, how many each object has right
-
-
-def gathered(several: list[dict[str, Any]]) -> tuple[np.ndarray, Right]:
-    """Rows of each object, and what each set of features got right of them, seed by seed. Raises SystemExit when the
-    seeds were not scored on the same rows."""
-    counts = [one["objects"] for one in several]
-    if any(count != counts[0] for count in counts):
-        raise SystemExit("the files of teaching/ are of different data: make them anew, without TABLE=1")
-    right = {name: [np.array(one["right"][name]) for one in several] for name in several[0]["right"]}
-    return np.array(list(counts[0].values())), right
-
-
-def ahead(counts: np.ndarray, first: np.ndarray, second: np.ndarray, *, interval: bool = True) -> str:
-    """How many points `first` is above `second`, with the 95 % interval over objects."""
-    change = np.repeat((first - second) / counts, counts)
-    low, high = results.mean_interval(change, np.repeat(np.arange(len(counts)), counts)) if interval else (None, None)
-    return f"{100 * change.mean():+.1f}" + (
-        "" if low is None or high is None else f" ({100 * low:+.1f} to {100 * high:+.1f})"
-    )
 
 
 def retrieval_table(found: list[dict[str, Any]]) -> str:
@@ -269,29 +235,6 @@ def retrieval_table(found: list[dict[str, Any]]) -> str:
     )
 
 
-def percent(counts: np.ndarray, several: list[np.ndarray]) -> str:
-    shares = [100 * one.sum() / counts.sum() for one in several]
-    return f"{np.mean(shares):.1f} %" + (f" +- {np.std(shares, ddof=1):.1f}" if len(shares) > 1 else "")
-
-
-def probe_table(found: list[dict[str, Any]]) -> str:
-    """Accuracies by label, and of all that captions name together; and how far stage 2 is ahead, by seed too: the
-    interval over objects is of these encoders, not of others trained alike."""
-    rows = []
-    for title, labels in [*((x, (x,)) for x in NAMED), ("these three", NAMED), *((x, (x,)) for x in UNNAMED)]:
-        each = [gathered([one["probes"][label] for one in found]) for label in labels]
-        counts = each[0][0]
-        right = {name: [np.mean(s, 0) for s in zip(*(r[name] for _, r in each), strict=True)] for name in NAMES[:5]}
-        changes = []
-        for name in RIVALS:
-            apart = zip(right["stage 2"], right[name], strict=True)
-            seeds = ", ".join(ahead(counts, a, b, interval=False) for a, b in apart)
-            changes.append(ahead(counts, np.mean(right["stage 2"], 0), np.mean(right[name], 0)) + "; " + seeds)
-        rows.append((title, *(percent(counts, right[name]) for name in NAMES[:5]), *changes))
-    head = ("label", *NAMES[:5], *(f"stage 2 ahead of {name} (points, 95 % over objects; by seed)" for name in RIVALS))
-    return markdown(head, rows)
-
-
 # %%
 files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
 told = files[GRADES[0]][0]
@@ -308,7 +251,7 @@ for grade, found in files.items():
     lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
     lines += [retrieval_table(found), ""]
     lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
-    lines += [probe_table(found), ""]
+    lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
 OUT.mkdir(parents=True, exist_ok=True)
 write_whole(OUT / "teaching.md", "\n".join(lines))
 print("\n".join(lines))

@@ -7,7 +7,7 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import Model, Stack, TextTower
-from anytouch_jax.nn.layers import Dense, LayerNorm, activation, read_blocks, rows_of, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
 from anytouch_jax.nn.product import stored
 from anytouch_jax.ops import tokens
 
@@ -25,20 +25,16 @@ class ImageTower(nnx.Module):
         self.projection = Dense(stack.width, model.embed, model, bias=False)
         self.patch_size, self.remat = model.patch, model.remat
 
-    def tokens(self, image: Array) -> Array:
-        """The normed input sequence (V, 1 + N, D) of normalised images (V, H, W, 3)."""
-        x = self.patch(tokens.patchify(image[:, None], self.patch_size)[:, :, 0])
-        start = jnp.broadcast_to(self.class_token[...].astype(x.dtype)[None, None], (len(x), 1, x.shape[-1]))
-        return self.pre_norm(jnp.concatenate([start, x], axis=1) + self.position[...].astype(x.dtype)[None])
-
     def hidden(self, image: Array) -> Array:
         """Last hidden states (V, 1 + N, D) of normalised images (V, H, W, 3)."""
-        return run_blocks(self.blocks, self.tokens(image), remat=self.remat)
+        x = self.patch(tokens.patchify(image[:, None], self.patch_size)[:, :, 0])
+        start = jnp.broadcast_to(self.class_token[...].astype(x.dtype)[None, None], (len(x), 1, x.shape[-1]))
+        x = jnp.concatenate([start, x], axis=1) + self.position[...].astype(x.dtype)[None]
+        return run_blocks(self.blocks, self.pre_norm(x), remat=self.remat)
 
     def pooled(self, image: Array) -> Array:
         """The normed class token (V, D), before the projection."""
-        first = jnp.zeros(len(image), jnp.int32)
-        return self.post_norm(read_blocks(self.blocks, self.tokens(image), first, remat=self.remat))
+        return self.post_norm(self.hidden(image)[:, 0])
 
     def __call__(self, image: Array) -> Array:
         """Image embedding (V, E), not normalised."""
@@ -57,19 +53,15 @@ class TextEncoder(nnx.Module):
         self.projection = Dense(width, model.embed, model, bias=False)
         self.end_token, self.dtype, self.remat = tower.end_token, stored(model.dtype), model.remat
 
-    def tokens(self, ids: Array) -> Array:
-        """The input sequence (L, S, W) of token ids (L, S)."""
-        return (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(self.dtype)
-
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
         """Normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""
-        return self.final_norm(run_blocks(self.blocks, self.tokens(ids), remat=self.remat, causal=True, mask=mask))
+        x = (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(self.dtype)
+        return self.final_norm(run_blocks(self.blocks, x, remat=self.remat, causal=True, mask=mask))
 
     def pooled(self, ids: Array, mask: Array | None = None) -> Array:
         """The hidden state (L, W) of the end token: the largest id, or the first occurrence of `end_token`."""
         at = jnp.argmax(ids if self.end_token is None else ids == self.end_token, axis=1)
-        x = read_blocks(self.blocks, self.tokens(ids), at, remat=self.remat, causal=True, mask=mask)
-        return self.final_norm(x)
+        return jnp.take_along_axis(self.hidden(ids, mask), at[:, None, None], axis=1)[:, 0]
 
     def __call__(self, ids: Array, mask: Array | None = None) -> Array:
         """Text embedding (L, E), not normalised."""

@@ -149,13 +149,10 @@ class Block(nnx.Module):
         heads = self.attention.attend(*self._before(x), causal=causal, mask=mask)
         return self._after(x, heads)
 
-    def at(self, x: Array, positions: Array, *, causal: bool = False, mask: Array | None = None) -> Array:
-        """What `__call__` gives at one position (B,) of each row, (B, D): of all others keys and values alone."""
-        one = jnp.take_along_axis(x, positions[:, None, None], axis=1)
-        if causal:
-            before = jnp.arange(x.shape[1])[None] <= positions[:, None]
-            mask = before if mask is None else before & mask
-        heads = self.attention.attend(*self._before(x, one), causal=False, mask=mask)
+    def first(self, x: Array) -> Array:
+        """What `__call__` gives for the first token of each row, (B, D): of all others keys and values alone."""
+        one = x[:, :1]
+        heads = self.attention.attend(*self._before(x, one), causal=False, mask=None)
         return self._after(one, heads)[:, 0]
 
     @lean
@@ -184,20 +181,18 @@ def run_blocks(blocks: Block, x: Array, *, remat: bool, causal: bool = False, ma
     return nnx.scan(body, in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)(x, blocks)
 
 
-def read_blocks(
-    blocks: Block, x: Array, positions: Array, *, remat: bool, causal: bool = False, mask: Array | None = None
-) -> Array:
-    """What `run_blocks` gives at one position (B,) of each row, (B, D): the last block does nothing for the others."""
+def read_blocks(blocks: Block, x: Array, *, remat: bool) -> Array:
+    """What `run_blocks` gives for the first token of each row, (B, D): the last block does nothing for the others."""
 
     def end(x: Array, block: Block) -> Array:
-        return block.at(x, positions, causal=causal, mask=mask)
+        return block.first(x)
 
-    x = _but_last(blocks, x, mask, causal, remat) if _depth(blocks) > 1 else x
+    x = _but_last(blocks, x, remat) if _depth(blocks) > 1 else x
     return (nnx.remat(end) if remat else end)(x, jax.tree.map(lambda values: values[-1], blocks))
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _but_last(blocks: Block, x: Array, mask: Array | None, causal: bool, remat: bool) -> Array:
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
     """Send `x` through all blocks but the last one.
 
     Each takes its values out of the stack where it runs: blocks cut off before a scan are copied, which costs more than
@@ -207,21 +202,20 @@ def _but_last(blocks: Block, x: Array, mask: Array | None, causal: bool, remat: 
 
     def body(x: Array, number: Array) -> tuple[Array, None]:
         block = jax.tree.map(lambda values: jax.lax.dynamic_index_in_dim(values, number, keepdims=False), blocks)
-        return block(x, causal=causal, mask=mask), None
+        return block(x), None
 
     return jax.lax.scan(body, x, jnp.arange(_depth(blocks) - 1))[0]
 
 
-def _but_last_forward(blocks: Block, x: Array, mask: Array | None, causal: bool, remat: bool) -> Any:
+def _but_last_forward(blocks: Block, x: Array, remat: bool) -> Any:
     def cut(blocks: Block, x: Array) -> Array:
-        kept = blocks_between(blocks, 0, _depth(blocks) - 1)
-        return run_blocks(kept, x, remat=remat, causal=causal, mask=mask)
+        return run_blocks(blocks_between(blocks, 0, _depth(blocks) - 1), x, remat=remat)
 
     return jax.vjp(cut, blocks, x)
 
 
-def _but_last_backward(causal: bool, remat: bool, back: Any, gradient: Array) -> Any:
-    return (*back(gradient), None)
+def _but_last_backward(remat: bool, back: Any, gradient: Array) -> Any:
+    return back(gradient)
 
 
 _but_last.defvjp(_but_last_forward, _but_last_backward)

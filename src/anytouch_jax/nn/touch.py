@@ -97,8 +97,7 @@ class TouchEncoder(nnx.Module):
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Touch embedding (B, E) from the class token, of all patches or those to keep (B, K); not normalised."""
         x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
-        first = jnp.zeros(x.shape[0], jnp.int32)  # len() would have no number of touches that is left open
-        return self.embedding(read_blocks(self.blocks, x, first, remat=self.remat))
+        return self.embedding(read_blocks(self.blocks, x, remat=self.remat))
 
     def embedding(self, token: Array) -> Array:
         """Touch embedding (B, E) from the last hidden state of the class token (B, D)."""

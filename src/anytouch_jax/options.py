@@ -97,8 +97,8 @@ class Embed:
     """Mirror them after that: left and right exchanged, or top and bottom."""
     frames: int = 1
     """Frames of a clip that ends at each row: 1 (stills), 3, or more (segments of three)."""
-    pooling: Literal["class", "mean", "both"] = "class"
-    """Class token (what alignment trains), mean of patch tokens, or both."""
+    pooling: Literal["class", "mean", "both"] | None = None
+    """Class token (what alignment trains), mean of patch tokens, or both (default: what --head reads, else class)."""
     join: Literal["mean", "sum", "concat"] = "mean"
     """How the segments of a long clip are joined."""
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
@@ -113,6 +113,11 @@ class Embed:
     """Name the class too by a head of probe --save: label and its probability p, arrays or in each line of JSON."""
     on_bad_sample: Literal["error", "skip"] = "error"
     """A row or a picture of a folder that cannot be read stops the command, or is left out and counted."""
+
+    @property
+    def pooled(self) -> Literal["class", "mean", "both"]:
+        """The pooling, where no head asks for one."""
+        return self.pooling or "class"
 
 
 @dataclass(frozen=True)

@@ -42,29 +42,31 @@ def test_the_head_that_was_probed_names_the_rows_of_a_manifest(anytouch, tmp_pat
     assert (kept.classes.tolist(), kept.label, kept.pooling, kept.frames) == (["ball", "cube"], "object", "both", 1)
 
 
-def test_a_stream_names_each_frame(anytouch, tmp_path, tiny_run, head):
+def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
     video = tmp_path / "touch.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
     for value in (40, 180):
         writer.write(np.full((32, 32, 3), value, np.uint8))
     writer.release()
-    args = ("embed", "--run", tiny_run, "--input", video, "--stream", "--pooling", "both", "--head", head)
+    args = ("embed", "--run", tiny_run, "--input", video, "--stream", "--head", head)  # which says the pooling
     lines = [json.loads(line) for line in anytouch(*args, "--out", "-").out.splitlines()]
     labels, p = load_head(head)(np.array([line["features"] for line in lines], np.float32))
     assert [line["label"] for line in lines] == labels.tolist()
     np.testing.assert_allclose([line["p"] for line in lines], p.max(1), atol=1e-6)
     assert anytouch(*args, "--out", tmp_path / "f.npz").status == 0
     with np.load(tmp_path / "f.npz") as file:
-        assert file["label"].tolist() == labels.tolist()
+        assert file["label"].tolist() == labels.tolist() and file["about/pooling"] == "both"
+    assert "on other features than these: give --pooling both" in mistake(*args, "--pooling", "class", "--out", "-")
 
 
 def test_a_head_of_other_features_is_refused(mistake, tmp_path, world, tiny_run, head):
     args = ("embed", "--input", world, "--out", tmp_path / "f.npz", "--head")
-    assert "fitted on other features than these: give --pooling both" in mistake(*args, head, "--run", tiny_run)
-    assert "give --pooling both --frames 1" in mistake(*args, head, "--run", tiny_run, "--frames", 3)
+    other = ("--run", tiny_run, "--pooling", "mean")
+    assert "fitted on other features than these: give --pooling both" in mistake(*args, head, *other)
+    assert "give --pooling both --frames 1" in mistake(*args, head, *other, "--frames", 3)
     other = tmp_path / "other"
     train(run_config(world, seed=5, steps=1), other)
-    told = mistake(*args, head, "--run", other, "--pooling", "both")
+    told = mistake(*args, head, "--run", other)
     assert "the head was fitted on features of another encoder" in told and str(other) in told
     (tmp_path / "odd.npz").write_bytes(b"odd")
     assert "odd.npz is not the head of a probe" in mistake(*args, tmp_path / "odd.npz", "--run", tiny_run)

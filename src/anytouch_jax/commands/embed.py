@@ -38,12 +38,14 @@ def run(options: Embed) -> int:
         if options.out.suffix.lower() != ".npz":
             raise UserError(f"{options.out}: features are written as .npz; name such a file with --out")
     head = None if options.head is None else load_head(options.head)
+    if head is not None and options.pooling is None:
+        options = replace(options, pooling=head.pooling)
     enable_compilation_cache()
     encoder = features.load_encoder(options.run).computed_in(options.dtype)
     features.check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
     if head is not None:
-        head.check(encoder.source, encoder.mark, options.pooling, options.frames, options.join)
+        head.check(encoder.source, encoder.mark, options.pooled, options.frames, options.join)
     if options.batch < 1:
         raise UserError(f"--batch must be 1 or more, not {options.batch}")
     if options.stream:
@@ -73,7 +75,7 @@ def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
         "encoder": encoder.source,
         "weights": encoder.mark,
         "input": str(options.input),
-        "pooling": options.pooling,
+        "pooling": options.pooled,
         "frames": str(options.frames),
         "join": options.join,
         "dtype": encoder.config.model.dtype,
@@ -103,7 +105,7 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
         sensor=encoder.sensor_row(options.sensor or UNIVERSAL, say),
         frames=options.frames,
         stride=options.stride,
-        pooling=options.pooling,
+        pooling=options.pooled,
         join=options.join,
     )
     result = stream.collect(embedded, partial(_print_line, rate=rate, head=head) if lines else None)
@@ -179,7 +181,7 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     if len(usable) < len(rows):
         say(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
     rows, values = features.embed_rows(
-        encoder, manifest, usable, options.frames, options.pooling, options.join, batch=options.batch,
+        encoder, manifest, usable, options.frames, options.pooled, options.join, batch=options.batch,
         on_bad_sample=options.on_bad_sample, say=say,
     )  # fmt: skip
     keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
@@ -205,7 +207,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
         if waiting:
             missing = options.batch - len(waiting) if values else 0  # one shape, one compilation
             full = np.stack(waiting + waiting[-1:] * missing)
-            z = encoder.embed(full, np.full(len(full), row), pooling=options.pooling, join=options.join)
+            z = encoder.embed(full, np.full(len(full), row), pooling=options.pooled, join=options.join)
             values.append(z[: len(waiting)])
             waiting.clear()
 

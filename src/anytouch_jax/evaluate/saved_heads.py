@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,9 @@ from scipy.special import expit, softmax
 from ..config import UserError
 from ..whole import replacing
 from .probe_models import Linear
+
+if TYPE_CHECKING:
+    from .features import Pooling
 
 Array = npt.NDArray[Any]
 FORMAT = "anytouch_jax.head.1"
@@ -33,7 +36,7 @@ class Head:
     mean: Array
     scale: Array
     label: str
-    pooling: str
+    pooling: Pooling
     frames: int
     mark: str
 
@@ -62,7 +65,7 @@ class Head:
             )
 
 
-def head_of(model: Linear, names: Array, *, label: str, pooling: str, frames: int, mark: str) -> Head:
+def head_of(model: Linear, names: Array, *, label: str, pooling: Pooling, frames: int, mark: str) -> Head:
     """The head of a fitted `Linear`, whose class numbers count in `names`."""
     assert model.fit is not None  # a probe needs two classes
     classes = np.asarray(names)[model.classes].astype(str)

@@ -139,6 +139,16 @@ def test_help_needs_no_heavy_imports():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env={**os.environ}, timeout=60)
 
 
+def test_what_features_are_is_told_without_heavy_imports(tmp_path):
+    np.savez(tmp_path / "f.npz", features=np.zeros((2, 3), np.float32), rows=np.arange(2))
+    code = (
+        f"import sys; from anytouch_jax.cli import main; assert main(['info', {str(tmp_path / 'f.npz')!r}]) == 0\n"
+        "heavy = {'jax', 'flax', 'optax', 'orbax', 'scipy', 'cv2', 'pyarrow'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env={**os.environ}, timeout=60)
+
+
 def test_an_unknown_command_is_answered_with_the_nearest(capsys):
     assert run("trin") == 2
     assert "did you mean train?" in capsys.readouterr().err

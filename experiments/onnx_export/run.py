@@ -20,8 +20,9 @@ import numpy as np
 
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.config import UserError, to_json
-from anytouch_jax.evaluate.export import call_of, describes
+from anytouch_jax.evaluate.export import call_of
 from anytouch_jax.evaluate.features import check_frames, load_encoder
+from anytouch_jax.evaluate.names import describes
 from anytouch_jax.io.checkpoint import export_safetensors
 
 BATCHES = (1, 5)

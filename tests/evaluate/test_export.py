@@ -14,8 +14,9 @@ from tiny_models import touch_model
 
 from anytouch_jax.config import Config, UserError
 from anytouch_jax.evaluate import export as exports
-from anytouch_jax.evaluate.export import describes, export, load
+from anytouch_jax.evaluate.export import export, load
 from anytouch_jax.evaluate.features import load_encoder, random_encoder
+from anytouch_jax.evaluate.names import describes
 
 RNG = np.random.default_rng(0)
 CLIPS = RNG.integers(0, 256, (5, 3, 28, 28, 3), np.uint8)

@@ -22,7 +22,6 @@ from anytouch_jax.evaluate import generation
 from anytouch_jax.evaluate.features import random_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import (
-    FILE,
     Design,
     Fit,
     Generator,
@@ -33,6 +32,7 @@ from anytouch_jax.evaluate.generator import (
     predict,
     save,
 )
+from anytouch_jax.evaluate.names import GENERATOR
 from anytouch_jax.io.tensors import write_safetensors
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import Part
@@ -326,21 +326,21 @@ def test_a_saved_generator_comes_back_bit_for_bit(made, regressed, tmp_path):
     for one, images in ((made, X), (regressed, X)):
         folder = tmp_path / one.design.target
         save(one, folder)
-        assert [file.name for file in folder.iterdir()] == [FILE]
+        assert [file.name for file in folder.iterdir()] == [GENERATOR]
         back = load(folder)
         assert back.design == one.design
         jax.tree.map(np.testing.assert_array_equal, back.params, jax.tree.map(np.asarray, one.params))
         np.testing.assert_array_equal(back(images), one(images))
-        assert load(folder / FILE).design == one.design
+        assert load(folder / GENERATOR).design == one.design
 
 
 def test_what_is_no_generator_is_said(tmp_path):
     with pytest.raises(UserError, match=r"there is no generator in .*--fit"):
         load(tmp_path / "none")
-    write_safetensors(tmp_path / FILE, {"a": np.zeros(2, np.float32)}, {"config": "{}"})
+    write_safetensors(tmp_path / GENERATOR, {"a": np.zeros(2, np.float32)}, {"config": "{}"})
     with pytest.raises(UserError, match="holds no generator"):
         load(tmp_path)
-    (tmp_path / FILE).write_bytes(b"nothing")
+    (tmp_path / GENERATOR).write_bytes(b"nothing")
     with pytest.raises(UserError, match="not a whole safetensors file"):
         load(tmp_path)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from anytouch_jax.commands.output import check_folder
 from anytouch_jax.commands.unused import refuse_join
+from anytouch_jax.evaluate.names import describes
 from anytouch_jax.options_use import Export
 
 
@@ -23,5 +24,5 @@ def run(options: Export) -> int:
     worst = about["worst_difference"]
     print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(platforms)}; {about['input']}")
     print(f"at most {worst:.1e} of the largest feature from the live model (1 and 5 touches)")
-    print(f"{export.describes(options.out)}: how to call it")
+    print(f"{describes(options.out)}: how to call it")
     return 0

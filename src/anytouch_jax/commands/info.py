@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from anytouch_jax.config import UNIVERSAL, Config, Model, UserError
+from anytouch_jax.evaluate.names import GENERATOR, POLICY, describes
 from anytouch_jax.options_use import Info
 
 _TABLES = (".csv", ".parquet")
@@ -24,19 +25,16 @@ def run(options: Info) -> int:
 
 
 def _lines(path: Path) -> list[str]:
-    from anytouch_jax.evaluate import export, generator
-    from anytouch_jax.evaluate.pouring_recordings import POLICY
-
     if not path.exists():
         raise UserError(f"there is no {path}")
     if path.is_dir():
         return _folder(path)
-    if path.name == generator.FILE:
+    if path.name == GENERATOR:
         return _translation(path)
     if path.name == POLICY:
         return _policy(path.parent)
-    if export.describes(path).is_file():
-        return [f"{path}: an exported encoder; how to call it", export.describes(path).read_text("utf-8").strip()]
+    if describes(path).is_file():
+        return [f"{path}: an exported encoder; how to call it", describes(path).read_text("utf-8").strip()]
     if path.suffix.lower() in _TABLES:
         return _manifest(path)
     if path.suffix == ".npz" and (found := _features(path)):
@@ -51,12 +49,10 @@ def _lines(path: Path) -> list[str]:
 def _folder(path: Path) -> list[str]:
     """A run, else a translation or a policy, else the manifest that is meant: by its name, or the only one."""
     from anytouch_jax.data.table import is_manifest
-    from anytouch_jax.evaluate import generator
-    from anytouch_jax.evaluate.pouring_recordings import POLICY
     from anytouch_jax.io.record import steps
 
     if not steps(path / "checkpoints"):
-        if (path / generator.FILE).is_file():
+        if (path / GENERATOR).is_file():
             return _translation(path)
         if (path / POLICY).is_file():
             return _policy(path)

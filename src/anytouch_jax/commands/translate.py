@@ -13,6 +13,7 @@ from anytouch_jax.commands.output import check_home
 from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import FIELD_SENSORS, UserError
+from anytouch_jax.evaluate.names import GENERATOR
 from anytouch_jax.options_use import Translate
 from anytouch_jax.strict_json import SEED, in_range
 from anytouch_jax.whole import write_whole
@@ -64,7 +65,7 @@ def _fit(options: Translate) -> int:
     if options.to in FIELD_SENSORS:
         refuse(options, ("adversarial",), f"to {options.to}, whose fields have no critic")
     check_home(home)
-    if (home / generator.FILE).exists():
+    if (home / GENERATOR).exists():
         raise UserError(f"{home} holds a translation already; remove it, or choose another folder with --out")
     how = generator.Fit(
         steps=options.steps,

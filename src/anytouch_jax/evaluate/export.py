@@ -20,6 +20,7 @@ import numpy as np
 from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL, UserError
+from anytouch_jax.evaluate.names import describes
 from anytouch_jax.whole import write_whole
 
 if TYPE_CHECKING:
@@ -152,11 +153,6 @@ def call_of(
         "sensors": {name: row for row, name in enumerate(model.sensors)},
         "seen": None if encoder.seen is None else list(encoder.seen),
     }
-
-
-def describes(path: Path) -> Path:
-    """The JSON beside an artefact."""
-    return path.with_name(f"{path.name}.json")
 
 
 def _check_platforms(platforms: Sequence[str]) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ConfigError, UserError, from_json, to_json
+from anytouch_jax.evaluate.names import GENERATOR
 from anytouch_jax.io.tensors import read_safetensors, write_safetensors
 from anytouch_jax.io.tree import flatten, nest
 from anytouch_jax.nn.functional import Part, build
@@ -35,7 +36,6 @@ from anytouch_jax.nn.translation import (
 )
 from anytouch_jax.objectives import normalise_touch
 
-FILE = "generator.safetensors"
 Params = dict[str, Any]
 _BATCH = 64
 _GREY = (0, 128, 255)  # least, middle and most of a touch less its gel (`data.transforms.subtract_background`)
@@ -205,7 +205,7 @@ def _heads(design: Design) -> Any:
 
 def save(generator: Generator, folder: str | Path) -> Path:
     """Write a generator into `folder`, whole or not at all: one safetensors file, its design as JSON in the header."""
-    path = Path(folder) / FILE
+    path = Path(folder) / GENERATOR
     arrays = {name: np.asarray(value) for name, value in flatten(generator.params).items()}
     write_safetensors(path, arrays, {"generator": to_json(generator.design)})
     return path
@@ -214,7 +214,7 @@ def save(generator: Generator, folder: str | Path) -> Path:
 def load(folder: str | Path) -> Generator:
     """The generator in a folder (or file). Raises UserError when there is none, or another kind of file."""
     path = Path(folder)
-    path = path / FILE if path.is_dir() else path
+    path = path / GENERATOR if path.is_dir() else path
     if not path.is_file():
         raise UserError(
             f"there is no generator in {folder}; train one: anytouch translate --fit --data M --run R --from A --to B"

@@ -27,13 +27,14 @@ from ..data.manifest import Manifest
 from ..data.transforms import touch_evaluation
 from ..sim.pouring import ACTIONS, STAND, Task
 from .features import load_encoder, text_column
+from .names import POLICY
 from .pouring import SENSOR, START, Controller, Trials
 from .pouring_bounds import blind_inputs, imitate_told
 from .pouring_policy import Head, Learning, Touch, forward
 
 Array = npt.NDArray[Any]
 LEARNING = ("train", "val", "test")  # splits that are read; the others take no part
-POLICY, WEIGHTS = "policy.npz", "encoder.safetensors"
+WEIGHTS = "encoder.safetensors"
 
 
 class Recordings(NamedTuple):

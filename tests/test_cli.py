@@ -509,6 +509,26 @@ def test_a_warning_of_the_library_is_a_sentence(monkeypatch, capsys, tmp_path):
     assert [one.category for one in others] == [FutureWarning]  # somebody else's, as Python shows it
 
 
+def test_an_interrupt_ends_a_simulation_while_a_thread_compiles(tmp_path):
+    code = (
+        "import signal, sys, time; from anytouch_jax import cli; from anytouch_jax.sim.record import Recorder\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # workers of pytest-xdist ignore it\n"
+        "def compile(*_): print('compiling', flush=True); time.sleep(60)\n"
+        "Recorder.record = compile; sys.exit(cli.main(sys.argv[1:]))"
+    )
+    words = ["simulate", "--touches", "2", "--sensors", "digit", "--out", str(tmp_path / "scenes")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", code, *words], stdout=pipe, stderr=pipe, text=True) as child:
+        assert child.stdout.readline() == "compiling\n"
+        child.send_signal(signal.SIGINT)
+        try:
+            said = child.communicate(timeout=20)[1].splitlines()
+        finally:
+            child.kill()
+    assert child.returncode == 130 and "Traceback" not in str(said)
+    assert said[-1] == "interrupted: what is finished is kept, the same command goes on"
+
+
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys, tmp_path):
     def interrupted(*_):
         raise KeyboardInterrupt

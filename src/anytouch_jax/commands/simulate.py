@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.commands.words import say
 from anytouch_jax.options import Simulate
@@ -46,11 +50,32 @@ def run(options: Simulate) -> int:
         say(f"no touch is of split {' and '.join(missing)}: more touches or more objects (some 16) give some")
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar, _ended_by_interrupt(bar):
         told = _teller(bar, scenes.sensors)
         path = simulate(scenes, options.out, threads=options.threads, progress=told)
     say(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
     return 0
+
+
+@contextmanager
+def _ended_by_interrupt(bar: Progress) -> Iterator[None]:
+    """Ctrl-C ends the process at once: a thread that compiles hears of nothing for a minute, and no file is there half
+    written. Nothing changes where Ctrl-C is ignored or another program's, and outside the main thread."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: Any) -> None:
+        bar.stop()
+        say("interrupted: what is finished is kept, the same command goes on")
+        os._exit(130)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _missing(scenes: Scenes) -> list[str]:

@@ -56,6 +56,7 @@ help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):[^#]*## /\1\t/p' Makefile | while IFS='	' read -r name text; do printf '  %-14s %s\n' "$$name" "$$text"; done
 	@echo
 	@echo "  DATA=a.parquet   manifest of frames, Parquet or CSV; several in quotes: DATA=\"a.parquet b.csv\""
+	@echo "                   a path with spaces in quotes of its own: DATA=\"'my folder/a.parquet' b.csv\""
 	@echo "                   (default: simulated scenes in $(SCENES), which are made when they are not there)"
 	@echo "  RUN=folder       where the run is kept and resumed from (runs/stage1, runs/stage2)"
 	@echo "  INIT=path        what stage 2 starts from: a stage-1 run or a weights file ($(INIT))"

@@ -66,6 +66,10 @@ def planned(*words: str) -> str:
             ["probe", "DATA=a.csv", "RUN=r", "LABEL=slip"],
             "anytouch_jax probe --run r --data a.csv --label slip",
         ),
+        (
+            ["train-stage1", "DATA='my folder/a.parquet' b.csv", "RUN='my runs/one'"],
+            "anytouch_jax train --stage 1 --data 'my folder/a.parquet' b.csv --run 'my runs/one' --preset tiny",
+        ),
         (["parity"], "anytouch_jax parity tests/parity/golden"),
         (["parity", "GOLDEN=g"], "anytouch_jax parity g"),
     ],
@@ -97,6 +101,7 @@ def test_plain_make_lists_every_target() -> None:
     targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
     assert done.returncode == 0
     assert [line.split()[0] for line in done.stdout.splitlines() if re.match(r"  [a-z]", line)] == targets
+    assert """DATA="'my folder/a.parquet' b.csv\"\n""" in done.stdout  # as the test above has it
 
 
 @pytest.mark.parametrize("target", ["train-stage1", "train-stage2", "probe"])

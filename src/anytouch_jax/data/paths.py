@@ -27,7 +27,8 @@ def resolve(root: str | Path, relative: str | None) -> Path:
     if relative[0] == "/":
         raise ManifestError(f"the path {relative!r} is absolute; write it relative to the manifest's folder, {root}")
     if not path.startswith(root if root[-1] == "/" else f"{root}/"):
-        raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}")
+        link = "" if ".." in relative.split("/") else ", by a link; put the files there, or the manifest beside them"
+        raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}{link}")
     return Path(path)
 
 

@@ -5,6 +5,7 @@ Inputs of the model: touches uint8 RGB (B, T, H, W, 3) and sensor rows int32 (B,
 
 from __future__ import annotations
 
+import logging
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -38,12 +39,18 @@ def encoder_of(folder: Path):
     return encode
 
 
+def _is_worth_telling(record: logging.LogRecord) -> bool:
+    """Not that a value inside has no type beside its shape, a line each: nothing reads it, the result is checked."""
+    return not record.getMessage().startswith("The value type for shape ")
+
+
 def main(folder: Path) -> int:
     with np.load(folder / "cases.npz") as file:
         cases = dict(file)
     counts = sorted(int(name.removeprefix("touches")) for name in cases if name.startswith("touches"))
     shape = cases[f"touches{counts[0]}"].shape[1:]
     inputs = [jax.ShapeDtypeStruct(("B", *shape), jnp.uint8), jax.ShapeDtypeStruct(("B",), jnp.int32)]
+    logging.getLogger("onnx_ir.serde").addFilter(_is_worth_telling)
     target, names = str(folder / "model.onnx"), ["touches", "sensor"]
     model = to_onnx(
         encoder_of(folder), inputs=inputs, model_name="touch_encoder", input_names=names, output_names=["features"]

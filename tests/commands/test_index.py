@@ -42,6 +42,8 @@ def test_without_out_it_lies_in_the_folder(anytouch, slides):
 def test_mistakes_are_one_sentence(mistake, slides, tmp_path, monkeypatch):
     assert "did you mean ycb_slide?" in mistake("index", "ycb-slides", slides)
     assert "there is no folder" in mistake("index", "ycb_slide", tmp_path / "nowhere")
+    (tmp_path / "a.zip").write_bytes(b"")
+    assert "a.zip is a file; ROOT is the folder that" in mistake("index", "ycb_slide", tmp_path / "a.zip")
     assert "does not use the option fold" in mistake("index", "ycb_slide", slides, "--fold", 2)
     assert "must lie in" in mistake("index", "ycb_slide", slides, "--out", tmp_path / "else" / "m.parquet")
     assert "nowhere; --lists is the folder" in mistake("index", "objectfolder", slides, "--lists", "nowhere")

@@ -114,7 +114,8 @@ def index(
     one, options = reader(name), options or Options()
     base = Path(root).expanduser().resolve()
     if not base.is_dir():
-        raise UserError(f"there is no folder {base}; ROOT is the folder that holds the dataset {name}")
+        what = f"{base} is a file" if base.exists() else f"there is no folder {base}"
+        raise UserError(f"{what}; ROOT is the folder that holds the dataset {name}")
     _refuse_unused(one, options)
     if options.lists is not None:
         options = replace(options, lists=(lists := options.lists.expanduser()))

@@ -337,6 +337,11 @@ def test_a_saved_generator_comes_back_bit_for_bit(made, regressed, tmp_path):
 def test_what_is_no_generator_is_said(tmp_path):
     with pytest.raises(UserError, match=r"there is no generator in .*--fit"):
         load(tmp_path / "none")
+    for name in ("digit-duragel", "gelslim-duragel"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / GENERATOR).touch()
+    with pytest.raises(UserError, match=r"none \(there are digit-duragel, gelslim-duragel\); train one"):
+        load(tmp_path / "none")
     write_safetensors(tmp_path / GENERATOR, {"a": np.zeros(2, np.float32)}, {"config": "{}"})
     with pytest.raises(UserError, match="holds no generator"):
         load(tmp_path)

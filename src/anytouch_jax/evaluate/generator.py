@@ -216,8 +216,11 @@ def load(folder: str | Path) -> Generator:
     path = Path(folder)
     path = path / GENERATOR if path.is_dir() else path
     if not path.is_file():
+        others = sorted(file.parent.name for file in path.parent.glob(f"*/{GENERATOR}"))
+        there = f" (there are {', '.join(others)})" if others else ""
         raise UserError(
-            f"there is no generator in {folder}; train one: anytouch translate --fit --data M --run R --from A --to B"
+            f"there is no generator in {folder}{there}; "
+            "train one: anytouch translate --fit --data M --run R --from A --to B"
         )
     arrays, about = read_safetensors(path)
     try:

@@ -56,7 +56,9 @@ QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
 SIZE = plan.QUICK if QUICK else plan.FULL
 STUDY = asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 OUT, NAME = asked.path("OUT", "experiments/results"), "named_quick" if QUICK else "named"
-SEEDS, STEPS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2"), asked.number("STEPS", 5 if QUICK else 1200)
+THERE = ",".join(sorted(file.stem for file in (OUT / NAME).glob("*.json"))) if TABLE else ""
+SEEDS = asked.numbers("SEEDS", THERE or ("0" if QUICK else "0,1,2"))  # the table alone is of all that are there
+STEPS = asked.number("STEPS", 5 if QUICK else 1200)
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)  # by captions
 LABELS = (*NAMED, *UNNAMED)
 LEFT_OUT = plan.Scenes("left_out", (plan.UNSEEN,), 6 * SIZE.objects, "fine", 0, 0.25, first=10_000)  # same objects

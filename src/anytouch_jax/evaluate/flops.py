@@ -3,7 +3,7 @@
 A product of (m, k) and (k, n) is 2 m k n operations, and twice as many again in the backward pass, once where its
 input needs no gradient (pixels). Norms, softmax, activations, masks and the optimiser are left out: they are not what
 a matmul peak measures. So are recomputation (remat), empty slots and hidden patches: a variant that does more work
-for the same result is not thereby faster. So is what the last block would do for tokens that nobody reads.
+for the same result is not thereby faster. So is what the last block of touch would do for tokens that nobody reads.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def image_tower(model: Model, images: int) -> float:
     """The image tower over so many images, forward and backward, trained whole."""
     if model.image is None or not images:
         return 0.0
-    rest = _blocks(model.image, images, 1 + model.patches, 1) + _dense(images, model.image.width, model.embed)
+    rest = _blocks(model.image, images, 1 + model.patches) + _dense(images, model.image.width, model.embed)
     return _FIRST * _patches(model, model.image.width, images * model.patches) + _TRAINED * rest
 
 
@@ -82,7 +82,7 @@ def text_tower(model: Model, texts: int, length: int) -> float:
     if model.text is None or not texts:
         return 0.0
     stack = model.text.stack
-    return _TRAINED * (_blocks(stack, texts, length, 1) + _dense(texts, stack.width, model.embed))
+    return _TRAINED * (_blocks(stack, texts, length) + _dense(texts, stack.width, model.embed))
 
 
 def align(config: Config, batch: int, frames: int, images: int, texts: int, length: int) -> float:

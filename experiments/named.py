@@ -56,11 +56,12 @@ QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
 SIZE = plan.QUICK if QUICK else plan.FULL
 STUDY = asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 OUT, NAME = asked.path("OUT", "experiments/results"), "named_quick" if QUICK else "named"
-THERE = ",".join(sorted(file.stem for file in (OUT / NAME).glob("*.json"))) if TABLE else ""
+THERE = ",".join(sorted((file.stem for file in (OUT / NAME).glob("*.json")), key=int)) if TABLE else ""
 SEEDS = asked.numbers("SEEDS", THERE or ("0" if QUICK else "0,1,2"))  # the table alone is of all that are there
 STEPS = asked.number("STEPS", 5 if QUICK else 1200)
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)  # by captions
 LABELS = (*NAMED, *UNNAMED)
+NAMES = ("AnyTouch", "trained with labels", "untrained")  # encoders
 LEFT_OUT = plan.Scenes("left_out", (plan.UNSEEN,), 6 * SIZE.objects, "fine", 0, 0.25, first=10_000)  # same objects
 BATCH, RATE, WARMUP = 64, 1e-3, 100
 SETTINGS = {"size": SIZE.name, "steps": STEPS, "batch": BATCH, "rate": RATE, "simulator": VERSION}
@@ -186,7 +187,6 @@ def one_seed(seed: int) -> dict[str, Any]:
     return found
 
 
-NAMES = ("AnyTouch", "trained with labels", "untrained")
 runs = [one_seed(seed) for seed in SEEDS]
 
 # %% [markdown]

@@ -53,7 +53,7 @@ from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
 from anytouch_jax.evaluate.results import markdown, seed_interval, verdict
 from anytouch_jax.nn.translation import Translation
-from anytouch_jax.sim.dataset import simulate
+from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.whole import write_whole
@@ -80,7 +80,7 @@ scenes = Scenes(
     touches=TOUCHES, objects=24 if QUICK else 60, sensors=("gelsight_mini", "digit", "duragel", "tac3d"),
     seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
 )  # fmt: skip
-PAIRS = WORK / f"pairs-{TOUCHES}"
+PAIRS = WORK / f"pairs-{TOUCHES}-{version(scenes.sensors)}"
 
 # %% [markdown]
 # ## What the encoders may be trained on
@@ -127,7 +127,7 @@ def settings(
     return {
         "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
-        "pairs": data, "version": generation.VERSION,
+        "pairs": data, "version": generation.VERSION, "simulator": version(task),
     }  # fmt: skip
 
 
@@ -179,10 +179,11 @@ def one_table(several: Sequence[dict[str, Any]]) -> None:
     kinds = ("touches", "pairs", "size", "subtracts", "version")
     ways = {(*(one.get(kind, 1) for kind in kinds), one["fit"]["steps"]) for one in several}
     known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
-    if len(ways) > 1 or len(known) > len({one[:2] for one in known}):
+    made = {(one["from"], one["to"], one.get("simulator")) for one in several}
+    if len(ways) > 1 or len(known) > len({one[:2] for one in known}) or len(made) > len({one[:2] for one in made}):
         raise UserError(
             f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
-            f"make no table together ({sorted(map(str, ways | known))}): choose another OUT"
+            f"make no table together ({sorted(map(str, ways | known | made))}): choose another OUT"
         )
 
 

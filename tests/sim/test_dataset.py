@@ -117,6 +117,14 @@ def test_images_and_fields_are_whole(made):
     assert not list(made.rglob("*.tmp")) and not (made / "parts").exists()
 
 
+def test_a_newer_sensor_makes_no_others_old(made, tmp_path, monkeypatch):
+    assert json.loads((made / "dataset.json").read_text())["version"] == dataset.version(("digit", "tac3d"))
+    monkeypatch.setattr(dataset, "NEWER", {"tac3d": 99})
+    assert [dataset.version(names) for names in (("tac3d", "digit"), ("digit",))] == [99, dataset.VERSION]
+    with pytest.raises(UserError, match=r"version \d+, not 99"):
+        dataset.simulate(SCENES, made)
+
+
 def test_only_what_is_asked_for_is_written(tmp_path, monkeypatch):
     folder = tmp_path / "few:v2"
     asked = replace(SCENES, sensors=("digit",), vision=0.0, text=0.0, fields=("pressure",), touches=3)

@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from anytouch_jax.sim import convolve, elastic
 from anytouch_jax.sim.convolve import Plan
+from anytouch_jax.sim.mechanics import Gel, sideways
 
 POISSON = 0.4
 
@@ -95,6 +97,31 @@ def test_layer_symbols_reach_the_thin_and_the_thick_limit():
         np.testing.assert_allclose(one, 1, atol=1e-6)
 
 
+def moved_by_a_wave(thickness, poisson):
+    """(along, into the layer) that a load cos(x) moves the surface of a bonded layer of E* = 1: plane strain's ODEs in
+    depth for (u, w, shear, normal stress), with shear and normal stress 0 and -1 above, and no motion below."""
+    modulus = 1 - poisson**2
+    lame, shear = modulus * poisson / (1 + poisson) / (1 - 2 * poisson), modulus / 2 / (1 + poisson)
+    whole = lame + 2 * shear
+    rates = np.array([
+        [0, -1, 1 / shear, 0],
+        [lame / whole, 0, 0, 1 / whole],
+        [whole - lame**2 / whole, 0, 0, -lame / whole],
+        [0, 0, 1, 0],
+    ])  # fmt: skip
+    through = scipy.linalg.expm(thickness * rates)
+    return np.linalg.solve(through[:2, :2], through[:2, 3])
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.45, 0.48])
+@pytest.mark.parametrize("wave", [0.05, 0.7, 2.0, 6.0])
+def test_the_symbols_of_a_layer_solve_its_equations(wave, poisson):
+    along, into = moved_by_a_wave(wave, poisson)  # a wave number of 1: its thickness is the wave
+    at = np.array([wave])
+    assert 2 * elastic.layer_symbols(at, poisson)[0][0] == pytest.approx(into, rel=1e-6)
+    assert 2 * elastic.sideways_symbol(at, poisson)[0] == pytest.approx(along, rel=1e-6)
+
+
 def surface_under(load, spectra, plan):
     return np.asarray(plan.inverse(plan.even(plan.forward(jnp.asarray(load)), spectra)))
 
@@ -145,3 +172,24 @@ def test_the_tangential_kernels_of_a_layer_are_those_of_its_symbols():
     for one, symbol, tolerance in zip(found, symbols, (0.01, 0.02), strict=True):
         moved = np.fft.ifft2(np.fft.fft2(load, wave.shape) * symbol).real[:n, :n]
         np.testing.assert_allclose(one, moved, atol=tolerance * np.abs(moved).max())
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.48])
+def test_the_sideways_kernel_is_that_of_its_symbol(poisson):
+    """The gradient of its potential is the sum over waves of what each wave of a smooth load moves sideways."""
+    n, pitch, thickness = 64, 0.2, 2.0
+    x, y = np.meshgrid(*[(np.arange(n) - (n - 1) / 2) * pitch] * 2)
+    load = np.exp(-((x - 0.7) ** 2 + y**2) / (2 * 0.9**2))
+    waves = 2 * np.pi * np.fft.fftfreq(8 * n, pitch)
+    wave_x, wave_y = np.meshgrid(waves, waves)
+    wave = np.hypot(wave_x, wave_y)
+    wave[0, 0] = 1e-9
+    symbol = 1j * wave_x * 2 / wave**2 * elastic.sideways_symbol(np.minimum(wave * thickness, 300), poisson)
+    moved = np.fft.ifft2(np.fft.fft2(load, wave.shape) * symbol).real[:n, :n]
+    gel = Gel(modulus=1 - poisson**2, poisson=poisson, thickness=thickness)
+    with jax.enable_x64(True):
+        found = np.asarray(sideways(jnp.asarray(load), gel, pitch))[..., 0]
+    inside = np.s_[1:-1, 1:-1]  # one-sided differences at the rim
+    np.testing.assert_allclose(found[inside], moved[inside], atol=0.02 * np.abs(moved).max())
+    turned = np.asarray(sideways(jnp.asarray(load.T, jnp.float32), gel, pitch))[..., 1].T
+    np.testing.assert_allclose(turned, found, atol=1e-3 * np.abs(moved).max())  # and float32 is enough

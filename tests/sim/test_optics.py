@@ -211,6 +211,16 @@ def test_the_field_adds_up_to_the_load():
         optics.field(jnp.zeros((4, 4)), jnp.zeros((4, 5, 2)), jnp.zeros((4, 4)), jnp.zeros((4, 4, 2)), pitch)
 
 
+def test_the_noise_of_a_field_is_in_mm_and_in_what_the_gel_makes_of_it():
+    still = [jnp.zeros((48, 48)), jnp.zeros((48, 48, 2)), jnp.zeros((48, 48)), jnp.zeros((48, 48, 2))]
+    noisy = partial(optics.field, *still, 17.0 / 48, noise=0.02, gel=SENSORS["tac3d"].gel)
+    seen = np.asarray(noisy(key=jax.random.key(3)))
+    newton = 0.02 * 200.0 * 17.0 / 20 * 1e-3
+    np.testing.assert_allclose(seen.std((0, 1)), [0.02] * 3 + [newton] * 3, rtol=0.15)
+    assert np.abs(seen.mean((0, 1)) / seen.std((0, 1))).max() < 0.2
+    assert not np.asarray(noisy()).any() and np.array_equal(noisy(key=jax.random.key(3)), seen)
+
+
 def test_the_spline_keeps_lines_differentiates_parabolas_and_repeats_the_edge():
     at = jnp.array([3.0, 4.25, 7.5, 11.9])
     value, slope = splines.spline(at, 16)

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -155,10 +156,31 @@ def test_a_sensor_of_fields_gives_no_picture(takes):
     for _, take in takes["tac3d"]:
         assert take.image is None and take.background is None and take.field.shape == (5, 20, 20, 6)
         force = take.field[..., 5]
-        np.testing.assert_allclose(force.sum((1, 2)), take.labels["force"], rtol=0.02, atol=1e-3)
-        x = (np.arange(20) - 9.5) / 20 * SENSORS["tac3d"].field[1]
-        middle = (force.sum(1) * x).sum(1) / force.sum((1, 2))
-        np.testing.assert_allclose(take.labels["x"], middle, atol=0.15)  # cells of 0.75 mm, some at the rim
+        np.testing.assert_allclose(force.sum((1, 2)), take.labels["force"], rtol=0.02, atol=0.15)  # 400 points' noise
+
+
+def test_a_field_is_felt_where_the_load_is_and_its_points_give_way_to_the_sides():
+    pressed = partial(record.record, sensor=SENSORS["tac3d"], fidelity="fast", size=0)
+    ball = -(AXIS[:, None] ** 2 + AXIS[None, :] ** 2) / 16
+    still = clip(relief=ball.astype(np.float32), motion=np.zeros((1, 3), np.float32), depth=np.full(1, 0.8, np.float32))
+    felt = jax.jit(pressed)
+    seen = np.asarray(felt(still).field)[0]
+    away = np.mgrid[:20, :20][::-1].transpose(1, 2, 0) - 9.5
+    ring = (np.linalg.norm(away, axis=-1) > 3) & (np.linalg.norm(away, axis=-1) < 4)  # just outside the contact
+    slippery = np.asarray(felt(still._replace(friction=np.float32(0))).field)[0]
+    held, free = (
+        ((one[..., :2] * away).sum(-1) / np.linalg.norm(away, axis=-1))[ring].mean() for one in (seen, slippery)
+    )
+    assert 0.02 * seen[..., 2].max() < held < 0.7 * free < 0.2 * seen[..., 2].max()  # of the dent
+    np.testing.assert_allclose(seen[..., :2], -seen[::-1, ::-1, :2], atol=2e-4)
+    noisy = still._replace(unit=still.unit._replace(noise=np.float32(0.03)))  # a unit's own
+    spread = np.asarray(felt(noisy).field)[0, ..., :3] - seen[..., :3]
+    assert 0.02 < spread.std() < 0.04
+    aside = felt(still._replace(start=np.asarray([1.3, -0.4, 0], np.float32)))
+    (force,), x = np.asarray(aside.field)[..., 5], (np.arange(20) - 9.5) / 20 * SENSORS["tac3d"].field[1]
+    middle = (force.sum(0) * x).sum() / force.sum(), (force.sum(1) * x).sum() / force.sum()
+    np.testing.assert_allclose((aside.labels["x"][0], aside.labels["y"][0]), middle, atol=0.05)
+    np.testing.assert_allclose(middle, (1.3, -0.4), atol=0.1)
 
 
 def test_labels_agree_with_the_pressure(takes):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import UserError
-from anytouch_jax.sim.mechanics import Contact, Gel, press
+from anytouch_jax.sim.mechanics import Contact, Gel, press, sideways
 from anytouch_jax.sim.shear import at_rest, shear_step
 
 N, MU = 48, 0.5
@@ -224,3 +224,28 @@ def test_mistakes_are_named():
         shear_step(None, CONTACT, (0, 0, 0), GEL, 0.0, MU)
     with pytest.raises(UserError, match="vmap"):
         shear_step(None, CONTACT._replace(pressure=jnp.zeros((2, N, N))), (0, 0, 0), GEL, PITCH, MU)
+
+
+@pytest.mark.parametrize("fidelity", ["exact", "fast"])
+def test_friction_holds_back_what_pressing_squeezes_out(fidelity):
+    layer = Gel(MODULUS, 0.48, 2.0)
+    contact = press(jnp.asarray(-(R**2) / (2 * RADIUS), jnp.float32), DEPTH, layer, PITCH)
+    squeezed = sideways(contact.pressure, layer, PITCH)
+    step = jax.jit(
+        lambda friction: shear_step(
+            None, contact, (0, 0, 0), layer, PITCH, friction, fidelity=fidelity, squeezed=squeezed, tolerance=3e-4
+        )
+    )
+    inside = np.asarray(contact.pressure) > 0.05 * float(contact.pressure.max())
+    free, partly, held = (step(friction) for friction in (0.0, 0.2, 20.0))
+    moved = [np.linalg.norm(state.displacement + squeezed, axis=-1)[inside] for state in (free, partly, held)]
+    np.testing.assert_allclose(moved[0], np.linalg.norm(squeezed, axis=-1)[inside], atol=1e-6)
+    assert (
+        moved[2].max() < (0.02 if fidelity == "exact" else 0.3) * moved[0].max()
+    )  # it moves with the object: not at all
+    assert moved[2].mean() < moved[1].mean() < moved[0].mean()
+    assert held.slip_fraction < 0.05 < partly.slip_fraction < 1
+    within_coulomb(jax.tree.map(np.asarray, partly), contact, 0.2)
+    inward = (partly.traction * jnp.asarray(np.stack([X, Y], -1))).sum(-1)
+    assert np.asarray(inward)[inside].max() < 1e-3  # the object pulls toward the middle
+    assert np.abs(partly.force).max() < 1e-3 * float(contact.force)

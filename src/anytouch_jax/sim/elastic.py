@@ -64,6 +64,17 @@ def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
     return (sinh - 4 * wave * decay) / below, (sinh + 4 * wave * decay) / below, np.tanh(wave)
 
 
+def sideways_symbol(wave: Host, poisson: float) -> Host:
+    """What a normal load moves a bonded layer's surface toward its crests, over what it moves a half-space's in.
+
+    `wave` as in `layer_symbols`, derived as they are; negative where the layer is squeezed out from under the load.
+    """
+    k = 3 - 4 * poisson
+    decay = np.exp(-2 * wave)
+    below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
+    return (k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2 - 2 * wave**2 * decay) / (1 - poisson) / below
+
+
 @functools.lru_cache(maxsize=8)
 def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
     """Distance over thickness, and there: what the half-space's point load moves more than the layer's.
@@ -85,6 +96,29 @@ def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
 def is_infinite(value: Any) -> bool:
     """Whether a thickness or a modulus is known, before anything is traced, to be infinite."""
     return isinstance(value, float | int) and bool(np.isinf(value))
+
+
+@functools.lru_cache(maxsize=8)
+def sideways_table(poisson: float) -> tuple[Host, Host, float]:
+    """Distance over thickness, there the smooth part of `sideways_kernel`, and the factor of the rest, asinh(2 / d)."""
+    nodes, weights = np.polynomial.legendre.leggauss(128)
+    wave, weights = 7.0 * (nodes + 1), 7.0 * weights
+    rest = (1 - 2 * poisson) / (2 * (1 - poisson))  # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
+    smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
+    distance = np.linspace(0, FAR, 513)
+    turn = (np.arange(200) + 0.5) * np.pi / 200
+    bessel0 = np.cos(np.outer(distance, wave)[..., None] * np.sin(turn)).mean(-1)
+    return distance, bessel0 @ (weights * smooth), rest
+
+
+def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Array:
+    """(H, W) at offsets >= 0: the potential whose gradient is the sideways motion of a layer's surface by a load on a
+    pixel, in units of P / (pi E*). Beyond FAR thicknesses nothing moves."""
+    distance, table, rest = sideways_table(poisson)
+    radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))  # at 0 the mean of log r over a pixel
+    far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
+    smooth = jnp.interp(far, jnp.asarray(distance, dtype), jnp.asarray(table, dtype))
+    return jnp.where(far < FAR, smooth + rest * jnp.arcsinh(2 / far), 0)
 
 
 def _looked_up(far: Array, distance: Host, table: Host, limit: float) -> Array:

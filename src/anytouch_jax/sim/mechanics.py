@@ -1,8 +1,8 @@
 """Frictionless normal contact of a gel with an object pressed in to a given depth: pressure, displacement, force.
 
 mm, kPa, N. The gel is a linear elastic half-space, or a layer bonded to a rigid plate where its thickness is finite;
-friction does not change the pressure (exact for an incompressible half-space under a rigid object; on a bonded layer
-what pressing moves sideways, up to about a fifth of the dent, is left out).
+friction does not change the pressure (exact for an incompressible half-space under a rigid object), nor what pressing
+moves sideways (`sideways`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jax import Array
 
 from ..config import UserError
 from .convolve import Plan
-from .elastic import is_infinite, normal_spectrum
+from .elastic import is_infinite, normal_spectrum, sideways_kernel
 from .solver import OWN, Compliance, Solution, complementarity, conjugate_gradients, descent, scaled
 
 Fidelity = Literal["exact", "fast"]
@@ -197,6 +197,22 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
     factor = scaled(found.x, found.excess + cut, cut)
     excess = factor * (found.excess + cut) - cut
     return Solution(factor * found.x, excess, complementarity(factor * found.x, excess), found.iterations)
+
+
+def sideways(pressure: Array, gel: Gel, pitch: Any) -> Array:
+    """(H, W, 2) mm along x and y that `pressure` (H, W) kPa alone moves the surface of a bonded layer, frictionless.
+
+    A nearly incompressible layer gives way to the sides, by up to a fifth of the dent of a ball and more by a wide
+    block; a compressible one is also drawn toward the load. `shear_step` tells what friction leaves of it. By central
+    differences of a potential. Raises UserError for a gel without a thickness.
+    """
+    if is_infinite(gel.thickness):
+        raise UserError("what pressing moves sideways is that of a bonded layer: give the gel a thickness")
+    plan, pitch = Plan(*pressure.shape), jnp.asarray(pitch, pressure.dtype)
+    spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype), 1, jnp)
+    potential = plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)  # mm
+    y, x = jnp.gradient(potential)
+    return jnp.stack([x, y], -1)
 
 
 def halved(field: Array) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..config import UserError
 from . import markers, shading, splines
+from .mechanics import KPA_MM2, Gel
 from .sensors import Markers, Sensor, look
 from .units import Unit, turned
 
@@ -199,13 +200,24 @@ def _noise(bits: Array) -> Array:
 
 
 def field(
-    displacement: Array, tangential: Array, pressure: Array, traction: Array, pitch: Any, points: int = 20
+    displacement: Array,
+    tangential: Array,
+    pressure: Array,
+    traction: Array,
+    pitch: Any,
+    points: int = 20,
+    *,
+    noise: Any = 0.0,
+    gel: Gel | None = None,
+    key: Array | None = None,
 ) -> Array:
     """What a field sensor measures, f32 (points, points, 6): displacement x, y, z in mm, force x, y, z in N.
 
     Inputs on the solve grid: `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h, w) kPa, `traction`
-    (h, w, 2) kPa, `pitch` mm. A point reports the mean displacement and the whole force of its cell, so the forces
-    add up to the load. Raises UserError for maps of different sizes.
+    (h, w, 2) kPa, `pitch` mm. A point reports the mean displacement and the whole force of its cell, so but for noise
+    the forces add up to the load. `key` draws noise of standard deviation `noise` mm in a displacement; forces are
+    computed of displacements, so theirs is what a cube of `gel` under a cell needs for it. Raises UserError for maps of
+    different sizes.
     """
     shape = displacement.shape
     if not shape == pressure.shape == tangential.shape[:2] == traction.shape[:2]:
@@ -213,5 +225,14 @@ def field(
     maps = jnp.concatenate([tangential, displacement[..., None], traction, pressure[..., None]], -1)
     rows, columns = (jnp.asarray(splines.average(n, points)) for n in shape)
     means = jnp.einsum("ih,hwc,jw->ijc", rows, maps, columns)
-    newton = shape[0] * shape[1] / points**2 * pitch**2 * 1e-3
-    return (means * jnp.stack([jnp.ones(3), jnp.full(3, 1.0) * newton]).reshape(1, 1, 6)).astype(jnp.float32)
+    cell = shape[0] * shape[1] / points**2 * pitch**2  # mm^2
+    exact = means * _each(1.0, cell * KPA_MM2)
+    if key is not None and gel is not None:
+        spread = _each(noise, noise * gel.modulus * jnp.sqrt(cell) * KPA_MM2)
+        exact = exact + spread * jax.random.normal(key, exact.shape)
+    return exact.astype(jnp.float32)
+
+
+def _each(displacement: Any, force: Any) -> Array:
+    """A value for the displacements and one for the forces of a field, (1, 1, 6)."""
+    return jnp.repeat(jnp.stack([jnp.asarray(displacement), jnp.asarray(force)]), 3)[None, None]

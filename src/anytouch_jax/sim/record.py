@@ -107,18 +107,22 @@ def record(
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
     relief = surfaces(clip, x, y)
     contact = jax.vmap(press)(relief, clip.depth)
-    sheared = _sheared(clip, contact, gel, pitch, fidelity) if slides else _unsheared(contact)
+    squeezed = (
+        jax.vmap(lambda p: mechanics.sideways(p, gel, pitch))(contact.pressure) if sensor.kind == "field" else None
+    )
+    sheared = _sheared(clip, contact, squeezed, gel, pitch, fidelity) if slides else _unsheared(contact)
     labels = _labels(clip, contact, sheared, pitch) | {"depth": _depth(clip, relief)}
     if fidelity == "fast":
         del labels["converged"]  # a few rounds are not meant to converge
-    if sensor.kind == "field":
-        measured = jax.vmap(partial(optics.field, pitch=pitch, points=sensor.resolution[0]))(
-            contact.displacement, sheared.displacement, contact.pressure, sheared.traction
+    keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
+    if squeezed is not None:
+        measure = partial(optics.field, pitch=pitch, points=sensor.resolution[0], noise=clip.unit.noise, gel=gel)
+        measured = jax.vmap(lambda *maps: measure(*maps[:-1], key=maps[-1]))(
+            contact.displacement, sheared.displacement + squeezed, contact.pressure, sheared.traction, keys[1:]
         )
         return Take(None, None, measured, labels)
     shape = optics.picture_size(sensor, size)
     draw = partial(optics.render, pitch=pitch, sensor=sensor, unit=clip.unit, resolution=shape)
-    keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
     behind = optics.backdrop(sensor, clip.unit, shape)
     image = jax.vmap(lambda u, t, key: draw(u, t, key=key, behind=behind))(
         contact.displacement, sheared.displacement, keys[1:]
@@ -129,10 +133,12 @@ def record(
     return Take(image, background, seen, labels)
 
 
-def _sheared(clip: Clip, contact: Contact, gel: Gel, pitch: float, fidelity: Fidelity) -> shear.Shear:
+def _sheared(
+    clip: Clip, contact: Contact, squeezed: Array | None, gel: Gel, pitch: float, fidelity: Fidelity
+) -> shear.Shear:
     """The tangential state of every frame, each from the one before it."""
 
-    def step(state: shear.Shear, frame: tuple[Contact, Array]) -> tuple[shear.Shear, shear.Shear]:
+    def step(state: shear.Shear, frame: tuple[Contact, Array, Array | None]) -> tuple[shear.Shear, shear.Shear]:
         state = shear.shear_step(
             state,
             frame[0],
@@ -143,11 +149,13 @@ def _sheared(clip: Clip, contact: Contact, gel: Gel, pitch: float, fidelity: Fid
             fidelity=fidelity,
             modulus_object=clip.modulus,
             centre=clip.unit.offset,
+            squeezed=frame[2],
         )
         return state, state
 
     start = shear.at_rest((contact.pressure.shape[1], contact.pressure.shape[2]), contact.pressure.dtype)
-    return jax.lax.scan(step, start, (contact, gel_motion(clip)))[1]
+    change = None if squeezed is None else jnp.diff(squeezed, axis=0, prepend=jnp.zeros_like(squeezed[:1]))
+    return jax.lax.scan(step, start, (contact, gel_motion(clip), change))[1]
 
 
 def _unsheared(contact: Contact) -> shear.Shear:
@@ -232,7 +240,7 @@ class Recorder:
                 fidelity=scenes.fidelity,
                 size=scenes.size,
                 fields=scenes.fields,
-                slides=scenes.frames > 1,
+                slides=scenes.frames > 1 or SENSORS[name].kind == "field",
             )
             self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]

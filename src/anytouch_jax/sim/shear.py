@@ -1,8 +1,8 @@
 """Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial slip, full slip).
 
-The pressure is given; the coupling of normal and tangential motion is left out, as in Cattaneo's and Mindlin's
-solutions: on an incompressible half-space it is zero, but pressing alone moves the surface of a bonded layer sideways,
-by up to about a fifth of the dent. mm, kPa, N, rad; x to the right, y down, twist positive from x to y.
+The pressure is given, and friction does not change it. What pressing alone moves sideways is left out, as in
+Cattaneo's and Mindlin's solutions (on an incompressible half-space it is zero), unless it is given: a bonded layer is
+squeezed out, and the object holds it back. mm, kPa, N, rad; x to the right, y down, twist positive from x to y.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ def shear_step(
     fidelity: Fidelity = "exact",
     modulus_object: Any = float("inf"),
     centre: Any = (0.0, 0.0),
+    squeezed: Array | None = None,
     tolerance: float = 1e-3,
     iterations: int | None = None,
 ) -> Shear:
@@ -69,6 +70,8 @@ def shear_step(
     leaves a locked-in shear. `friction` is Coulomb's coefficient. `exact`: projected gradients with the full tangential
     influence coefficients on the grid of the pressure to `tolerance`, at most `iterations` (400). `fast`: an elastic
     predictor, return to the friction cone, and `iterations` (6) corrections on a coarser grid. For a batch, `jax.vmap`.
+    `squeezed` (H, W, 2) mm: what this step's change of pressure moves sideways (of `mechanics.sideways`); the traction
+    is then that which also holds it back, and `displacement` that of the traction alone.
     Raises UserError on a negative friction, where its value is known.
     """
     _check(contact, pitch, friction, fidelity)
@@ -85,6 +88,8 @@ def shear_step(
     apply = _compliance(plan, spectra)
     limit = jnp.where(coarse > 0, friction * coarse, 0) / unit * times
     moved = _rigid(plan, pitch * times, jnp.asarray(motion, dtype), jnp.asarray(centre, dtype))
+    if squeezed is not None:
+        moved = moved - _pooled(squeezed, times)
 
     def within(step: Array) -> Array:
         return _returned(before + step, limit) - before

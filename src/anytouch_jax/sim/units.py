@@ -29,7 +29,8 @@ class Unit(NamedTuple):
     are turned; `uneven` (5, 3) relative brightness on u, v, u^2, uv, v^2; `thickness`, `modulus` factors of the gel;
     `marked` 1 with markers, 0 without; `marker_phase` (2,) of a lattice step; `marker_size` factor; `zoom` (<= 1)
     share of the field that is shown, `window` (2,) its middle, mm (x, y); `mirror` (2,) +-1 along x and y;
-    `rotation` rad and `offset` (2,) mm of the object; `noise` standard deviation of a pixel, 0..255.
+    `rotation` rad and `offset` (2,) mm of the object; `noise` standard deviation of a pixel, 0..255, or of a
+    field's displacement, mm.
     """
 
     tint: Leaf

@@ -47,6 +47,7 @@ from study.work import Work
 
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.edit import select
 from anytouch_jax.evaluate import generation, pairs
 from anytouch_jax.evaluate.features import Encoder, load_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
@@ -160,6 +161,12 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
     print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
 
+def of_sensors(table: manifests.Manifest, names: tuple[str, str]) -> str:
+    """The hash of the rows of two sensors: what a translation from the one to the other is of."""
+    rows = np.flatnonzero(np.isin(table.column("sensor").to_pylist(), names))
+    return select(table, rows).content_hash[:16]
+
+
 def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
     """By the name that they have in the table, and by seed: those of RUNS, else those that this page trains."""
     if RUNS:
@@ -176,10 +183,10 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
 def one_table(several: Sequence[dict[str, Any]]) -> None:
     """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
     (errors of pictures of another size are no rivals), two encoders of one name and seed."""
-    kinds = ("touches", "pairs", "size", "subtracts", "version")
+    kinds = ("touches", "size", "subtracts", "version")
     ways = {(*(one.get(kind, 1) for kind in kinds), one["fit"]["steps"]) for one in several}
     known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
-    made = {(one["from"], one["to"], one.get("simulator")) for one in several}
+    made = {(one["from"], one["to"], one["pairs"], one.get("simulator")) for one in several}
     if len(ways) > 1 or len(known) > len({one[:2] for one in known}) or len(made) > len({one[:2] for one in made}):
         raise UserError(
             f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
@@ -201,14 +208,14 @@ def all_runs() -> None:
             remaining.write_remaining(Path(word), table)
         raise SystemExit(0)
     known = encoders(table)
-    content = table.content_hash[:16]
+    content = {task: of_sensors(table, task) for task in TASKS}
     plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
     wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in remaining.NOT_TUNED]
     plans = [*wanted, (PIXELS, "scratch")]
     every = {}
     for (task, seed), (name, tune) in product(product(TASKS, SEEDS), plans):
         encoder = known[name][seed] if name in known else None
-        about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content)
+        about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content[task])
         stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
         every[RUN_FILES / f"{stem}.json"] = (about, encoder)
     there = [file for file in RUN_FILES.glob("*-*.json") if file not in every]

@@ -14,30 +14,35 @@
 # is short, or can the simulated touches not tell it? So here the same encoder is trained with the labels themselves,
 # which is more than any caption can say, on the scenes of `make experiments`: contact frames of four sensors, turned
 # over by chance, one linear head a label. What it tells of its own frames is what could be learned by heart; what it
-# tells of the test split, whose pairs of primitive and texture training never had, is what carries over.
+# tells of the test split, whose pairs of primitive and texture training never had, is what carries over. A small
+# convolutional network is trained in the same way: what it tells and the encoder does not is there in the touches.
 #
 # Then the sensor that is left out, in six touches of each object: linear probes of contact frames, shallow and deep
 # ones, read hardness, roughness, material and indenter from the frozen features of AnyTouch of Tables 2 to 4, of the
-# encoder trained with the labels, of an untrained one, and from pixels less the untouched gel.
+# encoder trained with the labels, of an untrained one, and of the convolutional network, and from pixels less the
+# untouched gel.
 #
-# `python experiments/named.py` takes some ten minutes a seed on one core where the encoders of `make experiments` are
-# there. `STUDY=` is the folder of scenes and encoders (made where they are not there), `STEPS=` and `SEEDS=` change the
-# size, `QUICK=1` is a trial, `TABLE=1` only rewrites the page `named.md` from the JSON in `named/`, where what is
+# `python experiments/named.py` takes some twenty minutes a seed on one core where the encoders of `make experiments`
+# are there. `STUDY=` is the folder of scenes and encoders (made where they are not there), `STEPS=` and `SEEDS=` change
+# the size, `QUICK=1` is a trial, `TABLE=1` only rewrites the page `named.md` from the JSON in `named/`, where what is
 # finished is not done again.
 
 # %%
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from flax import nnx
 from study import asked, cuts, plan
 from study.by_object import probe_table, probed
+from study.convolutional import FEATURES, Convolutional
 from study.work import Work
 
 from anytouch_jax.config import UserError
@@ -62,6 +67,7 @@ STEPS = asked.number("STEPS", 5 if QUICK else 1200)
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)  # by captions
 LABELS = (*NAMED, *UNNAMED)
 NAMES = ("AnyTouch", "trained with labels", "untrained")  # encoders
+CONVOLUTIONAL = "convolutional, with labels"
 LEFT_OUT = plan.Scenes("left_out", (plan.UNSEEN,), 6 * SIZE.objects, "fine", 0, 0.25, first=10_000)  # same objects
 BATCH, RATE, WARMUP = 64, 1e-3, 100
 SETTINGS = {"size": SIZE.name, "steps": STEPS, "batch": BATCH, "rate": RATE, "simulator": VERSION}
@@ -73,21 +79,29 @@ enable_compilation_cache()
 
 
 # %%
+def frames(file: Path, splits: tuple[str, ...], encoder: Encoder) -> dict[str, np.ndarray]:
+    """Contact frames of a manifest: images u8 (n, h, w, 3) as the encoder gets them, sensor rows, splits, labels."""
+    table = manifests.read([file])
+    rows = contact_rows(table, splits)
+    batches = [
+        (np.asarray(batch.clip)[: len(ids), 0], np.asarray(batch.sensor)[: len(ids)])
+        for ids, batch in evaluation(table, rows, encoder.config, "still", frames=1, unknown="universal")
+    ]
+    image, sensor = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+    labels = {label: text_column(table, f"label.{label}")[rows] for label in LABELS}
+    return {"image": image, "sensor": sensor, "split": text_column(table, "split")[rows], **labels}
+
+
+def contact_rows(table: manifests.Manifest, splits: tuple[str, ...]) -> np.ndarray:
+    known = np.isin(text_column(table, "split"), splits)
+    return np.flatnonzero(known & (text_column(table, "label.contact") == "1"))
+
+
 def touches(work: Work, encoder: Encoder) -> dict[str, np.ndarray]:
-    """Contact frames that AnyTouch is trained on, and tested: images u8 (n, h, w, 3), sensor rows, splits, labels."""
+    """The frames that AnyTouch is trained on, and tested."""
     files = [work.manifest(f"own/{name}") for name in plan.SENSORS] + [work.manifest(name) for name in plan.ALIGNED]
-    found: dict[str, list[np.ndarray]] = {name: [] for name in ("image", "sensor", "split", *LABELS)}
-    for file in files:
-        table = manifests.read([file])
-        known = np.isin(text_column(table, "split"), ("train", "test"))
-        rows = np.flatnonzero(known & (text_column(table, "label.contact") == "1"))
-        for ids, batch in evaluation(table, rows, encoder.config, "still", frames=1, unknown="universal"):
-            found["image"].append(np.asarray(batch.clip)[: len(ids), 0])
-            found["sensor"].append(np.asarray(batch.sensor)[: len(ids)])
-            found["split"].append(text_column(table, "split")[ids])
-            for label in LABELS:
-                found[label].append(text_column(table, f"label.{label}")[ids])
-    return {name: np.concatenate(parts) for name, parts in found.items()}
+    several = [frames(file, ("train", "test"), encoder) for file in files]
+    return {name: np.concatenate([one[name] for one in several]) for name in several[0]}
 
 
 # %% [markdown]
@@ -95,19 +109,42 @@ def touches(work: Work, encoder: Encoder) -> dict[str, np.ndarray]:
 
 
 # %%
-def taught(encoder: Encoder, data: dict[str, np.ndarray], seed: int) -> tuple[Encoder, dict[str, dict[str, float]]]:
-    """The encoder trained with the labels of the train split; {label: {train, test, commonest}} shares told right."""
+class Pupil(NamedTuple):
+    """What is trained: f32 features (B, `width`) of images u8 (B, h, w, 3) and sensor rows (B,), by `params`."""
+
+    features: Callable[[Any, Any, Any], Any]
+    params: Any
+    width: int
+
+
+def of_encoder(encoder: Encoder) -> Pupil:
+    def features(params: Any, images: Any, sensor: Any) -> Any:
+        z = encoder.net.apply({"touch": params}, "encode", normalise_touch(images[:, None]), sensor)
+        return z.astype(jnp.float32)
+
+    return Pupil(features, encoder.params["touch"], encoder.config.model.embed)
+
+
+def convolutional(seed: int) -> Pupil:
+    graph, params = nnx.split(Convolutional(seed))
+    return Pupil(lambda params, images, _: nnx.merge(graph, params)(normalise_touch(images)), params, FEATURES)
+
+
+def taught(
+    pupil: Pupil, data: dict[str, np.ndarray], seed: int, universal: int
+) -> tuple[Any, dict[str, dict[str, float]]]:
+    """Parameters trained with the labels of the train split; {label: {train, test, commonest}} shares told right."""
     classes = {label: np.unique(data[label]) for label in LABELS}
     numbers = {label: np.searchsorted(classes[label], data[label]) for label in LABELS}
     train, test = (np.flatnonzero(data["split"] == part) for part in ("train", "test"))
-    params: Any = {"touch": encoder.params["touch"]}
-    params["heads"] = {label: jnp.zeros((encoder.config.model.embed, len(names))) for label, names in classes.items()}
+    heads = {label: jnp.zeros((pupil.width, len(names))) for label, names in classes.items()}
+    params: Any = {"features": pupil.params, "heads": heads}
     warm = min(WARMUP, STEPS // 2)
     optimiser = optax.adamw(optax.warmup_cosine_decay_schedule(0.0, RATE, warm, STEPS), weight_decay=0.1)
 
     def logits(params: Any, images: Any, sensor: Any) -> Any:
-        z = encoder.net.apply({"touch": params["touch"]}, "encode", normalise_touch(images[:, None]), sensor)
-        return {label: z.astype(jnp.float32) @ head for label, head in params["heads"].items()}
+        z = pupil.features(params["features"], images, sensor)
+        return {label: z @ head for label, head in params["heads"].items()}
 
     def loss(params: Any, images: Any, sensor: Any, wanted: Any) -> Any:
         cross = optax.softmax_cross_entropy_with_integer_labels
@@ -125,14 +162,13 @@ def taught(encoder: Encoder, data: dict[str, np.ndarray], seed: int) -> tuple[En
         images = np.stack(
             [data["image"][row][::down, ::across] for row, (down, across) in zip(rows, turned, strict=True)]
         )
-        sensor = np.where(rng.random(BATCH) < 0.5, encoder.config.model.universal_row, data["sensor"][rows])
+        sensor = np.where(rng.random(BATCH) < 0.5, universal, data["sensor"][rows])
         params, state = step(params, state, images, sensor.astype(np.int32), {k: v[rows] for k, v in numbers.items()})
 
     say = jax.jit(logits)
 
     def right(label: str, rows: np.ndarray) -> float:
-        parts = [rows[first : first + 256] for first in range(0, len(rows), 256)]
-        told = [np.asarray(say(params, data["image"][p], data["sensor"][p])[label]).argmax(-1) for p in parts]
+        told = [say(params, *some)[label].argmax(-1) for some in batched(data, rows)]
         return float(np.mean(np.concatenate(told) == numbers[label][rows]))
 
     some = np.random.default_rng(seed).choice(train, min(2000, len(train)), replace=False)
@@ -141,8 +177,13 @@ def taught(encoder: Encoder, data: dict[str, np.ndarray], seed: int) -> tuple[En
         commonest = np.bincount(numbers[label][train]).argmax()
         scores[label] = {"train": right(label, some), "test": right(label, test)}
         scores[label]["commonest"] = float(np.mean(numbers[label][test] == commonest))
-    taught_params = {"touch": jax.tree.map(np.asarray, params["touch"])}
-    return Encoder(encoder.config, taught_params, "trained with labels"), scores
+    return jax.tree.map(np.asarray, params["features"]), scores
+
+
+def batched(data: dict[str, np.ndarray], rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Images and sensor rows of some rows, some hundred at a time."""
+    parts = [rows[first : first + 256] for first in range(0, len(rows), 256)]
+    return [(data["image"][part], data["sensor"][part]) for part in parts]
 
 
 # %% [markdown]
@@ -150,38 +191,65 @@ def taught(encoder: Encoder, data: dict[str, np.ndarray], seed: int) -> tuple[En
 
 
 # %%
-def probes(encoders: dict[str, Encoder], work: Work) -> dict[str, Any]:
-    """What linear probes of contact frames (universal tokens) get right of each object never seen, by label."""
-    table = manifests.read([work.manifest(LEFT_OUT.name)])
-    known = np.isin(text_column(table, "split"), cuts.SPLITS)
-    rows = np.flatnonzero(known & (text_column(table, "label.contact") == "1"))
+def probes(features: dict[str, np.ndarray], table: manifests.Manifest, rows: np.ndarray) -> dict[str, Any]:
+    """What linear probes of contact frames get right of each object never seen, by label."""
     split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
-    found = {name: embed_rows(one, table, rows, pooling="both", say=silent)[1] for name, one in encoders.items()}
-    found["pixels"] = baseline.reduce(baseline.background_difference(table, rows), split == "train")
     labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in LABELS}
-    return probed(found, labels, groups, split)
+    return probed(features, labels, groups, split)
 
 
 # %%
-def one_seed(seed: int) -> dict[str, Any]:
-    file = OUT / NAME / f"{seed}.json"
-    found = json.loads(file.read_text()) if file.exists() else {}
-    if TABLE or found.get("settings") == SETTINGS:
-        if not found:
-            raise UserError(f"there is no {file}: run this page without TABLE=1")
-        return found
-    work = Work(STUDY)
+def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Work, table: Any) -> dict[str, Any]:
+    """What AnyTouch, the encoder trained with the labels, an untrained one and pixels tell."""
     last = plan.training(SIZE, "anytouch", seed)
     anytouch = load_encoder(work.runs({"anytouch": last}, SIZE)["anytouch"])
+    params, scores = taught(of_encoder(fresh), data, seed, fresh.config.model.universal_row)
+    named = (anytouch, Encoder(fresh.config, {"touch": params}, "trained with labels"), fresh)
+    rows = contact_rows(table, cuts.SPLITS)
+    found = [embed_rows(one, table, rows, pooling="both", say=silent)[1] for one in named]
+    pixels = baseline.background_difference(table, rows)
+    features = dict(zip(NAMES, found, strict=True))
+    features["pixels"] = baseline.reduce(pixels, text_column(table, "split")[rows] == "train")
+    return {
+        "settings": SETTINGS,
+        "anytouch": f"{last.key} (weights {anytouch.mark})",
+        "data": {name: cuts.content_hash(work.manifest(name)) for name in (*last.manifests, LEFT_OUT.name)},
+        "machine": machine.describe().sentence(),
+        "scores": scores,
+        "probes": probes(features, table, rows),
+    }
+
+
+def by_convolutions(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Work, table: Any) -> dict[str, Any]:
+    """What a convolutional network trained with the labels tells."""
+    pupil, rows = convolutional(seed), contact_rows(table, cuts.SPLITS)
+    params, scores = taught(pupil, data, seed, fresh.config.model.universal_row)
+    read, seen = jax.jit(pupil.features), frames(work.manifest(LEFT_OUT.name), cuts.SPLITS, fresh)
+    features = np.concatenate([np.asarray(read(params, *some)) for some in batched(seen, np.arange(len(rows)))])
+    return {"scores": scores, "probes": probes({CONVOLUTIONAL: features}, table, rows)}
+
+
+def one_seed(seed: int) -> dict[str, Any]:
+    """What the file of a seed says; what it does not say yet, or says of other settings, is found first."""
+    file = OUT / NAME / f"{seed}.json"
+    found = json.loads(file.read_text()) if file.exists() else {}
+    if not TABLE and found.get("settings") != SETTINGS:
+        found = {}
+    if {"probes", CONVOLUTIONAL} <= set(found):
+        return found
+    if TABLE:
+        raise UserError(f"{file} is not there, or not whole: run this page without TABLE=1")
+    work = Work(STUDY)
+    first = plan.training(SIZE, "anytouch", seed).init
+    assert first is not None
+    work.make_sets(first.manifests, SIZE)
     if not work.made(LEFT_OUT, SIZE):
         work.make(LEFT_OUT, SIZE)
-    assert last.init is not None
-    fresh = random_encoder(last.init.config, seed)
-    trained, scores = taught(fresh, touches(work, fresh), seed)
-    data = {name: cuts.content_hash(work.manifest(name)) for name in (*last.manifests, LEFT_OUT.name)}
-    found = {"settings": SETTINGS, "anytouch": f"{last.key} (weights {anytouch.mark})", "data": data}
-    found |= {"machine": machine.describe().sentence(), "scores": scores}
-    found["probes"] = probes(dict(zip(NAMES, (anytouch, trained, fresh), strict=True)), work)
+    fresh = random_encoder(first.config, seed)
+    about = seed, fresh, touches(work, fresh), work, manifests.read([work.manifest(LEFT_OUT.name)])
+    if "probes" not in found:
+        found = by_encoders(*about)
+    found[CONVOLUTIONAL] = by_convolutions(*about)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(found) + "\n")
     return found
@@ -200,13 +268,25 @@ def percent(values: list[float]) -> str:
     return f"{100 * np.mean(values):.1f} %{interval}"
 
 
-rows = [
-    (label, *(percent([run["scores"][label][part] for run in runs]) for part in ("commonest", "train", "test")))
-    for label in LABELS
-]
-told = markdown(("label", "commonest answer of train", "its own frames", "objects never touched"), rows)
-probed_runs = [run["probes"] for run in runs]
-left_out = probe_table(probed_runs, (*NAMES, "pixels", "commonest"), ("untrained", "pixels"), NAMED, UNNAMED)
+def row(label: str) -> tuple[str, ...]:
+    ways = [(run["scores"][label], run[CONVOLUTIONAL]["scores"][label]) for run in runs]
+    known = [percent([own["commonest"] for own, _ in ways])]
+    known += [percent([way[number][part] for way in ways]) for number in (0, 1) for part in ("train", "test")]
+    return (label, *known)
+
+
+def joined(run: dict[str, Any], label: str) -> dict[str, Any]:
+    """Both files' counts of a label, by object."""
+    one, other = run["probes"][label], run[CONVOLUTIONAL]["probes"][label]
+    return one | {"right": one["right"] | {CONVOLUTIONAL: other["right"][CONVOLUTIONAL]}}
+
+
+head = ("label", "commonest answer of train", "its own frames", "objects never touched")
+head += ("convolutional: its own frames", "convolutional: objects never touched")
+told = markdown(head, [row(label) for label in LABELS])
+probed_runs = [{label: joined(run, label) for label in LABELS} for run in runs]
+columns = (*NAMES, CONVOLUTIONAL, "pixels", "commonest")
+left_out = probe_table(probed_runs, columns, ("untrained", "pixels"), NAMED, UNNAMED)
 seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
 made = f"SEEDS={','.join(map(str, SEEDS))} python experiments/named.py"
 text = f"""# What captions name, of objects never touched
@@ -214,6 +294,7 @@ text = f"""# What captions name, of objects never touched
 The encoder of Tables 2 to 4 trained with the labels themselves ({runs[0]["settings"]["steps"]} steps of {BATCH} contact
 frames of four sensors), {seeds}; mean with its 95 % interval over seeds. The test split has pairs of primitive and
 texture that training never had. Captions name hardness, roughness and material; they do not name the indenter.
+Beside it a convolutional network with group norms, trained in the same way.
 
 {told}
 

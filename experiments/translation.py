@@ -319,6 +319,7 @@ first = records[0]
 tunes = {r["settings"]["fit"]["tune"] for r in records if r["settings"]["name"] != PIXELS}
 ours = {(r["settings"]["name"], r["settings"]["encoder"]) for r in records if r["settings"]["name"] != PIXELS}
 own = len(ours) > len({name for name, _ in ours})
+seeds = sorted({r["settings"]["fit"]["seed"] for r in records})
 other = (
     "" if first["settings"].get("version") == generation.VERSION else " Translations of today's code learn otherwise."
 )
@@ -328,9 +329,9 @@ lines = [
     "",
     f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, {first['pairs'][2]} of "
     f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
-    f"{len({r['settings']['fit']['seed'] for r in records})} seeds, each over "
+    f"{len(seeds)} seeds, each over "
     f"{'encoders of its own' if own else 'the same encoders'}. By "
-    f"`{'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`." + other,
+    f"`SEEDS={','.join(map(str, seeds))} {'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`." + other,
     "",
     markdown(head, cells),
     "",

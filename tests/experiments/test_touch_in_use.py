@@ -91,6 +91,9 @@ def test_named(tmp_path, monkeypatch, capsys):
     assert found["scores"]["indenter"]["train"] > 0.15
     features = {"AnyTouch", "trained with labels", "untrained", "pixels", "commonest"}
     assert set(found["probes"]["hardness"]["right"]) == features
+    network = found["convolutional, with labels"]
+    assert network["scores"]["indenter"]["train"] > 0.15
+    assert network["probes"]["hardness"]["objects"] == found["probes"]["hardness"]["objects"]
     page, before = (tmp_path / "named_quick.md").read_text(), (tmp_path / "named_quick" / "0.json").stat().st_mtime_ns
     visit("named", monkeypatch, **size)
     assert (tmp_path / "named_quick.md").read_text() == page

@@ -75,18 +75,24 @@ def sideways_symbol(wave: Host, poisson: float) -> Host:
     return (k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2 - 2 * wave**2 * decay) / (1 - poisson) / below
 
 
+@functools.lru_cache(maxsize=1)
+def _hankel() -> tuple[Host, Host, Host, Host, Host]:
+    """Waves and their quadrature weights, distances, and J0 and J2 of the one times the other (distances, waves)."""
+    nodes, weights = np.polynomial.legendre.leggauss(128)
+    wave, weights = 7.0 * (nodes + 1), 7.0 * weights
+    distance = np.linspace(0, FAR, 513)
+    turn = (np.arange(200) + 0.5) * np.pi / 200
+    phase = np.outer(distance, wave)[..., None] * np.sin(turn)
+    return wave, weights, distance, np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
+
+
 @functools.lru_cache(maxsize=8)
 def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
     """Distance over thickness, and there: what the half-space's point load moves more than the layer's.
 
     Normal, tangential (mean over directions), tangential (amplitude of cos 2 phi); units of P / (pi E* thickness).
     """
-    nodes, weights = np.polynomial.legendre.leggauss(128)
-    wave, weights = 7.0 * (nodes + 1), 7.0 * weights
-    distance = np.linspace(0, FAR, 513)
-    turn = (np.arange(200) + 0.5) * np.pi / 200
-    phase = np.outer(distance, wave)[..., None] * np.sin(turn)
-    bessel0, bessel2 = np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
+    wave, weights, distance, bessel0, bessel2 = _hankel()
     normal, along, across = (1 - one for one in layer_symbols(wave, poisson))
     across = across / (1 - poisson)
     twofold = -bessel2 @ (weights * (along - across) / 2)
@@ -101,13 +107,9 @@ def is_infinite(value: Any) -> bool:
 @functools.lru_cache(maxsize=8)
 def sideways_table(poisson: float) -> tuple[Host, Host, float]:
     """Distance over thickness, there the smooth part of `sideways_kernel`, and the factor of the rest, asinh(2 / d)."""
-    nodes, weights = np.polynomial.legendre.leggauss(128)
-    wave, weights = 7.0 * (nodes + 1), 7.0 * weights
+    wave, weights, distance, bessel0, _ = _hankel()
     rest = (1 - 2 * poisson) / (2 * (1 - poisson))  # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
     smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
-    distance = np.linspace(0, FAR, 513)
-    turn = (np.arange(200) + 0.5) * np.pi / 200
-    bessel0 = np.cos(np.outer(distance, wave)[..., None] * np.sin(turn)).mean(-1)
     return distance, bessel0 @ (weights * smooth), rest
 
 

@@ -1,8 +1,8 @@
 """Frictionless normal contact of a gel with an object pressed in to a given depth: pressure, displacement, force.
 
 mm, kPa, N. The gel is a linear elastic half-space, or a layer bonded to a rigid plate where its thickness is finite;
-friction does not change the pressure (exact for an incompressible half-space under a rigid object), nor what pressing
-moves sideways (`sideways`).
+friction does not change the pressure (exact for an incompressible half-space under a rigid object). `sideways` is what
+pressing moves to the sides before friction holds it back (`shear`).
 """
 
 from __future__ import annotations

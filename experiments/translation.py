@@ -18,11 +18,11 @@
 #     make translation
 #
 # trains the encoders, too: AnyTouch and T3-style as in Tables 2 to 4, AnyTouch's stage 1 by itself, and its stage 2
-# with the reconstruction kept as in the authors' release; one of each a seed, on the scenes of `make experiments`
-# (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs. `RUNS="anytouch=runs/stage2
-# t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c for one a seed. Each is compared
-# with two plain references trained on the same pairs: copying the mean training target, and a U-Net (images) or an MLP
-# on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
+# with a layer decay (`--optim.layer-decay 0.1`: the lower layers stay nearly as stage 1 left them); one of each a seed,
+# on the scenes of `make experiments` (`STUDY=runs/matrix`; made where they are not there) less all objects of the
+# pairs. `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
+# for one a seed. Each is compared with two plain references trained on the same pairs: copying the mean training
+# target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
 # What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
 # is made of these files alone (`TABLE=1`: nothing but that). `WORK=` and `OUT=` in the environment are where data and
@@ -48,8 +48,9 @@ from study.work import Work
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.edit import select
-from anytouch_jax.evaluate import generation, pairs
-from anytouch_jax.evaluate.features import Encoder, load_encoder
+from anytouch_jax.evaluate import generation, pairs, retrieval
+from anytouch_jax.evaluate.contacts import deepest_rows
+from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
 from anytouch_jax.evaluate.results import markdown, seed_interval, verdict
@@ -57,6 +58,7 @@ from anytouch_jax.nn.translation import Translation
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.watch import silent
 from anytouch_jax.whole import write_whole
 
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
@@ -198,6 +200,29 @@ def _settings_of(file: Path) -> dict[str, Any]:
     return json.loads(file.read_text())["settings"]
 
 
+# %% [markdown]
+# ## What an encoder knows beside pictures
+#
+# What a stage keeps of the picture it may lose for what touches have in common, so beside the errors stands how often
+# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`).
+
+
+# %%
+def find_again(name: str, seed: int, encoder: Encoder, table: manifests.Manifest) -> None:
+    """Write how often an encoder finds the same touch first of 50 and among the first five, where it is not known."""
+    file = RUN_FILES / f"found_{name}_{seed}.json"
+    if file.exists() and json.loads(file.read_text())["encoder"] == mark(encoder):
+        return
+    rows = deepest_rows(table, table.rows_of("test"))
+    seen = {name: embed_rows(encoder, table, rows, say=silent)[1]}
+    scored = retrieval.cross_sensor_retrieval(table, seen, rows, centre=(True,))
+    one = next(one.found for one in scored if one.query_sensor == retrieval.ALL)
+    if one is None:  # a trial has too few touches
+        return
+    shares = {part: float(np.mean(getattr(one, part))) for part in ("top1", "top5")}
+    write_whole(file, json.dumps({"encoder": mark(encoder), "queries": len(one.top1)} | shares) + "\n")
+
+
 # %%
 def all_runs() -> None:
     """Every run that is not there yet, task by task: frames are read once a task."""
@@ -208,6 +233,10 @@ def all_runs() -> None:
             remaining.write_remaining(Path(word), table)
         raise SystemExit(0)
     known = encoders(table)
+    if not RUNS:
+        fine = manifests.read(Work(STUDY).manifest("fine"))
+        for name, seed in product(known, SEEDS):
+            find_again(name, seed, known[name][seed], fine)
     content = {task: of_sensors(table, task) for task in TASKS}
     plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
     wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in remaining.NOT_TUNED]
@@ -296,6 +325,16 @@ for ours in (name for name in names if name.startswith(("anytouch", "stage1"))):
     rivals = [name for name in names if name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
     rivals += [*(name for name in names if "pixels" in name), MEAN]
     claims += [(f"{ours} below {rival}", *(against(task, ours, rival) for task in TASKS)) for rival in rivals]
+
+
+def found_again(name: str) -> tuple[str, str]:
+    """Shares of queries answered first and among the first five, in the mean over seeds."""
+    every = [json.loads(file.read_text()) for file in sorted(RUN_FILES.glob(f"found_{name}_[0-9]*.json"))]
+    return tuple(f"{100 * np.mean([one[part] for one in every]):.1f} %" for part in ("top1", "top5"))
+
+
+kinds = sorted({file.stem.split("_", 1)[1].rsplit("_", 1)[0] for file in RUN_FILES.glob("found_*.json")})
+again = [(kind, *found_again(kind)) for kind in kinds]
 QUESTION = "is the paper's order found? (and is it below both references?)"
 head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
 
@@ -347,6 +386,9 @@ lines = [
     f"Objects of the pairs that an encoder was trained on in its last stage: {told}.",
     "",
 ]
+if again:
+    lines += ["The same touch by another sensor and unit, objects never seen, found by the encoder itself:", ""]
+    lines += [markdown(("encoder", "first of 50", "among the first five"), again), ""]
 if not any(record["critic"] for record in records):
     lines += ["No critic judged the images.", ""]
 lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]

@@ -15,7 +15,8 @@ from .plan import Size, Training
 from .work import Work
 
 LESS = "_remaining"
-NOT_TUNED = (("anytouch_release", "fine"), ("stage1", "fine"))  # they tell why a frozen row is what it is
+LAYER_DECAY = 0.1  # by the error of images of the third split, seed 0: 0.0347, with 0.3 0.0363, with 1 0.0365
+NOT_TUNED = (("stage1", "fine"),)  # it tells why a frozen row is what it is
 
 
 def write_remaining(path: Path, taken: Manifest) -> Path:
@@ -29,11 +30,11 @@ def write_remaining(path: Path, taken: Manifest) -> Path:
 
 
 def trainings(size: Size, seed: int) -> dict[str, Training]:
-    """AnyTouch, its stage 1, its stage 2 with the reconstruction kept as in the authors' release, and T3-style."""
+    """AnyTouch, its stage 1, its stage 2 with the lower layers kept nearly as stage 1 left them, and T3-style."""
     whole, t3 = (plan.training(size, recipe, seed) for recipe in ("anytouch", "t3"))
     assert whole.init is not None
-    keeps = replace(whole.config, objective=replace(whole.config.objective, reconstruct=True))
-    found = {"anytouch": whole, "anytouch_release": Training(keeps, whole.init), "stage1": whole.init, "t3": t3}
+    kept = replace(whole.config, optim=replace(whole.config.optim, layer_decay=LAYER_DECAY))
+    found = {"anytouch": whole, "anytouch_layer_decay": Training(kept, whole.init), "stage1": whole.init, "t3": t3}
     return {name: less(one) for name, one in found.items()}
 
 

@@ -83,6 +83,7 @@ class Optim:
     beta2: float = 0.99  # AdamW's
     eps: float = 1e-8  # AdamW's
     weight_decay: float = 0.1  # of matrices; vectors have none
+    layer_decay: float = 1.0  # each layer of the touch encoder learns so much slower than the next; 1: all alike (ours)
     clip_norm: float | None = None  # largest norm of the gradient; None: any
     ema: float | None = None  # decay of an average of the parameters, which is then what is used; None: no average
     accumulate: int = 1  # batches whose gradients make one update
@@ -90,6 +91,7 @@ class Optim:
     def __post_init__(self) -> None:
         chosen("--optim.", self)
         in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, clip_norm=ABOVE_0, ema=BELOW_1, accumulate=COUNT)
+        in_range("--optim.", self, layer_decay=SHARE)
         in_range("--optim.", self, eps=NORMAL)  # without it a gradient of 0 is divided by 0
         others = ("learning_rate", "min_rate", "warmup", "weight_decay")
         in_range("--optim.", self, **dict.fromkeys(others, NOT_NEGATIVE))

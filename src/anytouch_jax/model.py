@@ -12,6 +12,7 @@ UNIVERSAL = "universal"
 SENSORS = (
     "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
 )  # fmt: skip
+STEM = (24, 64)  # channels of the convolutions of patch_encoder "convolutional"
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 
 
@@ -81,7 +82,7 @@ class Model:
     norm_eps: float = 1e-5  # of layer norms
     decoder_norm_eps: float = 1e-12  # of the decoder's
     decoder_sensor_tokens: bool = False  # the decoder gets the sensor tokens themselves, not as encoded
-    patch_encoder: Literal["shared", "sensor"] = "shared"  # one for all sensors, or one each (T3)
+    patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # of all; of each sensor (T3); deeper (ours)
     force_head: bool = False  # stage 1 tells force and its change, from labels
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # cosine is ours: `ops.losses.contrast_loss`
     lora_rank: int = 0  # of the image tower's LoRA; 0: none

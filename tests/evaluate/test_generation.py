@@ -221,9 +221,9 @@ def test_a_field_that_is_linear_in_the_features_is_found_again():
     assert np.sqrt((away**2).mean()) < 0.25 * targets.std()
 
 
-def test_up_to_four_blocks_of_an_encoder_are_read():
+def test_the_embedded_patches_and_up_to_four_blocks_of_an_encoder_are_read():
     shapes = [generation._design(ENCODER, X, y, "digit", "duragel", Fit(), None).shape for y in (Y, FIELDS)]
-    assert [one.depths for one in shapes] == [MODEL.touch.depth] * 2 and MODEL.touch.depth < DEPTHS == 4
+    assert [one.depths for one in shapes] == [MODEL.touch.depth + 1] * 2 and MODEL.touch.depth + 1 < DEPTHS == 5
     deep = replace(MODEL, touch=replace(MODEL.touch, depth=9))
     many = replace(ENCODER, config=replace(ENCODER.config, model=deep))
     assert generation._design(many, X, Y, "digit", "duragel", Fit(), None).shape.depths == DEPTHS

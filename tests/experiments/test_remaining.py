@@ -48,11 +48,11 @@ def test_encoders_learn_from_what_remains_and_are_trained_once(tmp_path):
     taken, study = table(tmp_path / "pairs" / "manifest.parquet", ["cup"]), Study(tmp_path)
     runs = remaining.train(study, plan.FULL, 3, taken)
     assert set(study.sets) == {"own", "fine", "coarse"}  # nobody trains on `other`
-    assert list(runs) == ["anytouch", "anytouch_release", "stage1", "t3"] and len(set(runs.values())) == 4
+    assert list(runs) == ["anytouch", "anytouch_layer_decay", "stage1", "t3"] and len(set(runs.values())) == 4
     assert [one.config.stage for one in study.trained] == [1, 2, 2, 1]
     of = {one.key: one for one in study.trained}
     whole, kept, first, _ = (of[path.name] for path in runs.values())
-    assert whole.init == kept.init == first and kept.config.objective.reconstruct
+    assert whole.init == kept.init == first and kept.config.optim.layer_decay == 0.1
     usual = plan.training(plan.FULL, "anytouch", 3)
     assert whole.key != usual.key and first.key != usual.init.key  # of other data: another run folder
     before = list(study.trained)

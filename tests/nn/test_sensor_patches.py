@@ -86,7 +86,7 @@ def test_the_default_network_has_the_parameters_it_had():
 
 
 def test_the_authors_files_have_no_place_for_several_patch_encoders():
-    with pytest.raises(WeightsError, match="one patch encoder for all sensors"):
+    with pytest.raises(WeightsError, match="one patch projection for all sensors"):
         to_release(parameters(OWN), OWN)
 
 

@@ -7,11 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_models import tiny_config
 from train_toy import toy_config, toy_params
 
 from anytouch_jax.config import ConfigError, preset
+from anytouch_jax.io.shapes import param_shapes
 from anytouch_jax.io.tree import flatten
+from anytouch_jax.nn.functional import build
 from anytouch_jax.train.optim import (
+    depth_rate,
     learning_rate,
     match_rules,
     moments,
@@ -206,3 +210,57 @@ def test_rules_come_from_the_config():
     params = {"w": jnp.ones(2)}
     got, _ = run_updates(config, params, [{"w": jnp.zeros(2)}] * 5)
     np.testing.assert_array_equal(got["w"], 1.0)
+
+
+# Layer decay ----------------------------------------------------------------------------------------------------------
+
+
+def decayed(decay, **optim):
+    config = tiny_config(2)
+    model = dataclasses.replace(config.model, touch=dataclasses.replace(config.model.touch, depth=3))
+    optim = dataclasses.replace(config.optim, layer_decay=decay, **optim)
+    return dataclasses.replace(config, model=model, optim=optim)
+
+
+def test_each_block_learns_so_much_slower_than_the_next():
+    config = decayed(0.5)
+    rates = {name: depth_rate(name, shape, config) for name, shape in param_shapes(config.model).items()}
+    blocks = [name for name in rates if name.startswith("touch/blocks/")]
+    assert len(blocks) == 16
+    for name in blocks:
+        assert rates[name].shape == (3, *[1] * (len(param_shapes(config.model)[name]) - 1))
+        np.testing.assert_allclose(rates[name].ravel(), [0.25, 0.5, 1.0])
+    before = {name: rate for name, rate in rates.items() if rate is not None and name not in blocks and rate != 1}
+    names = ("class_token", "position", "sensor_tokens", "patch/kernel", "pre_norm/scale", "pre_norm/bias")
+    assert before == dict.fromkeys((f"touch/{name}" for name in names), 0.125)
+
+
+def test_a_layer_decay_scales_the_step_and_none_is_no_change():
+    def updates(config):
+        params = build(config.model).init(jax.random.key(0))
+        grads = jax.tree.map(lambda x: jnp.sin(jnp.arange(x.size, dtype=jnp.float32)).reshape(x.shape) + 2, params)
+        one = optimizer(config)
+        return flatten(jax.jit(one.update)(grads, one.init(params), params, learning_rate=1e-3)[0])
+
+    plain, slow, still = (updates(decayed(decay)) for decay in (1.0, 0.1, 0.0))
+    for name, change in plain.items():
+        rate = depth_rate(name, change.shape, decayed(0.1))
+        np.testing.assert_allclose(slow[name], change * rate, rtol=1e-5, err_msg=name)
+    assert not np.any(still["touch/patch/kernel"]) and not np.any(still["touch/blocks/mlp/up/kernel"][:2])
+    np.testing.assert_array_equal(still["touch/blocks/mlp/up/kernel"][2], plain["touch/blocks/mlp/up/kernel"][2])
+    np.testing.assert_array_equal(still["touch/projection/kernel"], plain["touch/projection/kernel"])
+    np.testing.assert_array_equal(still["image/patch/kernel"], plain["image/patch/kernel"])
+
+
+def test_the_average_of_parameters_is_of_the_slower_ones():
+    config = decayed(0.0, ema=0.5)
+    params = build(config.model).init(jax.random.key(0))
+    one = optimizer(config)
+    state = one.update(jax.tree.map(jnp.ones_like, params), one.init(params), params, learning_rate=1e-2)[1]
+    np.testing.assert_array_equal(state.ema["touch"]["position"], params["touch"]["position"])
+    assert np.any(state.ema["image"]["position"] != params["image"]["position"])
+
+
+def test_a_layer_decay_above_one_is_refused():
+    with pytest.raises(ConfigError, match=r"--optim.layer-decay"):
+        decayed(1.5)

@@ -39,7 +39,7 @@ Say = Callable[[str], None]
 _SAMPLE = 512  # images that the features' mean and deviation are taken from
 _CHUNK = 64
 _FAINT = 1e-4
-VERSION = 2  # of how a translation learns from the same pairs
+VERSION = 3  # of how a translation learns from the same pairs
 
 
 class Batch(NamedTuple):
@@ -117,7 +117,7 @@ def _design(
             raise UserError("a reference without an encoder needs its shape")
         model = encoder.config.model
         field = () if targets.dtype == np.uint8 else targets.shape[1:]
-        shape = Translation(model, field=field, depths=min(DEPTHS, model.touch.depth))
+        shape = Translation(model, field=field, depths=min(DEPTHS, model.touch.depth + 1))
     side = shape.model.image_size
     if images.shape[1:] != (side, side, 3) or (targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]):
         raise UserError(f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}")

@@ -26,7 +26,7 @@ def same_size(path: Path, before: Config, config: Config) -> None:
         )
 
 
-SHAPES: tuple[str, ...] = ("patch", "embed", "frames", "sensor_tokens")
+SHAPES: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
 SHAPES += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
 UNSEEN = ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")  # no shape hangs on them
 

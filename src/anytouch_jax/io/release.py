@@ -139,7 +139,8 @@ def to_release(params: Params, model: Model, *, allow_extra: bool = False) -> di
             "the matching MLP of recipe paper has no counterpart in the authors' files; allow extra keys to store it"
         )
     if model.patch_encoder != "shared":
-        raise WeightsError("the authors' files have one patch encoder for all sensors; this model has one for each")
+        own = "one for each" if model.patch_encoder == "sensor" else "convolutions"
+        raise WeightsError(f"the authors' files have one patch projection for all sensors; this model has {own}")
     if model.sensors[-1] != UNIVERSAL:
         raise WeightsError(
             f"the authors' files keep the universal tokens in the last row; here it is {model.sensors[-1]!r}"
@@ -310,7 +311,12 @@ def _grafted(params: Params, parts: Params) -> Params:
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
     """`params` with the touch encoder from the image tower `image`, see `clip_to_touch`; sensor tokens stay. `divide`
-    makes the response to a still the tower's."""
+    makes the response to a still the tower's. Raises WeightsError for a touch encoder without such a projection."""
+    if "kernel" not in params["touch"]["patch"]:
+        raise WeightsError(
+            "an image tower's patch projection has no place in convolutions: leave out --model.patch-encoder "
+            "convolutional, or the --clip weights"
+        )
     shape = params["touch"]["patch"]["kernel"].shape  # (T, ...), one of them for each sensor where it has its own
     kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(shape[-3] if divide else 1)
     touch = {**image, "patch": {"kernel": kernel}, "sensor_tokens": params["touch"]["sensor_tokens"]}

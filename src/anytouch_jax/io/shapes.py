@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from anytouch_jax.config import Model, Stack
 from anytouch_jax.io.tree import flatten
+from anytouch_jax.model import STEM
 
 Shape = tuple[int, ...]
 
@@ -13,11 +14,10 @@ PROJECTIONS = ("query", "key", "value", "out")
 def param_shapes(model: Model) -> dict[str, Shape]:
     """Name -> shape of every parameter of a model."""
     pixels, rows, width, deep = 3 * model.patch**2, model.patches + 1, model.touch.width, model.decoder.width
-    own = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
     tree: dict[str, object] = {
         "touch": {
             **_vision_shapes(model.touch, rows, model.embed),
-            "patch": {"kernel": (*own, model.frames, pixels, width)},
+            "patch": _patch_shapes(model),
             "sensor_tokens": (len(model.sensors), model.sensor_tokens, width),
         },
         "decoder": {
@@ -59,6 +59,21 @@ def param_shapes(model: Model) -> dict[str, Shape]:
 
 def _dense_shapes(inner: int, outer: int) -> dict[str, Shape]:
     return {"kernel": (inner, outer), "bias": (outer,)}
+
+
+def _patch_shapes(model: Model) -> dict[str, object]:
+    if model.patch_encoder == "convolutional":
+        few, more = STEM
+        left = -(-model.patch // 4)
+        return {
+            "first": (model.frames, 25 * 3, few),
+            "norm1": _norm_shapes(few),
+            "second": {"kernel": (9 * few, more)},
+            "norm2": _norm_shapes(more),
+            "last": {"kernel": (left * left * more, model.touch.width)},
+        }
+    own = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
+    return {"kernel": (*own, model.frames, 3 * model.patch**2, model.touch.width)}
 
 
 def _norm_shapes(width: int) -> dict[str, Shape]:

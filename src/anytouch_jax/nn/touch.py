@@ -9,11 +9,13 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import Model
+from anytouch_jax.model import STEM
 from anytouch_jax.nn.layers import (
     Dense,
     LayerNorm,
     activation,
     blocks_between,
+    gelu,
     read_blocks,
     rows_of,
     run_blocks,
@@ -48,12 +50,52 @@ class TouchPatch(nnx.Module):
         return jnp.einsum("bktc,btcd->bkd", patches.astype(own), each.astype(own))
 
 
+class ConvolutionalPatch(nnx.Module):
+    """Small convolutions inside each patch in place of the projection (ours; convolutions before a ViT: Xiao et al.
+    2021, "Early convolutions help transformers see better"). Nothing is read over a patch's border, so that what is
+    masked stays hidden."""
+
+    def __init__(self, model: Model) -> None:
+        few, more = STEM
+        self.first = table(model.frames, 5 * 5 * 3, few)
+        self.norm1 = LayerNorm(few, model.norm_eps, model.dtype)
+        self.second = Dense(3 * 3 * few, more, model, bias=False)
+        self.norm2 = LayerNorm(more, model.norm_eps, model.dtype)
+        left = -(-model.patch // 4)
+        self.last = Dense(left * left * more, model.touch.width, model, bias=False)
+        self.patch, self.dtype = model.patch, jnp.dtype(model.dtype)
+
+    def __call__(self, patches: Array, sensor: Array) -> Array:
+        """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
+        b, k, frames, _ = patches.shape
+        kernel = self.first[...]
+        if frames == 1:
+            kernel = reduce(jnp.add, kernel)[None]
+        x = jnp.moveaxis(patches.reshape(b * k, frames, self.patch, self.patch, 3), 1, 3)
+        x = windows(x.reshape(b * k, self.patch, self.patch, frames * 3), 5)
+        kernel = jnp.moveaxis(kernel.reshape(frames, 25, 3, -1), 0, 1).reshape(-1, kernel.shape[-1])
+        x = product(x.reshape(-1, x.shape[-1]), kernel, self.dtype).reshape(*x.shape[:3], -1)
+        x = self.second(windows(gelu(self.norm1(x)), 3))
+        x = gelu(self.norm2(x))
+        return self.last(x.reshape(b, k, -1))
+
+
+def windows(x: Array, side: int) -> Array:
+    """Every second window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it: (B, ceil(H / 2),
+    ceil(W / 2), side * side * C), in the order (row, col, channel)."""
+    around = side // 2
+    x = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
+    ends = [size - side + 1 for size in x.shape[1:3]]
+    cut = [x[:, i : i + ends[0] : 2, j : j + ends[1] : 2] for i in range(side) for j in range(side)]
+    return jnp.concatenate(cut, axis=-1)
+
+
 class TouchEncoder(nnx.Module):
     """ViT over [class, sensor tokens, visible patches]; the architecture of CLIP's image tower."""
 
     def __init__(self, model: Model) -> None:
         width = model.touch.width
-        self.patch = TouchPatch(model)
+        self.patch = (ConvolutionalPatch if model.patch_encoder == "convolutional" else TouchPatch)(model)
         self.class_token = table(width)
         self.position = table(model.patches + 1, width)
         self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)
@@ -82,16 +124,16 @@ class TouchEncoder(nnx.Module):
         return run_blocks(self.blocks, x, remat=self.remat)
 
     def depths(self, clip: Array, sensor: Array, count: int) -> Array:
-        """Hidden states of `count` blocks, evenly spaced, the last among them, beside each other:
-        (B, 1 + S + N, count * D). What paints or measures reads them (as DPT does, Ranftl et al. 2021): an encoder's
-        last block holds what it was last asked for."""
+        """`count` hidden states, evenly spaced from the embedded tokens (normed, as the first block gets them) to the
+        last block's, beside each other: (B, 1 + S + N, count * D); one is the last. What paints or measures reads them
+        (as DPT does, Ranftl et al. 2021): an encoder's last block holds what it was last asked for."""
         x = self.pre_norm(self.tokens(clip, sensor))
         found, before = [], 0
-        for number in range(1, count + 1):
-            last = round(number * self.depth / count)
-            x = run_blocks(blocks_between(self.blocks, before, last), x, remat=self.remat)
+        for number in range(count):
+            block = round(number * self.depth / (count - 1)) if count > 1 else self.depth
+            x = run_blocks(blocks_between(self.blocks, before, block), x, remat=self.remat) if block > before else x
             found.append(x)
-            before = last
+            before = block
         return jnp.concatenate(found, axis=-1)
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:

@@ -18,15 +18,15 @@ from anytouch_jax.nn.product import stored
 from anytouch_jax.ops import tokens
 
 DECODER = Stack(128, 2, 4, 512)
-DEPTHS = 4  # blocks of an encoder that are read, as many as DPT reads (Ranftl et al., 2021)
+DEPTHS = 5  # hidden states of an encoder that are read: the embedded patches, and as many blocks as DPT reads
 
 
 @dataclass(frozen=True)
 class Translation:
     """What decides the shapes: the encoder's `model`, the ViT `decoder`, `hidden` channels of the MLPs, and the shape
-    of the `field` to regress; () for an image of the encoder's size. `depths`: blocks of the encoder whose tokens are
-    read. `few`: channels of a patch that a field's MLP reads; `channels`: of the U-Net, from its finest level to its
-    coarsest."""
+    of the `field` to regress; () for an image of the encoder's size. `depths`: hidden states of the encoder that are
+    read (`TouchEncoder.depths`). `few`: channels of a patch that a field's MLP reads; `channels`: of the U-Net, from
+    its finest level to its coarsest."""
 
     model: Model
     decoder: Stack = DECODER

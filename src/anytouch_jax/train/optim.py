@@ -92,6 +92,19 @@ def schedule(config: Config) -> Callable[[Array | float], Array]:
     return rate
 
 
+def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | float:
+    """How fast a parameter learns beside the others: `layer_decay` once for every block of the touch encoder behind it.
+
+    Of L blocks the i-th learns by layer_decay^(L - i), what stands before them by layer_decay^L, all else, the last
+    block among it, by 1; in the manner of BEiT's fine-tuning (Bao et al. 2022), where the last block learns by the
+    factor once. Returns a number, or one for each of stacked blocks (L, 1, ...).
+    """
+    depth, decay = config.model.touch.depth, config.optim.layer_decay
+    if name.startswith("touch/blocks/"):
+        return jnp.expand_dims(decay ** jnp.arange(depth - 1, -1, -1.0), range(1, len(shape)))
+    return decay**depth if re.match(r"touch/(?!post_norm|projection)", name) else 1.0
+
+
 def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
     """AdamW as PyTorch computes it: decoupled decay by `config.weight_decay`, optional global-norm clipping and EMA.
 
@@ -124,6 +137,9 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
         layout = packing(params)
         directions, count, mu, nu = _adamw(config, layout, grads, state, params, used)
         updates = layout.unpack([(-lr * d).astype(d.dtype) for d in directions])
+        if options.layer_decay != 1:
+            slower = [d * depth_rate(name, d.shape, config) for name, d in flatten(updates).items()]
+            updates = layout.treedef.unflatten(slower)
         ema = state.ema
         if options.ema is not None:
             ema = optax.incremental_update(optax.apply_updates(params, updates), ema, 1.0 - options.ema)

@@ -1,0 +1,109 @@
+"""Small convolutions inside each patch in place of the projection (ours): what they keep of the projection's laws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_models import tiny_config, touch_model
+
+from anytouch_jax.config import UserError
+from anytouch_jax.io import fits
+from anytouch_jax.io.release import WeightsError, inflate, to_release
+from anytouch_jax.io.shapes import param_shapes
+from anytouch_jax.io.tree import flatten
+from anytouch_jax.nn.functional import build
+from anytouch_jax.nn.touch import windows
+
+RNG = np.random.default_rng(0)
+MODEL = touch_model(patch_encoder="convolutional")
+NET = build(MODEL)
+PARAMS = NET.init(jax.random.key(0))
+CLIP = jnp.asarray(RNG.standard_normal((2, 3, 28, 28, 3)), jnp.float32)
+SENSOR = jnp.array([0, 3])
+
+
+def encode(clip):
+    return np.asarray(NET.apply(PARAMS, "encode", clip, SENSOR))
+
+
+@pytest.mark.parametrize("side", [3, 5])
+@pytest.mark.parametrize(("height", "width"), [(7, 7), (8, 5), (14, 14), (1, 2)])
+def test_a_product_with_windows_is_a_convolution_of_stride_2(side, height, width):
+    x = jnp.asarray(RNG.standard_normal((2, height, width, 3)), jnp.float32)
+    kernel = jnp.asarray(RNG.standard_normal((side * side * 3, 4)), jnp.float32)
+    around = [(side // 2, side // 2)] * 2
+    wanted = jax.lax.conv_general_dilated(
+        x, kernel.reshape(side, side, 3, 4), (2, 2), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+    assert wanted.shape == (2, -(-height // 2), -(-width // 2), 4)
+    np.testing.assert_allclose(windows(x, side) @ kernel, wanted, atol=1e-5)
+
+
+def test_a_still_is_a_clip_of_equal_frames():
+    np.testing.assert_allclose(encode(CLIP[:, :1]), encode(jnp.repeat(CLIP[:, :1], 3, axis=1)), atol=2e-5)
+
+
+def test_the_order_of_frames_is_seen():
+    assert np.abs(encode(CLIP) - encode(CLIP[:, ::-1])).max() > 1e-3
+
+
+def test_a_patch_hangs_on_its_own_pixels_alone():
+    """Nothing is read over its border: what is masked stays hidden."""
+
+    def tokens(clip):
+        return NET.apply(PARAMS, "touch.tokens", clip, SENSOR)[:, 6:]
+
+    before = np.asarray(tokens(CLIP))
+    after = np.asarray(tokens(CLIP.at[:, :, 7:14, 14:21].add(1.0)))  # the second row's third patch of four by four
+    changed = np.abs(after - before).max(axis=(0, 2)) > 0
+    assert np.flatnonzero(changed).tolist() == [4 + 2]
+
+
+def test_every_parameter_of_it_learns():
+    grad = jax.grad(lambda params: jnp.sum(NET.apply(params, "encode", CLIP, SENSOR) ** 2))(PARAMS)
+    for name, value in flatten(grad["touch"]["patch"]).items():
+        assert np.abs(value).max() > 1e-4, name
+
+
+def test_tokens_start_at_the_size_of_projected_ones():
+    plain = touch_model()
+    own, shared = (
+        np.asarray(build(model).apply(build(model).init(jax.random.key(0)), "touch.patch", patches, SENSOR)).std()
+        for model in (MODEL, plain)
+        for patches in [jnp.asarray(RNG.standard_normal((2, 16, 3, 147)), jnp.float32)]
+    )
+    assert 0.3 < own / shared < 3
+
+
+@pytest.mark.parametrize("patch", [6, 7, 14])
+def test_the_shapes_written_down_are_those_of_the_network(patch):
+    model = touch_model(patch_encoder="convolutional", patch=patch, image_size=4 * patch)
+    wanted = {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
+    assert {name: tuple(shape) for name, shape in param_shapes(model).items()} == wanted
+
+
+def test_both_stages_run_with_it():
+    for stage in (1, 2):
+        model = tiny_config(stage, patch_encoder="convolutional").model
+        assert "touch/patch/last/kernel" in flatten(build(model).abstract())
+
+
+def test_the_authors_files_have_no_place_for_convolutions():
+    with pytest.raises(WeightsError, match="one patch projection"):
+        to_release(PARAMS, MODEL)
+
+
+def test_an_image_tower_has_no_projection_to_give():
+    with pytest.raises(WeightsError, match=r"leave out --model.patch-encoder"):
+        inflate(PARAMS, {"patch": {"kernel": np.zeros((147, 16))}})
+
+
+def test_weights_of_another_patch_encoder_are_told_with_the_option_that_lacks():
+    config = tiny_config(1, patch_encoder="convolutional")
+    with pytest.raises(UserError, match=r"add --model.patch-encoder shared"):
+        fits.same_form(Path("run"), replace(config.model, patch_encoder="shared"), config)

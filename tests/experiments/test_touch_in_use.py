@@ -99,3 +99,9 @@ def test_named(tmp_path, monkeypatch, capsys):
     visit("named", monkeypatch, **size)
     assert (tmp_path / "named_quick.md").read_text() == page
     assert (tmp_path / "named_quick" / "0.json").stat().st_mtime_ns == before
+    visit("named", monkeypatch, CONVOLUTIONS=1, **size)  # other encoders, the same network
+    inside = json.loads((tmp_path / "named_convolutional_quick" / "0.json").read_text())
+    assert inside["anytouch"] != found["anytouch"] and inside["probes"] != found["probes"]
+    assert inside["convolutional, with labels"] == network
+    assert "convolutions inside its patches" in (tmp_path / "named_convolutional_quick.md").read_text()
+    assert (tmp_path / "named_quick.md").read_text() == page

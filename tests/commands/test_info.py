@@ -53,6 +53,10 @@ def test_weights_tell_whose_names_they_have(anytouch, tmp_path):
     release.write_safetensors(theirs, release.to_release(params, model), {release.MODEL_KEY: to_json(model)})
     assert "by our own names" in (said := anytouch("info", ours)).out and "trained on: digit;" in said.out
     assert "by the authors (stage1) names" in (said := anytouch("info", theirs)).out and "is not told" in said.out
+    for kind, told in (("sensor", "patches of 7, each sensor by its own;"), ("convolutional", "read by convolutions;")):
+        other = touch_model(patch_encoder=kind)
+        export_safetensors(theirs, build(other).init(jax.random.key(0)), {release.MODEL_KEY: to_json(other)})
+        assert told in anytouch("info", theirs).out
     params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
     export_safetensors(ours, params, {release.MODEL_KEY: to_json(model)})
     assert "not finite: nothing can be embedded" in anytouch("info", ours).out

@@ -106,9 +106,10 @@ def _run(path: Path) -> list[str]:
 
 def _model(model: Model) -> str:
     touch = model.touch
+    read = {"shared": "", "sensor": ", each sensor by its own", "convolutional": ", read by convolutions"}
     return (
         f"touch encoder of width {touch.width}, depth {touch.depth}, {touch.heads} heads; pictures of "
-        f"{model.image_size} pixels in patches of {model.patch}; features of {model.embed}"
+        f"{model.image_size} pixels in patches of {model.patch}{read[model.patch_encoder]}; features of {model.embed}"
     )
 
 

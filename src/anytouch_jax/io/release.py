@@ -312,7 +312,7 @@ def _grafted(params: Params, parts: Params) -> Params:
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
     """`params` with the touch encoder from the image tower `image`, see `clip_to_touch`; sensor tokens stay. `divide`
     makes the response to a still the tower's. Raises WeightsError for a touch encoder without such a projection."""
-    if "kernel" not in params["touch"]["patch"]:
+    if set(params["touch"]["patch"]) != {"kernel"}:
         raise WeightsError(
             "an image tower's patch projection has no place in convolutions: leave out --model.patch-encoder "
             "convolutional, or the --clip weights"

@@ -66,7 +66,7 @@ def _patch_shapes(model: Model) -> dict[str, object]:
         few, more = STEM
         left = -(-model.patch // 4)
         return {
-            "first": (model.frames, 25 * 3, few),
+            "kernel": (model.frames, 25 * 3, few),
             "norm1": _norm_shapes(few),
             "second": {"kernel": (9 * few, more)},
             "norm2": _norm_shapes(more),

@@ -102,8 +102,6 @@ def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: Model, seed: l
         value = np.ones(shape)
     elif last in ("bias", "b"):  # b: LoRA starts as no change
         value = np.zeros(shape)
-    elif name == "touch/patch/first":
-        value = rng.uniform(-1, 1, shape) * np.sqrt(6 / (shape[0] * shape[1] + shape[2]))
     elif last == "kernel":  # Xavier uniform, as MAE; the touch kernel's inputs span its frames
         inputs = shape[-2] * (shape[-3] if name == "touch/patch/kernel" else 1)
         value = rng.uniform(-1, 1, shape) * np.sqrt(6 / (inputs + shape[-1]))

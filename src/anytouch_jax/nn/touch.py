@@ -57,7 +57,7 @@ class ConvolutionalPatch(nnx.Module):
 
     def __init__(self, model: Model) -> None:
         few, more = STEM
-        self.first = table(model.frames, 5 * 5 * 3, few)
+        self.kernel = table(model.frames, 5 * 5 * 3, few)
         self.norm1 = LayerNorm(few, model.norm_eps, model.dtype)
         self.second = Dense(3 * 3 * few, more, model, bias=False)
         self.norm2 = LayerNorm(more, model.norm_eps, model.dtype)
@@ -68,7 +68,7 @@ class ConvolutionalPatch(nnx.Module):
     def __call__(self, patches: Array, sensor: Array) -> Array:
         """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
         b, k, frames, _ = patches.shape
-        kernel = self.first[...]
+        kernel = self.kernel[...]
         if frames == 1:
             kernel = reduce(jnp.add, kernel)[None]
         x = jnp.moveaxis(patches.reshape(b * k, frames, self.patch, self.patch, 3), 1, 3)

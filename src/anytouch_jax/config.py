@@ -83,7 +83,7 @@ class Optim:
     beta2: float = 0.99  # AdamW's
     eps: float = 1e-8  # AdamW's
     weight_decay: float = 0.1  # of matrices; vectors have none
-    layer_decay: float = 1.0  # each layer of the touch encoder learns so much slower than the next; 1: all alike (ours)
+    layer_decay: float = 1.0  # rate of a layer of the touch encoder as a share of the next one's; 1: all alike (ours)
     clip_norm: float | None = None  # largest norm of the gradient; None: any
     ema: float | None = None  # decay of an average of the parameters, which is then what is used; None: no average
     accumulate: int = 1  # batches whose gradients make one update

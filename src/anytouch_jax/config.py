@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from anytouch_jax.model import FIELD_SENSORS as FIELD_SENSORS
 from anytouch_jax.model import SENSORS as SENSORS
+from anytouch_jax.model import STEM as STEM
 from anytouch_jax.model import UNIVERSAL as UNIVERSAL
 from anytouch_jax.model import Model, Stack, TextTower
 from anytouch_jax.model import SpellingError as SpellingError

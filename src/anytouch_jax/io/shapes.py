@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from anytouch_jax.config import Model, Stack
+from anytouch_jax.config import STEM, Model, Stack
 from anytouch_jax.io.tree import flatten
-from anytouch_jax.model import STEM
 
 Shape = tuple[int, ...]
 

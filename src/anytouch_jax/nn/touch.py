@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import Model
-from anytouch_jax.model import STEM
+from anytouch_jax.config import STEM, Model
 from anytouch_jax.nn.layers import (
     Dense,
     LayerNorm,

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from pair_world import arrays
 from tiny_models import tiny_config
 
-from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Stack, UserError
+from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Stack, UserError, to_json
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.evaluate import generation
 from anytouch_jax.evaluate.features import random_encoder
@@ -36,7 +36,7 @@ from anytouch_jax.evaluate.names import GENERATOR
 from anytouch_jax.io.tensors import write_safetensors
 from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import Part
-from anytouch_jax.nn.translation import DEPTHS, Conv, Translation, UNet, doubled, halved, thumbnail_side
+from anytouch_jax.nn.translation import STATES, Conv, Translation, UNet, doubled, halved, thumbnail_side
 from anytouch_jax.objectives import normalise_touch
 
 X, Y, FIELDS = arrays(24)
@@ -223,10 +223,10 @@ def test_a_field_that_is_linear_in_the_features_is_found_again():
 
 def test_the_embedded_patches_and_up_to_four_blocks_of_an_encoder_are_read():
     shapes = [generation._design(ENCODER, X, y, "digit", "duragel", Fit(), None).shape for y in (Y, FIELDS)]
-    assert [one.depths for one in shapes] == [MODEL.touch.depth + 1] * 2 and MODEL.touch.depth + 1 < DEPTHS == 5
+    assert [one.states for one in shapes] == [MODEL.touch.depth + 1] * 2 and MODEL.touch.depth + 1 < STATES == 5
     deep = replace(MODEL, touch=replace(MODEL.touch, depth=9))
     many = replace(ENCODER, config=replace(ENCODER.config, model=deep))
-    assert generation._design(many, X, Y, "digit", "duragel", Fit(), None).shape.depths == DEPTHS
+    assert generation._design(many, X, Y, "digit", "duragel", Fit(), None).shape.states == STATES
     seen = np.asarray(features(design(shapes[0]), ENCODER.params, X[:2]))
     assert seen.shape == (2, IMAGE.special + MODEL.patches, shapes[0].read)
     last = np.asarray(features(design(), ENCODER.params, X[:2]))
@@ -344,6 +344,10 @@ def test_what_is_no_generator_is_said(tmp_path):
         load(tmp_path / "none")
     write_safetensors(tmp_path / GENERATOR, {"a": np.zeros(2, np.float32)}, {"config": "{}"})
     with pytest.raises(UserError, match="holds no generator"):
+        load(tmp_path)
+    before = to_json(design()).replace('"states"', '"depths"')  # of blocks, without the embedded patches
+    write_safetensors(tmp_path / GENERATOR, {"a": np.zeros(2, np.float32)}, {"generator": before})
+    with pytest.raises(UserError, match="train it again"):
         load(tmp_path)
     (tmp_path / GENERATOR).write_bytes(b"nothing")
     with pytest.raises(UserError, match="not a whole safetensors file"):

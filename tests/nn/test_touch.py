@@ -47,12 +47,12 @@ def test_a_still_is_a_clip_of_equal_frames():
     )
 
 
-def test_depths_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
+def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
     """The first is what the first block gets, the last is `hidden`; each hangs on the blocks before it alone."""
     model = touch_model(touch=Stack(8, 5, 2, 16))
     net, clip = build(model), clips(1)
     params = net.init(jax.random.key(0))
-    found = np.asarray(net.apply(params, "touch.depths", clip, SENSOR, 3))
+    found = np.asarray(net.apply(params, "touch.states", clip, SENSOR, 3))
     assert found.shape == (2, 1 + 5 + 16, 3 * 8)
     for depth, part in ((0, found[..., :8]), (2, found[..., 8:16]), (5, found[..., 16:])):  # 2.5 is rounded to even
         early = replace(model, touch=replace(model.touch, depth=max(depth, 1)))
@@ -61,9 +61,9 @@ def test_depths_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
         if depth == 0:  # a block that adds nothing
             cut["touch"]["blocks"] = jax.tree.map(jnp.zeros_like, cut["touch"]["blocks"])
         np.testing.assert_allclose(part, build(early).apply(cut, "touch.hidden", clip, SENSOR), atol=1e-6)
-    last = net.apply(params, "touch.depths", clip, SENSOR, 1)
+    last = net.apply(params, "touch.states", clip, SENSOR, 1)
     np.testing.assert_allclose(last, net.apply(params, "touch.hidden", clip, SENSOR), atol=1e-6)
-    every = net.apply(params, "touch.depths", clip, SENSOR, 6)
+    every = net.apply(params, "touch.states", clip, SENSOR, 6)
     assert every.shape[-1] == 6 * 8
     np.testing.assert_allclose(every[..., :8], found[..., :8], atol=1e-6)
 

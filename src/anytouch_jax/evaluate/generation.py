@@ -31,7 +31,7 @@ from anytouch_jax.evaluate.generator import (
     predict,
     units,
 )
-from anytouch_jax.nn.translation import DEPTHS, Translation
+from anytouch_jax.nn.translation import STATES, Translation
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.train.optim import learning_rate
 
@@ -117,7 +117,7 @@ def _design(
             raise UserError("a reference without an encoder needs its shape")
         model = encoder.config.model
         field = () if targets.dtype == np.uint8 else targets.shape[1:]
-        shape = Translation(model, field=field, depths=min(DEPTHS, model.touch.depth + 1))
+        shape = Translation(model, field=field, states=min(STATES, model.touch.depth + 1))
     side = shape.model.image_size
     if images.shape[1:] != (side, side, 3) or (targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]):
         raise UserError(f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}")

@@ -104,15 +104,15 @@ def features(design: Design, encoder: Params | None, images: Array) -> Array:
         side = pixels.shape[1]
         times = side // thumbnail_side(side)
         return halved(pixels, times).reshape(len(pixels), -1) if design.shape.field else pixels
-    return encoded(design, encoder, pixels, design.source, design.shape.depths)
+    return encoded(design, encoder, pixels, design.source, design.shape.states)
 
 
-def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, depths: int = 1) -> Array:
-    """Tokens f32 (B, 1 + S + N, depths * D) of normalised images, with those of `sensor`, or the universal ones."""
+def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, states: int = 1) -> Array:
+    """Tokens f32 (B, 1 + S + N, states * D) of normalised images, with those of `sensor`, or the universal ones."""
     model = design.shape.model
     row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
     rows = jnp.full(len(pixels), row, jnp.int32)
-    hidden: Array = build(model).apply(encoder, "touch.depths", pixels[:, None], rows, depths)
+    hidden: Array = build(model).apply(encoder, "touch.states", pixels[:, None], rows, states)
     return hidden.astype(jnp.float32)
 
 

@@ -122,7 +122,7 @@ class TouchEncoder(nnx.Module):
         x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
         return run_blocks(self.blocks, x, remat=self.remat)
 
-    def depths(self, clip: Array, sensor: Array, count: int) -> Array:
+    def states(self, clip: Array, sensor: Array, count: int) -> Array:
         """`count` hidden states, evenly spaced from the embedded tokens (normed, as the first block gets them) to the
         last block's, beside each other: (B, 1 + S + N, count * D); one is the last. What paints or measures reads them
         (as DPT does, Ranftl et al. 2021): an encoder's last block holds what it was last asked for."""

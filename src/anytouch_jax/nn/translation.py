@@ -18,21 +18,21 @@ from anytouch_jax.nn.product import stored
 from anytouch_jax.ops import tokens
 
 DECODER = Stack(128, 2, 4, 512)
-DEPTHS = 5  # hidden states of an encoder that are read: the embedded patches, and as many blocks as DPT reads
+STATES = 5  # hidden states of an encoder that are read: the embedded patches, and as many blocks as DPT reads
 
 
 @dataclass(frozen=True)
 class Translation:
     """What decides the shapes: the encoder's `model`, the ViT `decoder`, `hidden` channels of the MLPs, and the shape
-    of the `field` to regress; () for an image of the encoder's size. `depths`: hidden states of the encoder that are
-    read (`TouchEncoder.depths`). `few`: channels of a patch that a field's MLP reads; `channels`: of the U-Net, from
+    of the `field` to regress; () for an image of the encoder's size. `states`: hidden states of the encoder that are
+    read (`TouchEncoder.states`). `few`: channels of a patch that a field's MLP reads; `channels`: of the U-Net, from
     its finest level to its coarsest."""
 
     model: Model
     decoder: Stack = DECODER
     hidden: int = 256
     field: tuple[int, ...] = ()
-    depths: int = 1
+    states: int = 1
     few: int = 16
     channels: tuple[int, ...] = (16, 32, 48, 64)
 
@@ -44,7 +44,7 @@ class Translation:
     @property
     def read(self) -> int:
         """Channels of a token that is read."""
-        return self.depths * self.model.touch.width
+        return self.states * self.model.touch.width
 
 
 class Painter(nnx.Module):

@@ -87,7 +87,7 @@ def test_the_shapes_written_down_are_those_of_the_network(patch):
     assert {name: tuple(shape) for name, shape in param_shapes(model).items()} == wanted
 
 
-def test_both_stages_run_with_it():
+def test_both_stages_are_built_with_it():
     for stage in (1, 2):
         model = tiny_config(stage, patch_encoder="convolutional").model
         assert "touch/patch/last/kernel" in flatten(build(model).abstract())

@@ -24,7 +24,9 @@
 # not done again. `TOUCHES=500 STEPS2=1000` is less than half the work, and less is learned;
 # `TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs
 # and results go: the page `teaching.md` and the folder `teaching/`, a JSON file for each grade and seed, from which
-# `TABLE=1` makes the page anew.
+# `TABLE=1` makes the page anew. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small
+# convolutions (`--model.patch-encoder convolutional`), which find more in as many steps and take longer for them:
+# `teaching_convolutional.md`.
 
 # %%
 from __future__ import annotations
@@ -54,6 +56,8 @@ MORE = asked.number("MORE", 2 * TOUCHES, least=0)
 OBJECTS = asked.number("OBJECTS", min(TOUCHES // 2, 500))
 SEEDS = asked.numbers("SEEDS", "0,1,2")
 GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
+CONVOLUTIONS = asked.switch("CONVOLUTIONS")
+NAME = "teaching_convolutional" if CONVOLUTIONS else "teaching"
 SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
 STACK, DEPTH = {"width": 128, "heads": 4, "mlp": 512}, {"touch": 4, "image": 2, "text.stack": 2}
 KNOWN = ["gelsight_mini", "digit", "duragel", "universal"]  # the sensor table of the encoders
@@ -90,6 +94,7 @@ def anytouch(*words: Any) -> None:
 
 # %%
 SMALL = ["--preset", "tiny", "--model.image-size", 84]
+SMALL += ["--model.patch-encoder", "convolutional"] if CONVOLUTIONS else []
 LESS = ["--loader.background", "subtract"]  # the contact alone: units differ more than touches do
 LESS += ["--loader.contact-only", "--loader.jitter", 0, 0, 0, 0]  # colours tell slopes
 LESS += ["--loader.cache", 5000]  # all frames, once read
@@ -126,7 +131,8 @@ def scenes(grade: str) -> list[Path]:
 
 def prepare(seed: int) -> tuple[Path, Path]:
     """The runs of both stages for a seed."""
-    one, two = (WORK / f"{'-'.join(GRADES)}-{seed}-stage{stage}" for stage in (1, 2))
+    name = "-".join([*GRADES, *(["convolutional"] if CONVOLUTIONS else []), str(seed)])
+    one, two = (WORK / f"{name}-stage{stage}" for stage in (1, 2))
     manifests_of = [manifest for grade in GRADES for manifest in scenes(grade)]
     data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *KNOWN, *LESS]
     anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
@@ -191,7 +197,7 @@ SETTINGS |= {"simulator": VERSION}
 
 def scored(grade: str, seed: int) -> dict[str, Any]:
     """What the file of a grade and a seed says; it is made first where it is not there, or is of other encoders."""
-    file = OUT / "teaching" / f"{grade}-{seed}.json"
+    file = OUT / NAME / f"{grade}-{seed}.json"
     if TABLE:
         if not file.exists():
             raise SystemExit(f"there is no {file}: run this page without TABLE=1")
@@ -239,13 +245,14 @@ def retrieval_table(found: list[dict[str, Any]]) -> str:
 files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
 told = files[GRADES[0]][0]
 if any(one["settings"] != told["settings"] for found in files.values() for one in found):
-    raise SystemExit("the files of teaching/ were made by different settings: make them anew, without TABLE=1")
+    raise SystemExit(f"the files of {NAME}/ were made by different settings: make them anew, without TABLE=1")
 size = " ".join(f"{name.upper()}={told['settings'][name]}" for name in ("touches", "more", "objects"))
 size += " STEPS1={} STEPS2={}".format(*told["settings"]["steps"])
-size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}"
+size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
 tower = told["config"]["model"]["touch"]
 network = f"preset tiny with a touch tower of {tower['width']} x {tower['depth']}"
 network += f" at {told['config']['model']['image_size']} pixels"
+network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
 lines = ["# Simulated scenes as teachers", "", f"Made by `{size} python experiments/teaching.py`, {network}.", ""]
 for grade, found in files.items():
     lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
@@ -253,5 +260,5 @@ for grade, found in files.items():
     lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
     lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
 OUT.mkdir(parents=True, exist_ok=True)
-write_whole(OUT / "teaching.md", "\n".join(lines))
+write_whole(OUT / f"{NAME}.md", "\n".join(lines))
 print("\n".join(lines))

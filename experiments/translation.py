@@ -43,14 +43,14 @@ from typing import Any
 
 import numpy as np
 from study import asked, page, plan, remaining
+from study.found import find_again, found_table
 from study.work import Work
 
 from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.edit import select
-from anytouch_jax.evaluate import generation, pairs, retrieval
-from anytouch_jax.evaluate.contacts import deepest_rows
-from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder
+from anytouch_jax.evaluate import generation, pairs
+from anytouch_jax.evaluate.features import Encoder, load_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
 from anytouch_jax.evaluate.results import markdown, seed_interval, verdict
@@ -58,7 +58,6 @@ from anytouch_jax.nn.translation import Translation
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
-from anytouch_jax.train.watch import silent
 from anytouch_jax.whole import write_whole
 
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
@@ -204,22 +203,8 @@ def _settings_of(file: Path) -> dict[str, Any]:
 # ## What an encoder knows beside pictures
 #
 # What a stage keeps of the picture it may lose for what touches have in common, so beside the errors stands how often
-# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`).
-
-
-# %%
-def find_again(name: str, seed: int, encoder: Encoder, table: manifests.Manifest) -> None:
-    """Write how often an encoder finds the same touch first of 50 and among the first five, where it is not known."""
-    file = RUN_FILES / f"found_{name}_{seed}.json"
-    if file.exists() and json.loads(file.read_text())["encoder"] == mark(encoder):
-        return
-    rows = deepest_rows(table, table.rows_of("test"))
-    seen = {name: embed_rows(encoder, table, rows, say=silent)[1]}
-    scored = retrieval.cross_sensor_retrieval(table, seen, rows, centre=(True,))
-    one = next(one.found for one in scored if one.query_sensor == retrieval.ALL)
-    assert one is not None
-    shares = {part: float(np.mean(getattr(one, part))) for part in ("top1", "top5")}
-    write_whole(file, json.dumps({"encoder": mark(encoder), "queries": len(one.top1)} | shares) + "\n")
+# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`;
+# `study/found.py`).
 
 
 # %%
@@ -235,7 +220,8 @@ def all_runs() -> None:
     if not (RUNS or QUICK):  # a trial has too few touches for galleries of 50
         fine = manifests.read(Work(STUDY).manifest("fine"))
         for name, seed in product(known, SEEDS):
-            find_again(name, seed, known[name][seed], fine)
+            one = known[name][seed]
+            find_again(RUN_FILES, name, seed, one, mark(one), fine)
     content = {task: of_sensors(table, task) for task in TASKS}
     plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
     wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in remaining.NOT_TUNED]
@@ -326,14 +312,6 @@ for ours in (name for name in names if name.startswith(("anytouch", "stage1"))):
     claims += [(f"{ours} below {rival}", *(against(task, ours, rival) for task in TASKS)) for rival in rivals]
 
 
-def found_again(name: str) -> tuple[str, str]:
-    """Shares of queries answered first and among the first five, in the mean over seeds."""
-    every = [json.loads(file.read_text()) for file in sorted(RUN_FILES.glob(f"found_{name}_[0-9]*.json"))]
-    return tuple(f"{100 * np.mean([one[part] for one in every]):.1f} %" for part in ("top1", "top5"))
-
-
-kinds = sorted({file.stem.split("_", 1)[1].rsplit("_", 1)[0] for file in RUN_FILES.glob("found_*.json")})
-again = [(kind, *found_again(kind)) for kind in kinds]
 QUESTION = "is the paper's order found? (and is it below both references?)"
 head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
 
@@ -385,9 +363,9 @@ lines = [
     f"Objects of the pairs that an encoder was trained on in its last stage: {told}.",
     "",
 ]
-if again:
-    lines += ["The same touch by another sensor and unit, objects never seen, found by the encoder itself:", ""]
-    lines += [markdown(("encoder", "first of 50", "among the first five"), again), ""]
+if again := found_table(RUN_FILES):
+    title = "The same touch by another sensor and unit, objects never seen, found by the encoder itself:"
+    lines += [title, "", again, ""]
 if not any(record["critic"] for record in records):
     lines += ["No critic judged the images.", ""]
 lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]

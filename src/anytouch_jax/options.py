@@ -218,6 +218,10 @@ class Convert:
     """The .safetensors to write."""
     names: Literal["release", "own"] = "release"
     """Key names of the authors' files, or this package's parameter names."""
+    between: Path | None = None
+    """Run or weights file that SOURCE was trained from, as its stage 1: what is written lies between the two."""
+    share: float = 0.5
+    """How far from BETWEEN (0) to SOURCE (1): less keeps more of the picture, more what stage 2 learned."""
 
 
 @dataclass(frozen=True)

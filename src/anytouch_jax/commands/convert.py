@@ -9,37 +9,32 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.commands.output import check_folder
+from anytouch_jax.commands.unused import refuse
 from anytouch_jax.commands.words import say
 from anytouch_jax.config import UNIVERSAL, Model, UserError
 from anytouch_jax.options import Convert
 
+Loaded = tuple[dict[str, Any], Model, dict[str, str]]  # parameters, their model, what a file says of them
+
 
 def run(options: Convert) -> int:
     """Write a run or a weights file as safetensors, by the authors' key names or by ours."""
-    from anytouch_jax.config import from_json, to_json
+    from anytouch_jax.config import to_json
     from anytouch_jax.io import checkpoint, release
 
-    source: Path = options.source
+    source, other = options.source, options.between
     if options.target.suffix != ".safetensors":
         raise UserError(f"{options.target} must end in .safetensors, the form that is written")
-    check_folder(options.target, "TARGET", read=() if source.is_dir() else (source,))
-    about = {"source": str(source)}
-    if source.is_dir():
-        params, text, told = checkpoint.load_params(source)
-        config = from_json(text)
-        model = config.model
-        about |= {release.BACKGROUND_KEY: config.data.background}
-        params = release.served(params, config, told)
-        if "touch" in params and "seen" in told:
-            about |= {release.SEEN_KEY: ",".join(told["seen"])}
-    else:
-        kept = release.read_metadata(source)
-        about |= {key: kept[key] for key in (release.BACKGROUND_KEY,) if key in kept}
-        weights = release.read_weights(source)
-        model = release.model_of(source, weights)
-        params = release.to_params(weights, model)
-        seen = release.seen_by_file(kept, model) if "touch" in params else None
-        about |= {} if seen is None else {release.SEEN_KEY: ",".join(seen)}
+    if other is None:
+        refuse(options, ("share",), "without --between")
+    if not 0 <= options.share <= 1:
+        raise UserError(f"--share is the share of the way to {source}, 0 to 1, not {options.share:g}")
+    read = [path for path in (source, other) if path is not None and not path.is_dir()]
+    check_folder(options.target, "TARGET", read=read)
+    params, model, about = _loaded(source)
+    if other is not None:
+        params = _between(_loaded(other), (params, model, about), options)
+        about |= {"source": f"{options.share:g} of the way from {other} to {source}"}
     if options.names == "release" and not {"touch", "decoder"} <= params.keys():
         raise UserError(f"{source} lacks a touch encoder or a decoder, which the authors' files hold: add --names own")
     if options.names == "release" and model.sensors[-1] != UNIVERSAL:
@@ -57,6 +52,44 @@ def run(options: Convert) -> int:
         release.write_safetensors(options.target, arrays, about | {"format": "pt"})
     print(f"{options.target}: written")
     return 0
+
+
+def _loaded(source: Path) -> Loaded:
+    """The parameters of a run or a file as they are used, the model, and what a file says of them."""
+    from anytouch_jax.config import from_json
+    from anytouch_jax.io import checkpoint, release
+
+    about = {"source": str(source)}
+    if source.is_dir():
+        params, text, told = checkpoint.load_params(source)
+        config = from_json(text)
+        about |= {release.BACKGROUND_KEY: config.data.background}
+        if "touch" in params and "seen" in told:
+            about |= {release.SEEN_KEY: ",".join(told["seen"])}
+        return release.served(params, config, told), config.model, about
+    kept = release.read_metadata(source)
+    about |= {key: kept[key] for key in (release.BACKGROUND_KEY,) if key in kept}
+    weights = release.read_weights(source)
+    model = release.model_of(source, weights)
+    params = release.to_params(weights, model)
+    seen = release.seen_by_file(kept, model) if "touch" in params else None
+    return params, model, about | ({} if seen is None else {release.SEEN_KEY: ",".join(seen)})
+
+
+def _between(first: Loaded, second: Loaded, options: Convert) -> dict[str, Any]:
+    """Parameters on the way from `first` to `second`. Raises UserError where they are not of one network."""
+    from anytouch_jax.io import release, tree
+
+    names = ("touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "activation", "sensors")
+    other = [name for name in names if getattr(first[1], name) != getattr(second[1], name)]
+    if first[2].get(release.BACKGROUND_KEY, "keep") != second[2].get(release.BACKGROUND_KEY, "keep"):
+        other.append("background")
+    if other:
+        raise UserError(
+            f"{options.between} and {options.source} are of different networks ({', '.join(other)}): --between takes "
+            "what SOURCE was trained from, as its stage 1"
+        )
+    return tree.between(first[0], second[0], options.share)
 
 
 def _universal_last(params: dict[str, Any], model: Model) -> tuple[dict[str, Any], Model]:

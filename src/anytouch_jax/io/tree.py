@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import numpy as np
 
 from anytouch_jax.config import UserError
 
@@ -41,3 +42,14 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
             raise UserError(f"the name {name!r} is also the beginning of another array's name; rename one of them")
         node[last] = leaf
     return tree
+
+
+def between(first: Mapping[str, Any], second: Mapping[str, Any], share: float) -> dict[str, Any]:
+    """Parameters `share` of the way from `first` to `second` (WiSE-FT, Wortsman et al. 2022); what `first` has not is
+    as in `second`. Raises UserError for arrays of different shapes."""
+    start, found = flatten(first), flatten(second)
+    for name in start.keys() & found.keys():
+        if np.shape(start[name]) != np.shape(found[name]):
+            raise UserError(f"{name} is {np.shape(start[name])} in the one and {np.shape(found[name])} in the other")
+        found[name] = (1 - share) * np.asarray(start[name]) + share * np.asarray(found[name])
+    return nest(found)

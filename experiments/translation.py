@@ -17,10 +17,11 @@
 #
 #     make translation
 #
-# trains the encoders, too: AnyTouch and T3-style as in Tables 2 to 4, AnyTouch's stage 1 by itself, and its stage 2
-# with a layer decay (`--optim.layer-decay 0.1`: the lower layers stay nearly as stage 1 left them); one of each a seed,
-# on the scenes of `make experiments` (`STUDY=runs/matrix`; made where they are not there) less all objects of the
-# pairs. `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
+# trains the encoders, too: AnyTouch and T3-style as in Tables 2 to 4, AnyTouch's stage 1 by itself, its stage 2 with a
+# layer decay (`--optim.layer-decay 0.1`: the lower layers stay nearly as stage 1 left them), and the weights half-way
+# from stage 1 to stage 2 (`anytouch convert --between`); one of each a seed, on the scenes of `make experiments`
+# (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs.
+# `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
 # for one a seed. Each is compared with two plain references trained on the same pairs: copying the mean training
 # target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
@@ -175,9 +176,9 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
         return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
     found: dict[str, dict[int, Encoder]] = {}
     for seed in SEEDS:
-        trained = remaining.train(Work(STUDY), plan.QUICK if QUICK else plan.FULL, seed, table)
-        for name, path in trained.items():
-            found.setdefault(name, {})[seed] = load_encoder(path)
+        size = plan.QUICK if QUICK else plan.FULL
+        for name, one in remaining.encoders(Work(STUDY), size, seed, table).items():
+            found.setdefault(name, {})[seed] = one
     return found
 
 

@@ -9,12 +9,15 @@ from pathlib import Path
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.manifest import Manifest
 from anytouch_jax.evaluate import pairs
+from anytouch_jax.evaluate.features import Encoder, load_encoder
+from anytouch_jax.io.tree import between
 
 from . import cuts, plan
 from .plan import Size, Training
 from .work import Work
 
 LESS = "_remaining"
+SHARE = 0.5  # of the way from stage 1 to stage 2, of the encoder between them
 LAYER_DECAY = 0.1  # by the error of images of the third split, seed 0: 0.0347, with 0.3 0.0363, with 1 0.0365
 NOT_TUNED = (("stage1", "fine"),)  # it tells why a frozen row is what it is
 
@@ -56,3 +59,11 @@ def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]
     for name in names:
         write_remaining(work.manifest(name.removesuffix(LESS)), taken)
     return work.runs(asked, size)
+
+
+def encoders(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Encoder]:
+    """Those of `train`, and the one half-way from AnyTouch's stage 1 to its stage 2."""
+    found = {name: load_encoder(run) for name, run in train(work, size, seed, taken).items()}
+    first, second = found["stage1"], found["anytouch"]
+    params = between(first.params, second.params, SHARE)
+    return found | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}

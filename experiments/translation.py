@@ -306,13 +306,20 @@ def against(task: tuple[str, str], better: str, worse: str) -> str:
     return f"{np.mean(change):+.4f}{said}, {verdict(low, high, len(change), wanted=-1)}"
 
 
-claims = []
-for ours in (name for name in names if name.startswith(("anytouch", "stage1"))):  # its variants, and its stage 1
-    rivals = [name for name in names if name != ours and name.split(", ")[-1] == ours.split(", ")[-1]]
-    rivals += [*(name for name in names if "pixels" in name), MEAN]
-    claims += [(f"{ours} below {rival}", *(against(task, ours, rival) for task in TASKS)) for rival in rivals]
+def rivals(name: str) -> list[str]:
+    """What a row of ours is compared with: rows of others, tuned alike, AnyTouch as it is, and the references."""
+    tune = name.split(", ")[-1]
+    alike = [one for one in names if one.split(", ")[-1] == tune and not one.startswith(OURS)]
+    return [*alike, *({f"anytouch, {tune}"} & {*names} - {name}), *(one for one in names if "pixels" in one), MEAN]
 
 
+OURS = ("anytouch", "stage1")  # its variants, and its stage 1
+claims = [
+    (f"{one} below {rival}", *(against(task, one, rival) for task in TASKS))
+    for one in names
+    if one.startswith(OURS)
+    for rival in rivals(one)
+]
 QUESTION = "is the paper's order found? (and is it below both references?)"
 head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
 

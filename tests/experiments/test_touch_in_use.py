@@ -77,9 +77,9 @@ def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp
     visit("translation", monkeypatch, WORK=tmp_path / "work", STUDY=tmp_path / "study", **size)
     folder = tmp_path / "translation_quick"
     names = {path.stem.split("tac3d-", 1)[1] for path in folder.glob("digit-tac3d-*.json")}
-    frozen = {f"{name}-frozen-0" for name in ("anytouch", "anytouch_layer_decay", "stage1", "t3")}
-    fine = {f"{name}-fine-0" for name in ("anytouch", "anytouch_layer_decay", "t3")}
-    assert names == frozen | fine | {"pixels-scratch-0"}
+    kinds = ("anytouch", "anytouch_between", "anytouch_layer_decay", "t3")
+    both = {f"{name}-{tune}-0" for name in kinds for tune in ("frozen", "fine")}
+    assert names == both | {"stage1-frozen-0", "pixels-scratch-0"}
     assert set(json.loads((folder / "overlap.json").read_text()).values()) == {"0"}
 
 

@@ -37,6 +37,15 @@ def test_the_committed_page_is_what_its_files_give(tmp_path, monkeypatch, capsys
         run(monkeypatch, TABLE=1, OUT=tmp_path)
 
 
+def test_the_page_of_convolutions_is_what_its_files_give(tmp_path, monkeypatch, capsys):
+    shutil.copytree(RESULTS / "teaching_convolutional", tmp_path / "teaching_convolutional")
+    run(monkeypatch, TABLE=1, CONVOLUTIONS=1, SEEDS=0, OUT=tmp_path)
+    page = (tmp_path / "teaching_convolutional.md").read_text()
+    assert page == (RESULTS / "teaching_convolutional.md").read_text()
+    assert "CONVOLUTIONS=1 python experiments/teaching.py" in page and "convolutions inside its patches" in page
+    assert not (tmp_path / "teaching.md").exists()
+
+
 @pytest.mark.slow
 def test_a_trial_from_data_to_page(tmp_path, monkeypatch, capsys):
     small = {"TOUCHES": 220, "MORE": 8, "OBJECTS": 60, "STEPS1": 1, "STEPS2": 1, "SEEDS": 0, "GRADES": "fine"}

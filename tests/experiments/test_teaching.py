@@ -39,7 +39,7 @@ def test_the_committed_page_is_what_its_files_give(tmp_path, monkeypatch, capsys
 
 def test_the_page_of_convolutions_is_what_its_files_give(tmp_path, monkeypatch, capsys):
     shutil.copytree(RESULTS / "teaching_convolutional", tmp_path / "teaching_convolutional")
-    run(monkeypatch, TABLE=1, CONVOLUTIONS=1, SEEDS=0, OUT=tmp_path)
+    run(monkeypatch, TABLE=1, CONVOLUTIONS=1, OUT=tmp_path)
     page = (tmp_path / "teaching_convolutional.md").read_text()
     assert page == (RESULTS / "teaching_convolutional.md").read_text()
     assert "CONVOLUTIONS=1 python experiments/teaching.py" in page and "convolutions inside its patches" in page

@@ -37,14 +37,13 @@ from study import asked
 
 from anytouch_jax.config import Config, from_json
 from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.evaluation import evaluation
 from anytouch_jax.data.samples import Reader
-from anytouch_jax.evaluate import figures, probe_command, results
+from anytouch_jax.evaluate import probe_command, results
 from anytouch_jax.evaluate.features import Encoder, embed_rows, load_encoder, random_encoder
+from anytouch_jax.evaluate.pixels import pixel_scores
 from anytouch_jax.io import checkpoint
 from anytouch_jax.nn.functional import build
-from anytouch_jax.objectives import normalise_touch, stage1_terms
-from anytouch_jax.ops import masking
+from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.options import Probe
 from anytouch_jax.train.loop import fit
 from anytouch_jax.whole import write_whole
@@ -73,33 +72,8 @@ def write(line: str = "") -> None:
 # mean of the visible patches of the same sample, the next frame against a copy of the last one.
 
 # %%
-net = build(config.model)
-
-
-@jax.jit
-def terms(params: Any, clip: Any, sensor: Any, noise: Any) -> Any:
-    return stage1_terms(params, normalise_touch(clip), sensor, noise, net=net, config=config)[1]
-
-
-def pixel_report() -> dict[str, float]:
-    """Reconstruction and next frame on every four-frame window of the test split, with the plain guesses beside."""
-    ends = manifest.clips(config.model.frames + 1, "test")[:, -1]
-    sums: dict[str, float] = {}
-    count = 0
-    for ids, batch in evaluation(manifest, ends, config, "clip", frames=config.model.frames + 1):
-        noise = jax.random.uniform(jax.random.key(count), (len(batch.sensor), config.model.patches))
-        visible = masking.kept(config.model.patches, config.objective.keep_ratio)
-        hidden = np.asarray(masking.random_mask(noise, visible)[2])
-        ours = {k: float(v) for k, v in terms(params, batch.clip, batch.sensor, noise).items()}
-        plain = figures.pixel_baselines(batch.clip, hidden, patch=config.model.patch, frames=config.model.frames)
-        for name in ours:
-            sums[name] = sums.get(name, 0.0) + ours[name] * len(ids)
-            sums[f"plain {name}"] = sums.get(f"plain {name}", 0.0) + plain[name] * len(ids)
-        count += len(ids)
-    return {name: value / count for name, value in sums.items()}
-
-
-record["pixels"] = pixels = pixel_report()
+ends = manifest.clips(config.model.frames + 1, "test")[:, -1]  # every four-frame window
+record["pixels"] = pixels = pixel_scores(params, manifest, ends, config)
 write("## Stage 1: pixels of the test recordings\n")
 write("| | stage 1 | guess without a model |\n| --- | --- | --- |")
 write(f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} (mean of visible) |")
@@ -118,6 +92,7 @@ class Labelled(NamedTuple):
     label: Any
 
 
+net = build(config.model)
 probe_options = Probe(data=(DATA,), label="object", where=("label.contact_score", 7.0), sensor="gelsight_mini")
 task = probe_command.read_task(probe_options, print)
 names = sorted(set(task.labels[task.split == "train"]))

@@ -1,4 +1,4 @@
-"""Figures and the guesses without a model, checked by hand."""
+"""Figures, checked by hand."""
 
 from dataclasses import replace
 
@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from tiny_models import tiny_config
 
-from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD
 from anytouch_jax.evaluate import figures
-from anytouch_jax.evaluate.figures import pixel_baselines, reconstruction_panels, write_png
+from anytouch_jax.evaluate.figures import reconstruction_panels, write_png
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops.losses import normalise_patches
@@ -79,26 +78,6 @@ def test_normalised_patches_are_brought_back_to_pixels(monkeypatch):
     grid = cells(reconstruction_panels(PARAMS, CLIP, SENSOR, net=NET, config=config)).astype(int)
     assert np.abs(grid[:, 6:9] - CLIP[:, :3].astype(int)).max() <= 1
     assert np.abs(grid[:, 10] - CLIP[:, 3].astype(int)).max() <= 1
-
-
-@pytest.mark.parametrize("frames", [1, 4])
-def test_the_guesses_without_a_model(frames):
-    clip = CLIP[:, :frames]
-    hidden = np.random.default_rng(1).permuted(np.arange(16) < np.full((2, 1), 12), axis=1)
-    pixels = (clip / 255.0 - IMAGENET_MEAN) / IMAGENET_STD
-    target = pixels.reshape(2, frames, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(2, 16, frames, 147)
-    shown = min(frames, 3)
-    errors = []
-    for sample in range(2):
-        for patch in np.flatnonzero(hidden[sample]):
-            guess = target[sample, ~hidden[sample], :shown].mean(axis=0)
-            errors.append(((target[sample, patch, :shown] - guess) ** 2).mean())
-    found = pixel_baselines(clip, hidden, patch=7, frames=3)
-    assert found["reconstruction"] == pytest.approx(np.mean(errors), rel=1e-5)
-    if frames == 1:
-        assert set(found) == {"reconstruction"}
-    else:
-        assert found["next_frame"] == pytest.approx(((pixels[:, 3] - pixels[:, 2]) ** 2).mean(), rel=1e-5)
 
 
 def test_a_figure_is_written_whole_or_not_at_all(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ import numpy as np
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.objectives import normalise_touch, reconstruct
-from anytouch_jax.ops import losses, tokens
+from anytouch_jax.ops import tokens
 from anytouch_jax.whole import write_whole
 
 _GREY, _GAP = 128, 4
@@ -80,21 +80,3 @@ def _to_pixels(normalised: np.ndarray) -> np.ndarray:
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an RGB image u8 (H, W, 3), whole or not at all. Raises OSError."""
     write_whole(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
-
-
-def pixel_baselines(clip: np.ndarray, hidden: np.ndarray, *, patch: int, frames: int) -> dict[str, float]:
-    """What a guess without a model scores in the units of the loss (normalised pixels, mean squared error).
-
-    `reconstruction`: every hidden patch is the mean of the sample's visible ones; `next_frame`: a copy of the last
-    frame that the encoder sees. `clip` u8 (B, T, H, W, 3), `hidden` bool (B, N).
-    """
-    target = np.asarray(tokens.patchify(normalise_touch(jnp.asarray(clip)), patch))
-    visible = ~hidden[:, :, None, None]
-    mean = (target * visible).sum(axis=1, keepdims=True) / visible.sum(axis=1, keepdims=True)
-    guess = np.broadcast_to(mean, target.shape).copy()
-    if target.shape[2] > frames:
-        guess[:, :, frames] = target[:, :, frames - 1]
-    _, metrics = losses.reconstruction_loss(
-        jnp.asarray(guess), jnp.asarray(target), jnp.asarray(hidden), next_frame=target.shape[2] > frames
-    )
-    return {name: float(value) for name, value in metrics.items()}

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..config import FIELD_SENSORS, from_json
+from ..config import FIELD_SENSORS, Config, from_json
+from ..data.contact import known_contact
 from ..data.evaluation import evaluation
 from ..data.images import decode
 from ..data.manifest import Manifest
@@ -24,6 +25,7 @@ from . import matching, plots, results, retrieval
 from .contacts import deepest_rows
 from .features import text_column
 from .figures import reconstruction_panels, write_png
+from .pixels import pixel_scores
 from .space import Space
 
 Array = npt.NDArray[Any]
@@ -134,6 +136,7 @@ def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> Sect
     config = replace(config, data=replace(config.data, batch_size=len(rows), on_bad_sample="error"))
     _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))  # type: ignore[arg-type]
     params = {name: params[name] for name in ("touch", "decoder")}
+    table = _pixels_table(params, manifest, ends, config)
     image = reconstruction_panels(params, batch.clip, batch.sensor, net=build(usable(config.model)), config=config)
     path = folder / "figures" / "reconstructions.png"
     write_png(path, image)
@@ -141,7 +144,25 @@ def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> Sect
     words = f"Stage 1 sees a quarter of the patches of an object it has never met; from above: {names}. " + (
         "The last pair is the frame that follows, and what is predicted of it." if frames > 1 else ""
     )
-    return Section("Reconstructions and next frames" if frames > 1 else "Reconstructions", words, figure=path)
+    return Section("Reconstructions and next frames" if frames > 1 else "Reconstructions", words, table, path)
+
+
+def _pixels_table(params: Any, manifest: Manifest, ends: Array, config: Config, most: int = 240) -> str:
+    """Errors of stage 1 beside guesses without a model on up to `most` clips in contact, "" where there are none."""
+    ends = ends[known_contact(manifest)[ends] != 0]  # or nothing is known
+    if config.objective.norm_pix_loss or not len(ends):
+        return ""
+    ends = ends[np.linspace(0, len(ends) - 1, min(most, len(ends))).astype(int)]
+    config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
+    scores = pixel_scores(params, manifest, ends, config)
+    terms = {"reconstruction": "hidden patches", "next_frame": "next frame"}
+    rivals = {"untouched": "untouched gel", "plain": "mean of the visible patches; copy of the last frame"}
+    rivals = {kind: name for kind, name in rivals.items() if f"{kind} reconstruction" in scores}
+    rows = [
+        (words, *(f"{scores[key]:.4f}" for key in (term, *(f"{kind} {term}" for kind in rivals))))
+        for term, words in terms.items()
+    ]
+    return results.markdown((f"error on {len(ends)} clips in contact", "stage 1", *rivals.values()), rows)
 
 
 def _deepest_of_sensors(manifest: Manifest, rows: Array) -> Array:

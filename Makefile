@@ -25,6 +25,7 @@ WORKERS    ?= 2
 
 DEMO       ?= runs/demo
 DEMO_STEPS ?= 200
+DEMO_STEPS1 ?= 400
 PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets pouring translation
 
 train-stage1: RUN ?= runs/stage1
@@ -36,8 +37,10 @@ export-onnx: FRAMES ?= 1
 # touch against all others of its batch (experiments/teaching.py says why).
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --loader.background subtract --loader.contact-only --loader.jitter 0 0 0 0
-DEMO1 := $(DEMO0) --steps 400 --batch 48
-DEMO_LONGER := $(if $(filter-out 200,$(DEMO_STEPS)),-$(DEMO_STEPS))
+DEMO1 := $(DEMO0) --steps $(DEMO_STEPS1) --batch 48
+# A longer demo lies beside the plain one, on the same scenes: stage1-3000, stage2-3000-600, report-3000-600.
+DEMO_LONGER1 := $(if $(filter-out 400,$(DEMO_STEPS1)),-$(DEMO_STEPS1))
+DEMO_LONGER := $(DEMO_LONGER1)$(if $(DEMO_LONGER1)$(filter-out 200,$(DEMO_STEPS)),-$(DEMO_STEPS))
 DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --loader.negatives same_sensor
 
 ANYTOUCH := $(PY) -m anytouch_jax
@@ -67,12 +70,12 @@ help: ## list the targets
 
 setup: $(STAMP) ## make .venv with the pinned versions
 
-demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2]
+demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2, DEMO_STEPS1=400, of stage 1]
 	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
 	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
-	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1 $(DEMO1)
-	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2$(DEMO_LONGER) --init $(DEMO)/stage1 $(DEMO2)
-	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1 --stage2 $(DEMO)/stage2$(DEMO_LONGER) --out $(DEMO)/report$(DEMO_LONGER)
+	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO1)
+	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2$(DEMO_LONGER) --init $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO2)
+	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1$(DEMO_LONGER1) --stage2 $(DEMO)/stage2$(DEMO_LONGER) --out $(DEMO)/report$(DEMO_LONGER)
 
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
 	$(ANYTOUCH) simulate --out $(SCENES)

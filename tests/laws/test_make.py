@@ -15,6 +15,8 @@ NAMES = (
     "DATA",
     "SCENES",
     "DEMO",
+    "DEMO_STEPS",
+    "DEMO_STEPS1",
     "RUN",
     "INIT",
     "PRESET",
@@ -134,6 +136,11 @@ def test_a_longer_demo_goes_on_from_the_scenes_and_stage_1_of_the_plain_one() ->
     assert "--run d/stage2-600 --init d/stage1 " in longer[-2] and "--steps 600" in longer[-2]
     assert longer[-1].endswith("--stage2 d/stage2-600 --out d/report-600")
     assert plain[-1].endswith("--stage2 d/stage2 --out d/report")
+    longest = make("-n", "demo", "DEMO=d", "DEMO_STEPS1=3000", "DEMO_STEPS=600").stdout.splitlines()
+    assert plain[:-3] == longest[:-3]
+    assert "--run d/stage1-3000 " in longest[-3] and "--steps 3000" in longest[-3]
+    assert "--run d/stage2-3000-600 --init d/stage1-3000 " in longest[-2]
+    assert longest[-1].endswith("--stage1 d/stage1-3000 --stage2 d/stage2-3000-600 --out d/report-3000-600")
 
 
 def test_notebooks_run_in_their_own_folder_and_find_their_helpers() -> None:

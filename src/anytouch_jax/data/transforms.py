@@ -82,6 +82,9 @@ def turned(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarra
     return {"none": frame, "across": frame[:, ::-1], "down": frame[::-1]}[flip]
 
 
+UNTOUCHED = 128  # grey level of a gel that nothing touches, once it is subtracted
+
+
 def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:
     """Each of T frames u8 (h, w, 3) less the untouched gel, on middle grey: frame - background + 128, clipped to u8.
 
@@ -92,7 +95,7 @@ def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: n
         height, width = frame.shape[:2]
         same = background.shape[:2] == (height, width)
         gel = background if same else cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA)
-        return cv2.addWeighted(frame, 1.0, gel, -1.0, 128.0)
+        return cv2.addWeighted(frame, 1.0, gel, -1.0, UNTOUCHED)
 
     return [less(frame) for frame in frames]
 

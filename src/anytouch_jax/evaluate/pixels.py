@@ -12,12 +12,11 @@ import numpy as np
 from ..config import Config
 from ..data.evaluation import evaluation
 from ..data.manifest import Manifest
+from ..data.transforms import UNTOUCHED
 from ..nn.attention import usable
 from ..nn.functional import Net, build
 from ..objectives import normalise_touch, reconstruct
 from ..ops import losses, tokens
-
-UNTOUCHED = 128  # grey level of a gel that nothing touches, where the background is subtracted
 
 
 def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, config: Config) -> dict[str, float]:
@@ -49,9 +48,8 @@ def _scores(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config
     target = tokens.patchify(clip, net.model.patch)
     guesses = {"": pixels, "plain ": plain_guess(target, hidden, net.model.frames)}
     if config.data.background == "subtract":
-        guesses["untouched "] = tokens.patchify(
-            normalise_touch(jnp.full(clip.shape, UNTOUCHED, jnp.uint8)), net.model.patch
-        )
+        gel = normalise_touch(jnp.full(clip.shape, UNTOUCHED, jnp.uint8))
+        guesses["untouched "] = tokens.patchify(gel, net.model.patch)
     following = clip.shape[1] > net.model.frames
     return {
         kind + term: value

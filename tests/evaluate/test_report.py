@@ -227,6 +227,9 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
     assert numbers["data"] == manifests.read(touched).content_hash and numbers["seconds"] > 0
     assert [one["name"] for one in numbers["space"]] == list(NAMES)
     assert all(one["rows"] == 72 for one in numbers["space"])  # 24 of 30 touches by three sensors
+    pixels, text = numbers["pixels"], path.read_text()
+    assert pixels["clips"] > 0 and f"error on {pixels['clips']} clips in contact" in text
+    assert f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} |" in text
     kinds = numbers["retrieval"]["found"]
     assert set(kinds) == {"fine", "coarse"} and set(kinds["fine"]) == {"matched", "by chance"}
     everything = {*NAMES, *(f"{name} (patches)" for name in NAMES), PIXELS, VECTOR}
@@ -262,7 +265,7 @@ def test_a_report_says_what_it_could_not_score(
     gone = ("label.x", "label.y", "label.depth", "label.force", "label.area", "background_path", "grade")
     poor = touched.parent / "poor.parquet"
     manifests.write(manifests.from_columns(table.drop_columns(list(gone)).to_pydict(), poor), poor)
-    monkeypatch.setattr("anytouch_jax.evaluate.report.reconstructions_section", lambda *args: Section("none"))
+    monkeypatch.setattr("anytouch_jax.evaluate.report.reconstructions_section", lambda *args: (Section("none"), {}))
     path = demo_report(poor, tiny_run, later, tmp_path, lambda _: None, touches=12)
     text = path.read_text()
     for words in (

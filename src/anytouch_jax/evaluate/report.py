@@ -147,7 +147,8 @@ def _contents(
     numbers: dict[str, Any] = {"data": table.content_hash, "stage1": str(stage1), "stage2": str(stage2)}
     sections = [_facts(table, first, second, _lineage(stage1, stage2)), *samples_section(table, out, seed=seed)]
     sections.append(losses_section({"stage 1": stage1, "stage 2": stage2}, out))
-    sections.append(reconstructions_section(table, stage1, out))
+    section, numbers["pixels"] = reconstructions_section(table, stage1, out)
+    sections.append(section)
     say("report: samples, losses and reconstructions are drawn")
     study = _study(table, encoders, touches, seed, say)
     say(f"report: {len(study.rows)} touches embedded by {len(encoders)} encoders")

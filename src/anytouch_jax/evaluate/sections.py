@@ -122,8 +122,8 @@ def losses_section(runs: Mapping[str, Path], folder: Path) -> Section:
     return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
 
 
-def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> Section:
-    """Hidden patches filled in by stage 1, and the next frame, on a test clip of each sensor."""
+def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> tuple[Section, dict[str, Any]]:
+    """Hidden patches filled in by stage 1, and the next frame, on a test clip of each sensor; its errors in numbers."""
     params, text, _ = checkpoint.load_params(run)
     config = from_json(text)
     rows = manifest.rows_of("test")
@@ -136,7 +136,7 @@ def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> Sect
     config = replace(config, data=replace(config.data, batch_size=len(rows), on_bad_sample="error"))
     _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))  # type: ignore[arg-type]
     params = {name: params[name] for name in ("touch", "decoder")}
-    table = _pixels_table(params, manifest, ends, config)
+    scores = _pixel_errors(params, manifest, ends, config)
     image = reconstruction_panels(params, batch.clip, batch.sensor, net=build(usable(config.model)), config=config)
     path = folder / "figures" / "reconstructions.png"
     write_png(path, image)
@@ -144,17 +144,21 @@ def reconstructions_section(manifest: Manifest, run: Path, folder: Path) -> Sect
     words = f"Stage 1 sees a quarter of the patches of an object it has never met; from above: {names}. " + (
         "The last pair is the frame that follows, and what is predicted of it." if frames > 1 else ""
     )
-    return Section("Reconstructions and next frames" if frames > 1 else "Reconstructions", words, table, path)
+    title = "Reconstructions and next frames" if frames > 1 else "Reconstructions"
+    return Section(title, words, _pixels_table(scores) if scores else "", path), scores
 
 
-def _pixels_table(params: Any, manifest: Manifest, ends: Array, config: Config, most: int = 240) -> str:
-    """Errors of stage 1 beside guesses without a model on up to `most` clips in contact, "" where there are none."""
+def _pixel_errors(params: Any, manifest: Manifest, ends: Array, config: Config, most: int = 240) -> dict[str, Any]:
+    """Errors of stage 1 beside guesses without a model on up to `most` clips in contact, {} where there are none."""
     ends = ends[known_contact(manifest)[ends] != 0]  # or nothing is known
     if config.objective.norm_pix_loss or not len(ends):
-        return ""
+        return {}
     ends = ends[np.linspace(0, len(ends) - 1, min(most, len(ends))).astype(int)]
     config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
-    scores = pixel_scores(params, manifest, ends, config)
+    return {"clips": len(ends)} | pixel_scores(params, manifest, ends, config)
+
+
+def _pixels_table(scores: Mapping[str, Any]) -> str:
     terms = {"reconstruction": "hidden patches", "next_frame": "next frame"}
     rivals = {"untouched": "untouched gel", "plain": "mean of the visible patches; copy of the last frame"}
     rivals = {kind: name for kind, name in rivals.items() if f"{kind} reconstruction" in scores}
@@ -162,7 +166,7 @@ def _pixels_table(params: Any, manifest: Manifest, ends: Array, config: Config, 
         (words, *(f"{scores[key]:.4f}" for key in (term, *(f"{kind} {term}" for kind in rivals))))
         for term, words in terms.items()
     ]
-    return results.markdown((f"error on {len(ends)} clips in contact", "stage 1", *rivals.values()), rows)
+    return results.markdown((f"error on {scores['clips']} clips in contact", "stage 1", *rivals.values()), rows)
 
 
 def _deepest_of_sensors(manifest: Manifest, rows: Array) -> Array:

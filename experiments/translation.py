@@ -36,25 +36,24 @@ import json
 import os
 import re
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import asked, page, plan, remaining
-from study.found import find_again, found_table
+from study import asked, page, plan, remaining, translated
+from study.found import find_again
+from study.translated import PIXELS, TASKS, one_table
 from study.work import Work
 
-from anytouch_jax.config import UserError, preset
+from anytouch_jax.config import preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.edit import select
 from anytouch_jax.evaluate import generation, pairs
 from anytouch_jax.evaluate.features import Encoder, load_encoder
 from anytouch_jax.evaluate.generation_figures import picture_grid
 from anytouch_jax.evaluate.generator import Fit
-from anytouch_jax.evaluate.results import markdown, seed_interval, verdict
 from anytouch_jax.nn.translation import Translation
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
@@ -66,10 +65,9 @@ NAME = "translation_quick" if QUICK else "translation"
 WORK, OUT = asked.path("WORK", "runs/translation"), asked.path("OUT", "experiments/results")
 RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 TOUCHES, STEPS = asked.number("TOUCHES", 24 if QUICK else 400), asked.number("STEPS", 40 if QUICK else 600)
+STEPS1 = asked.number("STEPS1", (plan.QUICK if QUICK else plan.FULL).steps1)
 SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
 TUNE = asked.names("TUNE", "frozen", ("frozen", "fine"))
-TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
-PIXELS = "pixels"
 RUN_FILES = OUT / NAME
 enable_compilation_cache()
 
@@ -176,24 +174,10 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
         return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
     found: dict[str, dict[int, Encoder]] = {}
     for seed in SEEDS:
-        size = plan.QUICK if QUICK else plan.FULL
+        size = replace(plan.QUICK if QUICK else plan.FULL, steps1=STEPS1)
         for name, one in remaining.encoders(Work(STUDY), size, seed, table).items():
             found.setdefault(name, {})[seed] = one
     return found
-
-
-def one_table(several: Sequence[dict[str, Any]]) -> None:
-    """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
-    (errors of pictures of another size are no rivals), two encoders of one name and seed."""
-    kinds = ("touches", "size", "subtracts", "version")
-    ways = {(*(one.get(kind, 1) for kind in kinds), one["fit"]["steps"]) for one in several}
-    known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
-    made = {(one["from"], one["to"], one["pairs"], one.get("simulator")) for one in several}
-    if len(ways) > 1 or len(known) > len({one[:2] for one in known}) or len(made) > len({one[:2] for one in made}):
-        raise UserError(
-            f"{RUN_FILES}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
-            f"make no table together ({sorted(map(str, ways | known | made))}): choose another OUT"
-        )
 
 
 def _settings_of(file: Path) -> dict[str, Any]:
@@ -234,7 +218,7 @@ def all_runs() -> None:
         stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
         every[RUN_FILES / f"{stem}.json"] = (about, encoder)
     there = [file for file in RUN_FILES.glob("*-*.json") if file not in every]
-    one_table([*(about for about, _ in every.values()), *map(_settings_of, there)])
+    one_table([*(about for about, _ in every.values()), *map(_settings_of, there)], RUN_FILES)
     counts = RUN_FILES / "overlap.json"
     before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
     met = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
@@ -259,127 +243,8 @@ if not TABLE:
 # ## The table, from the JSON of the runs
 
 # %%
-MEAN = "mean of the training targets"
-TITLES = {"gelsight_mini": "GelSight Mini", "digit": "DIGIT", "duragel": "DuraGel", "tac3d": "Tac3D"}
-records = [json.loads(file.read_text()) for file in sorted(RUN_FILES.glob("*-*.json"))]
-if not records:
-    raise UserError(f"{RUN_FILES} holds no results; run this page without TABLE=1")
-known_objects = json.loads((RUN_FILES / "overlap.json").read_text())
-one_table([record["settings"] for record in records])
-
-
-def row_name(record: dict[str, Any]) -> str:
-    about = record["settings"]
-    if about["name"] == PIXELS:
-        return "U-Net / MLP on pixels, from scratch"
-    return f"{about['name']}, {'fine-tuned' if about['fit']['tune'] == 'fine' else 'frozen'}"
-
-
-def of(task: tuple[str, str], name: str) -> list[dict[str, Any]]:
-    return [r for r in records if (r["settings"]["from"], r["settings"]["to"]) == task and row_name(r) == name]
-
-
-def spread(values: list[float]) -> str:
-    if not values:
-        return "-"
-    return f"{np.mean(values):.4f}" + (f" +- {np.std(values, ddof=1):.4f}" if len(values) > 1 else "")
-
-
-names = sorted({row_name(record) for record in records}, key=lambda name: ("pixels" in name, name))
-cells = [(name, *(spread([r["error"] for r in of(task, name)]) for task in TASKS)) for name in names]
-means = [spread([r["mean_target"] for r in of(task, name)][:1]) for task in TASKS for name in names[:1]]
-cells.append((MEAN, *means))
-counted = [*known_objects, *(name.split(", ")[0] for name in names if "pixels" not in name)]
-told = ", ".join(f"{name} {known_objects.get(name, 'not counted')}" for name in dict.fromkeys(counted))
-
-
-def against(task: tuple[str, str], better: str, worse: str) -> str:
-    """Error of one row less that of another, seed by seed on the same pairs, with a 95 % interval over seeds."""
-    several = [{r["settings"]["fit"]["seed"]: r["error"] for r in of(task, name)} for name in (better, worse)]
-    if worse == MEAN:
-        several[1] = {r["settings"]["fit"]["seed"]: r["mean_target"] for r in of(task, better)}
-    change = [several[0][seed] - several[1][seed] for seed in sorted(several[0].keys() & several[1].keys())]
-    if not change:
-        return "-"
-    low, high = seed_interval(change)
-    said = "" if low is None or high is None else f" ({low:+.4f} to {high:+.4f})"
-    return f"{np.mean(change):+.4f}{said}, {verdict(low, high, len(change), wanted=-1)}"
-
-
-def rivals(name: str) -> list[str]:
-    """What a row of ours is compared with: rows of others, tuned alike, AnyTouch as it is, and the references."""
-    tune = name.split(", ")[-1]
-    alike = [one for one in names if one.split(", ")[-1] == tune and not one.startswith(OURS)]
-    return [*alike, *({f"anytouch, {tune}"} & {*names} - {name}), *(one for one in names if "pixels" in one), MEAN]
-
-
-OURS = ("anytouch", "stage1")  # its variants, and its stage 1
-claims = [
-    (f"{one} below {rival}", *(against(task, one, rival) for task in TASKS))
-    for one in names
-    if one.startswith(OURS)
-    for rival in rivals(one)
-]
-QUESTION = "is the paper's order found? (and is it below both references?)"
-head = ("mean squared error, lower is better", *(f"{TITLES[a]} -> {TITLES[b]}" for a, b in TASKS))
-
-# %% [markdown]
-# In units: grey levels (0..255) for images, mm of displacement and mN of force for fields.
-
-
-# %%
-def in_units(found: list[dict[str, Any]]) -> str:
-    if not found:
-        return "-"
-    rms = np.sqrt(np.mean([np.square(r["rms"]) for r in found], axis=0))
-    length = lambda part: float(np.sqrt(np.sum(np.square(part))))  # noqa: E731
-    if len(rms) == 3:
-        return f"{length(rms) / np.sqrt(3):.2f}"
-    return f"{length(rms[:3]):.4f} mm, {1e3 * length(rms[3:]):.2f} mN"
-
-
-physical = [(name, *(in_units(of(task, name)) for task in TASKS)) for name in names]
-first = records[0]
-tunes = {r["settings"]["fit"]["tune"] for r in records if r["settings"]["name"] != PIXELS}
-ours = {(r["settings"]["name"], r["settings"]["encoder"]) for r in records if r["settings"]["name"] != PIXELS}
-own = len(ours) > len({name for name, _ in ours})
-seeds = sorted({r["settings"]["fit"]["seed"] for r in records})
-other = (
-    "" if first["settings"].get("version") == generation.VERSION else " Translations of today's code learn otherwise."
-)
-steps = sorted({r["settings"]["fit"]["steps"] for r in records})  # more than one: some runs are of another size
-lines = [
-    "# One sensor's touch as another would feel it",
-    "",
-    f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, {first['pairs'][2]} of "
-    f"objects never seen to test on; {' and '.join(map(str, steps))} steps; mean and deviation over "
-    f"{len(seeds)} seeds, each over "
-    f"{'encoders of its own' if own else 'the same encoders'}. By "
-    f"`SEEDS={','.join(map(str, seeds))} {'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`." + other,
-    "",
-    markdown(head, cells),
-    "",
-    *([markdown((QUESTION, *head[1:]), claims), ""] if claims else []),
-    "Images: normalised pixels (ImageNet's mean and deviation). Fields: each of the six channels in deviations over "
-    "the training fields. The paper, on its own recordings (units not stated): T3 0.2261, 0.0167, 0.0155; AnyTouch "
-    "0.2159, 0.0151, 0.0144.",
-    "",
-    "The same in units, root mean square of a pixel (0..255), or of a point's displacement and force:",
-    "",
-    markdown(("", *head[1:]), physical),
-    "",
-    f"Objects of the pairs that an encoder was trained on in its last stage: {told}.",
-    "",
-]
-if again := found_table(RUN_FILES):
-    title = "The same touch by another sensor and unit, objects never seen, found by the encoder itself:"
-    lines += [title, "", again, ""]
-if not any(record["critic"] for record in records):
-    lines += ["No critic judged the images.", ""]
-lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]
-lines += [f"![{path.stem}]({NAME}/{path.name})" for path in sorted(RUN_FILES.glob("*.png"))]
-lines.append("")
-write_whole(OUT / f"{NAME}.md", "\n".join(lines))
-print("\n".join(lines))
+said = translated.page(RUN_FILES)
+write_whole(OUT / f"{NAME}.md", said)
+print(said)
 for picture in sorted(RUN_FILES.glob("*.png")):
     page.show(picture)

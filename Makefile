@@ -120,8 +120,8 @@ bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; not
 pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="anytouch=path static=path t3=path" STUDY= QUICK=1 OUT=]
 	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/pouring.py
 
-translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: [RUNS="anytouch=path t3=path" STUDY= QUICK=1 OUT=]
-	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
+translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: [RUNS="anytouch=path t3=path" STUDY= STEPS1=3000 QUICK=1 OUT=]
+	RUNS="$(RUNS)" STUDY="$(STUDY)" STEPS1="$(STEPS1)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
 
 long-clips: RUN ?= runs/stage2
 long-clips: $(STAMP) $(scenes) ## longer clips, what they see beside what they cost: [RUN= DATA= QUICK=1 OUT=]

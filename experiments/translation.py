@@ -22,8 +22,9 @@
 # from stage 1 to stage 2 (`anytouch convert --between`); one of each a seed, on the scenes of `make experiments`
 # (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs.
 # `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
-# for one a seed. Each is compared with two plain references trained on the same pairs: copying the mean training
-# target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
+# for one a seed. `STEPS1=3000` gives stage 1, T3-style's too, so many steps, and its table a page of its own
+# (`translation_3000.md`). Each is compared with two plain references trained on the same pairs: copying the mean
+# training target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
 # What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
 # is made of these files alone (`TABLE=1`: nothing but that). `WORK=` and `OUT=` in the environment are where data and
@@ -47,7 +48,7 @@ from study.found import find_again
 from study.translated import PIXELS, TASKS, one_table
 from study.work import Work
 
-from anytouch_jax.config import preset
+from anytouch_jax.config import UserError, preset
 from anytouch_jax.data import manifest as manifests
 from anytouch_jax.data.edit import select
 from anytouch_jax.evaluate import generation, pairs
@@ -61,11 +62,15 @@ from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.whole import write_whole
 
 QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
-NAME = "translation_quick" if QUICK else "translation"
+USUAL = plan.QUICK if QUICK else plan.FULL
+SIZE = replace(USUAL, steps1=asked.number("STEPS1", USUAL.steps1))
+LONGER = {} if SIZE == USUAL else {"steps1": SIZE.steps1}
+NAME = "_".join(["translation", *(["quick"] if QUICK else []), *map(str, LONGER.values())])
 WORK, OUT = asked.path("WORK", "runs/translation"), asked.path("OUT", "experiments/results")
 RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 TOUCHES, STEPS = asked.number("TOUCHES", 24 if QUICK else 400), asked.number("STEPS", 40 if QUICK else 600)
-STEPS1 = asked.number("STEPS1", (plan.QUICK if QUICK else plan.FULL).steps1)
+if RUNS and LONGER:
+    raise UserError("STEPS1 is for the encoders that this page trains; leave it out with RUNS, whose encoders are done")
 SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
 TUNE = asked.names("TUNE", "frozen", ("frozen", "fine"))
 RUN_FILES = OUT / NAME
@@ -128,7 +133,7 @@ def settings(
     return {
         "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
-        "pairs": data, "version": generation.VERSION, "simulator": version(task),
+        "pairs": data, "version": generation.VERSION, "simulator": version(task), **LONGER,
     }  # fmt: skip
 
 
@@ -174,8 +179,7 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
         return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
     found: dict[str, dict[int, Encoder]] = {}
     for seed in SEEDS:
-        size = replace(plan.QUICK if QUICK else plan.FULL, steps1=STEPS1)
-        for name, one in remaining.encoders(Work(STUDY), size, seed, table).items():
+        for name, one in remaining.encoders(Work(STUDY), SIZE, seed, table).items():
             found.setdefault(name, {})[seed] = one
     return found
 

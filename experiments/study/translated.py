@@ -68,7 +68,7 @@ def page(folder: Path) -> str:
 def one_table(several: Sequence[dict[str, Any]], folder: Path) -> None:
     """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
     (errors of pictures of another size are no rivals), two encoders of one name and seed."""
-    kinds = ("touches", "size", "subtracts", "version")
+    kinds = ("touches", "size", "subtracts", "version", "steps1")
     ways = {(*(one.get(kind, 1) for kind in kinds), one["fit"]["steps"]) for one in several}
     known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
     made = {(one["from"], one["to"], one["pairs"], one.get("simulator")) for one in several}
@@ -86,12 +86,16 @@ def _about(records: Sequence[Record]) -> str:
     own = len(ours) > len({name for name, _ in ours})
     tunes = {one["fit"]["tune"] for one in settings if one["name"] != PIXELS}
     seeds = sorted({one["fit"]["seed"] for one in settings})
+    steps1 = first["settings"].get("steps1")  # where it is not that of `make experiments`
+    longer = f"stage 1, T3-style's too, of {steps1} steps; " if steps1 else ""
+    asked = f"STEPS1={steps1} " if steps1 else ""
     today = first["settings"].get("version") == generation.VERSION
     return (
         f"Simulated fine-aligned pairs, one device of each sensor; {first['pairs'][0]} to train on, "
-        f"{first['pairs'][2]} of objects never seen to test on; {first['settings']['fit']['steps']} steps; mean and "
-        f"deviation over {len(seeds)} seeds, each over {'encoders of its own' if own else 'the same encoders'}. By "
-        f"`SEEDS={','.join(map(str, seeds))} {'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`."
+        f"{first['pairs'][2]} of objects never seen to test on; {first['settings']['fit']['steps']} steps; {longer}"
+        f"mean and deviation over {len(seeds)} seeds, each over "
+        f"{'encoders of its own' if own else 'the same encoders'}. By "
+        f"`{asked}SEEDS={','.join(map(str, seeds))} {'TUNE=frozen,fine ' if len(tunes) > 1 else ''}make translation`."
         + ("" if today else " Translations of today's code learn otherwise.")
     )
 

@@ -73,14 +73,18 @@ def test_translation(tmp_path, tiny_run, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp_path, monkeypatch):
-    size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "TUNE": "frozen,fine", "OUT": tmp_path}
+    size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "STEPS1": 5, "TUNE": "frozen,fine", "OUT": tmp_path}
     visit("translation", monkeypatch, WORK=tmp_path / "work", STUDY=tmp_path / "study", **size)
-    folder = tmp_path / "translation_quick"
+    folder = tmp_path / "translation_quick_5"
     names = {path.stem.split("tac3d-", 1)[1] for path in folder.glob("digit-tac3d-*.json")}
     kinds = ("anytouch", "anytouch_between", "anytouch_layer_decay", "t3")
     both = {f"{name}-{tune}-0" for name in kinds for tune in ("frozen", "fine")}
     assert names == both | {"stage1-frozen-0", "pixels-scratch-0"}
     assert set(json.loads((folder / "overlap.json").read_text()).values()) == {"0"}
+    stages = [path.name for path in (tmp_path / "study" / "trained").glob("stage1-*")]
+    configs = [json.loads((tmp_path / "study" / "trained" / name / "config.json").read_text()) for name in stages]
+    assert len(stages) == 2 and {one["run"]["steps"] for one in configs} == {5}  # AnyTouch's and T3-style
+    assert "stage 1, T3-style's too, of 5 steps" in folder.with_suffix(".md").read_text()
 
 
 @pytest.mark.slow

@@ -20,10 +20,11 @@ def visit(name, monkeypatch, **environment):
     return runpy.run_path(str(SCRIPTS / f"{name}.py"))
 
 
-@pytest.mark.parametrize("name", ["pouring", "translation", "named"])
+@pytest.mark.parametrize("name", ["pouring", "translation", "translation_3000", "named"])
 def test_the_committed_page_is_what_its_files_give(name, tmp_path, monkeypatch, capsys):
     shutil.copytree(SCRIPTS / "results" / name, tmp_path / name)
-    visit(name, monkeypatch, TABLE=1, OUT=tmp_path)
+    script, _, steps = name.partition("_")
+    visit(script, monkeypatch, TABLE=1, STEPS1=steps, OUT=tmp_path)
     assert (tmp_path / f"{name}.md").read_text() == (SCRIPTS / "results" / f"{name}.md").read_text()
 
 
@@ -37,6 +38,11 @@ def test_runs_that_are_no_rivals_make_no_table(changed, tmp_path, monkeypatch):
     file.write_text(json.dumps(found | {"settings": found["settings"] | changed}))
     with pytest.raises(UserError, match="make no table together"):
         visit("translation", monkeypatch, TABLE=1, OUT=tmp_path)
+
+
+def test_steps_of_stage_1_are_not_for_encoders_that_are_done(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="leave it out with RUNS"):
+        visit("translation", monkeypatch, RUNS=f"anytouch={tmp_path}", STEPS1=5, OUT=tmp_path)
 
 
 @pytest.mark.slow

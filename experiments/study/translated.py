@@ -101,6 +101,7 @@ def _about(records: Sequence[Record]) -> str:
 
 
 def _met(folder: Path, names: Sequence[str]) -> str:
+    """How many objects of the pairs each encoder was trained on."""
     known = json.loads((folder / "overlap.json").read_text())
     counted = dict.fromkeys([*known, *(name.split(", ")[0] for name in names if PIXELS not in name)])
     return ", ".join(f"{name} {known.get(name, 'not counted')}" for name in counted)
@@ -150,7 +151,7 @@ class Rows:
 
     def _against(self, task: Task, better: str, worse: str) -> str:
         """Error of one row less that of another, seed by seed on the same pairs, with a 95 % interval over seeds."""
-        ours = _by_seed(self.of(better, task), "error")
+        ours = _by_seed(self.of(better, task))
         theirs = _by_seed(self.of(better, task), "mean_target") if worse == MEAN else _by_seed(self.of(worse, task))
         change = [ours[seed] - theirs[seed] for seed in sorted(ours.keys() & theirs.keys())]
         if not change:

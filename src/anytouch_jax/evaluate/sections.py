@@ -159,6 +159,7 @@ def _pixel_errors(params: Any, manifest: Manifest, ends: Array, config: Config, 
 
 
 def _pixels_table(scores: Mapping[str, Any]) -> str:
+    """The errors of `_pixel_errors` as Markdown."""
     terms = {"reconstruction": "hidden patches", "next_frame": "next frame"}
     rivals = {"untouched": "untouched gel", "plain": "mean of the visible patches; copy of the last frame"}
     rivals = {kind: name for kind, name in rivals.items() if f"{kind} reconstruction" in scores}

@@ -2,7 +2,7 @@
 # `make` alone lists the targets.
 
 PYTHON ?= python3
-# Large pages: a million page faults a step less (src/anytouch_jax/pages.py).
+# Large pages of memory: a million page faults a step less.
 export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 VENV   := .venv
 PY     := $(VENV)/bin/python
@@ -34,7 +34,7 @@ export-onnx: OUT ?= encoder.onnx
 export-onnx: FRAMES ?= 1
 
 # The demo learns from scratch in minutes on two cores: small towers, contact frames less the untouched gel, and each
-# touch against all others of its batch (experiments/teaching.py says why).
+# touch against all others of its batch (experiments/tables/teaching.py says why).
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --loader.background subtract --loader.contact-only --loader.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps $(DEMO_STEPS1) --batch 48
@@ -90,7 +90,7 @@ probe: $(STAMP) $(scenes) ## linear and kNN probes of a run on a label column: [
 	$(ANYTOUCH) probe --run $(RUN) --data $(DATA) --label $(LABEL)
 
 parity: $(STAMP) ## compare with recorded outputs of the authors' code: [GOLDEN=]
-	$(ANYTOUCH) parity $(GOLDEN)
+	$(PY) -m tests.parity.run $(GOLDEN)
 
 test: $(STAMP) ## the quick tests, some minutes on two cores
 	$(PYTEST) -m "not slow"
@@ -108,37 +108,37 @@ format: $(STAMP) ## rewrite the sources in the project's format
 	$(PY) -m ruff format $(CHECKED)
 
 bench: $(STAMP) ## speed against error: [PRESET= BATCH= OUT= WHAT="stage1 embed ..."]; quiet the machine first
-	$(ANYTOUCH) bench $(WHAT) --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+	$(PY) -m experiments.benchmarks.run $(WHAT) --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-torch: $(TORCH)/.made
 bench-torch: $(STAMP) ## beside PyTorch, in a venv of its own: [PRESET= BATCH= OUT= WHAT=]
-	$(PY) experiments/torch_rival/run.py $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+	$(PY) -m experiments.benchmarks.pytorch.run $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
-	$(PYTHON) experiments/bench_gpu.py $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+	$(PYTHON) -m experiments.benchmarks.gpu $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="anytouch=path static=path t3=path" STUDY= QUICK=1 OUT=]
-	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/pouring.py
+	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.pouring.study
 
 translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: [RUNS="anytouch=path t3=path" STUDY= STEPS1=3000 QUICK=1 OUT=]
-	RUNS="$(RUNS)" STUDY="$(STUDY)" STEPS1="$(STEPS1)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/translation.py
+	RUNS="$(RUNS)" STUDY="$(STUDY)" STEPS1="$(STEPS1)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.translation.study
 
 long-clips: RUN ?= runs/stage2
 long-clips: $(STAMP) $(scenes) ## longer clips, what they see beside what they cost: [RUN= DATA= QUICK=1 OUT=]
-	RUN="$(RUN)" DATA="$(DATA)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) experiments/long_clips.py
+	RUN="$(RUN)" DATA="$(DATA)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.tables.long_clips
 
 export-onnx: $(ONNX)/.made
 export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]
-	$(PY) experiments/onnx_export/run.py --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
+	$(PY) -m experiments.onnx_export.run --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
 
 experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=1 MINUTES=75 CHUNK=2/5 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
-	$(PY) experiments/matrix.py$(if $(filter-out 0,$(QUICK)), --quick)$(if $(JOBS), --jobs $(JOBS))$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
+	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(JOBS), --jobs $(JOBS))$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
 notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..." RUN= DATA=]
 	@mkdir -p runs/notebooks
 	@for page in $(PAGES); do echo $$page; \
-	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$page.py && \
-	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=$(CURDIR)/experiments $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
+	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$(case $$page in pouring|translation) echo $$page/study;; *) echo tables/$$page;; esac).py && \
+	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=$(CURDIR) $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
 	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
 
 clean: ## remove .venv, builds and caches; runs stay
@@ -148,7 +148,7 @@ clean: ## remove .venv, builds and caches; runs stay
 $(SCENES)/manifest.parquet: | $(STAMP)
 	$(ANYTOUCH) simulate --out $(SCENES)
 
-$(TORCH)/.made: experiments/torch_rival/requirements.txt
+$(TORCH)/.made: experiments/benchmarks/pytorch/requirements.txt
 	$(PYTHON) -m venv $(TORCH)
 	@echo '*' > $(TORCH)/.gitignore
 	$(TORCH)/bin/python -m pip install --quiet --disable-pip-version-check -r $<

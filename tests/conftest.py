@@ -18,7 +18,9 @@ if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_disable_most_optimizations", True)
 
-sys.path.insert(0, str(Path(__file__).parent))  # runs.py, tiny_models.py
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]  # experiments, tests.parity and the tests' helpers
+
 
 jax.config.update("jax_num_cpu_devices", 4)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -10,16 +10,16 @@ import pytest
 from tiny_models import tiny_config
 from touch_world import make_touches
 
-from anytouch_jax.cli import main
-from anytouch_jax.config import Data, preset
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.evaluation import evaluation
+from anytouch_jax.cli.app import main
+from anytouch_jax.config import DataConfig, preset
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.loader import Loader, SampleError
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.loader import Loader, SampleError
+from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
-from anytouch_jax.evaluate import pouring_policy
-from anytouch_jax.evaluate.features import Encoder, Sight, embed_rows, load_encoder
+from anytouch_jax.encoder.encoder import Encoder, Sight, embed_rows, load_encoder
 from anytouch_jax.pretrain import pretrain
+from experiments.pouring import policy
 
 RNG = np.random.default_rng(0)
 GEL = RNG.integers(60, 200, (28, 28, 3), np.uint8)
@@ -33,7 +33,9 @@ def touches(tmp_path_factory):
 def settings(touches, background="subtract", **data):
     config = preset("tiny")
     data = {"batch_size": 4, "flip": 0.0, "jitter": (0.0,) * 4, "clip_share": 0.0, "background": background} | data
-    return replace(config, model=replace(config.model, image_size=28), data=Data(manifests=(str(touches),), **data))
+    return replace(
+        config, model=replace(config.model, image_size=28), data=DataConfig(manifests=(str(touches),), **data)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +107,7 @@ def test_a_sight_takes_its_first_frame_for_the_background_unless_told(encoder):
     assert [int(np.median(see(one))) for one in frames] == [128, 148]
     told = Sight(encoder, frames[1])
     assert [int(np.median(told(one))) for one in frames] == [108, 128]
-    plain = Sight(replace(encoder, config=replace(encoder.config, data=Data())))
+    plain = Sight(replace(encoder, config=replace(encoder.config, data=DataConfig())))
     np.testing.assert_array_equal(plain(GEL), GEL)
     lying = Sight(encoder, np.rot90(GEL), rotate=90)  # the background lies on its side as the frames do
     np.testing.assert_array_equal(lying(np.rot90(frames[1])), Sight(encoder, GEL)(frames[1]))
@@ -121,7 +123,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     shot = cv2.imread(str(table.file(row)))
     cv2.imwrite(str(frames / "0.png"), shot)
     ground = table.file(row, "background_path")
-    monkeypatch.setattr("anytouch_jax.evaluate.features.load_encoder", lambda _: encoder)
+    monkeypatch.setattr("anytouch_jax.encoder.encoder.load_encoder", lambda _: encoder)
     words = ["embed", "--run", "unused", "--input", str(frames), "--sensor", str(table.value(row, "sensor"))]
     assert main([*words, "--out", str(tmp_path / "a.npz"), "--background", str(ground)]) == 0
     assert "first frame" not in capsys.readouterr().err
@@ -168,15 +170,15 @@ def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
 def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder):
     frames = RNG.integers(100, 150, (9, 2, 28, 28, 3), np.uint8)
     where = np.array([[0, 1], [3, 0]])
-    clips = pouring_policy.segments(encoder, frames, where, 3)
+    clips = policy.segments(encoder, frames, where, 3)
     np.testing.assert_array_equal(clips[1, 2], frames[5, 0].astype(int) - frames[0, 0] + 128)
     np.testing.assert_array_equal(clips[0, 0], np.full_like(GEL, 128))
 
 
 def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
     frames = RNG.integers(100, 150, (3, 2, 28, 28, 3), np.uint8)
-    shown = pouring_policy.seen(encoder, frames, frames[0])
+    shown = policy.seen(encoder, frames, frames[0])
     assert (shown[0] == 128).all() and shown.dtype == np.uint8
     np.testing.assert_array_equal(shown[2, 1], frames[2, 1].astype(int) - frames[0, 1] + 128)
-    plain = Encoder(replace(encoder.config, data=Data()), encoder.params, "")
-    assert pouring_policy.seen(plain, frames, frames[0]) is frames
+    plain = Encoder(replace(encoder.config, data=DataConfig()), encoder.params, "")
+    assert policy.seen(plain, frames, frames[0]) is frames

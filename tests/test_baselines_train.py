@@ -9,11 +9,11 @@ import pytest
 from runs import arrays_of, read_metrics, run_config, train
 from touch_world import make_touches
 
-from anytouch_jax import baselines
-from anytouch_jax.cli import main
-from anytouch_jax.evaluate.features import load_encoder
-from anytouch_jax.io import checkpoint
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.cli.app import main
+from anytouch_jax.config import baselines
+from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.weights import checkpoint
+from anytouch_jax.weights.tree import flatten
 
 STILLS = np.random.default_rng(0).integers(0, 256, (2, 28, 28, 3), np.uint8)
 EVERY = [(name, stage) for name, one in baselines.BASELINES.items() for stage in one.stages]

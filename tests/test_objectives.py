@@ -12,11 +12,11 @@ from tiny_models import tiny_config
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import preset
-from anytouch_jax.io.tree import flatten
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.mesh import batch_sharding, make_mesh, put_batch, replicated
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step, merge
+from anytouch_jax.weights.tree import flatten
 
 RNG = np.random.default_rng(0)
 SENSOR = jnp.asarray([0, 3, 1, 9])

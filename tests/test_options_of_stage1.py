@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from tiny_models import tiny_config
 
-from anytouch_jax import baselines, objectives
+from anytouch_jax import objectives
 from anytouch_jax.batch import TouchBatch
+from anytouch_jax.config import baselines
 from anytouch_jax.nn.functional import build
 from anytouch_jax.ops import losses, masking
 from anytouch_jax.train.optim import optimizer

@@ -15,15 +15,16 @@ import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 from touch_world import make_touches
 
-from anytouch_jax.cli import main
-from anytouch_jax.config import SENSORS, UserError, from_json, to_json
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data import text as texts
-from anytouch_jax.data.loader import Loader
-from anytouch_jax.io import checkpoint, release
-from anytouch_jax.io.resize import resize_position
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.cli.app import main
+from anytouch_jax.config import SENSORS, from_json, to_json
+from anytouch_jax.data import tokenizer as texts
+from anytouch_jax.data.loading.loader import Loader
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
+from anytouch_jax.weights import checkpoint, release
+from anytouch_jax.weights.resize import resize_position
+from anytouch_jax.weights.tree import flatten
 
 TESTS = Path(__file__).parent
 ALONE = """

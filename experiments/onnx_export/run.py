@@ -18,12 +18,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from anytouch_jax.commands.output import check_folder
-from anytouch_jax.config import UserError, to_json
-from anytouch_jax.evaluate.export import call_of
-from anytouch_jax.evaluate.features import check_frames, load_encoder
-from anytouch_jax.evaluate.names import describes
-from anytouch_jax.io.checkpoint import export_safetensors
+from anytouch_jax.cli.output import check_folder
+from anytouch_jax.config import to_json
+from anytouch_jax.encoder.encoder import check_frames, load_encoder
+from anytouch_jax.encoder.export import call_of
+from anytouch_jax.encoder.names import describes
+from anytouch_jax.errors import UserError
+from anytouch_jax.weights.checkpoint import export_safetensors
 
 BATCHES = (1, 5)
 

@@ -18,10 +18,10 @@ import onnxruntime
 from jax2onnx import to_onnx
 from safetensors import safe_open
 
-from anytouch_jax.config import Model, from_json
-from anytouch_jax.io.tree import nest
+from anytouch_jax.config import ModelConfig, from_json
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.weights.tree import nest
 
 TOLERANCE = 1e-4  # of the largest feature
 
@@ -29,7 +29,7 @@ TOLERANCE = 1e-4  # of the largest feature
 def encoder_of(folder: Path):
     """(touches, sensor) -> features, with the parameters inside."""
     with safe_open(folder / "params.safetensors", framework="numpy") as file:
-        model = from_json(file.metadata()["model"], Model)
+        model = from_json(file.metadata()["model"], ModelConfig)
         params = nest({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
     net = build(replace(model, attention="xla"))  # the form that takes any number of touches
 

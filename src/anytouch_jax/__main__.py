@@ -2,6 +2,6 @@
 
 import sys
 
-from anytouch_jax.cli import console
+from anytouch_jax.cli.app import console
 
 sys.exit(console())

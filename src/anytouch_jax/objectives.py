@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, Model
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, ModelConfig
 from anytouch_jax.nn.functional import Net
-from anytouch_jax.ops import losses, masking, tokens, universal
+from anytouch_jax.ops import losses, masking, sensor_tokens, tokens
 
 Params = dict[str, Any]
 Metrics = dict[str, Array]
@@ -219,7 +219,7 @@ def stage2_terms(
 Touches = list[tuple[Array, Array]]
 
 
-def _touches(batch: Stage2Batch, model: Model) -> tuple[Touches, Touches]:
+def _touches(batch: Stage2Batch, model: ModelConfig) -> tuple[Touches, Touches]:
     """The touches that a batch embeds: those to align (without a next frame), and those to match: anchor, positive and,
     where a head tells pairs apart one by one, negative."""
     align, match = batch
@@ -261,9 +261,11 @@ def stage2_loss(
 
 def _draw(sensor: Array, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, Array]:
     """p_u at `progress`, and the sensor rows after the draw (Eq. 7), one draw a sample."""
-    p_u = universal.universal_probability(progress, config.objective.universal_start, config.objective.universal_end)
+    p_u = sensor_tokens.universal_probability(
+        progress, config.objective.universal_start, config.objective.universal_end
+    )
     uniform = jax.random.uniform(key, sensor.shape)
-    return p_u, universal.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
+    return p_u, sensor_tokens.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
 
 
 def _draw_match(batch: MatchBatch, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, MatchBatch]:

@@ -15,19 +15,20 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, UserError, from_json
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data import sources
-from anytouch_jax.data import text as texts
-from anytouch_jax.data.loader import Loader
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, from_json
+from anytouch_jax.data import tokenizer as texts
+from anytouch_jax.data.loading import sources
+from anytouch_jax.data.loading.loader import Loader
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import figures
-from anytouch_jax.io import checkpoint, fits, release
-from anytouch_jax.io.record import steps
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
-from anytouch_jax.train.record import alone_in, begun_with
-from anytouch_jax.train.watch import silent
+from anytouch_jax.train.metrics import alone_in, begun_with
+from anytouch_jax.train.progress import silent
+from anytouch_jax.weights import checkpoint, fits, release
+from anytouch_jax.weights.record import steps
 
 Params = dict[str, Any]
 Say = Callable[[str], None]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax import config as configuration
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.manifest import manifest as manifests
 
 
 def colour(row: int) -> tuple[int, int, int]:

@@ -1,13 +1,13 @@
 import struct
 import zlib
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from places import SHARED
 
-from anytouch_jax.config import UserError
 from anytouch_jax.data import images
+from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)
 RGB = RNG.integers(0, 256, (9, 13, 3), np.uint8)
@@ -229,10 +229,10 @@ def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
             list(images.frames_from_video(tmp_path / name))
 
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "real_touch"
+REAL = SHARED / "real_touch"
 
 
-@pytest.mark.parametrize("folder", [SHARED] if SHARED.is_dir() else [])
+@pytest.mark.parametrize("folder", [REAL] if REAL.is_dir() else [])
 def test_a_real_video(folder):
     path, *_ = sorted(folder.glob("*/**/videos/*.avi"))
     frame = next(images.frames_from_video(path))

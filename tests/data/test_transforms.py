@@ -5,10 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from anytouch_jax.config import Data
+from anytouch_jax.config import DataConfig
 from anytouch_jax.data import transforms as t
 
-PLAIN = Data(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0))
+PLAIN = DataConfig(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0))
 RNG = np.random.default_rng(0)
 CLIP = RNG.integers(0, 256, (3, 24, 32, 3), np.uint8)
 
@@ -144,18 +144,18 @@ def test_each_jitter_strength_is_its_own():
 
 def test_all_frames_of_a_clip_share_one_draw():
     same = np.stack([CLIP[0]] * 4)
-    out = t.touch_transform(same, 16, _rng(5), Data())
+    out = t.touch_transform(same, 16, _rng(5), DataConfig())
     for frame in out[1:]:
         np.testing.assert_array_equal(frame, out[0])
-    alone = t.touch_transform(CLIP[:1], 16, _rng(5), Data())
-    together = t.touch_transform(CLIP, 16, _rng(5), Data())
+    alone = t.touch_transform(CLIP[:1], 16, _rng(5), DataConfig())
+    together = t.touch_transform(CLIP, 16, _rng(5), DataConfig())
     np.testing.assert_array_equal(alone[0], together[0])
-    assert not np.array_equal(out, t.touch_transform(same, 16, _rng(6), Data()))
+    assert not np.array_equal(out, t.touch_transform(same, 16, _rng(6), DataConfig()))
 
 
 def test_augmentation_is_a_function_of_seed_epoch_and_row():
     def draw(*key):
-        return t.touch_transform(CLIP, 16, t.augmentation_rng(*key), Data())
+        return t.touch_transform(CLIP, 16, t.augmentation_rng(*key), DataConfig())
 
     base = draw(1, 2, 3)
     np.testing.assert_array_equal(base, draw(1, 2, 3))
@@ -166,7 +166,7 @@ def test_augmentation_is_a_function_of_seed_epoch_and_row():
 
 def test_inputs_are_not_touched():
     before = CLIP.copy()
-    t.touch_transform(CLIP, 24, _rng(2), Data(flip=1.0))
+    t.touch_transform(CLIP, 24, _rng(2), DataConfig(flip=1.0))
     t.vision_transform(CLIP[0], 24, _rng(2))
     np.testing.assert_array_equal(CLIP, before)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import baseline
 from anytouch_jax.evaluate.baseline import reduce
 

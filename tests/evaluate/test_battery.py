@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,24 +11,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from tiny_models import tiny_config
-
-sys.path.insert(0, str(Path(__file__).parent))  # battery_world.py
-sys.path.insert(0, str(Path(__file__).parents[1] / "data" / "readers"))  # reader_world.py
-
 from battery_world import row, simulated, table
 from reader_world import fill
+from tiny_models import tiny_config
 
-from anytouch_jax.cli import main
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.evaluation import evaluation
-from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.cli.app import main
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.readers import Options, index
+from anytouch_jax.encoder.encoder import Encoder, random_encoder
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import battery, battery_features, deals, heads
 from anytouch_jax.evaluate.battery_features import Store, digest, encoded, ordered
 from anytouch_jax.evaluate.benchmarks import BENCHMARKS, benchmark_of
-from anytouch_jax.evaluate.features import Encoder, random_encoder
 from anytouch_jax.evaluate.tasks import TASKS, Task, select
 
 WORLD = simulated()

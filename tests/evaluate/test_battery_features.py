@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from tiny_models import tiny_config
 
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.manifest import Manifest
-from anytouch_jax.data.pack import pack
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.prepare.shards import pack
+from anytouch_jax.encoder.encoder import Encoder, random_encoder
 from anytouch_jax.evaluate.battery_features import encoded, pictures
-from anytouch_jax.evaluate.features import Encoder, random_encoder
 
 ROWS = np.arange(3)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import deals
 from anytouch_jax.evaluate.choices import FOLDS
 from anytouch_jax.evaluate.deals import Rows, Sums, cuts, interval, scheme

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from touch_world import make_touches
 
-from anytouch_jax.cli import main
+from anytouch_jax.cli.app import main
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import pytest
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, logistic
 from anytouch_jax.evaluate.heads import Problem, Recipe, choose, fit
 

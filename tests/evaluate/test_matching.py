@@ -10,13 +10,14 @@ import pytest
 from runs import run_config
 from touch_world import make_touches
 
-from anytouch_jax.config import UserError, to_json
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.config import to_json
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import matching
 from anytouch_jax.evaluate.contacts import deepest_rows
 from anytouch_jax.evaluate.matching import MatchScore, auc, best_rule, draw_triples, matcher, score_matching
-from anytouch_jax.io.checkpoint import Checkpoints
 from anytouch_jax.nn.functional import build
+from anytouch_jax.weights.checkpoint import Checkpoints
 
 WAYS = ("any", "same_sensor")
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots
 from anytouch_jax.evaluate.plots import Bar, front, smoothed
 

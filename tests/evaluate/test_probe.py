@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import probe_models, probe_rows
 from anytouch_jax.evaluate.probe import knn_probe, leave_groups_out, linear_probe, majority, regression_probe
 

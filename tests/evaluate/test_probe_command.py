@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.cli.options import Probe
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import probe_command
-from anytouch_jax.options import Probe
 
 COUNT = 24
 

@@ -15,15 +15,16 @@ import numpy as np
 import pytest
 from touch_world import SENSORS, make_touches
 
-from anytouch_jax.config import UserError, from_json, to_json
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.config import from_json, to_json
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots, report
 from anytouch_jax.evaluate.matching import MatchScore
 from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, demo_report, write_report
-from anytouch_jax.evaluate.results import markdown
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval
 from anytouch_jax.evaluate.sections import Section, matching_section, retrieval_section, samples_section
-from anytouch_jax.io import checkpoint
+from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.weights import checkpoint
 
 NAMES = (RANDOM, "stage 1", "stage 2")
 

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # battery_world.py
-
 from battery_world import row, simulated, table
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import tasks
 from anytouch_jax.evaluate.tasks import TASKS, Task, available, mirrored, select
 from anytouch_jax.sim import scene

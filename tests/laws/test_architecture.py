@@ -6,12 +6,12 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
+from places import ROOT
 
 PACKAGE = "anytouch_jax"
-ROOT = Path(__file__).resolve().parents[2] / "src" / PACKAGE
+ROOT = ROOT / "src" / PACKAGE
 LONGEST = 350
 
 # room -> what of ours it may import; a dotted name is one module of a room. A room may always import itself.

@@ -11,13 +11,13 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from places import ROOT
 from tiny_models import tiny_config
 
-from anytouch_jax import cli
+from anytouch_jax.cli import app
 from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
 
-ROOT = Path(__file__).resolve().parents[2]
 README, MAKEFILE = ((ROOT / name).read_text() for name in ("README.md", "Makefile"))
 PAGES = {
     name: (ROOT / name).read_text()
@@ -40,9 +40,9 @@ def test_a_command_of_the_readme_is_understood(line: str) -> None:
     if name == "train":
         if "--data" not in args:  # the example leaves to the reader what every run needs
             args += ["--data", "m.csv", "--run", "r"]
-        cli._parse_train(args)
+        app._parse_train(args)
     else:
-        cli._parse(cli._COMMANDS[name][0], name, args)
+        app._parse(app._COMMANDS[name][0], name, args)
 
 
 def test_one_spelling_of_the_command() -> None:

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from tiny_models import tiny_config, touch_model
 
-from anytouch_jax.config import UserError
-from anytouch_jax.io import fits
-from anytouch_jax.io.release import WeightsError, inflate, to_release
-from anytouch_jax.io.shapes import param_shapes
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.touch import windows
+from anytouch_jax.weights import fits
+from anytouch_jax.weights.release import WeightsError, inflate, to_release
+from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.tree import flatten
 
 RNG = np.random.default_rng(0)
 MODEL = touch_model(patch_encoder="convolutional")

@@ -12,7 +12,7 @@ from tiny_models import STACK, full_model, touch_model
 
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.layers import gelu, quick_gelu, read_blocks, run_blocks, stacked_blocks
-from anytouch_jax.nn.product import stored
+from anytouch_jax.nn.matmul import stored
 
 X = jnp.linspace(-6, 6, 241)
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tiny_models import full_model, tiny_config, touch_model
 
-from anytouch_jax import baselines
-from anytouch_jax.io.release import WeightsError, serve_unseen, to_release
-from anytouch_jax.io.shapes import param_shapes
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.config import baselines
 from anytouch_jax.nn.functional import build
+from anytouch_jax.weights.release import WeightsError, serve_unseen, to_release
+from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.tree import flatten
 
 RNG = np.random.default_rng(0)
 SHARED, OWN = touch_model(), touch_model(patch_encoder="sensor")

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import SHARED
 
-from anytouch_jax.cli import main
-from anytouch_jax.config import UserError
-from anytouch_jax.evaluate import parity, parity_weights
-from anytouch_jax.evaluate.golden import GRADIENT, OUTPUT, Case, Row, read_cases
+from anytouch_jax.cli.app import main
+from anytouch_jax.errors import UserError
+from tests.parity import cases, weights
+from tests.parity.golden_files import GRADIENT, OUTPUT, Case, Row, read_cases
 
 HERE = Path(__file__).parent / "golden"
-ALL = Path(__file__).resolve().parents[3] / "shared" / "golden"  # the whole set, where it lies beside the checkout
+ALL = SHARED / "golden"  # the whole set, where it lies beside the checkout
 WHOLE = [case.name for case in read_cases(ALL)] if ALL.is_dir() else []
 SAVED = sorted(ALL.glob("*.pth"))
 CASES = {case.name: case for case in read_cases(HERE)}
@@ -45,12 +46,12 @@ def copied(tmp_path: Path, name: str, info=None, **changes) -> Path:
 
 
 def bad(folder: Path) -> dict[str, Row]:
-    return {row.array: row for row in parity.run(folder) if not row.good}
+    return {row.array: row for row in cases.run(folder) if not row.good}
 
 
 @pytest.mark.parametrize("name", sorted(COMPARISONS))
 def test_a_case_is_within_tolerance(name):
-    rows = parity.run_case(CASES[name])
+    rows = cases.run_case(CASES[name])
     assert {r.array: (r.error, r.tolerance, r.note) for r in rows if not r.good} == {}
     assert len(rows) >= COMPARISONS[name]
 
@@ -78,7 +79,7 @@ def test_where_all_cases_lie_the_list_of_them_is_not_empty():
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_case_of_the_whole_set_is_within_tolerance(name):
     (case,) = [case for case in read_cases(ALL) if case.name == name]
-    assert {r.array: (r.error, r.tolerance, r.note) for r in parity.run_case(case) if not r.good} == {}
+    assert {r.array: (r.error, r.tolerance, r.note) for r in cases.run_case(case) if not r.good} == {}
 
 
 @pytest.mark.slow
@@ -87,7 +88,7 @@ def test_the_authors_checkpoints_give_the_parameters_beside_them(path, tmp_path)
     stage = path.name.split("_")[0]
     for file in (path, ALL / f"{stage}_params.npz", ALL / f"{stage}_params.json"):
         shutil.copy(file, tmp_path)
-    rows = parity.run(tmp_path)
+    rows = cases.run(tmp_path)
     assert [row.case for row in rows] == [f"{stage}_params", path.name] and all(row.good for row in rows)
 
 
@@ -129,7 +130,7 @@ def test_an_unlisted_array_is_reported(tmp_path):
 def test_unknown_and_broken_cases_are_failures_not_tracebacks(tmp_path):
     (tmp_path / "Z_new.json").write_text("{}")
     (tmp_path / "A_broken.json").write_text("{}")
-    rows = parity.run(tmp_path)
+    rows = cases.run(tmp_path)
     assert [row.case for row in rows if not row.good] == ["A_broken", "Z_new"]
     assert all("understand" in row.note or "understood" in row.note for row in rows)
 
@@ -137,14 +138,14 @@ def test_unknown_and_broken_cases_are_failures_not_tracebacks(tmp_path):
 def test_a_case_in_which_nothing_is_compared_has_failed(tmp_path):
     (tmp_path / "I_pos.json").write_text("{}")
     np.savez(tmp_path / "I_pos.npz", unknown=np.zeros(3))
-    (row,) = parity.run(tmp_path)
+    (row,) = cases.run(tmp_path)
     assert not row.good and row.note == "nothing was compared"
 
 
 def test_a_broken_checkpoint_is_a_failed_case(tmp_path):
     folder = copied(tmp_path, "I_pos_embed")
     (folder / "stage1_tiny.pth").write_bytes(b"x" * 100)
-    rows = parity.run(folder)
+    rows = cases.run(folder)
     assert [row.case for row in rows if not row.good] == ["stage1_tiny.pth"] and len(rows) > 3
 
 
@@ -155,22 +156,22 @@ def test_checkpoints_that_do_not_fit_their_parameters_are_failed_cases(tmp_path,
     (folder / "stage1_tiny.pth").write_bytes(b"")
     for dropped, wrong in (("head", []), ("touch_decoder_blocks.1", None)):
         fewer = {name: array for name, array in stored.items() if dropped not in name}
-        monkeypatch.setattr(parity_weights.release, "read_weights", lambda path, fewer=fewer: fewer)
-        found = [row for row in parity.run(folder) if not row.good]
+        monkeypatch.setattr(weights.release, "read_weights", lambda path, fewer=fewer: fewer)
+        found = [row for row in cases.run(folder) if not row.good]
         assert {row.case for row in found} == ({"stage1_tiny.pth"} if wrong is None else set())
     whole = (folder / "stage1_params.npz").read_bytes()
     (folder / "stage1_params.npz").write_bytes(whole[: len(whole) // 2])  # truncated
-    found = [row for row in parity.run(folder) if not row.good]
+    found = [row for row in cases.run(folder) if not row.good]
     assert {row.case for row in found} == {"stage1_params", "stage1_tiny.pth"}
     assert all("cannot read the golden arrays" in row.note for row in found)
 
 
 def test_a_folder_without_cases_is_one_sentence(tmp_path):
     with pytest.raises(UserError, match="no golden case"):
-        parity.run(tmp_path)
+        cases.run(tmp_path)
     (tmp_path / "A_x.json").write_text("{")
     with pytest.raises(UserError, match=r"A_x\.json is not JSON"):
-        parity.run(tmp_path)
+        cases.run(tmp_path)
 
 
 def test_tolerances_are_the_larger_of_relative_and_five_times_the_noise():

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from anytouch_jax.cli import main
-from anytouch_jax.config import UserError, preset
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.loader import Loader
+from anytouch_jax.cli.app import main
+from anytouch_jax.config import preset
+from anytouch_jax.data.loading.loader import Loader
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
 from anytouch_jax.sim import dataset, scene
 from anytouch_jax.sim.scene import Scenes
-from anytouch_jax.sim.sensors import SENSORS
+from anytouch_jax.sim.sensing.sensors import SENSORS
 
 SCENES = Scenes(touches=10, objects=24, seed=4, sensors=("digit", "tac3d"), size=32, frames=4, vision=0.5, text=0.5)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 from anytouch_jax.sim import scene
 from anytouch_jax.sim.scene import Gesture, Scenes
 

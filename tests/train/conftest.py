@@ -1,14 +1,10 @@
 """Makes the toy problem of this folder importable, and compiles each of its programs once for the whole folder."""
 
-import sys
-from pathlib import Path
-
 import jax
 import pytest
 
 from anytouch_jax.train.mesh import enable_compilation_cache
 
-sys.path.insert(0, str(Path(__file__).parent))
 SETTINGS = {
     "jax_compilation_cache_dir": None,
     "jax_persistent_cache_min_compile_time_secs": 0.0,

@@ -14,17 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from places import ROOT, SUPPORT
 from runs import TIMING
 from train_toy import ROWS, stopping_batches, toy_batch, toy_batches, toy_config, toy_loss, toy_params
 
-from anytouch_jax.config import ConfigError, UserError
+from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
 from anytouch_jax.train.optim import moments
 
-TOY = Path(__file__).parent / "train_toy.py"
-SRC = Path(__file__).parents[2] / "src"
+TOY = SUPPORT / "train_toy.py"
+SRC = ROOT / "src"
 
 
 def run(run_dir, config=None, *, said=None, **more):

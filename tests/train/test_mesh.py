@@ -9,7 +9,7 @@ import pytest
 from jax.sharding import AxisType, PartitionSpec
 from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
-from anytouch_jax.config import ConfigError
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.mesh import (
     batch_sharding,
     enable_compilation_cache,

@@ -10,18 +10,12 @@ import pytest
 from tiny_models import tiny_config
 from train_toy import toy_config, toy_params
 
-from anytouch_jax.config import ConfigError, preset
-from anytouch_jax.io.shapes import param_shapes
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.config import preset
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.train.optim import (
-    depth_rate,
-    learning_rate,
-    match_rules,
-    moments,
-    optimizer,
-    schedule,
-)
+from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, moments, optimizer, schedule
+from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.tree import flatten
 
 PEAK, FLOOR = 2e-4, 1e-6
 

@@ -11,10 +11,11 @@ import pytest
 from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
-from anytouch_jax.config import ConfigError, preset
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.config import preset
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.optim import moments, optimizer, schedule
 from anytouch_jax.train.step import init_state, make_step, merge, micro_batches, split
+from anytouch_jax.weights.tree import flatten
 
 KEY = jax.random.key(5)
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data.packed import HEADER_LOCK, read_file
-from anytouch_jax.data.table import is_manifest
+from anytouch_jax.data.manifest.packed import HEADER_LOCK, read_file
+from anytouch_jax.data.manifest.schema import is_manifest
+from anytouch_jax.errors import UserError
 
 MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
 MOST_TIMES = (

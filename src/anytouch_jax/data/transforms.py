@@ -13,7 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from anytouch_jax.config import Data
+from anytouch_jax.config import DataConfig
 from anytouch_jax.data.images import ImageError, decode
 
 __all__ = [
@@ -35,7 +35,7 @@ def touch_transform(
     frames: Sequence[np.ndarray] | np.ndarray,
     size: int,
     rng: np.random.Generator,
-    config: Data,
+    config: DataConfig,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
     """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), one draw for all frames.

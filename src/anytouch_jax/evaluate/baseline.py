@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from sklearn.decomposition import PCA
 
-from ..config import UserError
-from ..data.manifest import Manifest
-from ..data.samples import read_picture
+from anytouch_jax.data.loading.samples import read_picture
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
 Size = tuple[int, int]  # rows, columns

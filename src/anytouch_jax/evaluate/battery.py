@@ -17,15 +17,15 @@ import numpy as np
 import numpy.typing as npt
 from sklearn.decomposition import PCA
 
-from ..config import UserError
-from ..data.manifest import Manifest
-from . import deals, heads, logistic
-from .battery_features import Order, Store, encoded, raw
-from .features import Encoder, Join, Pooling
-from .heads import HeadName, Problem, Recipe
-from .probe_models import Scaling, commonest
-from .results import Protocol
-from .tasks import Selection, Task, select, task_of
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import Encoder, Join, Pooling
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import deals, heads, logistic
+from anytouch_jax.evaluate.battery_features import Order, Store, encoded, raw
+from anytouch_jax.evaluate.heads import HeadName, Problem, Recipe
+from anytouch_jax.evaluate.probe_models import Scaling, commonest
+from anytouch_jax.evaluate.statistics import Protocol
+from anytouch_jax.evaluate.tasks import Selection, Task, select, task_of
 
 Array = npt.NDArray[Any]
 

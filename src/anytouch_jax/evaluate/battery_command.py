@@ -7,18 +7,19 @@ import json
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
-from anytouch_jax.config import UserError, preset
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.config import preset
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.encoder import check_frames, load_encoder, random_encoder
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import battery
 from anytouch_jax.evaluate.benchmarks import benchmark_of
-from anytouch_jax.evaluate.features import check_frames, load_encoder, random_encoder
 from anytouch_jax.evaluate.given import given
 from anytouch_jax.evaluate.heads import HeadName
-from anytouch_jax.evaluate.results import markdown
+from anytouch_jax.evaluate.statistics import markdown
 from anytouch_jax.evaluate.tasks import TASKS, available, task_of
 
 if TYPE_CHECKING:
-    from anytouch_jax.options import Probe
+    from anytouch_jax.cli.options import Probe
 
 RAW = "raw pixels"
 

@@ -15,14 +15,14 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
-from ..data.evaluation import evaluation
-from ..data.files import distinct_files
-from ..data.manifest import Manifest
-from ..data.packed import read_file, split_packed
-from ..io.tree import flatten
-from . import baseline
-from .features import Encoder, Features, Join, Pooling, check_backgrounds, save_npz
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest.files import distinct_files
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.packed import read_file, split_packed
+from anytouch_jax.encoder.encoder import Encoder, Features, Join, Pooling, check_backgrounds, save_npz
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import baseline
+from anytouch_jax.weights.tree import flatten
 
 Array = npt.NDArray[Any]
 Order = Literal["right", "shuffled", "repeated"]

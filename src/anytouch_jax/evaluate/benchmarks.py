@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..config import UserError
-from .features import Pooling
-from .heads import Recipe
-from .tasks import Task
+from anytouch_jax.encoder.encoder import Pooling
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.heads import Recipe
+from anytouch_jax.evaluate.tasks import Task
 
 
 @dataclass(frozen=True)

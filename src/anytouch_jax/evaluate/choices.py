@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
+from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
 

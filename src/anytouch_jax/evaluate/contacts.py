@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from ..config import UserError
-from ..data.manifest import Manifest
-from .features import text_column
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
 

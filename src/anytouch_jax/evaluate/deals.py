@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
-from .choices import dealt
-from .results import Protocol, group_draws
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.choices import dealt
+from anytouch_jax.evaluate.statistics import Protocol, group_draws
 
 Array = npt.NDArray[Any]
 

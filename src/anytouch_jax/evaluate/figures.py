@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.files import write_whole
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import tokens
-from anytouch_jax.whole import write_whole
 
 _GREY, _GAP = 128, 4
 

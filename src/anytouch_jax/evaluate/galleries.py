@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
+from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
 Metric = Literal["cosine", "euclidean"]

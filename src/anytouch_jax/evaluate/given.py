@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
-from ..data.manifest import Manifest
-from ..io.tensors import read_npz
-from .battery_features import Store
-from .features import text_column
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.battery_features import Store
+from anytouch_jax.weights.tensors import read_npz
 
 Array = npt.NDArray[Any]
 

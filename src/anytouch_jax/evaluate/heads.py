@@ -15,10 +15,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
-from . import logistic
-from .choices import NEIGHBOURS, PENALTIES, RIDGE, best_of, thinned
-from .probe_models import Scaling, nearest, ridge, standard, vote
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import logistic
+from anytouch_jax.evaluate.choices import NEIGHBOURS, PENALTIES, RIDGE, best_of, thinned
+from anytouch_jax.evaluate.probe_models import Scaling, nearest, ridge, standard, vote
 
 Array = npt.NDArray[Any]
 HeadName = Literal["linear", "knn", "gradient"]

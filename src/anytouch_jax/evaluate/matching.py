@@ -15,14 +15,15 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError, from_json
-from ..data.manifest import Manifest
-from ..data.matching import Keys, Matches
-from ..io import checkpoint
-from ..nn.functional import build
-from ..ops.losses import normalise
-from .features import text_column
-from .results import mean_interval
+from anytouch_jax.config import from_json
+from anytouch_jax.data.loading.matching import Keys, Matches
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.nn.functional import build
+from anytouch_jax.ops.losses import normalise
+from anytouch_jax.weights import checkpoint
 
 Array = npt.NDArray[Any]
 Negatives = Literal["any", "same_sensor"]

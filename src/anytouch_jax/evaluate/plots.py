@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.whole import write_whole
-
-from ..config import UserError
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

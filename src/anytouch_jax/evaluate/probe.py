@@ -18,11 +18,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
-from .choices import NEIGHBOURS, PENALTIES, RIDGE
-from .probe_models import Linear, Scaling, commonest, nearest, path, ridge, vote
-from .probe_rows import Rows, Scores, bootstraps, choose, folded, prepare
-from .results import Outcome, ProbeResult, Protocol, RegressionResult, mean_interval, parts_of, r2_interval
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.choices import NEIGHBOURS, PENALTIES, RIDGE
+from anytouch_jax.evaluate.probe_models import Linear, Scaling, commonest, nearest, path, ridge, vote
+from anytouch_jax.evaluate.probe_rows import Rows, Scores, bootstraps, choose, folded, prepare
+from anytouch_jax.evaluate.statistics import (
+    Outcome,
+    ProbeResult,
+    Protocol,
+    RegressionResult,
+    mean_interval,
+    parts_of,
+    r2_interval,
+)
 
 Array = npt.NDArray[Any]
 

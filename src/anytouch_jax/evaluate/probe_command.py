@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from anytouch_jax.config import FIELD_SENSORS, Config, UserError, preset
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.config import FIELD_SENSORS, Config, preset
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.encoder import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import baseline, probe
-from anytouch_jax.evaluate.features import Encoder, check_frames, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.evaluate.given import given
 from anytouch_jax.evaluate.probe_rows import prepare
 from anytouch_jax.evaluate.saved_heads import head_of, save_head
 
 if TYPE_CHECKING:
-    from anytouch_jax.options import Probe
+    from anytouch_jax.cli.options import Probe
 
 Say = Callable[[str], None]
 RAW = "raw pixels"

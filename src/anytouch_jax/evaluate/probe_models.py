@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from . import logistic
-from .logistic import Logistic
+from anytouch_jax.evaluate import logistic
+from anytouch_jax.evaluate.logistic import Logistic
 
 Array = npt.NDArray[Any]
 Scaling = Literal["column", "common"]

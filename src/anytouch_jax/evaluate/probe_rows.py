@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import UserError
-from .choices import FOLDS, best_of, dealt, thinned
-from .results import Protocol
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.choices import FOLDS, best_of, dealt, thinned
+from anytouch_jax.evaluate.statistics import Protocol
 
 Array = npt.NDArray[Any]
 Scores = Callable[[Array, Array, Sequence[float]], list[float]]  # (fit rows, scored rows, options) -> higher is better

@@ -16,17 +16,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.whole import write_whole
-
-from ..config import FIELD_SENSORS, UserError
-from ..data import manifest as manifests
-from ..data.manifest import Manifest
-from ..io import checkpoint
-from . import baseline, matching, probe, results, retrieval, space
-from .baseline import background_difference
-from .contacts import contact_vector, deepest_rows
-from .features import Encoder, embed_rows, load_encoder, random_encoder, text_column
-from .sections import (
+from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import baseline, geometry, matching, probe, retrieval, statistics
+from anytouch_jax.evaluate.baseline import background_difference
+from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
+from anytouch_jax.evaluate.sections import (  # fmt: skip
     Section,
     losses_section,
     matching_section,
@@ -35,7 +33,9 @@ from .sections import (
     retrieval_section,
     samples_section,
     space_section,
-)  # fmt: skip
+)
+from anytouch_jax.files import write_whole
+from anytouch_jax.weights import checkpoint
 
 Array = npt.NDArray[Any]
 Say = Callable[[str], None]
@@ -67,7 +67,7 @@ def write_report(
             lines.append(f"![{section.title}](figures/{_placed(section.figure, folder / 'figures' / name)})")
         lines += [part.strip() for part in (section.table, section.notes) if part]
     if numbers is not None:
-        write_whole(folder / "report.json", json.dumps(results.plain(numbers), indent=2, allow_nan=False) + "\n")
+        write_whole(folder / "report.json", json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n")
     write_whole(folder / "report.md", "\n\n".join(lines) + "\n")
     return folder / "report.md"
 
@@ -192,7 +192,7 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
     shown = (first.config.data.background, second.config.data.background)
     if shown[0] != shown[1]:
         lineage += f" Stage 1 sees touches with background {shown[0]}, stage 2 with background {shown[1]}."
-    counted = results.markdown(("split", "frames", "touches", "objects", "sensors"), rows)
+    counted = statistics.markdown(("split", "frames", "touches", "objects", "sensors"), rows)
     return Section("Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else "")
 
 
@@ -241,7 +241,7 @@ def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
     return rows
 
 
-def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[space.Space]]:
+def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[geometry.Space]]:
     rows = study.test(study.rows)
     sensors, objects = text_column(study.manifest, "sensor")[rows], text_column(study.manifest, "object")[rows]
     touch = study.manifest.codes("touch", own=True)[rows]
@@ -249,8 +249,8 @@ def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[space.Spa
     found, points = [], {}
     for name, values in study.classes.items():
         here = study.test(values)
-        found.append(space.describe(here, sensors, objects, touch, name=name))
-        points[name] = space.tsne(here[shown], seed=seed)
+        found.append(geometry.describe(here, sensors, objects, touch, name=name))
+        points[name] = geometry.tsne(here[shown], seed=seed)
     return space_section(found, points, sensors[shown], objects[shown], out), found
 
 
@@ -309,7 +309,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
         features[PIXELS] = baseline.reduce(study.pixels, study.split == "train")
     objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
     groups = np.where(objects == "", sequences, objects)
-    found: dict[str, list[results.Result]] = {}
+    found: dict[str, list[statistics.Result]] = {}
     for label in (*LABELS, *QUANTITIES):
         name = f"label.{label}"
         if name not in table.table.column_names:
@@ -327,7 +327,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     return probes_section(found, notes, out), {"found": found, "notes": notes}
 
 
-def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> results.Result:
+def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> statistics.Result:
     if measured:
         return probe.regression_probe(x, labels, groups, split, name=name)
     # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import FIELD_SENSORS, UserError
-from ..data.manifest import Manifest
-from .contacts import COVARIATES, deepest_rows, numbers
-from .features import text_column
-from .galleries import GALLERY, Galleries, Metric, draw_galleries, score, texts
-from .results import mean_interval
+from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.contacts import COVARIATES, deepest_rows, numbers
+from anytouch_jax.evaluate.galleries import GALLERY, Galleries, Metric, draw_galleries, score, texts
+from anytouch_jax.evaluate.statistics import mean_interval
 
 Array = npt.NDArray[Any]
 ALL = "all"

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import expit, softmax
 
-from ..config import UserError
-from ..whole import replacing
-from .probe_models import Linear
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.probe_models import Linear
+from anytouch_jax.files import replacing
 
 if TYPE_CHECKING:
-    from .features import Pooling
+    from anytouch_jax.encoder.encoder import Pooling
 
 Array = npt.NDArray[Any]
 FORMAT = "anytouch_jax.head.1"

@@ -12,21 +12,21 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..config import FIELD_SENSORS, Config, from_json
-from ..data.contact import known_contact
-from ..data.evaluation import evaluation
-from ..data.images import decode
-from ..data.manifest import Manifest
-from ..data.packed import read_file
-from ..io import checkpoint
-from ..nn.attention import usable
-from ..nn.functional import build
-from . import matching, plots, results, retrieval
-from .contacts import deepest_rows
-from .features import text_column
-from .figures import reconstruction_panels, write_png
-from .pixels import pixel_scores
-from .space import Space
+from anytouch_jax.config import FIELD_SENSORS, Config, from_json
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.packed import read_file
+from anytouch_jax.data.prepare.contact import known_contact
+from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.evaluate import matching, plots, retrieval, statistics
+from anytouch_jax.evaluate.contacts import deepest_rows
+from anytouch_jax.evaluate.figures import reconstruction_panels, write_png
+from anytouch_jax.evaluate.geometry import Space
+from anytouch_jax.evaluate.reconstruction import pixel_scores
+from anytouch_jax.nn.attention import usable
+from anytouch_jax.nn.functional import build
+from anytouch_jax.weights import checkpoint
 
 Array = npt.NDArray[Any]
 _SHOWN = 5  # touches in a sample grid
@@ -118,7 +118,7 @@ def losses_section(runs: Mapping[str, Path], folder: Path) -> Section:
             if len(values):
                 smooth = plots.smoothed(values)
                 rows.append((title, name.replace("_", " "), str(len(lines)), f"{smooth[0]:.3f}", f"{smooth[-1]:.3f}"))
-    table = results.markdown(("run", "term", "steps", "at the start", "at the end"), rows)
+    table = statistics.markdown(("run", "term", "steps", "at the start", "at the end"), rows)
     return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
 
 
@@ -167,7 +167,7 @@ def _pixels_table(scores: Mapping[str, Any]) -> str:
         (words, *(f"{scores[key]:.4f}" for key in (term, *(f"{kind} {term}" for kind in rivals))))
         for term, words in terms.items()
     ]
-    return results.markdown((f"error on {scores['clips']} clips in contact", "stage 1", *rivals.values()), rows)
+    return statistics.markdown((f"error on {scores['clips']} clips in contact", "stage 1", *rivals.values()), rows)
 
 
 def _deepest_of_sensors(manifest: Manifest, rows: Array) -> Array:
@@ -195,7 +195,7 @@ def space_section(
         "best). Uniformity: lower is more even. Silhouette (-1 to 1): a low one by sensor and a high one by object is "
         "what alignment is for."
     )
-    return Section("The space of touches", text, results.markdown(head, rows), path)
+    return Section("The space of touches", text, statistics.markdown(head, rows), path)
 
 
 def retrieval_section(
@@ -227,8 +227,8 @@ def retrieval_section(
         ahead += [(grade, name, _change(*change)) for name, change in changes[grade].items()]
     head = ("data", "features", "top-1 matched", "top-5 matched", "top-1 matched, centred", "top-1 by chance",
             "top-1 by chance, centred", "gallery", "queries")  # fmt: skip
-    table = results.markdown(head, rows) + f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
-    table += results.markdown(("data", "features", f"{best} minus these"), ahead)
+    table = statistics.markdown(head, rows) + f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
+    table += statistics.markdown(("data", "features", f"{best} minus these"), ahead)
     path = folder / "figures" / "retrieval.png"
     if panels:
         plots.bars(path, panels, label="top-1")
@@ -252,7 +252,7 @@ def matching_section(found: Sequence[matching.MatchScore], notes: Sequence[str])
         "other. In brackets: 95 % over objects drawn anew."
     )
     listed = "\n".join(f"- {note}" for note in notes)
-    table = results.markdown(*matching.table(found)) if found else ""
+    table = statistics.markdown(*matching.table(found)) if found else ""
     return Section("Cross-sensor matching", text, table, notes=listed)
 
 
@@ -273,12 +273,12 @@ def _ahead(pooled: Mapping[Any, retrieval.Retrieval], names: Sequence[str], best
     }  # fmt: skip
 
 
-def probes_section(found: Mapping[str, Sequence[results.Result]], notes: Sequence[str], folder: Path) -> Section:
+def probes_section(found: Mapping[str, Sequence[statistics.Result]], notes: Sequence[str], folder: Path) -> Section:
     """Probes {label: results of several features}: accuracy of classes, R2 of quantities, on objects never seen."""
     parts, panels = [], {}
     for label, several in found.items():
-        parts.append(f"### {label}\n\n{results.to_table(several).strip()}")
-        classified = [one for one in several if isinstance(one, results.ProbeResult)]
+        parts.append(f"### {label}\n\n{statistics.to_table(several).strip()}")
+        classified = [one for one in several if isinstance(one, statistics.ProbeResult)]
         if classified:
             panels[label] = {one.probe: plots.Bar(one.accuracy, one.low, one.high, one.baseline) for one in classified}
     path = folder / "figures" / "probes.png"

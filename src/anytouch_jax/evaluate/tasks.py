@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from ..config import UserError
-from ..data.contact import known_contact
-from ..data.manifest import KEYS, Manifest
-from .features import text_column
+from anytouch_jax.data.manifest.manifest import KEYS, Manifest
+from anytouch_jax.data.prepare.contact import known_contact
+from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
 Which = Literal["all", "press", "contact", "moving"]

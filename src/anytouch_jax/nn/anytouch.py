@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import Model
+from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.clip import ImageTower, TextEncoder
 from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
@@ -27,7 +27,7 @@ class Lora(nnx.Module):
         self.a, self.b = table(depth, width, rank), table(depth, rank, width)
 
 
-def _matcher(model: Model) -> Mlp | Dense | None:
+def _matcher(model: ModelConfig) -> Mlp | Dense | None:
     """The matching head of Eq. 5: an MLP (paper), one linear layer (release), or none (as for cosines). Its logits
     are float32 at least, as those of every contrast."""
     model = replace(model, dtype="float32") if model.dtype == "bfloat16" else model
@@ -39,7 +39,7 @@ def _matcher(model: Model) -> Mlp | Dense | None:
 class AnyTouch(nnx.Module):
     """The whole network. Parts that the config leaves out do not exist and cost nothing."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ModelConfig) -> None:
         self.touch = TouchEncoder(model)
         self.decoder = TouchDecoder(model)
         self.frames, self.embed = model.frames, model.embed

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from anytouch_jax.config import Model
+from anytouch_jax.config import ModelConfig
 
 CACHE = 1_700_000  # bytes of logits at a time: what stays in a core's cache; six heads of a still at 262 tokens
 
@@ -32,7 +32,7 @@ def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, m
     return jax.nn.dot_product_attention(q, k, v, mask=keys, is_causal=causal, implementation=known)
 
 
-def usable(model: Model) -> Model:
+def usable(model: ModelConfig) -> ModelConfig:
     """`model` with a form of attention that this machine has: what cuDNN trained can be used where there is none."""
     there = model.attention != "cudnn" or jax.default_backend() == "gpu"
     return model if there else replace(model, attention="auto")

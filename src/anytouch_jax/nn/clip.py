@@ -6,16 +6,16 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import Model, Stack, TextTower
+from anytouch_jax.config import ModelConfig, Stack, TextTower
 from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
-from anytouch_jax.nn.product import stored
+from anytouch_jax.nn.matmul import stored
 from anytouch_jax.ops import tokens
 
 
 class ImageTower(nnx.Module):
     """ViT over [class, patches] of one photograph; embedding from the class token."""
 
-    def __init__(self, model: Model, stack: Stack) -> None:
+    def __init__(self, model: ModelConfig, stack: Stack) -> None:
         self.patch = Dense(model.patch**2 * 3, stack.width, model, bias=False)
         self.class_token = table(stack.width)
         self.position = table(model.patches + 1, stack.width)
@@ -44,7 +44,7 @@ class ImageTower(nnx.Module):
 class TextEncoder(nnx.Module):
     """Causal transformer over token ids; embedding from the end token (golden Q10)."""
 
-    def __init__(self, model: Model, tower: TextTower) -> None:
+    def __init__(self, model: ModelConfig, tower: TextTower) -> None:
         width = tower.stack.width
         self.token = table(tower.vocab, width)
         self.position = table(tower.length, width)

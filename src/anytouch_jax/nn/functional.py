@@ -15,7 +15,7 @@ import numpy as np
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import Model
+from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.lora import merge_lora
 from anytouch_jax.ops import tokens
@@ -27,7 +27,7 @@ Params = dict[str, Any]
 class Net:
     """A network as functions of its parameters, a plain nested dict of arrays."""
 
-    model: Model
+    model: ModelConfig
 
     def init(self, key: Array) -> Params:
         """Fresh float32 parameters, drawn on the host from a PRNG key: the same on every device and version."""
@@ -47,7 +47,7 @@ class Net:
         return operator.attrgetter(method)(module)(*args, **kwargs)
 
 
-def build(model: Model) -> Net:
+def build(model: ModelConfig) -> Net:
     """The network of a model configuration."""
     return Net(model)
 
@@ -84,12 +84,12 @@ def _with(params: Params, graph: Any, state: Any) -> Any:
     return nnx.merge(graph, state)
 
 
-def _drawn(abstract: Params, model: Model, key: Array) -> Params:
+def _drawn(abstract: Params, model: ModelConfig, key: Array) -> Params:
     seed = np.asarray(jax.random.key_data(key)).tolist()
     return jax.tree_util.tree_map_with_path(partial(_first_value, model=model, seed=seed), abstract)
 
 
-def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: Model, seed: list[int]) -> Array:
+def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, seed: list[int]) -> Array:
     """The initial value of the parameter at `path`: every rule of initialisation in one place."""
     name, shape = "/".join(entry.key for entry in path), leaf.shape
     last = name.rsplit("/", 1)[-1]

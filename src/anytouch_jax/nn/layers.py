@@ -12,9 +12,9 @@ from flax import nnx
 from jax import Array
 from jax.typing import DTypeLike
 
-from anytouch_jax.config import Model, Stack
+from anytouch_jax.config import ModelConfig, Stack
 from anytouch_jax.nn.attention import attention
-from anytouch_jax.nn.product import product, products_saveable, stored
+from anytouch_jax.nn.matmul import product, products_saveable, stored
 
 Activation = Callable[[Array], Array]
 
@@ -72,7 +72,7 @@ def rows_of(values: Array, ids: Array) -> Array:
 class Dense(nnx.Module):
     """A linear layer (..., inputs) -> (..., outputs): float32 parameters, arithmetic in the model's dtype."""
 
-    def __init__(self, inputs: int, outputs: int, model: Model, *, bias: bool = True) -> None:
+    def __init__(self, inputs: int, outputs: int, model: ModelConfig, *, bias: bool = True) -> None:
         self.kernel = table(inputs, outputs)
         self.bias = table(outputs) if bias else None
         self.dtype = jnp.dtype(model.dtype)
@@ -105,7 +105,7 @@ class Attention(nnx.Module):
     """Multi-head attention of (B, Q, D) over (B, S, D): `project` to q (B, Q, H, D / H) and k, v (B, S, H, D / H),
     `attend`, then `out`."""
 
-    def __init__(self, stack: Stack, model: Model) -> None:
+    def __init__(self, stack: Stack, model: ModelConfig) -> None:
         self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
         self.heads, self.how = stack.heads, model.attention
 
@@ -122,7 +122,7 @@ class Attention(nnx.Module):
 class Mlp(nnx.Module):
     """Two linear layers with an activation between them."""
 
-    def __init__(self, width: int, hidden: int, model: Model, act: Activation, outputs: int = 0) -> None:
+    def __init__(self, width: int, hidden: int, model: ModelConfig, act: Activation, outputs: int = 0) -> None:
         self.up = Dense(width, hidden, model)
         self.down = Dense(hidden, outputs or width, model)
         self.act = act
@@ -139,7 +139,7 @@ lean = nnx.remat(prevent_cse=False, policy=products_saveable)
 class Block(nnx.Module):
     """Pre-norm transformer block: x + attention(norm1 x), then x + mlp(norm2 x)."""
 
-    def __init__(self, stack: Stack, model: Model, eps: float, act: Activation) -> None:
+    def __init__(self, stack: Stack, model: ModelConfig, eps: float, act: Activation) -> None:
         self.norm1 = LayerNorm(stack.width, eps, model.dtype)
         self.attention = Attention(stack, model)
         self.norm2 = LayerNorm(stack.width, eps, model.dtype)
@@ -166,7 +166,7 @@ class Block(nnx.Module):
         return x + self.mlp(self.norm2(x))
 
 
-def stacked_blocks(stack: Stack, model: Model, eps: float, act: Activation) -> Block:
+def stacked_blocks(stack: Stack, model: ModelConfig, eps: float, act: Activation) -> Block:
     """`stack.depth` blocks as one, every parameter with a leading axis of that length."""
     return nnx.vmap(lambda: Block(stack, model, eps, act), axis_size=stack.depth)()
 

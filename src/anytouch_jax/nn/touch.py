@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import STEM, Model
+from anytouch_jax.config import STEM, ModelConfig
 from anytouch_jax.nn.layers import (
     Dense,
     LayerNorm,
@@ -21,7 +21,7 @@ from anytouch_jax.nn.layers import (
     stacked_blocks,
     table,
 )
-from anytouch_jax.nn.product import product, stored
+from anytouch_jax.nn.matmul import product, stored
 from anytouch_jax.ops import masking, tokens
 
 
@@ -31,7 +31,7 @@ class TouchPatch(nnx.Module):
     It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3, D).
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ModelConfig) -> None:
         rows = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
         self.kernel = table(*rows, model.frames, model.patch**2 * 3, model.touch.width)
         self.own, self.dtype = bool(rows), jnp.dtype(model.dtype)
@@ -54,7 +54,7 @@ class ConvolutionalPatch(nnx.Module):
     2021, "Early convolutions help transformers see better"). Nothing is read over a patch's border, so that what is
     masked stays hidden."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ModelConfig) -> None:
         few, more = STEM
         self.kernel = table(model.frames, 5 * 5 * 3, few)
         self.norm1 = LayerNorm(few, model.norm_eps, model.dtype)
@@ -92,7 +92,7 @@ def windows(x: Array, side: int) -> Array:
 class TouchEncoder(nnx.Module):
     """ViT over [class, sensor tokens, visible patches]; the architecture of CLIP's image tower."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ModelConfig) -> None:
         width = model.touch.width
         self.patch = (ConvolutionalPatch if model.patch_encoder == "convolutional" else TouchPatch)(model)
         self.class_token = table(width)
@@ -148,7 +148,7 @@ class TouchEncoder(nnx.Module):
 class TouchDecoder(nnx.Module):
     """Light ViT that paints every position from the visible ones; heads for a still and for a clip."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ModelConfig) -> None:
         width, pixels = model.decoder.width, model.patch**2 * 3
         self.embed = Dense(model.embed, width, model)
         self.mask_token = table(width)

@@ -22,14 +22,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.whole import alone, replacing, write_whole
-
-from . import captions, objects, photo, scene
-from .record import Recorder, Take
-from .scene import Recording, Scenes
-from .sensors import SENSORS
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import alone, replacing, write_whole
+from anytouch_jax.sim import scene
+from anytouch_jax.sim.recorder import Recorder, Take
+from anytouch_jax.sim.scene import Recording, Scenes
+from anytouch_jax.sim.sensing import photo
+from anytouch_jax.sim.sensing.sensors import SENSORS
+from anytouch_jax.sim.world import captions, objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches a part

@@ -14,11 +14,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config import UserError
-
-from .objects import Object, catalogue, hold_out
-from .sensors import SENSORS
-from .units import THINNEST, Unit, draw_unit
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.sensing.sensors import SENSORS
+from anytouch_jax.sim.sensing.units import THINNEST, Unit, draw_unit
+from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray
 Grade = Literal["fine", "coarse"]

@@ -15,8 +15,9 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from anytouch_jax.config import Config, UserError, to_json
-from anytouch_jax.io.checkpoint import PARTIAL, Checkpoints
+from anytouch_jax.config import Config, to_json
+from anytouch_jax.errors import UserError
+from anytouch_jax.train.distributed import Ballot, check_shared, told_by_first, whole
 from anytouch_jax.train.mesh import (
     batch_sharding,
     donated,
@@ -27,11 +28,11 @@ from anytouch_jax.train.mesh import (
     replicated,
     state_sharding,
 )
+from anytouch_jax.train.metrics import Record, alone_in, goes_on, open_run, writing
 from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.processes import Ballot, check_shared, told_by_first, whole
-from anytouch_jax.train.record import Record, alone_in, goes_on, open_run, writing
+from anytouch_jax.train.progress import Bar, Say, progress, signals, silent, to_stderr
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
-from anytouch_jax.train.watch import Bar, Say, progress, signals, silent, to_stderr
+from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
 Tree = Any
 _SIGNAL, _SKIPPED = "signal", "skipped_samples"  # beside the metrics of a step: what its ballot says

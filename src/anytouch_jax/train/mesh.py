@@ -14,7 +14,7 @@ import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from anytouch_jax.config import ConfigError
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.pack import SMALL
 
 Tree = Any

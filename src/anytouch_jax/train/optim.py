@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from anytouch_jax.config import Config, ConfigError
-from anytouch_jax.io.tree import flatten
+from anytouch_jax.config import Config
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.pack import Packing, norm, packing
+from anytouch_jax.weights.tree import flatten
 
 Array = jax.Array
 Tree = Any

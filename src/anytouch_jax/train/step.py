@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import optax
 
 from anytouch_jax.batch import AlignBatch
-from anytouch_jax.config import Config, ConfigError
-from anytouch_jax.io.tree import flatten, nest
+from anytouch_jax.config import Config
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.optim import match_rules, optimizer
 from anytouch_jax.train.pack import norm, packing
 from anytouch_jax.train.usage import used_parameters
+from anytouch_jax.weights.tree import flatten, nest
 
 __all__ = ["TrainState", "init_state", "make_step", "merge", "split", "used_parameters"]
 

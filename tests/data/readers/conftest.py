@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # reader_world.py
-
 from reader_world import Table, check_laws
 
 from anytouch_jax.data.readers import Options, index

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from reader_world import fill
 
-from anytouch_jax.config import UserError
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.readers.feel_files import strings_in_pickle
+from anytouch_jax.errors import UserError
 
 PHASES = ("before", "during", "after")
 

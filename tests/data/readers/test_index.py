@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from reader_world import fill
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.readers import READERS, Notes, Options, index, reader
 from anytouch_jax.data.readers.common import Rows, hash_split, listing, numbered
+from anytouch_jax.errors import UserError
 
 
 def _ycb(root, objects=("mug",), frames=4):

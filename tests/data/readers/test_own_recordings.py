@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from reader_world import fill
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.edit import replace_column
 from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.edit import replace_column
 from anytouch_jax.data.readers import Options, index
 from anytouch_jax.data.readers.recordings import ranked_split
+from anytouch_jax.errors import UserError
 
 
 def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):

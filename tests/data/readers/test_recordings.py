@@ -5,7 +5,7 @@ import json
 import pytest
 from reader_world import fill
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 
 
 def _visgel(root, names=("a/rec_0", "a/rec_1", "größe 3/rec 2"), frames=5, place="images"):

@@ -1,7 +1,7 @@
 import pytest
 from reader_world import fill
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 
 SENSORS = ("gelsight", "digit", "duragel")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reader_world import fill
 
-from anytouch_jax.config import UserError
+from anytouch_jax.errors import UserError
 
 REC = "0-1702507215.615537"
 

@@ -8,9 +8,8 @@ from collections import Counter
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.checks import misspelt_sensors
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.prepare.checks import misspelt_sensors
 from anytouch_jax.data.readers import (
     before,
     cloth,
@@ -29,6 +28,7 @@ from anytouch_jax.data.readers import (
     ycb_slide,
 )
 from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader
+from anytouch_jax.errors import UserError
 
 __all__ = ["READERS", "Columns", "DatasetError", "IndexReport", "Notes", "Options", "Reader", "index", "reader"]
 

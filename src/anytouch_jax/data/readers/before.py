@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet
 
-from anytouch_jax.config import UserError
-from anytouch_jax.data import manifest as manifests
-from anytouch_jax.data.edit import replace_column
-from anytouch_jax.data.manifest import Manifest
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.edit import replace_column
+from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.readers.common import Notes
+from anytouch_jax.errors import UserError
 
 _MARK = b"anytouch.index"  # in the schema of a Parquet file: the content hash with which `index` wrote it
 _FROM_FILES = ("path", "sequence", "frame_index", "stride")  # what the files on disk say, never the user

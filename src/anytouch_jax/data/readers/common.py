@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from anytouch_jax.config import UserError
 from anytouch_jax.data.images import natural
+from anytouch_jax.errors import UserError
 
 Columns = dict[str, list[Any]]
 Frames = list[tuple[int, str]]  # (frame number, file name), by number

@@ -14,7 +14,7 @@ import numpy as np
 
 from anytouch_jax.data.images import natural
 from anytouch_jax.data.readers.common import DatasetError
-from anytouch_jax.whole import write_whole
+from anytouch_jax.files import write_whole
 
 PARTS = ("train", "val", "test")
 PICTURES = {

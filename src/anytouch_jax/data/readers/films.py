@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.config import UserError
 from anytouch_jax.data.images import ImageError, frames_from_video, frames_told
 from anytouch_jax.data.readers.common import Notes, walk
-from anytouch_jax.whole import whole_folder
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import whole_folder
 
 SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from anytouch_jax.data.manifest.schema import typed_label
 from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, read_csv
-from anytouch_jax.data.table import typed_label
 
 KEYS = ("object", "sequence")
 PLAIN = ("unit", "touch", "text")  # columns of a manifest; any other one becomes label.<name>

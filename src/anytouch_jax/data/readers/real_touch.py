@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pyarrow.compute as pc
 
-from anytouch_jax.data import manifest as manifests
+from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader, walk
 
 

@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, UserError, check_spelling
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, by_stem, frame_numbers, frame_order
 from anytouch_jax.data.readers import films, label_table
 from anytouch_jax.data.readers.common import (
@@ -33,6 +33,7 @@ from anytouch_jax.data.readers.common import (
     add_recording,
     walk,
 )
+from anytouch_jax.errors import UserError
 
 CAPTION = "caption.txt"
 MANIFESTS = (".csv", ".parquet")  # such as an earlier index

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader, Rows, hash_split
-from anytouch_jax.whole import write_whole
+from anytouch_jax.files import write_whole
 
 FOLDER = "taxim_presses"
 

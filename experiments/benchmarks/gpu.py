@@ -1,0 +1,99 @@
+"""ViT-L/14 on an accelerator: steps of both stages, speed beside error, memory against batch size.
+
+    make bench-gpu PYTHON=python3
+
+Needs jax, flax, optax and numpy, nothing else; the package is read from src, not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "src"))
+
+import jax
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import statistics
+from experiments.benchmarks import machine, speed, speed_report
+from experiments.benchmarks.variants import variants_of
+from experiments.benchmarks.workloads import Workload, workloads
+
+BATCHES = (8, 16, 32, 64, 128, 256, 512)
+
+
+def fastest(rows: list[speed.Row]) -> str:
+    """The variant that a user of an accelerator wants, among those that ran."""
+    return min((row for row in rows if not row.note), key=lambda row: row.seconds).variant
+
+
+def sweep(work: Workload, rows: list[speed.Row], batches: tuple[int, ...], rounds: int) -> list[list[str]]:
+    """Speed and memory of the fastest variant, and of the one with remat, for every batch that fits."""
+    names = dict.fromkeys([fastest(rows), *(row.variant for row in rows if "remat" in row.variant and not row.note)])
+    lines = []
+    for variant in variants_of(work, jax.default_backend()):
+        if variant.name not in names:
+            continue
+        for row in speed.batch_sweep(variant, work, batches, rounds):
+            gib = f"{row.peak_bytes / 2**30:.2f}"
+            figures = [f"{row.samples_per_second:.4g}", f"{100 * row.peak_share:.0f} %", gib] if not row.note else []
+            lines.append([row.workload, variant.name, str(row.samples), *(figures or [row.note[:80], "", ""])])
+            print("  ".join(lines[-1]), file=sys.stderr, flush=True)
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", default=["stage1", "stage2", "embed"])
+    parser.add_argument("--preset", default="large", choices=("tiny", "small", "base", "large"))
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--batches", type=int, nargs="*", default=list(BATCHES), help="of the memory sweep")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    options = parser.parse_args()
+    if unknown := set(options.what) - {"stage1", "stage2", "embed"}:
+        parser.error(f"{', '.join(sorted(unknown))}: choose among stage1, stage2, embed")
+    here = machine.describe()
+    print(here.sentence(), file=sys.stderr)
+    rows: list[speed.Row] = []
+    swept: list[list[str]] = []
+
+    def save() -> Path:
+        """After every workload: a machine that is only lent may go away."""
+        heads = ("workload", "variant", "batch", "samples/s", "of its peak", "GiB")
+        text = f"# Speed against error, preset {options.preset}\n\n{here.sentence()}\n\n{speed_report.NOTES}\n\n"
+        text += speed_report.to_markdown(rows)
+        text += f"\n## Memory against batch size\n\n{statistics.markdown(heads, swept)}\n" if swept else ""
+        numbers = {"machine": dataclasses.asdict(here), "preset": options.preset, "sweep": swept}
+        return speed_report.write(
+            options.out, "gpu", text, numbers | {"rows": [speed_report.as_dict(row) for row in rows]}
+        )
+
+    def say(sentence: str) -> None:
+        print(sentence, file=sys.stderr, flush=True)
+
+    works = [work for what in options.what for work in workloads(what, options.preset, options.batch)]
+    for work in works:
+        try:
+            found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, say=say)
+        except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
+            found = [speed.Row(work.name, "none", work.samples, note=str(error).splitlines()[0])]
+        rows += found
+        print(speed_report.to_markdown(found), flush=True)
+        save()
+    for work in works:
+        if work.trains and options.batches:
+            mine = [row for row in rows if row.workload == work.name]
+            if all(row.note for row in mine):
+                continue
+            swept += sweep(work, mine, tuple(options.batches), max(2, options.rounds // 3))
+            save()
+    print(save())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # How long does a probe on 100,000 features take?
+#
+# Multinomial logistic regression with five penalties to choose from (on 20,000 rows), then the fit on all rows with
+# the one chosen: d = 384, 20 classes, spreads of the directions from 1 to 100, as a network has. Beside it, with
+# SKLEARN=1, scikit-learn's fit for that one penalty: its time, and the loss of both.
+#
+# `.venv/bin/python experiments/probe_speed.py`; `ROWS=10000` is a trial of a second.
+
+# %%
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+from sklearn.linear_model import LogisticRegression
+
+from anytouch_jax.evaluate import heads, logistic
+from anytouch_jax.evaluate.heads import Problem
+from experiments.tables import asked
+
+ROWS, OTHERS = asked.number("ROWS", 100_000), 10_000
+WIDTH, CLASSES = 384, 20
+
+rng = np.random.default_rng(0)
+mixing = np.linalg.qr(rng.normal(size=(WIDTH, WIDTH)))[0] * np.geomspace(1, 100, WIDTH)
+labels = rng.integers(CLASSES, size=ROWS + 2 * OTHERS)
+hidden = rng.normal(size=(len(labels), WIDTH)) + 0.12 * rng.normal(size=(CLASSES, WIDTH))[labels]
+features = (hidden @ mixing).astype(np.float32)
+train, val, test = slice(ROWS), slice(ROWS, ROWS + OTHERS), slice(ROWS + OTHERS, None)
+
+# %%
+start, spent = time.perf_counter(), time.process_time()
+path = heads.fit("linear", Problem(features[train], labels[train], features[val], features[test], CLASSES))
+option = heads.choose(path.val, labels[val], CLASSES)
+accuracy = heads.score(path.final(option), labels[test], CLASSES)
+wall, spent = time.perf_counter() - start, time.process_time() - spent
+penalty = path.options[option]
+print(f"{ROWS} features of {WIDTH}, {CLASSES} classes, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}:")
+print(
+    f"{wall:.1f} s ({spent:.1f} s of processor) with the choice of the penalty ({penalty:g}), accuracy {accuracy:.3f}"
+)
+
+# %%
+if asked.switch("SKLEARN"):
+    x = (features[train] - features[train].mean(0)) / features[train].std(0)
+    ours = next(logistic.path(x, labels[train], CLASSES, [penalty])).loss
+    start, spent = time.perf_counter(), time.process_time()
+    model = LogisticRegression(C=1 / (penalty * ROWS), tol=1e-4, max_iter=1000).fit(x, labels[train])
+    wall, spent = time.perf_counter() - start, time.process_time() - spent
+    right = model.predict_log_proba(x)[np.arange(ROWS), labels[train]]
+    theirs = -right.mean(dtype=np.float64) + penalty / 2 * np.sum(model.coef_.astype(np.float64) ** 2)
+    print(f"scikit-learn, that penalty alone: {wall:.1f} s ({spent:.1f} s); loss {theirs:.6f}, ours {ours:.6f}")

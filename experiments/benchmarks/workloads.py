@@ -1,0 +1,227 @@
+"""What is timed: training steps and embeddings on made-up batches, as programs ready to be compiled.
+
+Imports nothing but jax, flax, optax, numpy and what of ours stands on them: a bare accelerator image can run it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from anytouch_jax import objectives
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.config import Config, ModelConfig, Recipe, preset
+from anytouch_jax.nn.functional import build
+from anytouch_jax.ops import losses
+from anytouch_jax.train.mesh import gathering
+from anytouch_jax.train.optim import optimizer
+from anytouch_jax.train.step import init_state, make_step
+from experiments.benchmarks import flops
+
+Tree = Any
+VISION, TEXT = 0.25, 0.5  # shares of a stage-2 batch that have a photograph, a caption
+BATCHES = {"tiny": 16, "small": 16, "base": 8, "large": 4}  # samples a step, where none is asked for
+_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A thing to time: its name, its configuration, how many samples a call has and how many frames a sample.
+
+    `dense`: every row of a stage-2 batch has a slot for an image and for a text, used or not.
+    """
+
+    name: str
+    config: Config
+    samples: int
+    frames: int
+    dense: bool = False
+
+    @property
+    def trains(self) -> bool:
+        """Whether a call is a training step (or an embedding)."""
+        return not self.name.startswith("embed")
+
+    @property
+    def operations(self) -> float:
+        """Useful operations of a call; see `flops`."""
+        config, samples = self.config, self.samples
+        if not self.trains:
+            return flops.embedding(config.model, samples, self.frames)
+        if config.stage == 1:
+            return flops.stage1(config, samples, self.frames)
+        if self.name.endswith("match"):
+            return flops.match(config, samples, self.frames)
+        length = config.model.text.length if config.model.text else 0
+        return flops.align(config, samples, self.frames, _share(samples, VISION), _share(samples, TEXT), length)
+
+    def resized(self, samples: int) -> Workload:
+        """The same with another number of samples."""
+        return replace(self, samples=samples)
+
+
+def _share(samples: int, share: float) -> int:
+    return max(1, round(samples * share))
+
+
+def workloads(what: str, name: str, batch: int | None = None, recipe: Recipe = "release") -> list[Workload]:
+    """The workloads of stage1, stage2 (towers from scratch; by `recipe`) or embed for a preset."""
+    batch = batch or BATCHES[name]
+    one = replace(preset(name), run=replace(preset(name).run, steps=_STEPS))
+    if what == "stage1":
+        return [Workload("stage1 clips", one, batch, 4), Workload("stage1 stills", one, batch, 1)]
+    if what == "stage2":
+        two = preset(name, stage=2, recipe=recipe, towers="scratch")
+        two = replace(two, run=one.run)
+        return [Workload("stage2 align", two, batch, 4), Workload("stage2 match", two, max(2, batch // 2), 3)]
+    return [Workload("embed one still", one, 1, 1), Workload("embed one clip", one, 1, 3)] + (
+        [Workload("embed clips", one, batch, 3)] if batch > 1 else []
+    )
+
+
+# Batches ------------------------------------------------------------------------------------------------------------
+
+
+def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
+    """A made-up uint8 batch of a workload, the same for the same seed: noise, every sensor of the release's table."""
+    rng, side = np.random.default_rng(seed), work.config.model.image_size
+
+    def touches(frames: int) -> tuple[np.ndarray, np.ndarray]:
+        sensor = np.arange(work.samples, dtype=np.int32) % 5
+        return rng.integers(0, 256, (work.samples, frames, side, side, 3), np.uint8), sensor
+
+    if work.config.stage == 1 or not work.trains:
+        return TouchBatch(*touches(work.frames))
+    if work.name.endswith("match"):
+        return Stage2Batch(None, MatchBatch(*touches(work.frames), *touches(work.frames), *touches(work.frames)))
+    part = touches(work.frames)
+    image_row, text_row = _rows(work, VISION, 0), _rows(work, TEXT, 1)
+    image = rng.integers(0, 256, (len(image_row), side, side, 3), np.uint8)
+    text, mask = _captions(rng, work.config.model, len(text_row))
+    align = AlignBatch(*part, image, image_row, text, mask, text_row)
+    return Stage2Batch(_spread(align) if work.dense else align, None)
+
+
+def _rows(work: Workload, share: float, offset: int) -> np.ndarray:
+    """Rows of the batch that have a modality, spread evenly."""
+    count = _share(work.samples, share)
+    return np.sort((np.arange(count) * work.samples // count + offset) % work.samples).astype(np.int32)
+
+
+def _spread(align: AlignBatch) -> AlignBatch:
+    """The same batch with a slot for every row; what is not there is zeros."""
+    rows = len(align.clip)
+
+    def full(values: np.ndarray, row: np.ndarray) -> np.ndarray:
+        spread = np.zeros((rows, *values.shape[1:]), values.dtype)
+        spread[row] = values
+        return spread
+
+    slots = np.arange(rows, dtype=np.int32)
+    there = [np.where(np.isin(slots, row), slots, rows).astype(np.int32) for row in (align.image_row, align.text_row)]
+    return align._replace(
+        image=full(align.image, align.image_row),
+        image_row=there[0],
+        text=full(align.text, align.text_row),
+        text_mask=full(align.text_mask, align.text_row),
+        text_row=there[1],
+    )
+
+
+def _captions(rng: np.random.Generator, model: ModelConfig, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Token ids (L, S) of eight to twenty words and the end token, and which may be read."""
+    assert model.text is not None
+    vocab, length = model.text.vocab, model.text.length
+    words = rng.integers(min(8, length // 2), min(20, length - 1) + 1, count)
+    ids = rng.integers(1, vocab - 1, (count, length)).astype(np.int32)
+    at = np.arange(length)[None]
+    ids = np.where(at < words[:, None], ids, vocab - 1).astype(np.int32)
+    return ids, at <= words[:, None]
+
+
+# Programs -----------------------------------------------------------------------------------------------------------
+
+
+def first_state(config: Config) -> Tree:
+    """The state before the first step, on the device."""
+    return jax.jit(partial(init_state, config=config))(build(config.model).init(jax.random.key(0)))
+
+
+def abstract_state(config: Config) -> Tree:
+    """Its shapes; allocates nothing."""
+    return jax.eval_shape(partial(init_state, config=config), build(config.model).abstract())
+
+
+def step_of(config: Config, mesh: Mesh | None = None) -> Callable[..., Any]:
+    """The training step of a configuration, as `train.loop.fit` builds it: (state, batch, key) -> (state, metrics)."""
+    loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
+    loss_fn: Callable[..., Any] = partial(loss, net=build(config.model), config=config)
+    loss_fn = loss_fn if mesh is None else gathering(loss_fn, mesh)
+    return make_step(loss_fn, optimizer(config), total_steps=config.run.steps)
+
+
+def embed_of(config: Config) -> Callable[..., jax.Array]:
+    """(params, clip u8, sensor) -> features (B, E) float32, as `evaluate.features` computes them."""
+    net = build(config.model)
+
+    def embed(params: Tree, clip: jax.Array, sensor: jax.Array) -> jax.Array:
+        return net.apply(params, "encode", objectives.normalise_touch(clip), sensor).astype(jnp.float32)
+
+    return embed
+
+
+def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, Any]]:
+    """(params, normalised batch, noise) -> {"output", and for a training step "loss" and "gradient"}.
+
+    Nothing is drawn inside, so that the same call in float64 is the reference of all others. The output of stage 1 is
+    the painted pixels, of alignment and matching the touch embeddings, of an embedding itself.
+    """
+    net = build(config.model)
+
+    def values(params: Tree, batch: Any, noise: jax.Array) -> dict[str, Any]:
+        if not trains:
+            return {"output": net.apply(params, "encode", batch.clip, batch.sensor)}
+        trained = {name: value for name, value in params.items() if name != "decoder"} | {
+            "decoder": {name: value for name, value in params["decoder"].items() if name != "position"}
+        }
+
+        def loss(trained: Tree) -> tuple[jax.Array, Any]:
+            whole = trained | {"decoder": trained["decoder"] | {"position": params["decoder"]["position"]}}
+            return _terms(whole, batch, noise, net, config)
+
+        (value, output), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
+        return {"output": output, "loss": value, "gradient": gradient}
+
+    return values
+
+
+def _terms(params: Tree, batch: Any, noise: jax.Array, net: Any, config: Config) -> tuple[jax.Array, jax.Array]:
+    if config.stage == 1:
+        pred, _, _ = objectives.reconstruct(params, batch.clip, batch.sensor, noise, net=net, config=config)
+        value, _ = objectives.stage1_terms(params, batch.clip, batch.sensor, noise, net=net, config=config)
+        return value, pred
+    value, _ = objectives.stage2_terms(params, batch, noise, net=net, config=config)
+    clip, sensor = (batch.align or batch.match)[:2]
+    output = losses.normalise(net.apply(params, "encode", clip[:, : net.model.frames], sensor))
+    return value, output
+
+
+def normalised(batch: Any) -> Any:
+    """A uint8 batch with its pixels as float32 numpy, normalised."""
+    touch = lambda clip: np.asarray(objectives.normalise_touch(jnp.asarray(clip)))  # noqa: E731
+    if isinstance(batch, TouchBatch):
+        return batch._replace(clip=touch(batch.clip))
+    align, match = batch
+    if align is not None:
+        image = np.asarray(objectives.normalise_image(jnp.asarray(align.image)))
+        align = align._replace(clip=touch(align.clip), image=image)
+    if match is not None:
+        match = match._replace(**{name: touch(getattr(match, name)) for name in ("clip", "positive", "negative")})
+    return Stage2Batch(align, match)

@@ -1,0 +1,228 @@
+"""Recordings of pouring, of a robot or of the simulation, as demonstrations; and policies on disk.
+
+The form: a manifest whose sequences are runs, one row a moment of choice (five a second), `label.action` pour, wait or
+retract. In the first STAND moments of a run the fingers hold the cylinder while it still stands; then it is lifted. A
+column `label.choice` says what should have been done where that differs (a hand that was late). `split` test is
+learned by nobody.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.transforms import touch_evaluation
+from anytouch_jax.encoder.encoder import load_encoder, text_column
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import write_whole
+from experiments.pouring.bounds import blind_inputs, imitate_told
+from experiments.pouring.physics import ACTIONS, STAND, Task
+from experiments.pouring.policy import Head, Learning, Touch, forward
+from experiments.pouring.trials import SENSOR, START, Controller, Trials
+
+POLICY = "policy.npz"
+
+Array = npt.NDArray[Any]
+LEARNING = ("train", "val", "test")  # splits that are read; the others take no part
+WEIGHTS = "encoder.safetensors"
+
+
+class Recordings(NamedTuple):
+    """Runs as trials of B (masses are unknown: NaN), those of the test split last: `test` (B,); their sensor, and the
+    content hash of their manifest (`data`)."""
+
+    trials: Trials
+    test: Array
+    sensor: str
+    data: str
+
+    def part(self, test: bool) -> Trials:
+        """The runs of test, or those to learn from; no copy."""
+        first = len(self.test) - int(self.test.sum())
+        keep = slice(first, None) if test else slice(first)
+        over_time = {name: getattr(self.trials, name) for name in Trials._fields[2:]}
+        cut: dict[str, Any] = {name: None if x is None else x[:, keep] for name, x in over_time.items()}
+        return Trials(self.trials.poured[keep], self.trials.steps[keep], **cut)
+
+
+def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -> Path:
+    """Write trials with frames as PNG files and `manifest.parquet`, the last `held_out` of the runs as split test.
+
+    Masses stand in `label.mass` (g), which no policy reads. Gives back the manifest's path. Raises UserError.
+    """
+    import cv2
+
+    if trials.frames is None:
+        raise UserError("these demonstrations have no frames; record them with a picture size")
+    rows: list[dict[str, Any]] = []
+    if len(trials.steps) < 2:
+        raise UserError("one run is too few: of two or more, some are kept for the test")
+    first_test = len(trials.steps) - max(1, round(held_out * len(trials.steps)))
+    for run, steps in enumerate(trials.steps):
+        for moment in range(int(steps)):
+            name = f"run_{run:04d}/{moment:04d}.png"
+            png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[1]
+            write_whole(folder / name, png.tobytes(), sync=False)
+            action, choice = (ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices))
+            rows.append(
+                {"path": name, "sensor": SENSOR, "sequence": f"run_{run:04d}", "frame_index": moment,
+                 "split": "test" if run >= first_test else "train", "label.action": action, "label.choice": choice,
+                 "label.mass": float(trials.mass[moment, run]), "dataset": f"pouring {task.target:g} g"}
+            )  # fmt: skip
+    path = folder / "manifest.parquet"
+    manifests.write(manifests.from_columns({name: [row[name] for row in rows] for name in rows[0]}, path), path)
+    return path
+
+
+def read(path: Path, side: int) -> Recordings:
+    """The runs of a manifest, frames resized to `side` pixels. Raises UserError: no labels, gaps, too short a run."""
+    table = manifests.read(path)
+    split = text_column(table, "split")
+    part = np.isin(split, LEARNING)
+    if not table.present("label.action")[part].all():
+        raise UserError(f"{path}: label.action must be {', '.join(ACTIONS)} on every row of {', '.join(LEARNING)}")
+    sensors = np.unique(text_column(table, "sensor")[part])
+    if len(sensors) > 1:
+        raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
+    runs = sorted(_runs(table, path), key=lambda rows: split[rows[0]] == "test")
+    test = np.array([split[rows[0]] == "test" for rows in runs])
+    if not test.any() or test.all():
+        raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
+    steps = np.array([len(rows) for rows in runs])
+    padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
+    order = np.stack(padded, 1)  # (S, B) row numbers
+    actions = _numbers(table, "label.action")
+    choices = actions
+    if "label.choice" in table.table.column_names:
+        choices = np.where(table.present("label.choice"), _numbers(table, "label.choice"), actions)
+    frame = lru_cache(len(runs))(partial(_frame, table, side))  # a run that has ended repeats its last one
+    frames = np.stack([np.stack([frame(int(row)) for row in rows]) for rows in order])
+    unknown = np.full(order.shape, np.nan)
+    trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
+    return Recordings(trials, test, str(sensors[0]), table.content_hash)
+
+
+def _runs(table: Manifest, path: Path) -> list[Array]:
+    """The rows of each run in time. Raises UserError for a run on both sides of a split, or where there is none."""
+    split = text_column(table, "split")
+    sequences = np.where(np.isin(split, LEARNING), text_column(table, "sequence"), "")
+    names = np.unique(sequences[sequences != ""])
+    if not names.size:
+        raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
+    for name in names:
+        sides = np.unique(split[sequences == name])
+        if len(sides) > 1:
+            raise UserError(f"{path}: run {name} is in the splits {' and '.join(sides)}; a run is of one")
+    return [_ordered(table, np.flatnonzero(sequences == name), name) for name in names]
+
+
+def _ordered(table: Manifest, rows: Array, name: str) -> Array:
+    """The rows of a run in time. Raises UserError for a gap or a run without a moment of choice."""
+    number = np.array([table.value(int(row), "frame_index") for row in rows])
+    rows, number = rows[np.argsort(number)], np.sort(number)
+    stride = np.array([table.value(int(row), "stride") or 1 for row in rows])
+    gaps = np.flatnonzero(np.diff(number) != stride[1:])
+    if len(gaps):
+        raise UserError(f"run {name}: frame {number[gaps[0]]} is followed by {number[gaps[0] + 1]}, a gap or a repeat")
+    if len(rows) <= START:
+        raise UserError(f"run {name} has {len(rows)} frames; {STAND} standing ones, and more than {START} in all")
+    return rows
+
+
+def _numbers(table: Manifest, column: str) -> Array:
+    names = np.where(table.present(column), text_column(table, column), ACTIONS[0])
+    unknown = sorted(set(names) - set(ACTIONS))
+    if unknown:
+        raise UserError(f"{column} {str(unknown[0])!r} is no action; use {', '.join(ACTIONS)}")
+    return np.array([ACTIONS.index(name) for name in names], np.int32)
+
+
+def _frame(table: Manifest, side: int, row: int) -> Array:
+    return touch_evaluation([decode(table.file(row))], side)[0]
+
+
+class Agreement(NamedTuple):
+    """How a policy follows the hand on runs that it did not learn: the share of moments with the same action (mean of
+    runs), the mean share over the three actions, and |moment of turning back - the hand's| in s (median of runs)."""
+
+    share: float
+    balanced: float
+    turn: float
+
+
+def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
+    """Show the frames of recorded runs to a policy, as the hand's actions led to them; `rate` moments a second."""
+    assert trials.frames is not None
+    policy.begin(len(trials.steps))
+    said = np.stack([policy.act(frames, None) for frames in trials.frames])  # type: ignore[arg-type]
+    return compare(said, trials, rate)
+
+
+def agreement_blind(shown: Trials, unseen: Trials, learning: Learning, rate: float) -> Agreement:
+    """The agreement of the same MLP that is told the time and the hand's actions so far, not the touch."""
+    head = imitate_told(shown, blind_inputs(shown.actions)[START:], learning)
+    said = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
+    return compare(np.stack(said), unseen, rate)
+
+
+def compare(said: Array, trials: Trials, rate: float) -> Agreement:
+    """The agreement of actions `said` (S, B) with those that the hand chose."""
+    taken = trials.taken.copy()
+    taken[:START] = False
+    same = (said == trials.choices) & taken
+    by_action = [same[chosen].mean() for a in range(len(ACTIONS)) if (chosen := taken & (trials.choices == a)).any()]
+    back = ACTIONS.index("retract")
+    moment = np.arange(len(said))[:, None]
+    turns = [np.where((one == back) & taken, moment, trials.steps).min(0) for one in (said, trials.choices)]
+    late = np.abs(turns[0] - turns[1]) / rate
+    return Agreement(float((same.sum(0) / taken.sum(0)).mean()), float(np.mean(by_action)), float(np.median(late)))
+
+
+def save_policy(folder: Path, policy: Touch) -> None:
+    """Write the MLP to `policy.npz` and the encoder beside it, each in one move. Raises UserError."""
+    from anytouch_jax.config import to_json
+    from anytouch_jax.weights import checkpoint, release
+
+    folder.mkdir(parents=True, exist_ok=True)
+    encoder, head = policy.encoder, policy.head
+    about = {release.MODEL_KEY: to_json(encoder.config.model), release.BACKGROUND_KEY: encoder.config.data.background}
+    if encoder.seen is not None:
+        about[release.SEEN_KEY] = ",".join(encoder.seen)
+    checkpoint.export_safetensors(folder / WEIGHTS, encoder.params, about)
+    layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
+    layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
+    told = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}
+    data = io.BytesIO()
+    arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
+    np.savez(data, about=np.asarray(json.dumps(told | {"encoder": encoder.mark})), **arrays)
+    write_whole(folder / POLICY, data.getvalue())
+
+
+def load_policy(folder: Path | str) -> Touch:
+    """The policy that `save_policy` wrote. `begin(1)`, then `act(frame[None])` at every moment: 0 pour, 1 wait,
+    2 retract (`sim.pouring.ACTIONS`). Raises UserError when files are missing or do not belong together."""
+    folder = Path(folder)
+    encoder = load_encoder(folder / WEIGHTS)
+    try:
+        with np.load(io.BytesIO((folder / POLICY).read_bytes()), allow_pickle=False) as file:
+            arrays, told = dict(file), json.loads(str(file["about"]))
+        stills, sensor, mark = bool(told["stills"]), str(told["sensor"]), told["encoder"]
+        pooling, votes = told.get("pooling", "class"), int(told.get("votes", 1))  # of earlier policies
+        count = sum(name.startswith("w/") for name in arrays)
+        layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
+        head = Head(arrays["mean"], arrays["basis"], layers)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
+    if mark != encoder.mark:
+        raise UserError(f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}; pour again")
+    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=votes)

@@ -1,0 +1,250 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Pouring by touch alone
+#
+# A cylinder with 100 g of beads is held by two fingers, one of them a GelSight Mini. Three actions (pour, wait,
+# retract) tilt it by 0.25 degrees five times a second. Pour out 60 g, then retract, with nothing but tactile frames.
+# The paper did it with a robot; here cylinder, beads, gel and camera are simulated, and bead size, friction, grip,
+# stiffness, first pose and sensor differ from run to run. A run begins with the grip on the standing cylinder: nothing
+# else tells how soft the gel and how firm the grip is. Then it is lifted, and the actions begin. An expert that sees
+# the scales demonstrates; a small MLP over features of four segments (the last two, the first of the lifted cylinder
+# and that of the standing one) imitates it, the encoder frozen or fine-tuned.
+#
+# `make pouring` takes the encoders of Tables 2 to 4, one of each a seed, from `make experiments` (`STUDY=runs/matrix`),
+# and trains those that are not there. `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3"` takes encoders of
+# yours. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without a path an
+# untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only), `anytouch`.
+# `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is finished is
+# not done again. QUICK=1 is a trial of minutes; TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS (a thousand of
+# 84 pixels take 9 GB at the most), TUNE (steps of fine-tuning), MODES, NAME (of the page and its folder) and OUT in
+# the environment change the size and the place.
+
+# %%
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.config import preset
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import plots
+from anytouch_jax.files import write_whole
+from anytouch_jax.train.mesh import enable_compilation_cache
+from experiments.pouring import bounds as pouring_bounds
+from experiments.pouring import policy as pouring_policy
+from experiments.pouring import table
+from experiments.pouring import trials as pouring
+from experiments.pouring import tuning as pouring_tuning
+from experiments.pouring.physics import VERSION, Task
+from experiments.tables import asked, page, plan
+from experiments.tables.results import noted
+from experiments.tables.work import Work
+
+enable_compilation_cache()
+
+QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
+RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
+SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
+MODES = asked.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", table.MODES)
+TRIALS, DEMOS = asked.number("TRIALS", 10 if QUICK else 60), asked.number("DEMOS", 12 if QUICK else 1000)
+TUNE = asked.number("TUNE", 20 if QUICK else max(400, DEMOS))
+OUT = asked.path("OUT", "experiments/results")
+NAME = asked.path("NAME", "pouring-quick" if QUICK else "pouring").name
+FOLDER, PAGE = OUT / NAME, OUT / f"{NAME}.md"
+TASK = Task()
+
+if unknown := set(RUNS) - set(table.PAPER):
+    raise UserError(f"RUNS names {', '.join(table.PAPER)}, not {', '.join(sorted(unknown))}")
+
+# %% [markdown]
+# ## The rows
+#
+# Every row of a seed learns from the same demonstrations and is tried on the same runs, so that rows can be compared
+# run by run.
+
+
+# %%
+@cache
+def of_the_tables(seed: int) -> dict[str, Path]:
+    """The runs of Tables 2 to 4 by the names of the rows; the image tower of AnyTouch's is the one untouched."""
+    size = plan.QUICK if QUICK else plan.FULL
+    recipes = {"none": "anytouch", "t3": "t3", "static": "static_only", "anytouch": "anytouch"}
+    return Work(STUDY).runs({name: plan.training(size, recipe, seed) for name, recipe in recipes.items()}, size)
+
+
+def path_of(name: str, seed: int) -> str | None:
+    """The run of a row: one for all seeds, or one each."""
+    if not RUNS:
+        return str(of_the_tables(seed)[name])
+    paths = RUNS.get(name) or (RUNS.get("anytouch") if name == "static" else None)
+    return paths[seed % len(paths)] if paths else None
+
+
+@cache
+def encoder_of(name: str, seed: int) -> Encoder | None:
+    path = path_of(name, seed)
+    if path is not None:
+        return image_tower_encoder(path) if name == "none" else load_encoder(path)
+    if name == "none":
+        known = next((load_encoder(paths[0]).config for paths in RUNS.values()), preset("tiny"))
+        return random_encoder(known, seed)
+    return None
+
+
+def source_of(name: str, seed: int, encoder: Encoder) -> str:
+    """What a row's encoder is, and a mark of its weights: a run that was trained anew is another encoder."""
+    shown = "" if name in RUNS or name == "none" or not RUNS else f", {table.SHOWN}"
+    path = path_of(name, seed)
+    return f"{'untrained' if path is None else Path(path).name} (weights {encoder.mark}{shown})"
+
+
+LEARNING = asdict(pouring_policy.Learning(tune_steps=TUNE))
+del LEARNING["seed"]
+SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS, "version": VERSION, "policy": pouring_policy.VERSION}
+SETTINGS |= {name: value for name, value in LEARNING.items() if not name.startswith("tune")}
+
+
+def path_of_row(name: str, mode: str, seed: int) -> Path:
+    return FOLDER / f"{name}-{mode}-{seed}.json"
+
+
+def settings_of(mode: str) -> dict[str, Any]:
+    tuning = {name: value for name, value in LEARNING.items() if name.startswith("tune")}
+    return SETTINGS | (tuning if mode == "fine-tuned" else {})
+
+
+def finished(path: Path, settings: dict[str, Any], source: str) -> bool:
+    """Whether a row is there with these settings; one of another encoder or size is done again."""
+    found = noted(path)
+    return bool(found.get("settings") == settings and found.get("source") == source)
+
+
+FOLDER.mkdir(parents=True, exist_ok=True)
+
+
+def do_seed(seed: int) -> None:
+    learning = pouring_policy.Learning(seed=seed, tune_steps=TUNE)
+    setups, keys = pouring.draw_runs(TASK, seed + pouring_policy.UNSEEN, TRIALS)
+    shown: dict[int, pouring.Trials] = {}
+    grasps = cache(lambda side: pouring.hold(setups, side=side))
+
+    def demonstrations(side: int) -> pouring.Trials:
+        if side not in shown:
+            shown.clear()
+            shown[side] = pouring_policy.demonstrate(TASK, seed, DEMOS, side=side)
+        return shown[side]
+
+    def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float, **about: float) -> None:
+        path, about["seconds"] = path_of_row(name, mode, seed), round(time.time() - since, 1)
+        write_whole(path, table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
+        mean = pouring.error(trials.poured, TASK.target).mean
+        print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {about['seconds']:.0f} s", flush=True)
+
+    bounds = {
+        "blind": lambda: pouring_bounds.learn_blind(TASK, seed, DEMOS, learning),
+        "count": lambda: pouring.best_counter(TASK, *pouring.draw_runs(TASK, seed, DEMOS)),
+        "load": lambda: pouring_bounds.Scales(TASK, setups, pouring_bounds.learn_loads(TASK, seed, DEMOS, learning)),
+        "expert": lambda: pouring.Expert(TASK),
+    }
+    for name, make in bounds.items():
+        if not finished(path_of_row(name, "bound", seed), SETTINGS, name):
+            since = time.time()
+            write(name, "bound", pouring.run(TASK, setups, keys, make()), name, since)
+    for name in table.PAPER:
+        encoder, stills = encoder_of(name, seed), name not in table.DYNAMIC
+        if encoder is None:
+            if seed == SEEDS[0]:
+                print(f"no run is given for row {name}: it is left out")
+            continue
+        source = source_of(name, seed, encoder)
+        left = [m for m in MODES if not finished(path_of_row(name, m, seed), settings_of(m), source)]
+        todo = sorted(left, key=("frozen", "fine-tuned").index)  # fine-tuning goes on from the frozen policy
+        if not todo:
+            continue
+        since, side = time.time(), encoder.config.model.image_size
+        policy = pouring_policy.learn_frozen(encoder, demonstrations(side), learning, stills=stills)
+        for mode in todo:
+            if mode == "fine-tuned":
+                since, policy = time.time(), pouring_tuning.fine_tune(policy, demonstrations(side), learning)
+            trials = pouring.run(TASK, setups, keys, policy, side=side, grasps=grasps(side))
+            write(name, mode, trials, source, since, loss=round(policy.loss, 4))
+
+
+if not TABLE:
+    for seed in SEEDS:
+        do_seed(seed)
+
+# %% [markdown]
+# ## One demonstration, seen
+#
+# Frames of the gel while the cylinder empties, and their change from the standing cylinder: the lifted weight draws the
+# markers along, and they come back as it leaves.
+
+# %%
+figures = OUT / "figures"
+if not TABLE or not (figures / "pouring.gif").exists():
+    one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
+    last = int(one.steps[0]) - 1
+    moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
+    assert one.frames is not None
+    change = [one.frames[m, 0].astype(np.float32) - one.frames[2, 0].astype(np.float32) for m in moments]
+    standing = ["standing", *(f"{one.mass[m, 0]:.0f} g left, {one.tilt[m, 0]:.0f} deg" for m in moments[1:])]
+    plots.sample_grid(
+        figures / "pouring_frames.png",
+        [[one.frames[m, 0] for m in moments], [np.clip(128 + 2 * c, 0, 255).astype(np.uint8) for c in change]],
+        ["frame", "change x 2"],
+        standing,
+    )
+    pouring.write_film(figures / "pouring.gif", one, TASK)
+
+# %% [markdown]
+# ## The table
+
+# %%
+rows = table.read_rows(FOLDER)
+runs = {run for row in rows for run in row.runs}
+seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
+fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
+picture = f"{FOLDER.name}.png"
+table.draw(figures / picture, rows)
+settings = max((row.settings for row in rows), key=len)
+told = json.loads(settings)
+other = "" if told["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
+text = f"""# Pouring by touch alone (simulated), {told["demonstrations"]} demonstrations
+
+{len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
+    "; fewer: " + ", ".join(fewer) if fewer else ""
+}); mean
+|poured - {TASK.target:g} g| with its 95 % interval over seeds (Student's t; the runs of a seed share one policy).
+The paper's numbers are of a robot: only the order can be
+compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
+claimed of fewer than three. Each row has one encoder unless several are named below. Settings (`version` is that of the
+flow and the load, {VERSION} now):
+{settings}.
+
+{table.table(rows)}
+![errors](figures/{picture})
+![frames](figures/pouring_frames.png)
+![film](figures/pouring.gif)
+
+Made by `SEEDS={",".join(seeds)} make pouring`, from the JSON in `{FOLDER.name}/`.{other}
+"""
+write_whole(PAGE, text)
+print(text)
+for name in (picture, "pouring_frames.png"):
+    page.show(figures / name)

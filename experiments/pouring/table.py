@@ -1,0 +1,225 @@
+"""The pouring table in the paper's form, made from the JSON of its rows alone (Sec. Q3, table "real-world pouring")."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.statistics import markdown, seed_interval, verdict
+from experiments.pouring.physics import Task
+from experiments.pouring.trials import Error, Trials, error
+
+Array = npt.NDArray[Any]
+MODES = ("fine-tuned", "frozen")
+TITLES = {
+    "none": "no tactile pre-training",
+    "t3": "T3-style",
+    "static": "AnyTouch, static only",
+    "anytouch": "AnyTouch",
+    "blind": "blind: time and own actions",
+    "count": "blind: the best number of pours",
+    "load": "bound: told the load on the gel, no picture",
+    "expert": "expert: sees the scales",
+}
+PAPER = {"none": (5.22, 49.1), "t3": (2.33, 9.74), "static": (2.45, 9.60), "anytouch": (1.56, 8.22)}
+BLIND = ("blind", "count")
+SHOWN = "shown stills"  # of the run `anytouch` in place of one trained on stills: says nothing of such training
+DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the others see stills
+CLAIMS = (("anytouch", "static"), ("anytouch", "t3"), ("static", "none"), ("t3", "none"), ("anytouch", "none"))
+
+
+class Row(NamedTuple):
+    """One row and mode over all its seeds: `poured` g of each run, `runs` names them ("seed/number"), and `lost` runs
+    were never turned back."""
+
+    name: str
+    mode: str
+    poured: Array
+    runs: tuple[str, ...]
+    target: float
+    sources: tuple[str, ...]
+    settings: str
+    lost: int
+
+    @property
+    def wrong(self) -> Array:
+        """|poured - target| (n,) g."""
+        return np.abs(self.poured - self.target)
+
+    @property
+    def error(self) -> Error:
+        """Its mean, with the 95 % interval over seeds (Student's t), whose runs share one policy; of one seed over
+        its runs."""
+        each = _by_seed(self.wrong, self.runs)
+        if len(each) < 2:
+            return error(self.poured, self.target)
+        return Error(float(self.wrong.mean()), *seed_interval(each))
+
+
+def _by_seed(values: Array, runs: Sequence[str]) -> tuple[float, ...]:
+    """The mean over each seed's runs ("seed/number")."""
+    seed = np.array([run.split("/")[0] for run in runs])
+    return tuple(float(values[seed == one].mean()) for one in np.unique(seed))
+
+
+def record(
+    name: str,
+    mode: str,
+    seed: int,
+    trials: Trials,
+    task: Task,
+    source: str,
+    settings: Mapping[str, Any],
+    about: Mapping[str, Any],
+) -> str:
+    """The JSON of a row's trials with one seed; `about`: what else is known of it (seconds, the loss of learning)."""
+    found = error(trials.poured, task.target)
+    values = {
+        "row": name, "mode": mode, "seed": seed, "target": task.target, "source": source, "settings": dict(settings),
+        "poured": [round(float(x), 3) for x in trials.poured], "steps": [int(x) for x in trials.steps],
+        "mean_error": round(found.mean, 3), "limit": task.limit,
+    }  # fmt: skip
+    return json.dumps(values | dict(about), indent=2) + "\n"
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """The rows of a folder of JSON files. Raises UserError for one that cannot be read, other settings, or none."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            one = json.loads(path.read_text(encoding="utf-8"))
+            found.setdefault((one["row"], one["mode"]), []).append(one)
+        except (ValueError, KeyError, TypeError) as bad:
+            raise UserError(f"{path} is not the result of a pouring row ({bad}); remove it and run again") from None
+    if not found:
+        raise UserError(f"no result of a pouring row in {folder}; run experiments/pouring.py")
+    for tuned in (False, True):
+        common = {json.dumps(one, sort_keys=True) for one in _settings(found, tuned)}
+        if len(common) > 1:
+            raise UserError(
+                f"rows of {folder} were run with different settings ({'; '.join(sorted(common))}); remove the old"
+            )
+    return [_row(name, mode, parts) for (name, mode), parts in found.items()]
+
+
+def _settings(found: Mapping[tuple[str, str], Sequence[Mapping[str, Any]]], tuned: bool) -> list[dict[str, Any]]:
+    """The settings that rows must share to be compared: all those of fine-tuned ones; of all rows those but of that."""
+    return [
+        {name: value for name, value in one["settings"].items() if tuned or not name.startswith("tune")}
+        for (_, mode), parts in found.items()
+        for one in parts
+        if mode == "fine-tuned" or not tuned
+    ]
+
+
+def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
+    settings = {json.dumps(part["settings"], sort_keys=True) for part in parts}
+    if len(settings) > 1:
+        raise UserError(f"the seeds of row {name} ({mode}) were run with different settings; remove the old results")
+    parts = sorted(parts, key=lambda part: part["seed"])
+    runs = tuple(f"{part['seed']}/{number}" for part in parts for number in range(len(part["poured"])))
+    poured = np.concatenate([np.asarray(part["poured"], np.float64) for part in parts])
+    sources = tuple(dict.fromkeys(part["source"] for part in parts))
+    lost = sum(int(steps) >= part.get("limit", Task().limit) for part in parts for steps in part["steps"])
+    return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop(), lost)
+
+
+class Difference(NamedTuple):
+    """Mean of a paired difference of errors in g, the mean of every seed `each`, and the 95 % interval over seeds
+    (Student's t): the runs of a seed share one learned policy."""
+
+    mean: float
+    low: float | None
+    high: float | None
+    each: tuple[float, ...]
+
+
+def difference(a: Row, b: Row) -> Difference:
+    """The error of `a` minus that of `b` over the runs that both have."""
+    shared = [run for run in a.runs if run in b.runs]
+    if not shared:
+        raise UserError(f"rows {a.name} and {b.name} have no run in common; run them with the same seeds")
+    change = np.array([a.wrong[a.runs.index(run)] - b.wrong[b.runs.index(run)] for run in shared])
+    each = _by_seed(change, shared)
+    return Difference(float(change.mean()), *seed_interval(each), each)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown: mean errors beside the paper's, then each of the paper's orders with its paired difference."""
+    by = {(row.name, row.mode): row for row in rows}
+    lines = []
+    for name, title in TITLES.items():
+        if not any(row.name == name for row in rows):
+            continue
+        cells = []
+        for number, mode in enumerate(MODES):
+            row = by.get((name, mode)) or by.get((name, "bound"))
+            cells += [_cell(row) if row else "-", _paper(name, number)]
+        lines.append((title, "yes" if name in DYNAMIC else "no" if name in PAPER else "-", *cells))
+    head = ("policy", "sees segments", "fine-tuned, g", "paper", "frozen, g", "paper")
+    parts = [markdown(head, lines)]
+    trained = [row for row in rows if row.mode != "bound"]
+    if trained:
+        used = "; ".join(f"{TITLES[row.name]}, {row.mode}: {', '.join(row.sources)}" for row in trained)
+        parts.append(f"Encoders: {used}.")
+    claims = [_claim(by, mode, better, worse) for mode in MODES for better, worse in CLAIMS]
+    claims += [_claim(by, mode, name, bound) for mode in MODES for name in PAPER for bound in BLIND]
+    found = [claim for claim in claims if claim]
+    if found:
+        parts.append(
+            markdown(("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), found)
+        )
+    return "\n\n".join(parts) + "\n"
+
+
+def _claim(by: Mapping[tuple[str, str], Row], mode: str, better: str, worse: str) -> tuple[str, ...] | None:
+    a, b = by.get((better, mode)), by.get((worse, "bound" if worse in BLIND else mode))
+    if a is None or b is None or any(SHOWN in source for source in (*a.sources, *b.sources)):
+        return None
+    change = difference(a, b)
+    words = _words(Error(*change[:3]), "+.1f")
+    return TITLES[better], TITLES[worse], mode, words, verdict(change.low, change.high, len(change.each), wanted=-1)
+
+
+def _paper(name: str, mode: int) -> str:
+    return f"{PAPER[name][mode]:g}" if name in PAPER else "-"
+
+
+def _cell(row: Row) -> str:
+    return _words(row.error) + (f", {row.lost} never turned back" if row.lost else "")
+
+
+def _words(found: Error, form: str = ".1f") -> str:
+    if found.low is None or found.high is None:
+        return f"{found.mean:{form}}"
+    return f"{found.mean:{form}} ({found.low:{form}} to {found.high:{form}})"
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Every run's poured mass by row, and the row's mean error, as PNG."""
+    from matplotlib.figure import Figure
+
+    from anytouch_jax.evaluate.plots import write_figure
+
+    places = [(name, mode) for name in TITLES for mode in (*MODES, "bound")]
+    order = sorted(rows, key=lambda row: places.index((row.name, row.mode)))
+    figure = Figure(figsize=(7.5, 0.8 + 0.42 * len(order)), layout="constrained")
+    axis = figure.subplots()
+    for place, row in enumerate(order):
+        jitter = 0.5 * (np.arange(len(row.poured)) / max(len(row.poured) - 1, 1) - 0.5)
+        colour = f"C{list(TITLES).index(row.name)}"
+        axis.scatter(row.poured, place + jitter, s=14, color=colour, alpha=0.8, linewidths=0)
+    names = [f"{TITLES[row.name]}{'' if row.mode == 'bound' else ', ' + row.mode}" for row in order]
+    errors = [f"{name} ({row.wrong.mean():.1f} g)" for name, row in zip(names, order, strict=True)]
+    axis.set_yticks(range(len(order)), errors)
+    axis.axvline(order[0].target, color="#222222", linewidth=1)
+    axis.set(xlabel="poured, g (mean error in brackets)", xlim=(-2, 102))
+    axis.invert_yaxis()
+    axis.grid(axis="x", alpha=0.25)
+    write_figure(path, figure)

@@ -1,0 +1,269 @@
+"""Runs of the pouring task in batches: who chooses the actions, demonstrations of an expert, errors and a film."""
+
+from __future__ import annotations
+
+import io
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.files import write_whole
+from anytouch_jax.sim.sensing.units import stack
+from experiments.pouring import physics, render
+from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
+
+Array = npt.NDArray[Any]
+SENSOR = render.SENSOR.name
+FRAMES = 3  # of a segment
+START = STAND + FRAMES - 1  # the first moment at which somebody chooses: a segment of the lifted cylinder is complete
+
+
+class Controller(Protocol):
+    """Who chooses the actions of a batch of runs; `looks`: it is given the frames u8 (B, side, side, 3), else None."""
+
+    looks: bool
+
+    def begin(self, count: int) -> None:
+        """Forget everything: `count` runs begin."""
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,) of this moment. Only an expert may look at the state."""
+
+
+class Trials(NamedTuple):
+    """What happened in B runs of up to S actions: `poured` (B,) g, `steps` (B,) taken, `choices` and `actions` (S, B),
+    which differ only where a late hand went on, `mass` g, `tilt` degrees and `rate` g/s (S, B) before each action, and
+    the `frames` u8 (S, F, side, side, 3) of those F runs, the first ones, that were filmed, or None."""
+
+    poured: Array
+    steps: Array
+    choices: Array
+    actions: Array
+    mass: Array
+    tilt: Array
+    rate: Array
+    frames: Array | None
+
+    @property
+    def taken(self) -> Array:
+        """(S, B) bool: the moments before a run's end."""
+        return np.arange(len(self.actions))[:, None] < self.steps
+
+
+class Expert:
+    """Sees the scales: pours, waits while much is under way (if `patient`), goes back just before the target."""
+
+    looks = False
+
+    def __init__(self, task: Task, *, patient: bool = True) -> None:
+        self._task, self._patient = task, patient
+
+    def begin(self, count: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,) from the mass, the flow and whether the cylinder has been on its way back."""
+        mass, rate, tilt, highest = jax.device_get((state.mass, state.rate, state.tilt, state.highest))
+        left = self._task.target - (self._task.beads - mass)
+        back = (left <= 0.3 + 0.35 * rate) | (highest > tilt + 1e-6)
+        return np.where(back, RETRACT, np.where((rate > 0.8 + 0.2 * left) & self._patient, WAIT, POUR))
+
+
+class Replay:
+    """Does again what was done: `actions` (S, B)."""
+
+    looks = False
+
+    def __init__(self, actions: Array) -> None:
+        self._actions = actions
+
+    def begin(self, count: int) -> None:
+        """Time is 0 again."""
+        self._step = -1
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,) of this moment; the last ones for ever."""
+        self._step += 1
+        return self._actions[min(self._step, len(self._actions) - 1)]
+
+
+class Counter:
+    """Blind: pours a fixed number of times and goes back."""
+
+    looks = False
+
+    def __init__(self, pours: int) -> None:
+        self.pours = pours
+
+    def begin(self, count: int) -> None:
+        """Time is 0 again."""
+        self._step = 0
+
+    def act(self, frames: Array | None, state: State) -> Array:
+        """Actions (B,): all the same."""
+        self._step += 1
+        now = WAIT if self._step <= START else POUR if self._step <= START + self.pours else RETRACT
+        return np.full(len(state.mass), now)
+
+
+def best_counter(task: Task, setups: Setup, keys: jax.Array) -> Counter:
+    """The number of pours whose mean error over these runs is the least: the best that counting alone can do."""
+    counts = jnp.arange(0, task.limit, 4)
+
+    def end(setup: Setup, key: jax.Array, pours: jax.Array) -> jax.Array:
+        def step(state: State, number: jax.Array) -> tuple[State, None]:
+            action = jnp.where(number < START, WAIT, jnp.where(number < START + pours, POUR, RETRACT))
+            return physics.advance(state, action, setup, task), None
+
+        state, _ = jax.lax.scan(step, physics.begin(setup, task, key), jnp.arange(task.limit))
+        return physics.poured(state, task)
+
+    over_runs = jax.vmap(end, in_axes=(0, 0, None))
+    poured = jax.jit(jax.vmap(over_runs, in_axes=(None, None, 0)))(setups, keys, counts)  # (counts, runs)
+    return Counter(int(counts[np.abs(np.asarray(poured) - task.target).mean(1).argmin()]))
+
+
+def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
+    """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
+    setups = [physics.draw_setup(task, np.random.default_rng([seed % 2**63, number])) for number in range(count)]
+    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(count))
+    return stack(setups), keys
+
+
+@partial(jax.jit, static_argnames=("task",))
+def _begin(setups: Setup, keys: jax.Array, *, task: Task) -> State:
+    return jax.vmap(lambda setup, key: physics.begin(setup, task, key))(setups, keys)
+
+
+@partial(jax.jit, static_argnames=("task",))
+def _advance(state: State, actions: jax.Array, setups: Setup, *, task: Task) -> State:
+    return jax.vmap(lambda state, action, setup: physics.advance(state, action, setup, task))(state, actions, setups)
+
+
+def hold(setups: Setup, *, side: int) -> render.Grasp:
+    """The grasps of stacked runs, for pictures of `side` pixels."""
+    render.prepare()
+    return _hold(setups, side=side)
+
+
+@partial(jax.jit, static_argnames=("side",))
+def _hold(setups: Setup, *, side: int) -> render.Grasp:
+    return jax.vmap(lambda setup: render.hold(setup, side)[0])(setups)
+
+
+@partial(jax.jit, static_argnames=("task", "side"))
+def look(state: State, setups: Setup, grasps: render.Grasp, *, task: Task, side: int) -> jax.Array:
+    """The frames u8 (B, side, side, 3) of stacked runs at this moment."""
+
+    def one(state: State, setup: Setup, grasp: render.Grasp) -> jax.Array:
+        noise = jax.random.fold_in(state.key, physics.PIXELS)
+        return render.picture(grasp, setup, physics.load(state, setup, task), noise, side)
+
+    return jax.vmap(one)(state, setups, grasps)
+
+
+def run(
+    task: Task,
+    setups: Setup,
+    keys: jax.Array,
+    controller: Controller,
+    *,
+    side: int = 112,
+    film: int = 0,
+    late: Array | None = None,
+    grasps: render.Grasp | None = None,
+) -> Trials:
+    """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to `film` runs.
+
+    `film`: of so many runs, the first ones, the frames are kept.
+
+    `grasps`: those of `hold` for these runs and `side`, where they are at hand.
+    `late` (B,): a hand that goes on pouring for so many moments after it was told to retract, which then stays the
+    choice. So demonstrations show what to do where the target is already passed.
+    """
+    drawn = controller.looks or film > 0
+    if drawn and grasps is None:
+        grasps = hold(setups, side=side)
+    state = _begin(setups, keys, task=task)
+    count = len(state.mass)
+    controller.begin(count)
+    told: list[tuple[Array, ...]] = []
+    frames: list[Array] = []
+    steps, waited = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    while not np.asarray(state.done).all():
+        seen = np.asarray(look(state, setups, grasps, task=task, side=side)) if drawn else None
+        choices = np.asarray(controller.act(seen if controller.looks else None, state), np.int32)
+        if len(told) < START:
+            choices = np.full_like(choices, WAIT)
+        actions = choices
+        if late is not None:
+            choices = np.where(waited > 0, RETRACT, choices)
+            waited += choices == RETRACT
+            actions = np.where((choices == RETRACT) & (waited <= late), POUR, choices)
+        told.append((choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate))))
+        steps += ~np.asarray(state.done)
+        if seen is not None and film:
+            frames.append(seen[:film].copy())
+        state = _advance(state, actions, setups, task=task)
+    choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*told, strict=True))
+    out = np.asarray(physics.poured(state, task))
+    return Trials(out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if film else None)
+
+
+class Error(NamedTuple):
+    """Mean of |poured - target| in g over runs, with its 95 % interval (None for a single run)."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+def error(poured: Array, target: float) -> Error:
+    """The mean error of runs `poured` (n,) g with a bootstrap interval over the runs."""
+    wrong = np.abs(np.asarray(poured, np.float64) - target)
+    return Error(float(wrong.mean()), *mean_interval(wrong, np.arange(len(wrong))))
+
+
+def write_film(path: Path, trials: Trials, task: Task, *, every: int = 4) -> None:
+    """Write the first run as a GIF: the frame, beside it the mass left over time and the action. Whole or not at all.
+
+    Every `every`-th moment is shown, ten a second. Raises OSError.
+    """
+    from PIL import Image  # matplotlib cannot be had without it
+
+    if trials.frames is None:
+        raise ValueError("these trials kept no frames; run them with film=1")
+    last = int(trials.steps[0])
+    pages = [Image.fromarray(_page(trials, task, step)).quantize(64) for step in [*range(0, last - 1, every), last - 1]]
+    data = io.BytesIO()
+    pages[0].save(data, "gif", save_all=True, append_images=pages[1:], duration=100, loop=0)
+    write_whole(path, data.getvalue())
+
+
+def _page(trials: Trials, task: Task, step: int) -> Array:
+    """One page of the film, u8 RGB: drawn with OpenCV, since a figure a page would take minutes."""
+    import cv2
+
+    side, wide = 180, 260
+    assert trials.frames is not None
+    frame = cv2.resize(trials.frames[step, 0], (side, side), interpolation=cv2.INTER_CUBIC)
+    chart = np.full((side, wide, 3), 255, np.uint8)
+    last, top = int(trials.steps[0]), task.beads
+    x = 34 + np.arange(last) * (wide - 44) / max(last - 1, 1)
+    y = 30 + (side - 60) * (1 - trials.mass[:last, 0] / top)
+    goal = int(30 + (side - 60) * (task.target / top))
+    cv2.line(chart, (34, goal), (wide - 10, goal), (200, 60, 60), 1)
+    cv2.rectangle(chart, (34, 30), (wide - 10, side - 30), (160, 160, 160), 1)
+    points = np.stack([x, y], 1)[: step + 1].round().astype(np.int32)
+    cv2.polylines(chart, [points], False, (40, 90, 170), 2, cv2.LINE_AA)
+    out = task.beads - trials.mass[step, 0]
+    words = f"{ACTIONS[trials.actions[step, 0]]}   {out:.1f} g out   {trials.tilt[step, 0]:.1f} deg"
+    for text, place in ((words, (34, 20)), (f"{step / task.rate:.1f} s", (34, side - 10)), ("g left", (wide - 60, 46))):
+        cv2.putText(chart, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
+    return np.concatenate([frame, chart], 1)

@@ -1,0 +1,258 @@
+"""The pictures of the results, drawn from the JSON files alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.evaluate import plots
+from experiments.tables import adaptation, paper, questions, real
+from experiments.tables.results import Column, Run, change, spread, values
+from experiments.tables.tables import commonest, title
+
+STAGES = (
+    ("untrained", "no pre-training"),
+    ("masked", "+ masked modelling"),
+    ("aligned", "+ alignment"),
+    ("matched", "+ matching"),
+)
+MARKS = ("o", "s", "^", "D", "v")
+COLOURED = 12  # touches that get a colour and their lines; the others are grey
+
+
+def draw_all(runs: Sequence[Run], folder: Path) -> list[Path]:
+    """Every picture for which there is a run; a file is named after its question."""
+    found = []
+    for name, draw in (
+        ("q1", q1),
+        ("q2", q2),
+        ("q3", q3),
+        ("ablations", ablations),
+        ("dynamics", dynamics),
+        ("new_sensor", new_sensor),
+        ("real", real_touch),
+    ):
+        if any(run.question == name for run in runs):
+            path = draw(runs, folder / f"{name}.png")
+            found += [path] if path is not None else []
+    return found
+
+
+def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | None:
+    """Touches by three sensors in four spaces (Figure 4): a mark a sensor, a colour and dashed lines a touch.
+
+    All panels are of one `seed`: the smallest that every stage there has, else (no common one) nothing is drawn.
+    """
+    every = {(run.name, run.seed): run.about["points"] for run in runs if run.question == "q2"}
+    stages = [(name, text) for name, text in STAGES if any(name == one for one, _ in every)]
+    common = [{number for one, number in every if one == name} for name, _ in stages]
+    seeds = set.intersection(*common) if common else set()
+    if seed is None and seeds:
+        seed = min(seeds)
+    if seed is None or seed not in seeds:
+        return None
+    of = {name: every[name, seed] for name, _ in stages}
+    figure, axes = _panels(1, len(stages), 3.6, 3.8)
+    sensors = sorted({point["sensor"] for name, _ in stages for point in of[name]})
+    touches = sorted({point["touch"] for name, _ in stages for point in of[name]})
+    colours = {
+        touch: f"C{i}" if i < 10 else ("#222222", "#b5b35c")[i - 10] for i, touch in enumerate(touches[:COLOURED])
+    }
+    for axis, (name, text) in zip(axes, stages, strict=True):
+        for touch in touches:
+            mine = [point for point in of[name] if point["touch"] == touch]
+            if not mine:  # this space has no point of it
+                continue
+            colour = colours.get(touch, "#c8c8c8")
+            ring = [*mine, mine[0]]
+            if touch in colours:
+                axis.plot([p["x"] for p in ring], [p["y"] for p in ring], "--", color=colour, linewidth=0.7, zorder=1)
+            for point in mine:
+                mark = MARKS[sensors.index(point["sensor"])]
+                axis.scatter(
+                    point["x"], point["y"], s=26, color=colour, marker=mark, linewidths=0, zorder=2 + (touch in colours)
+                )
+        axis.set(title=text, xticks=[], yticks=[])
+    marks = [axes[-1].scatter([], [], s=30, color="#555555", marker=MARKS[i]) for i in range(len(sensors))]
+    title = f"seed {seed}"
+    figure.legend(marks, sensors, loc="outside lower center", ncols=len(sensors), frameon=False, title=title)
+    plots.write_figure(path, figure)
+    return path
+
+
+def q1(runs: Sequence[Run], path: Path) -> Path:
+    """The columns of Table 1 as sensors are added: the material, as there, and the form of the indenter."""
+    names = list(paper.TABLE1)
+    figure, axes = _panels(1, len(questions.FOUR), 3.0, 3.2)
+    for axis, column, form, theirs in zip(axes, questions.FOUR, questions.FORM, questions.FOUR_PAPER, strict=True):
+        _line(axis, [spread(runs, "q1", name, column) for name in names], "material", "C0")
+        _line(axis, [spread(runs, "q1", name, form) for name in names], "form", "C1")
+        axis.set_title(f"{column.title}\n(grey, right axis: paper, {theirs})", fontsize=8)
+        axis.set_xticks(
+            range(len(names)),
+            ["none", *(f"+{name.split('+')[-1]}" for name in names[1:])],
+            rotation=40,
+            ha="right",
+            fontsize=7,
+        )
+        right = axis.twinx()
+        right.plot(
+            [paper.TABLE1[name][questions.FOUR.index(column)] for name in names], "--", color="#999999", linewidth=1
+        )
+        right.tick_params(labelsize=7, colors="#999999")
+    axes[0].set_ylabel("accuracy, %")
+    axes[0].legend(frameon=False, fontsize=7, loc="lower right")
+    plots.write_figure(path, figure)
+    return path
+
+
+def q3(runs: Sequence[Run], path: Path) -> Path:
+    """Static and dynamic tasks, a panel a task, a line a model: mean and interval; dotted, one answer for all."""
+    names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
+    columns = (*questions.SIX[:3], questions.FOUR[2], *questions.dynamic("clips"))
+    figure, axes = _lines(names, columns)
+    for axis, column in zip(axes, columns, strict=False):
+        for place, name in enumerate(names):
+            _dot(axis, place, spread(runs, "q3", name, column), "C0" if name == "anytouch" else "#7a94b0")
+        chance = commonest(runs, "q3", column)
+        if chance is not None:
+            axis.axvline(chance, linestyle=":", color="#222222", linewidth=1)
+    plots.write_figure(path, figure)
+    return path
+
+
+def ablations(runs: Sequence[Run], path: Path) -> Path:
+    """What leaving out a part changes, in points: the material beside the paper's change, and the form."""
+    names = [name for name in paper.TABLE6 if name != "anytouch"]
+    figure, axes = _lines(names, questions.FOUR)
+    for number, (axis, column) in enumerate(zip(axes, questions.FOUR, strict=True)):
+        for place, name in enumerate(names):
+            for shift, colour, one in ((-0.15, "C0", column), (0.15, "C1", questions.FORM[number])):
+                whole = values(runs, "ablations", "anytouch", one)
+                found = change(values(runs, "ablations", name, one), whole, None)
+                if found.mean is not None:
+                    _dot(axis, place + shift, (found.mean, found.low, found.high), colour)
+            theirs = paper.TABLE6[name][number] - paper.TABLE6["anytouch"][number]  # type: ignore[operator]
+            axis.scatter(theirs, place, s=22, marker="D", color="#bbbbbb", zorder=1)
+        axis.axvline(0, color="#222222", linewidth=0.7)
+        axis.set_xlabel(
+            f"blue: material, orange: form, points\ndiamonds: paper, {questions.FOUR_PAPER[number]}", fontsize=7
+        )
+    plots.write_figure(path, figure)
+    return path
+
+
+def dynamics(runs: Sequence[Run], path: Path) -> Path:
+    """The dynamic tasks of AnyTouch from clips, stills, shuffled and repeated frames."""
+    figure, axes = _panels(1, 4, 2.7, 3.0)
+    views = ("clips", "stills", "shuffled", "repeated")
+    for i, axis in enumerate(axes):
+        for place, view in enumerate(views):
+            for shift, name in ((-0.2, "anytouch"), (0.2, "static_only")):
+                found = spread(runs, "dynamics", name, questions.dynamic(view)[i])
+                if found is not None:
+                    _bar(axis, place + shift, found, 0.38, "C0" if name == "anytouch" else "#bbbbbb")
+        axis.set_title(questions.dynamic("clips")[i].title, fontsize=9)
+        axis.set_xticks(range(len(views)), views, rotation=30, fontsize=8)
+        axis.axhline(0, color="#222222", linewidth=0.6)
+        chance = commonest(runs, "dynamics", questions.dynamic("clips")[i])
+        if chance:
+            axis.axhline(chance, linestyle=":", color="#222222", linewidth=1)
+    axes[0].set_ylabel("%; blue: AnyTouch, grey: stills only")
+    plots.write_figure(path, figure)
+    return path
+
+
+def new_sensor(runs: Sequence[Run], path: Path) -> Path:
+    """Accuracy on a sensor left out against how many frames of it there are."""
+    figure, axes = _panels(1, len(adaptation.TASKS), 3.4, 3.2)
+    counts = (0, *adaptation.FRAMES)
+    for axis, task in zip(axes, adaptation.TASKS, strict=True):
+        zero = spread(runs, "new_sensor", "left_out", Column(task, "universal, 0 unlabelled", task))
+        for number, kind in enumerate(("fitted, {} unlabelled", "universal, {} labelled", "fitted, {} labelled")):
+            later = [spread(runs, "new_sensor", "left_out", Column(task, kind.format(n), task)) for n in counts[1:]]
+            _line(axis, [zero, *later], kind.replace(" {}", ""), f"C{number}", bars=False)
+        goal = spread(runs, "new_sensor", "seen", Column(task, "seen", task))
+        if goal is not None:
+            axis.axhline(goal[0], linestyle="--", color="#222222", linewidth=1)
+        axis.set(title=f"{task} (dashes: trained on the sensor)", xlabel="frames of the new sensor")
+        axis.title.set_fontsize(8)
+        axis.set_xticks(range(len(counts)), list(map(str, counts)))
+    axes[0].set_ylabel("accuracy, %")
+    axes[-1].legend(frameon=False, fontsize=7)
+    plots.write_figure(path, figure)
+    return path
+
+
+def real_touch(runs: Sequence[Run], path: Path) -> Path:
+    """Tasks on real touch, a panel each: ours, an untrained encoder and raw pixels, a dot a seed with its interval."""
+    several = [run for run in runs if run.question == "real"]
+    tasks = list(dict.fromkeys(row["task"] for run in several for row in run.about["rows"]))
+    views = (real.OURS, real.UNTRAINED, real.PIXELS)
+    figure, axes = _panels(1, len(tasks), 3.0, 2.4)
+    for axis, task in zip(axes, tasks, strict=True):
+        for number, run in enumerate(several):
+            for row in run.about["rows"]:
+                if row["task"] == task and row["view"] in views:
+                    found = tuple(None if row[key] is None else 100 * row[key] for key in ("mean", "low", "high"))
+                    shift = 0.18 * (number - (len(several) - 1) / 2)
+                    ours = row["view"] == real.OURS
+                    _dot(axis, views.index(row["view"]) + shift, found, "C0" if ours else "#7a94b0")  # type: ignore[arg-type]
+        axis.set_title(task, fontsize=8)
+        axis.set(ylim=(len(views) - 0.5, -0.5), xlabel="accuracy, %")
+        axis.set_yticks(range(len(views)), views if axis is axes[0] else [], fontsize=8)
+        axis.grid(alpha=0.25)
+    plots.write_figure(path, figure)
+    return path
+
+
+def _lines(names: Sequence[str], columns: Sequence[Column]) -> tuple[Any, list[Any]]:
+    """Panels of four in a row, a column each, with a line for each model."""
+    across = min(4, len(columns))
+    figure, axes = _panels(-(-len(columns) // across), across, 3.0, 0.7 + 0.28 * len(names))
+    for number, (axis, column) in enumerate(zip(axes, columns, strict=False)):
+        axis.set_title(column.title, fontsize=9)
+        axis.set_yticks(range(len(names)), [title(name) for name in names] if number % across == 0 else [], fontsize=7)
+        axis.set_ylim(len(names) - 0.5, -0.5)
+        axis.grid(alpha=0.25)
+    return figure, axes
+
+
+def _dot(axis: Any, place: float, found: tuple[float, float | None, float | None] | None, colour: str) -> None:
+    if found is not None:
+        mean, low, high = found
+        axis.scatter(mean, place, s=26, color=colour, zorder=3)
+        if low is not None and high is not None:
+            axis.plot([low, high], [place, place], color=colour, linewidth=1.4, zorder=2)
+
+
+def _bar(axis: Any, place: float, found: tuple[float, float | None, float | None], width: float, colour: str) -> None:
+    mean, low, high = found
+    axis.bar(place, mean, width, color=colour)
+    if low is not None and high is not None:
+        axis.plot([place, place], [low, high], color="#222222", linewidth=1.2)
+
+
+def _line(
+    axis: Any,
+    found: Sequence[tuple[float, float | None, float | None] | None],
+    label: str,
+    colour: str,
+    *,
+    bars: bool = True,
+) -> None:
+    there = [(i, one) for i, one in enumerate(found) if one is not None]
+    axis.plot([i for i, _ in there], [one[0] for _, one in there], "o-", color=colour, label=label, markersize=4)
+    for i, (_, low, high) in there if bars else ():
+        if low is not None and high is not None:
+            axis.plot([i, i], [low, high], color=colour, linewidth=1)
+
+
+def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Any, list[Any]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False)))

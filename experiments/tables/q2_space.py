@@ -1,0 +1,65 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Q2: what does the space of touches look like?
+#
+# The paper (Figure 4) shows a t-SNE of the same 30 touches by three sensors, for CLIP, and with masked modelling,
+# alignment and cross-sensor matching added one by one. By eye: without touch, samples lie by sensor; masked modelling
+# draws each sensor together; alignment begins to blend them; **matching mixes them, and they lie by touch**.
+#
+# A t-SNE shows what one wants to see, so numbers stand beside it here: is the same touch by another sensor found
+# among 50 (top-1, top-5), silhouettes by sensor and by object, alignment and uniformity (Wang & Isola, 2020).
+#
+#     make experiments ONLY=q2
+
+# %%
+from __future__ import annotations
+
+from experiments.tables import page
+from experiments.tables.questions import SPACE
+from experiments.tables.results import Column, spread
+
+runs = page.runs("q2")
+print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
+
+# %% [markdown]
+# ## Picture
+#
+# A mark is a sensor, a colour a touch; the same touch by three sensors is joined by dashed lines (twelve touches have
+# a colour, to keep it legible). Short triangles mean that sensors agree.
+
+# %%
+path = page.picture(runs)
+
+# %% [markdown]
+# ## Class token or patches?
+#
+# Alignment and matching train the class token alone. The mean of the patch tokens shows what the trunk knows of it.
+
+# %%
+for view in ("class token", "patches"):
+    for name in ("untrained", "masked", "aligned", "matched"):
+        found = [spread(runs, "q2", name, Column(one.title, view, *one[2:])) for one in SPACE[:4]]
+        cells = (f"{one.title} {value[0]:.{one.digits}f}" for one, value in zip(SPACE, found, strict=False) if value)
+        print(f"{view:12} {name:10}", ", ".join(cells))
+
+# %% [markdown]
+# ## A checkpoint of yours
+#
+# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
+# scored as above, in minutes on a CPU, and stands beside our rows.
+
+# %%
+mine = page.yours("q2", runs)
+
+# %% [markdown]
+# ## Finding
+
+# %%
+text = page.finding("q2", runs)

@@ -1,0 +1,302 @@
+"""The questions, one by one: which columns their tables have, and which signs of the paper they test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from anytouch_jax.evaluate.statistics import markdown
+from experiments.tables import adaptation, paper, plan, scores
+from experiments.tables.results import Column, Run, spread
+from experiments.tables.tables import Pair, Statement, Table, against, block, cell, judge, published, sentence, title
+
+
+def four(task: str) -> tuple[Column, ...]:
+    """The columns of the paper's tables, of one task."""
+    return (
+        Column("seen", "seen", task), Column("seen sensor, other data", "seen, other data", task),
+        Column("unseen sensor", "unseen", task), Column("unseen sensor, other data", "unseen, other data", task),
+    )  # fmt: skip
+
+
+FOUR, FORM = four("material"), four("indenter")
+FOUR_PAPER = ("TAG", "Feel", "OF 1.0", "OF 2.0")
+SIX = (
+    Column("material", "seen", "material"),
+    Column("roughness", "seen", "roughness"),
+    Column("hardness", "seen", "hardness"),
+    *FOUR[1:],
+)
+SIX_PAPER = ("TAG material", "roughness", "hardness", "Feel", "OF 1.0", "OF 2.0")
+
+
+def dynamic(view: str) -> tuple[Column, ...]:
+    """The columns of the dynamic tasks under one view."""
+    return (
+        Column("slip", view, "slip"), Column("force (R2)", view, "force", "r2"), Column("twist", view, "twist"),
+        Column("slide", view, "slide"),
+    )  # fmt: skip
+
+
+SPACE = (
+    Column("top-1", "class token", "top-1", "share"),
+    Column("top-5", "class token", "top-5", "share"),
+    Column("silhouette by sensor", "class token", "silhouette by sensor", "silhouette by sensor", 1.0, -1, 3),
+    Column("silhouette by object", "class token", "silhouette by object", "silhouette by object", 1.0, 1, 3),
+    Column("alignment", "class token", "alignment", "alignment", 1.0, -1, 3),
+    Column("uniformity", "class token", "uniformity", "uniformity", 1.0, -1, 3),
+)
+STATIC = tuple(Column(task, "static", task) for task in ("material", "roughness", "hardness"))
+ANY = "any"
+GRASP = (Column("during the grasp", "during", "grasp"), Column("after the grasp", "after", "grasp"))
+
+
+class Part(NamedTuple):
+    """A section of the results: its title, its Markdown, and the statements that it makes."""
+
+    title: str
+    text: str
+    statements: Sequence[Statement]
+
+
+def q1(runs: Sequence[Run]) -> Part:
+    """Table 1: every row against the row before; with all sensors against one, on the unseen one."""
+    table = Table("q1", (*paper.TABLE1,), FOUR, paper.TABLE1, FOUR_PAPER)
+    pairs = []
+    for before, name in zip(table.names, table.names[1:], strict=False):
+        expected = [a - b for a, b in zip(paper.TABLE1[name], paper.TABLE1[before], strict=True)]  # type: ignore[operator]
+        label = f"{title(name)} against {title(before)}"
+        pairs.append(Pair(label, name, before, expected, None if before == "no_pretraining" else (2, 3)))
+    first, last = table.names[1], table.names[-1]
+    expected = [a - b for a, b in zip(paper.TABLE1[last], paper.TABLE1[first], strict=True)]  # type: ignore[operator]
+    pairs.append(Pair("more sensors help the unseen one: four against one", last, first, expected, (2, 3)))
+    return Part("Q1: what each sensor's data adds (Table 1)", *_both(runs, table, pairs))
+
+
+def _both(runs: Sequence[Run], table: Table, pairs: Sequence[Pair]) -> tuple[str, list[Statement]]:
+    """A table of materials and, with the same signs expected, of forms: its text and statements."""
+    found = judge(runs, table.question, FOUR, pairs)
+    form = judge(runs, table.question, FORM, [pair._replace(label=f"form: {pair.label}") for pair in pairs])
+    text = (
+        f"The material, which captions name:\n\n{block(runs, table, found)}\n\n"
+        "The form of the indenter, which no caption names (the same signs are expected):\n\n"
+        f"{block(runs, table._replace(columns=FORM, paper={}, paper_titles=()), form)}"
+    )
+    return text, [*found, *form]
+
+
+def q2(runs: Sequence[Run]) -> Part:
+    """Figure 4 in numbers: what each component does to the space."""
+    names = ("pixels", "contact", "untrained", "masked", "aligned", "matched", "matched_mlp")
+    # The paper in words: masked modelling draws the touches of a sensor together; alignment begins to blend the
+    # sensors; matching mixes them and gathers the touches of an object. Signs are of what is better: to find the
+    # touch, not to be ordered by sensor.
+    found = []
+    for label, first, second, column, sign in (
+        ("masked modelling gathers each sensor's touches", "masked", "untrained", 2, -1),
+        ("alignment begins to blend the sensors", "aligned", "masked", 2, 1),
+        ("matching mixes the sensors", "matched", "aligned", 2, 1),
+        ("matching gathers the touches of an object", "matched", "aligned", 3, 1),
+    ):
+        found += judge(runs, "q2", SPACE[column : column + 1], [Pair(label, first, second, (sign,))])
+    finds = (1, 1)
+    found += judge(runs, "q2", SPACE[:2], [
+        Pair("retrieval: alignment above masked modelling", "aligned", "masked", finds),
+        Pair("retrieval: matching above alignment", "matched", "aligned", finds),
+        Pair("retrieval: matching above no pre-training", "matched", "untrained", finds),
+        Pair("our control: matching above raw pixels", "matched", "pixels", finds),
+        Pair("our control: matching above area, place and force", "matched", "contact", finds),
+    ])  # fmt: skip
+    table = Table("q2", names, SPACE)
+    return Part("Q2: the space of touches (Figure 4)", f"{_chances(runs)}{block(runs, table, found)}", found)
+
+
+def _chances(runs: Sequence[Run]) -> str:
+    """What top-1 and top-5 are among, and what chance gives."""
+    rows = [row for run in runs if run.question == "q2" for row in run.about["rows"] if "gallery" in row]
+    if not rows:
+        return ""
+    chance = {row["task"]: f"{100 * row['chance']:.0f} %" for row in rows}
+    among = " or ".join(sorted({str(row["gallery"]) for row in rows}))
+    words = ", ".join(f"{task} {value}" for task, value in chance.items())
+    known = [row for row in rows if row.get("nearness") is not None]
+    near = ""
+    if known:
+        near = f" of {known[0]['of']} (they lie {known[0]['nearness']:.2f} times as far as all do)"
+    return (
+        f"Retrieved among the {among} touches{near} that are nearest in place, depth and force; by chance {words}.\n\n"
+    )
+
+
+def q3(runs: Sequence[Run]) -> Part:
+    """Tables 2 and 3 (static) and Table 4's models on dynamic tasks."""
+    names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
+    static = Table("q3", names, SIX, paper.TABLES23, SIX_PAPER)
+    rivals = [pair for pair in against(static, "anytouch", None) if pair.second in paper.TABLES23]
+    one = judge(runs, "q3", SIX, [*rivals, *_controls(len(SIX))])
+    shape = [pair._replace(label=f"form: {pair.label}", expected=_of_form(pair)) for pair in rivals]
+    form = judge(runs, "q3", FORM, [*shape, *_controls(len(FORM), "form: ")])
+    moving = Table("q3", names, dynamic("clips"), paper.TABLE4, ("pouring, fine-tuned (g)", "frozen (g)"))
+    ahead = [
+        Pair(f"AnyTouch against {title(name)}", "anytouch", name, (1, 1, 1, 1), (0, 2, 3))  # R2 is no accuracy
+        for name in paper.TABLE4 if name != "anytouch"
+    ]  # fmt: skip
+    two = judge(runs, "q3", moving.columns, [*ahead, *_controls(len(moving.columns), "dynamic tasks: ", (0, 2, 3))])
+    text = (
+        f"Static tasks (Tables 2 and 3):\n\n{block(runs, static, one)}\n\n{_read(runs)}"
+        "The form of the indenter, which no caption names (signs as of the materials):\n\n"
+        f"{block(runs, Table('q3', names, FORM), form)}\n\n"
+        "Dynamic tasks, probes on clips; beside them the paper's pouring with a robot (Table 4,\n"
+        f"less is better):\n\n{block(runs, moving, two)}"
+    )
+    return Part("Q3: static and dynamic perception (Tables 2, 3, 4)", text, (*one, *form, *two))
+
+
+def _read(runs: Sequence[Run]) -> str:
+    """The same features by other heads and poolings than the tables'; nothing where no run was read so."""
+    columns = (*(Column(task, ANY, task) for task in scores.STATIC), Column("form", ANY, scores.FORM))
+    ways = {"seen": "linear, class token and mean of patches"}
+    ways |= {f"read: {way}": way if "pooling" in options else f"{way}, class token and mean of patches"
+             for way, options in scores.WAYS.items()}  # fmt: skip
+    parts = []
+    for name in scores.READ:
+        several = [run for run in runs if run.name == name and any(r["view"] in [*ways][1:] for r in run.about["rows"])]
+        if several:
+            found = [replace(run, name=ways[run.name]) for run in by_view(several, "q3", name, [*ways])]
+            parts.append(
+                f"{title(name)}, by head and pooling:\n\n{block(found, Table('q3', [*ways.values()], columns), ())}\n\n"
+            )
+    return "".join(parts)
+
+
+def _controls(columns: int, label: str = "", whole: Sequence[int] | None = None) -> list[Pair]:
+    """What the paper has no row for: AnyTouch above what was never trained, and above raw pixels."""
+    return [
+        Pair(f"{label}our control: AnyTouch above {title(name)}", "anytouch", name, (1,) * columns, whole)
+        for name in ("untrained", "pixels")
+    ]
+
+
+def _of_form(pair: Pair) -> tuple[float | None, ...]:
+    """What is expected of the columns of forms: the signs of material among the columns of `SIX`."""
+    return (pair.expected[0], *pair.expected[3:])
+
+
+def ablations(runs: Sequence[Run]) -> Part:
+    """Table 6."""
+    table = Table("ablations", (*paper.TABLE6,), FOUR, paper.TABLE6, FOUR_PAPER)
+    return Part("Ablations (Table 6)", *_both(runs, table, against(table, None, "anytouch")))
+
+
+def restricted(runs: Sequence[Run]) -> Part:
+    """The control of Table 2: the rival's data for both."""
+    table = Table("restricted", ("unitouch", "no_matching"), SIX, paper.RESTRICTED, SIX_PAPER)
+    found = judge(runs, "restricted", SIX, against(table, "no_matching", None))
+    text = (
+        f"Both see {' and '.join(plan.RESTRICTED)} alone, without touches felt twice (so AnyTouch has no matching).\n"
+        "In the paper both had trained on Feel and on OF 2.0, so those two columns are not of unseen data there.\n\n"
+    )
+    return Part("The same restricted data (control of Table 2)", text + block(runs, table, found), found)
+
+
+def grasp(runs: Sequence[Run]) -> Part:
+    """Frames after the grasp beside frames during it."""
+    table = Table("grasp", ("anytouch",), GRASP, {"anytouch": paper.FEEL_AFTER}, ("Feel, during", "Feel, after"))
+    pair = Pair("frames after the grasp are easier than frames during it", "after", "during", (1,))
+    views = by_view(runs, "grasp", "anytouch", ("during", "after"))
+    found = judge(views, "grasp", (Column("held or slipped", ANY, "grasp"),), (pair,))
+    text = (
+        "A simulated recording has no gripper: the press stands for the closing (the frame in which it is done), the\n"
+        "end of the slide or twist for the lift, and a touch slipped when more than half of its contact slid half-way\n"
+        "through the motion.\n\n"
+    )
+    if any("values" not in row for run in runs if run.question == "grasp" for row in run.about["rows"]):
+        text += "Each number is of one fit on the data set's own split; other tables deal the objects five times.\n\n"
+    return Part("Feel: frames after the grasp beside frames during it", text + block(runs, table, found), found)
+
+
+def by_view(runs: Sequence[Run], question: str, name: str, views: Sequence[str]) -> list[Run]:
+    """The views of one model as runs of their own, so that they can be set against each other."""
+    found = []
+    for run in runs:
+        if (run.question, run.name) == (question, name):
+            for view in views:
+                rows = [row | {"view": ANY} for row in run.about["rows"] if row["view"] == view]
+                found.append(Run(question, view, run.seed, {"rows": rows}))
+    return found
+
+
+def new_sensor(runs: Sequence[Run]) -> Part:
+    """How much of the gap to a seen sensor a few frames close."""
+    views = [NOTHING]
+    for frames in adaptation.FRAMES:
+        views += [f"fitted, {frames} unlabelled", f"universal, {frames} labelled", f"fitted, {frames} labelled"]
+    several = [*by_view(runs, "new_sensor", "left_out", views), *by_view(runs, "new_sensor", "seen", ("seen",))]
+    columns = [Column(task, ANY, task) for task in adaptation.TASKS]
+    lines = []
+    for name in (*views, "seen"):
+        cells = [cell(several, "new_sensor", name, one) + _closed(several, name, one) for one in columns]
+        lines.append((title(name), str(len({run.seed for run in several if run.name == name})), *cells))
+    said = published(several, Table("new_sensor", (*views, "seen"), columns))
+    text = (
+        f"{plan.UNSEEN} is left out of training. Tokens: the universal ones as they are, or fitted with all else\n"
+        "frozen, by reconstruction of unlabelled frames or by the material that labelled ones show. Labelled frames\n"
+        "also stand among the training rows of the probe; without them it has learned from the other sensors alone.\n"
+        "In brackets at the end: share of the gap to a model trained on the sensor that is closed (- below 3 points).\n"
+        "No sign is claimed. Reconstruction goes through the decoder of stage 1, which stage 2 has left behind.\n\n"
+    )
+    table = markdown(("tokens, frames", "seeds", *adaptation.TASKS), lines)
+    wide = (*(f"fitted, {adaptation.FRAMES[-1]} {kind}" for kind in ("unlabelled", "labelled")), "seen")
+    pairs = [Pair(f"{title(one)} against {NOTHING}", one, NOTHING, (None,) * len(columns)) for one in wide]
+    found = judge(several, "new_sensor", columns, pairs)
+    parts = (f"{text}{table}", said.rstrip(), "\n".join(map(sentence, found)))
+    return Part("A new sensor", "\n\n".join(part for part in parts if part), found)
+
+
+NOTHING = "universal, 0 unlabelled"
+
+
+def _closed(runs: Sequence[Run], name: str, column: Column) -> str:
+    start, here, goal = (spread(runs, "new_sensor", one, column) for one in (NOTHING, name, "seen"))
+    if start is None or here is None or goal is None or name == "seen":
+        return ""
+    gap = goal[0] - start[0]
+    return " (-)" if gap < 3 else f" ({100 * (here[0] - start[0]) / gap:.0f} %)"
+
+
+def dynamics(runs: Sequence[Run]) -> Part:
+    """Clips against stills, shuffled and repeated frames; what training makes of them."""
+    names = ("anytouch", "static_only", "no_flips", "frame_differences", "force_heads")
+    parts = [f"{what}:\n\n{block(runs, Table('dynamics', names, dynamic(view)), ())}" for view, what in VIEWS.items()]
+    parts.append(f"Static tasks, from a still:\n\n{block(runs, Table('dynamics', names, STATIC), ())}")
+    views = by_view(runs, "dynamics", "anytouch", tuple(VIEWS))
+    # The paper compares models, not views: differences of views are shown and no sign is expected of them.
+    pairs = [Pair(f"AnyTouch, clips against {view}", "clips", view, (None,) * 4) for view in ("stills", "shuffled")]
+    found = judge(views, "dynamics", dynamic(ANY), pairs)
+    trained = Pair("dynamic training against stills only, on clips", "anytouch", "static_only", (1, 1, 1, 1), (0, 2, 3))
+    found += judge(runs, "dynamics", dynamic("clips"), (trained,))
+    for name in names[2:]:
+        for columns, what in ((dynamic("clips"), "on clips"), (STATIC, "static tasks")):
+            pair = Pair(f"{title(name)}, against AnyTouch, {what}", name, "anytouch", (None,) * len(columns))
+            found += judge(runs, "dynamics", columns, (pair,))
+    text = (
+        "Twist and slide are directions of the picture as it is. Training flips touches, and the positive of a match\n"
+        "apart from its anchor, which asks the encoder to overlook directions; a probe sees frames unflipped. The\n"
+        "row without flips shows what that costs. The encoder takes a still as that frame three times over, so stills\n"
+        "and the last frame repeated are one measurement. What the paper claims is that dynamic training is better\n"
+        "(Table 4 compares models); what a clip shows beside a still is no claim of its.\n\n"
+    )
+    return Part("Dynamics", text + "\n\n".join(parts) + "\n\n" + "\n".join(map(sentence, found)), found)
+
+
+VIEWS = {
+    "clips": "Clips of three frames",
+    "stills": "Stills (the last frame)",
+    "shuffled": "Clips, frames shuffled",
+    "repeated": "Clips, the last frame repeated",
+}
+OF: Mapping[str, Callable[[Sequence[Run]], Part]] = {
+    "q1": q1, "q2": q2, "q3": q3, "ablations": ablations, "restricted": restricted, "grasp": grasp,
+    "new_sensor": new_sensor, "dynamics": dynamics,
+}  # fmt: skip

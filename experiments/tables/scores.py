@@ -1,0 +1,239 @@
+"""What is measured of a run's encoder, question by question: rows {view, task, protocol, metric, mean, low, high, ...}.
+
+A view says of which data and how: `seen` (the sensors trained on), `seen, other data` (a data set never trained on),
+`unseen` and `unseen, other data` (a sensor never trained on), `clips`, `stills`, and so on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anytouch_jax.config import Config
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.evaluate import battery, geometry, retrieval
+from anytouch_jax.evaluate.baseline import background_difference
+from anytouch_jax.evaluate.contacts import contact_vector
+from anytouch_jax.evaluate.tasks import Task
+from experiments.tables import adaptation, cuts, plan, real
+from experiments.tables.plan import Leaf
+
+if TYPE_CHECKING:
+    from experiments.tables.work import Work
+
+Row = dict[str, Any]
+STATIC = ("material", "roughness", "hardness")
+FORM = "indenter"  # no caption names it
+DYNAMIC = ("slip", "force", "twist", "slide")
+BOTH = ("honest", "published")
+PIXELS, CONTACT = "pixels", "contact"
+SHOWN = ("gelsight", "digit", "gelsight_mini")  # of the t-SNE, as the paper shows three
+TOUCHES = 30
+
+
+def score(leaf: Leaf, work: Work) -> dict[str, Any]:
+    """The results of a run: `rows`, `data` (names of the manifests read), and what else the question wants."""
+    return _OF[leaf.question](leaf, work)
+
+
+def encoder_of(leaf: Leaf, work: Work) -> Encoder:
+    """The encoder of a run: trained, the image tower of a trained model, or untrained."""
+    if leaf.model is None:
+        return random_encoder(untrained(leaf), leaf.seed)
+    run = work.run_of(leaf.model)
+    return image_tower_encoder(run) if leaf.tower else load_encoder(run)
+
+
+def untrained(leaf: Leaf) -> Config:
+    """The configuration of the encoder of a run that trains nothing."""
+    return plan.training(leaf.size, "no_stage2", leaf.seed).config
+
+
+def quiet(_: str) -> None:
+    """An unseen sensor is served by the universal tokens: that is what is asked here."""
+
+
+def _probes(
+    leaf: Leaf, work: Work, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
+) -> list[Row]:
+    """Rows of the battery on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
+    dataset, _, file = name.partition("/")
+    table = manifests.read(work.folder / dataset / file)
+    shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows, "cache": work.folder / "cache"}
+    shared |= options
+    return [{"view": view} | one for one in battery.run(encoder, table, tasks, **shared)]
+
+
+def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
+    """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0).
+
+    Of each the material and the form of the indenter; of the first also `tasks`.
+    """
+    encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
+    rows = []
+    for view, name, sensors, labels in (
+        ("seen", "own", tuple(seen), tasks),
+        ("seen, other data", "other", plan.SENSORS[:1], ("material",)),
+        ("unseen", "own", (plan.UNSEEN,), ("material",)),
+        ("unseen, other data", "other", (plan.UNSEEN,), ("material",)),
+    ):
+        labels = (*labels, FORM)
+        options = {"train_sensors": sensors, "test_sensors": sensors, "protocols": BOTH}
+        rows += _probes(leaf, work, f"{name}/{cuts.WHOLE}", labels, view, encoder, **options)
+    return rows
+
+
+def _q1(leaf: Leaf, work: Work) -> dict[str, Any]:
+    return {"rows": _four_columns(leaf, work, plan.SENSORS[:1]), "data": ["own", "other"]}
+
+
+def _q3(leaf: Leaf, work: Work) -> dict[str, Any]:
+    rows = _four_columns(leaf, work, plan.SENSORS, STATIC) + _dynamic(leaf, work, ("clips",))
+    return {"rows": rows + (_read(leaf, work) if leaf.name in READ else []), "data": ["own", "other"]}
+
+
+READ = ("anytouch", "untrained")  # the models whose features are read in every way
+WAYS: Mapping[str, dict[str, Any]] = {
+    "kNN": {"head_names": ("knn",)},
+    "gradient": {"head_names": ("gradient",)},
+    "class token": {"pooling": "class"},
+    "mean of patches": {"pooling": "mean"},
+}
+
+
+def _read(leaf: Leaf, work: Work) -> list[Row]:
+    """The static tasks and the form by other heads and poolings than the tables': views `read: <way>`."""
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    encoder, labels = encoder_of(leaf, work), (*STATIC, FORM)
+    return [
+        row
+        for way, options in WAYS.items()
+        for row in _probes(leaf, work, f"own/{cuts.WHOLE}", labels, f"read: {way}", encoder, **sensors, **options)
+    ]
+
+
+def _ablations(leaf: Leaf, work: Work) -> dict[str, Any]:
+    return {"rows": _four_columns(leaf, work, plan.SENSORS), "data": ["own", "other"]}
+
+
+def _restricted(leaf: Leaf, work: Work) -> dict[str, Any]:
+    return {"rows": _four_columns(leaf, work, plan.RESTRICTED, STATIC), "data": ["own", "other"]}
+
+
+_VIEWS: Mapping[str, dict[str, Any]] = {
+    "clips": {"frames": 3},
+    "stills": {"frames": 1},
+    "shuffled": {"frames": 3, "order": "shuffled"},
+    "repeated": {"frames": 3, "order": "repeated"},
+}
+
+
+def _dynamic(leaf: Leaf, work: Work, views: Sequence[str]) -> list[Row]:
+    encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    return [
+        row
+        for view in views
+        for row in _probes(leaf, work, f"own/{cuts.WHOLE}", DYNAMIC, view, encoder, **_VIEWS[view], **sensors)
+    ]
+
+
+def _dynamics(leaf: Leaf, work: Work) -> dict[str, Any]:
+    """Dynamic tasks under every view, and what the same training makes of static ones."""
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    static = _probes(leaf, work, f"own/{cuts.WHOLE}", STATIC, "static", encoder_of(leaf, work), **sensors)
+    return {"rows": _dynamic(leaf, work, tuple(_VIEWS)) + static, "data": ["own"]}
+
+
+def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
+    """The space of the test touches by the sensors trained on: numbers, and the t-SNE of some touches."""
+    table = manifests.read(work.folder / "own" / cuts.STATIC)
+    sensors = text_column(table, "sensor")
+    rows = table.rows_of("test")
+    rows = rows[np.isin(sensors[rows], plan.SENSORS)]
+    if leaf.name == PIXELS:
+        found = {"class token": background_difference(table, rows)}
+    elif leaf.name == CONTACT:
+        found = {"class token": contact_vector(table, rows)}
+    else:
+        encoder = encoder_of(leaf, work)
+        both = embed_rows(encoder, table, rows, pooling="both", say=quiet)[1]
+        width = encoder.config.model.embed
+        found = {"class token": both[:, :width], "patches": both[:, width:]}
+    metric: retrieval.Metric = "euclidean" if leaf.name == CONTACT else "cosine"
+    results = [row for view, values in found.items() for row in _space(table, rows, values, view, metric)]
+    return {"rows": results, "points": _points(table, rows, found["class token"], leaf.seed), "data": ["own"]}
+
+
+def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: retrieval.Metric) -> list[Row]:
+    sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
+    about = geometry.describe(values, sensors, text_column(table, "object")[rows], touch)
+    fewest = min(len(np.unique(touch[sensors == one])) for one in np.unique(sensors))
+    pooled = retrieval.cross_sensor_retrieval(
+        table,
+        {view: values},
+        rows,
+        gallery_size=min(retrieval.GALLERY, fewest),
+        centre=(False,),
+        metrics={view: metric},
+    )[-1]
+    plain = {
+        "alignment": about.alignment, "uniformity": about.uniformity,
+        "silhouette by sensor": about.silhouette_sensor, "silhouette by object": about.silhouette_object,
+    }  # fmt: skip
+    shared = {"view": view, "protocol": "honest", "test": len(rows)}
+    found = [shared | {"task": name, "metric": name, "mean": value} for name, value in plain.items()]
+    for name, mean, low, high, chance in (
+        ("top-1", pooled.top1, pooled.low, pooled.high, pooled.chance1),
+        ("top-5", pooled.top5, pooled.top5_low, pooled.top5_high, pooled.chance5),
+    ):
+        about_it = {"task": name, "metric": "share", "mean": mean, "low": low, "high": high, "chance": chance}
+        found.append(shared | about_it | {"gallery": pooled.gallery, "of": fewest, "nearness": pooled.nearness})
+    return found
+
+
+def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list[Row]:
+    """The t-SNE of some touches by three sensors: {x, y, sensor, touch} of each."""
+    sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
+    names = np.unique(touch)
+    some = np.random.default_rng(0).permutation(names)[:TOUCHES]  # the same touches for all
+    keep = np.isin(sensors, SHOWN) & np.isin(touch, some)
+    places = geometry.tsne(values[keep], seed=seed)
+    return [
+        {"x": round(float(x), 3), "y": round(float(y), 3), "sensor": str(sensor), "touch": int(code)}
+        for (x, y), sensor, code in zip(places, sensors[keep], touch[keep], strict=True)
+    ]
+
+
+def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
+    """Held or slipped, from the frame in which the press is done and from the last frame."""
+    encoder, found = encoder_of(leaf, work), []
+    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocols": BOTH}
+    for view in ("during", "after"):
+        task = Task("grasp", "label.held", which="all", where=("label.moment", view))
+        found += _probes(leaf, work, f"own/{cuts.GRASP}", (task,), view, encoder, **options)
+    return {"rows": found, "data": ["own", "own/grasp"]}
+
+
+def _new_sensor(leaf: Leaf, work: Work) -> dict[str, Any]:
+    read = ["own/static", f"own/{plan.UNSEEN}"]
+    if leaf.name != "seen":
+        read += [
+            f"own/{Path(adaptation.labelled(work.folder / 'own', count)).stem}" for count in (0, *adaptation.FRAMES)
+        ]
+    return {"rows": adaptation.rows(leaf, work, _probes), "data": read}
+
+
+def _real(leaf: Leaf, work: Work) -> dict[str, Any]:
+    return {"rows": real.rows(leaf, encoder_of(leaf, work), work.manifest(plan.REAL)), "data": [plan.REAL]}
+
+
+_OF: Mapping[str, Callable[[Leaf, Work], dict[str, Any]]] = {
+    "q1": _q1, "q2": _q2, "q3": _q3, "ablations": _ablations, "restricted": _restricted, "dynamics": _dynamics,
+    "grasp": _grasp, "new_sensor": _new_sensor, "real": _real,
+}  # fmt: skip

@@ -1,0 +1,265 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Do simulated scenes teach a representation of touch?
+#
+# On objects never touched in training (whole pairs of primitive and texture are held out):
+#
+# 1. **Retrieval.** The same touch by another sensor and another unit, among 50 touches that resemble it most in
+#    position, depth and force, after each sensor's mean feature was subtracted. Stage 2 against stage 1 alone, an
+#    untrained encoder (shown touches less the untouched gel, as the trained ones, and as the camera gives them),
+#    background-differenced pixels, and the vector (contact area, centroid, force). For fine data (one motion for all
+#    sensors) and coarse data (by hand); one encoder a seed learns from both.
+# 2. **A sensor left out.** GelSlim is not in the sensor table of the trained encoders: its touches get the universal
+#    tokens. Linear probes on its features, for labels that captions name (hardness, roughness, material) and for one
+#    that they do not (indenter).
+#
+# `.venv/bin/python experiments/teaching.py` does all of it, run by run, in an hour or more a seed: what is finished is
+# not done again. `TOUCHES=500 STEPS2=1000` is less than half the work, and less is learned;
+# `TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs
+# and results go: the page `teaching.md` and the folder `teaching/`, a JSON file for each grade and seed, from which
+# `TABLE=1` makes the page anew. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small
+# convolutions (`--model.patch-encoder convolutional`), which find more in as many steps and take longer for them:
+# `teaching_convolutional.md`.
+
+# %%
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.evaluate import baseline, retrieval
+from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
+from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.files import write_whole
+from anytouch_jax.sim.dataset import VERSION
+from anytouch_jax.train.progress import silent
+from experiments.benchmarks import machine
+from experiments.tables import asked
+from experiments.tables.by_object import ahead, by_object, gathered, probe_table, probed
+
+WORK, OUT, TABLE = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results"), asked.switch("TABLE")
+TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4000)
+MORE = asked.number("MORE", 2 * TOUCHES, least=0)
+OBJECTS = asked.number("OBJECTS", min(TOUCHES // 2, 500))
+SEEDS = asked.numbers("SEEDS", "0,1,2")
+GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
+CONVOLUTIONS = asked.switch("CONVOLUTIONS")
+NAME = "teaching_convolutional" if CONVOLUTIONS else "teaching"
+SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
+STACK, DEPTH = {"width": 128, "heads": 4, "mlp": 512}, {"touch": 4, "image": 2, "text.stack": 2}
+KNOWN = ["gelsight_mini", "digit", "duragel", "universal"]  # the sensor table of the encoders
+NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)
+
+
+def anytouch(*words: Any) -> None:
+    """Run a subcommand; a run or a data set that is finished answers at once."""
+    status = main([str(word) for word in words])
+    if status:
+        raise SystemExit(status)
+
+
+# %% [markdown]
+# ## Data and runs
+#
+# One data set a grade, and one by the sensor that is left out, with six touches of each of the same objects (at two
+# touches an object a probe cannot tell encoders apart). Places differ from grade to grade; objects, and which of
+# them are held out, do not. `MORE=` touches a grade, of the same objects at other places, are trained on alone, so that
+# what is scored stays the same whatever their number. Both stages for every seed, on all grades together as on
+# TacQuad's two parts, at preset tiny with smaller towers and pictures: less work a step, and more is learned in a
+# minute.
+#
+# **Contact frames.** The paper's data are contact frames. A simulated recording begins before anything shows, and pairs
+# of such a frame with one of full contact teach little: with them contrast learned more slowly. So `anytouch contact`
+# marks the frames that have six tenths of the strongest contact of their recording, and only these are drawn.
+#
+# Matching departs from the paper here. Its head tells a pair from *one* other pair, on an encoder that already knows
+# pictures (CLIP); the same loss on an encoder from scratch stays at chance for as long as a CPU can wait. Cosines
+# against all other touches of the batch (`match_head=cosine`) tell 126 pairs apart at once; all touches to be found in
+# a batch are of one sensor (`negatives=same_sensor`), as in the galleries, so that the sensor tells none of them apart.
+# It begins on a plateau, since stage 1 leaves the class token nearly equal for all touches; in a trial of one seed it
+# left it sooner, and came further, after 600 steps of stage 1 than after 150.
+
+# %%
+SMALL = ["--preset", "tiny", "--model.image-size", 84]
+SMALL += ["--model.patch-encoder", "convolutional"] if CONVOLUTIONS else []
+LESS = ["--loader.background", "subtract"]  # the contact alone: units differ more than touches do
+LESS += ["--loader.contact-only", "--loader.jitter", 0, 0, 0, 0]  # colours tell slopes
+LESS += ["--loader.cache", 5000]  # all frames, once read
+
+
+def tower(name: str) -> list[Any]:
+    return [word for size, n in (STACK | {"depth": DEPTH[name]}).items() for word in (f"--model.{name}.{size}", n)]
+
+
+TRAIN1 = [*SMALL, *tower("touch"), "--steps", STEPS1, "--batch", 48, "--optim.learning-rate", 1e-3]
+TRAIN2 = [*SMALL, *tower("touch"), *tower("image"), *tower("text.stack"), "--steps", STEPS2, "--batch", 64]
+TRAIN2 += ["--optim.learning-rate", 1e-3, "--loader.negatives", "same_sensor"]
+TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 8.0]
+
+
+def scenes(grade: str) -> list[Path]:
+    """The manifests to train on of a grade, contact frames marked. Makes touches by the sensor left out, too."""
+    turn, marked = GRADES.index(grade), []
+    sets = {  # sensors, touches, number of the first
+        f"scenes-{grade}": (SENSORS, TOUCHES, TOUCHES * turn),
+        f"more-{grade}": (SENSORS, MORE, TOUCHES * len(GRADES) + MORE * turn),
+        f"{LEFT_OUT}-{grade}": (LEFT_OUT, 6 * OBJECTS, 6 * OBJECTS * turn),
+    }
+    for name, (sensors, touches, first) in sets.items():
+        folder, how = WORK / name, ["--objects", OBJECTS, "--grade", grade, "--size", 128]
+        if touches:
+            anytouch("simulate", "--out", folder, "--sensors", sensors, "--touches", touches, "--first", first, *how)
+        if touches and sensors == SENSORS:
+            marked.append(folder / "manifest_contact.parquet")
+            if not marked[-1].exists():
+                anytouch("contact", folder / "manifest.parquet", "--share", 0.6, "--out", marked[-1])
+    return marked
+
+
+def prepare(seed: int) -> tuple[Path, Path]:
+    """The runs of both stages for a seed."""
+    name = "-".join([*GRADES, *(["convolutional"] if CONVOLUTIONS else []), str(seed)])
+    one, two = (WORK / f"{name}-stage{stage}" for stage in (1, 2))
+    manifests_of = [manifest for grade in GRADES for manifest in scenes(grade)]
+    data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *KNOWN, *LESS]
+    anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
+    finished(one, STEPS1)
+    anytouch("train", "--stage", 2, "--run", two, "--init", one, *TRAIN2, *data)
+    finished(two, STEPS2)
+    return one, two
+
+
+def finished(run: Path, steps: int) -> None:
+    """A signal ends training politely; what is half trained must not be scored."""
+    if not (run / "checkpoints" / f"{steps:08d}").is_dir():
+        raise SystemExit(f"{run} was stopped before its {steps} steps; the same command goes on")
+
+
+def features(encoders: dict[str, Encoder], seed: int, table: Any, rows: np.ndarray, pooling: Any) -> dict[str, Any]:
+    one = encoders["stage 1"]
+    plain = replace(one.config, data=replace(one.config.data, background="keep"))
+    fresh = {"untrained": random_encoder(one.config, seed), "untrained, whole picture": random_encoder(plain, seed)}
+    every = (encoders | fresh).items()
+    return {name: embed_rows(e, table, rows, pooling=pooling, say=silent)[1] for name, e in every}
+
+
+# %% [markdown]
+# ## Retrieval and probes on objects never seen
+#
+# Of every set of features what is kept is how many queries, or touches, of each object it got right: the share, and its
+# interval over objects, need no more.
+
+
+# %%
+def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any]:
+    table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
+    rows = deepest_rows(table, table.rows_of("test"))
+    found = features(encoders, seed, table, rows, "class")
+    found |= {"pixels": baseline.background_difference(table, rows), "vector": contact_vector(table, rows)}
+    scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(True,), metrics={"vector": "euclidean"})
+    pooled = {one.name: one.found for one in scored if one.query_sensor == retrieval.ALL and one.found}
+    groups = pooled["stage 2"].groups
+    parts = {part: {name: getattr(one, part) for name, one in pooled.items()} for part in ("top1", "top5")}
+    return {"data": table.content_hash} | {part: by_object(groups, right) for part, right in parts.items()}
+
+
+def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any]:
+    """Linear probes on the sensor left out, universal tokens, objects never seen in the test split."""
+    table = manifests.read(WORK / f"{LEFT_OUT}-{grade}" / "manifest.parquet")
+    rows = np.concatenate([deepest_rows(table, table.rows_of(split)) for split in ("train", "val", "test")])
+    split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
+    found = features(encoders, seed, table, rows, "both")
+    found["pixels"] = baseline.reduce(baseline.background_difference(table, rows), split == "train")
+    labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in (*NAMED, *UNNAMED)}
+    return {"data": table.content_hash} | probed(found, labels, groups, split)
+
+
+# %% [markdown]
+# ## Grade by grade, seed by seed
+
+# %%
+SETTINGS = {"touches": TOUCHES, "more": MORE, "objects": OBJECTS, "steps": [STEPS1, STEPS2], "grades": GRADES}
+SETTINGS |= {"simulator": VERSION}
+
+
+def scored(grade: str, seed: int) -> dict[str, Any]:
+    """What the file of a grade and a seed says; it is made first where it is not there, or is of other encoders."""
+    file = OUT / NAME / f"{grade}-{seed}.json"
+    if TABLE:
+        if not file.exists():
+            raise SystemExit(f"there is no {file}: run this page without TABLE=1")
+        return json.loads(file.read_text())
+    encoders = {f"stage {stage}": load_encoder(run) for stage, run in zip((1, 2), prepare(seed), strict=True)}
+    about: dict[str, Any] = {"settings": SETTINGS, "encoders": {name: one.mark for name, one in encoders.items()}}
+    if file.exists() and (found := json.loads(file.read_text())) | about == found:
+        return found
+    config = encoders["stage 2"].config
+    names = tuple("/".join(Path(one).parts[-2:]) for one in config.data.manifests)
+    config = replace(config, data=replace(config.data, manifests=names))
+    found = about | {"machine": machine.describe().sentence(), "config": asdict(config)}
+    found |= {"retrieval": retrieve(encoders, grade, seed), "probes": probes(encoders, grade, seed)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(file, json.dumps(found) + "\n")
+    return found
+
+
+# %% [markdown]
+# ## Tables
+
+
+# %%
+NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
+RIVALS = ("untrained", "pixels")  # of the probes
+
+
+def retrieval_table(found: list[dict[str, Any]]) -> str:
+    """Shares of the seeds together, and how far stage 2 is ahead: together, and seed by seed."""
+    (counts, first), (_, five) = (gathered([one["retrieval"][part] for one in found]) for part in ("top1", "top5"))
+    rows, best = [], first["stage 2"]
+    for name in NAMES:
+        shares = [f"{100 * np.mean(part[name], 0).sum() / counts.sum():.1f} %" for part in (first, five)]
+        change = each = "-"
+        if name != "stage 2":
+            change = ahead(counts, np.mean(best, 0), np.mean(first[name], 0))
+            each = "; ".join(ahead(counts, a, b) for a, b in zip(best, first[name], strict=True))
+        rows.append((name, *shares, change, each))
+    return markdown(
+        ("features", "top-1 of 50", "top-5", "stage 2 ahead by (points, 95 % over objects)", "seed by seed"), rows
+    )
+
+
+# %%
+files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
+told = files[GRADES[0]][0]
+if any(one["settings"] != told["settings"] for found in files.values() for one in found):
+    raise SystemExit(f"the files of {NAME}/ were made by different settings: make them anew, without TABLE=1")
+size = " ".join(f"{name.upper()}={told['settings'][name]}" for name in ("touches", "more", "objects"))
+size += " STEPS1={} STEPS2={}".format(*told["settings"]["steps"])
+size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
+tower = told["config"]["model"]["touch"]
+network = f"preset tiny with a touch tower of {tower['width']} x {tower['depth']}"
+network += f" at {told['config']['model']['image_size']} pixels"
+network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
+lines = ["# Simulated scenes as teachers", "", f"Made by `{size} python experiments/teaching.py`, {network}.", ""]
+for grade, found in files.items():
+    lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
+    lines += [retrieval_table(found), ""]
+    lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
+    lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
+OUT.mkdir(parents=True, exist_ok=True)
+write_whole(OUT / f"{NAME}.md", "\n".join(lines))
+print("\n".join(lines))

@@ -1,0 +1,232 @@
+"""A translation between two sensors: what it is, how it is applied, saved and loaded; training is in `generation`.
+
+The source's image goes through a ViT encoder with its sensor's tokens. A ViT decoder paints the target's image from all
+tokens, as the generator of a ViTGAN (Lee et al., 2021); a field is regressed by an MLP from the patch tokens (App.
+"Cross-sensor generation"). Without an encoder the network is one of the two references, a U-Net or an MLP on pixels.
+What is predicted is the difference from the mean target of the training pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, from_json, to_json
+from anytouch_jax.errors import ConfigError, UserError
+from anytouch_jax.nn.functional import Part, build
+from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.weights.tensors import read_safetensors, write_safetensors
+from anytouch_jax.weights.tree import flatten, nest
+from experiments.translation.networks import (
+    Critic,
+    FeatureField,
+    Painter,
+    PixelField,
+    Translation,
+    UNet,
+    halved,
+    thumbnail_side,
+)
+
+GENERATOR = "generator.safetensors"
+
+Params = dict[str, Any]
+_BATCH = 64
+_GREY = (0, 128, 255)  # least, middle and most of a touch less its gel (`data.transforms.subtract_background`)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a translation is trained. `adversarial`: weight of the critic's verdict beside the mean squared error, as a
+    share of the error of copying the mean target, so that it means the same in every unit; 0 for no critic. `penalty`:
+    on the critic's slope at real touches (R1, on features), which keeps the two in step. `tune` fine also trains the
+    encoders, at a tenth of the rate.
+    """
+
+    steps: int = 800
+    batch: int = 32
+    learning_rate: float = 1e-3
+    tune: Literal["frozen", "fine"] = "frozen"
+    adversarial: float = 0.02
+    penalty: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.batch < 1:
+            raise UserError(f"steps and batch are at least 1, not {self.steps} and {self.batch}")
+        if not (0 <= self.adversarial < np.inf and 0 <= self.penalty < np.inf and 0 < self.learning_rate < np.inf):
+            raise UserError("the adversarial weight and the penalty are 0 or more, and the learning rate is above 0")
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a generator is: sensors, shapes, where its encoder came from (None: it reads pixels), how it was trained.
+
+    `subtracts`: source images are wanted less the untouched gel.
+    """
+
+    source: str
+    target: str
+    shape: Translation
+    encoder: str | None
+    fit: Fit
+    pairs: int = 0
+    subtracts: bool = False
+
+    @property
+    def head(self) -> Part:
+        """What makes the output of the features."""
+        if self.encoder is None:
+            return Part(PixelField if self.shape.field else UNet, self.shape)
+        return Part(FeatureField if self.shape.field else Painter, self.shape)
+
+    @property
+    def critic(self) -> Part:
+        """What tells a real touch from a painted one, by an encoder's features."""
+        return Part(Critic, self.shape)
+
+    @property
+    def has_critic(self) -> bool:
+        """Images are judged by an encoder where the weight is not 0; fields and references never."""
+        return self.encoder is not None and not self.shape.field and self.fit.adversarial > 0
+
+
+def features(design: Design, encoder: Params | None, images: Array) -> Array:
+    """What the head reads of source images u8 (B, H, W, 3): an encoder's tokens, or pixels; f32."""
+    pixels = normalise_touch(images)
+    if encoder is None:
+        side = pixels.shape[1]
+        times = side // thumbnail_side(side)
+        return halved(pixels, times).reshape(len(pixels), -1) if design.shape.field else pixels
+    return encoded(design, encoder, pixels, design.source, design.shape.states)
+
+
+def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, states: int = 1) -> Array:
+    """Tokens f32 (B, 1 + S + N, states * D) of normalised images, with those of `sensor`, or the universal ones."""
+    model = design.shape.model
+    row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
+    rows = jnp.full(len(pixels), row, jnp.int32)
+    hidden: Array = build(model).apply(encoder, "touch.states", pixels[:, None], rows, states)
+    return hidden.astype(jnp.float32)
+
+
+def judged(design: Design, encoder: Params, pixels: Array, gel: Array | None) -> Array:
+    """What a critic reads of normalised images of the target: class token and mean of the patch tokens (B, 2 D).
+
+    `gel`: the target's untouched gel, alike, which is taken off for an encoder that `subtracts`.
+    """
+    if gel is not None:
+        grey = (np.array(_GREY)[:, None, None, None, None] / 255 - np.array(IMAGENET_MEAN)) / np.array(IMAGENET_STD)
+        low, middle, high = grey.astype(np.float32)  # (1, 1, 1, 3)
+        pixels = jnp.clip(pixels - gel[None] + middle, low, high)
+    hidden = encoded(design, encoder, pixels, design.target)
+    return jnp.concatenate([hidden[:, 0], hidden[:, design.shape.special :].mean(1)], axis=-1)
+
+
+def predict(design: Design, params: Params, x: Array) -> Array:
+    """The normalised target f32 from features: the mean target plus the head's answer in units of its spread."""
+    fixed = params["fixed"]
+    wide = lambda value, to: jnp.expand_dims(value, range(to.ndim - value.ndim))  # noqa: E731
+    x = x - wide(fixed["mean"], x)
+    x = x @ fixed["whiten"] if "whiten" in fixed else x / wide(fixed["scale"], x)
+    out = design.head.apply(params["head"], x).astype(jnp.float32)
+    return fixed["target"][None] + out * wide(fixed["spread"], out)
+
+
+def units(design: Design, fixed: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and scale (channels,) by which targets are normalised: ImageNet's on 0..255, or the training fields' own."""
+    if not design.shape.field:
+        return 255 * np.asarray(IMAGENET_MEAN, np.float32), 255 * np.asarray(IMAGENET_STD, np.float32)
+    return np.asarray(fixed["unit_mean"]), np.asarray(fixed["unit_scale"])
+
+
+@dataclass(frozen=True)
+class Generator:
+    """A trained translation: called on images u8 (n, H, W, 3) of the source sensor, at the model's size, it gives the
+    target's images u8 (n, H, W, 3), or fields f32 (n, 20, 20, 6) in mm and N."""
+
+    design: Design
+    params: Params = field(repr=False)
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        mean, scale = units(self.design, self.params["fixed"])
+        out = self.normalised(images) * scale + mean
+        return out if self.design.shape.field else np.rint(np.clip(out, 0, 255)).astype(np.uint8)
+
+    def normalised(self, images: np.ndarray) -> np.ndarray:
+        """The prediction f32 in the normalised units of the error. Raises UserError for images of another shape."""
+        side = self.design.shape.model.image_size
+        if images.dtype != np.uint8 or images.shape[1:] != (side, side, 3):
+            raise UserError(
+                f"images must be uint8 RGB of {side} x {side} pixels, not {images.dtype} {images.shape}; "
+                "data.transforms.touch_evaluation resizes them"
+            )
+        return in_batches(_program(nameless(self.design)), self.params, images)
+
+    def from_features(self, x: np.ndarray) -> np.ndarray:
+        """The prediction f32 in the normalised units of the error, from what `features` gave."""
+        return in_batches(_heads(nameless(self.design)), self.params, x)
+
+
+def in_batches(run: Callable[[Any, Any], Any], params: Any, images: np.ndarray) -> np.ndarray:
+    """`run(params, part)` of images part by part, the last part filled up: one shape, one compilation."""
+    found = []
+    for first in range(0, len(images), _BATCH):
+        part = images[first : first + _BATCH]
+        full = np.concatenate([part, np.repeat(part[-1:], min(_BATCH, len(images)) - len(part), axis=0)])
+        found.append(np.asarray(run(params, full))[: len(part)])
+    return np.concatenate(found)
+
+
+def nameless(design: Design) -> Design:
+    """The design without what does not change its programs, so that these are compiled once."""
+    name = None if design.encoder is None else "encoder"
+    return replace(design, encoder=name, fit=Fit(tune=design.fit.tune, adversarial=float(design.has_critic)), pairs=0)
+
+
+@lru_cache(maxsize=8)
+def _program(design: Design) -> Any:
+    def run(params: Params, images: Array) -> Array:
+        return predict(design, params, features(design, params.get("encoder"), images))
+
+    return jax.jit(run)
+
+
+@lru_cache(maxsize=8)
+def _heads(design: Design) -> Any:
+    return jax.jit(lambda params, x: predict(design, params, x))
+
+
+def save(generator: Generator, folder: str | Path) -> Path:
+    """Write a generator into `folder`, whole or not at all: one safetensors file, its design as JSON in the header."""
+    path = Path(folder) / GENERATOR
+    arrays = {name: np.asarray(value) for name, value in flatten(generator.params).items()}
+    write_safetensors(path, arrays, {"generator": to_json(generator.design)})
+    return path
+
+
+def load(folder: str | Path) -> Generator:
+    """The generator in a folder (or file). Raises UserError when there is none, or another kind of file."""
+    path = Path(folder)
+    path = path / GENERATOR if path.is_dir() else path
+    if not path.is_file():
+        others = sorted(file.parent.name for file in path.parent.glob(f"*/{GENERATOR}"))
+        there = f" (there are {', '.join(others)})" if others else ""
+        raise UserError(
+            f"there is no generator in {folder}{there}; "
+            "train one: anytouch translate --fit --data M --run R --from A --to B"
+        )
+    arrays, about = read_safetensors(path)
+    try:
+        design: Design = from_json(about["generator"], Design)
+    except (KeyError, ConfigError) as error:
+        raise UserError(f"{path} holds no generator that this version can read ({error}); train it again") from None
+    return Generator(design, nest(arrays))

@@ -1,0 +1,256 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # One sensor's touch as another would feel it
+#
+# The paper's appendix "Cross-sensor generation": images of a DuraGel painted from those of a GelSight Mini, and the
+# 20 x 20 field of a Tac3D (displacement and force) regressed from a GelSight Mini or a DIGIT, on fine-aligned pairs.
+# How well it goes is a measure of the encoder. Here the pairs are simulated: one device of each sensor, mounted
+# straight, one motion for all of them frame by frame; a quarter of the objects, by whole pairs of primitive and
+# texture, is only ever tested on. Training stops where the error on the objects of a third split is smallest.
+#
+#     make translation
+#
+# trains the encoders, too: AnyTouch and T3-style as in Tables 2 to 4, AnyTouch's stage 1 by itself, its stage 2 with a
+# layer decay (`--optim.layer-decay 0.1`: the lower layers stay nearly as stage 1 left them), and the weights half-way
+# from stage 1 to stage 2 (`anytouch convert --between`); one of each a seed, on the scenes of `make experiments`
+# (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs.
+# `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
+# for one a seed. `STEPS1=3000` gives stage 1, T3-style's too, so many steps, and its table a page of its own
+# (`translation_3000.md`). Each is compared with two plain references trained on the same pairs: copying the mean
+# training target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
+#
+# What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
+# is made of these files alone (`TABLE=1`: nothing but that). `WORK=` and `OUT=` in the environment are where data and
+# results go; `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` (frozen, fine or both with a comma) change the size.
+
+# %%
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from dataclasses import asdict, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.config import preset
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.edit import select
+from anytouch_jax.encoder.encoder import Encoder, load_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import write_whole
+from anytouch_jax.sim.dataset import simulate, version
+from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.train.mesh import enable_compilation_cache
+from experiments.tables import asked, page, plan, remaining
+from experiments.tables.found import find_again
+from experiments.tables.work import Work
+from experiments.translation import page as translated
+from experiments.translation import pairs, training
+from experiments.translation.figures import picture_grid
+from experiments.translation.generator import Fit
+from experiments.translation.networks import Translation
+from experiments.translation.page import PIXELS, TASKS, one_table
+
+QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
+USUAL = plan.QUICK if QUICK else plan.FULL
+SIZE = replace(USUAL, steps1=asked.number("STEPS1", USUAL.steps1))
+LONGER = {} if SIZE == USUAL else {"steps1": SIZE.steps1}
+NAME = "_".join(["translation", *(["quick"] if QUICK else []), *map(str, LONGER.values())])
+WORK, OUT = asked.path("WORK", "runs/translation"), asked.path("OUT", "experiments/results")
+RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
+TOUCHES, STEPS = asked.number("TOUCHES", 24 if QUICK else 400), asked.number("STEPS", 40 if QUICK else 600)
+if RUNS and LONGER:
+    raise UserError("STEPS1 is for the encoders that this page trains; leave it out with RUNS, whose encoders are done")
+SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
+TUNE = asked.names("TUNE", "frozen", ("frozen", "fine"))
+RUN_FILES = OUT / NAME
+enable_compilation_cache()
+
+# %% [markdown]
+# ## The pairs
+#
+# 60 objects (24 in a trial), several touches of each. The names of the objects say texture, material and primitive.
+
+# %%
+scenes = Scenes(
+    touches=TOUCHES, objects=24 if QUICK else 60, sensors=("gelsight_mini", "digit", "duragel", "tac3d"),
+    seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
+)  # fmt: skip
+PAIRS = WORK / f"pairs-{TOUCHES}-{version(scenes.sensors)}"
+
+# %% [markdown]
+# ## What the encoders may be trained on
+#
+# The paper takes the coarse data of the same objects out of pre-training. `study/remaining.py` does so by name: it
+# keeps the rows whose object is in no split of the pairs. For encoders of your own `REMAINING="coarse.parquet ..."
+# make translation` writes `coarse_remaining.parquet` beside each and stops; train them on that.
+
+
+# %%
+def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
+    """How many objects of the pairs the encoder was trained on in its last stage, if its manifests are still there."""
+    files = [Path(path) for path in encoder.config.data.manifests]
+    if not files or not all(file.is_file() for file in files):
+        return "unknown"
+    seen = manifests.read(files)
+    trained = {seen.value(int(row), "object") for row in seen.rows_of("train")}
+    return str(len(trained & set(table.column("object").to_pylist()) - {None}))
+
+
+# %% [markdown]
+# ## One run
+#
+# A frozen encoder (or one trained along, `TUNE=fine`), a fresh ViT decoder or MLP, and for images a critic: the same
+# encoder with an MLP. Error: mean squared error of normalised pixels, or of each channel of the field in deviations.
+
+
+# %%
+def seen_by(encoder: Encoder) -> tuple[int, bool]:
+    """The size of picture that an encoder is shown, and whether less the untouched gel."""
+    return encoder.config.model.image_size, encoder.subtracts
+
+
+def mark(encoder: Encoder | None) -> str:
+    """Where an encoder is from, and a mark of its weights: a run that was trained anew is another encoder."""
+    if encoder is None:
+        return PIXELS
+    return f"{Path(encoder.source).name} (weights {encoder.mark})"
+
+
+def settings(
+    task: tuple[str, str], name: str, encoder: Encoder | None, seen: tuple[int, bool], tune: str, seed: int, data: str
+) -> dict[str, Any]:
+    return {
+        "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
+        "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
+        "pairs": data, "version": training.VERSION, "simulator": version(task), **LONGER,
+    }  # fmt: skip
+
+
+def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Path) -> None:
+    """Train, score on objects never seen, and write the JSON of a run; the first seed also draws its pictures."""
+    (x, y), val, (test_x, test_y), shown = data
+    begun = time.perf_counter()
+    field = () if y.dtype == np.uint8 else y.shape[1:]
+    shape = None if encoder else Translation(replace(preset("tiny").model, image_size=about["size"]), field=field)
+    made, losses = training.fit(
+        encoder, x, y, source=about["from"], target=about["to"], val=val, options=Fit(**about["fit"]), shape=shape
+    )
+    seconds = time.perf_counter() - begun
+    away = made(test_x).astype(np.float64) - test_y
+    each = training.errors(made, test_x, test_y)
+    record = {
+        "settings": about,
+        "error": float(each.mean()),
+        "each": [round(float(value), 5) for value in each],
+        "mean_target": float(training.mean_errors(made, test_y).mean()),
+        "train_error": losses[-1]["error"],
+        "rms": [float(value) for value in np.sqrt((away**2).mean(axis=tuple(range(away.ndim - 1))))],
+        "pairs": [len(x), len(val[0]), len(test_x)],
+        "seconds": round(seconds, 1),
+        "critic": made.design.has_critic,
+    }
+    if about["fit"]["seed"] == SEEDS[0]:
+        picture_grid(file.with_suffix(".png"), made, test_x[shown], test_y[shown])
+    write_whole(file, json.dumps(record, indent=2) + "\n")
+    print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
+
+
+def of_sensors(table: manifests.Manifest, names: tuple[str, str]) -> str:
+    """The hash of the rows of two sensors: what a translation from the one to the other is of."""
+    rows = np.flatnonzero(np.isin(table.column("sensor").to_pylist(), names))
+    return select(table, rows).content_hash[:16]
+
+
+def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
+    """By the name that they have in the table, and by seed: those of RUNS, else those that this page trains."""
+    if RUNS:
+        loaded = {path: load_encoder(path) for paths in RUNS.values() for path in paths}
+        return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
+    found: dict[str, dict[int, Encoder]] = {}
+    for seed in SEEDS:
+        for name, one in remaining.encoders(Work(STUDY), SIZE, seed, table).items():
+            found.setdefault(name, {})[seed] = one
+    return found
+
+
+def _settings_of(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text())["settings"]
+
+
+# %% [markdown]
+# ## What an encoder knows beside pictures
+#
+# What a stage keeps of the picture it may lose for what touches have in common, so beside the errors stands how often
+# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`;
+# `study/found.py`).
+
+
+# %%
+def all_runs() -> None:
+    """Every run that is not there yet, task by task: frames are read once a task."""
+    simulate(scenes, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
+    table = manifests.read(PAIRS / "manifest.parquet")
+    if os.environ.get("REMAINING"):
+        for word in os.environ["REMAINING"].split():
+            remaining.write_remaining(Path(word), table)
+        raise SystemExit(0)
+    known = encoders(table)
+    if not (RUNS or QUICK):  # a trial has too few touches for galleries of 50
+        fine = manifests.read(Work(STUDY).manifest("fine"))
+        for name, seed in product(known, SEEDS):
+            one = known[name][seed]
+            find_again(RUN_FILES, name, seed, one, mark(one), fine)
+    content = {task: of_sensors(table, task) for task in TASKS}
+    plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
+    wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in remaining.NOT_TUNED]
+    plans = [*wanted, (PIXELS, "scratch")]
+    every = {}
+    for (task, seed), (name, tune) in product(product(TASKS, SEEDS), plans):
+        encoder = known[name][seed] if name in known else None
+        about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content[task])
+        stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
+        every[RUN_FILES / f"{stem}.json"] = (about, encoder)
+    there = [file for file in RUN_FILES.glob("*-*.json") if file not in every]
+    one_table([*(about for about, _ in every.values()), *map(_settings_of, there)], RUN_FILES)
+    counts = RUN_FILES / "overlap.json"
+    before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
+    met = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
+    write_whole(counts, json.dumps(before | {name: " to ".join(found) for name, found in met.items()}) + "\n")
+    for source, target in TASKS:
+        mine = [(*one, file) for file, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
+        todo = [one for one in mine if not (one[2].exists() and _settings_of(one[2]) == one[0])]
+        if not todo:
+            continue
+        split = pairs.find_pairs(table, source, target)
+        data = [pairs.read_pairs(table, part, plain[0], subtract=plain[1]) for part in split]
+        force = [table.value(int(row), "label.force") for row in split.test.source]
+        shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
+        for about, encoder, file in todo:
+            one_run(about, encoder, (*data, shown), file)
+
+
+if not TABLE:
+    all_runs()
+
+# %% [markdown]
+# ## The table, from the JSON of the runs
+
+# %%
+said = translated.page(RUN_FILES)
+write_whole(OUT / f"{NAME}.md", said)
+print(said)
+for picture in sorted(RUN_FILES.glob("*.png")):
+    page.show(picture)

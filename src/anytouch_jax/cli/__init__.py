@@ -1,0 +1,1 @@
+"""The `anytouch` command line: one file a command."""

@@ -1,0 +1,106 @@
+"""Reading dataclasses from JSON strictly, ranges, choices, and the errors that all rooms raise for a user's mistake."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import types
+import typing
+from typing import Any, Literal, NamedTuple
+
+from anytouch_jax.errors import ConfigError
+
+
+class Range(NamedTuple):
+    """Numbers `low` to `high`, both included, and how a message calls them."""
+
+    low: float
+    high: float
+    words: str
+
+
+COUNT = Range(1, math.inf, "1 or more")
+NOT_NEGATIVE = Range(0, math.inf, "0 or more")
+ABOVE_0 = Range(math.ulp(0.0), math.inf, "above 0")
+FLOAT32 = 3.4e38  # what is larger is infinite where it is used
+NORMAL = Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")
+SHARE = Range(0, 1, "0 to 1")
+SEED = Range(0, 2**32 - 1, "0 to 4294967295")
+BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
+
+
+def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
+    """Raise ConfigError for a field of `settings` outside its range; `prefix` is its section on the command line.
+
+    None is in every range, NaN and what is infinite in float32 in none; of a tuple every entry counts.
+    """
+    for name, (low, high, words) in ranges.items():
+        value = getattr(settings, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not (low <= number <= high and number < FLOAT32):
+                raise ConfigError(f"{_spelled(prefix, name)} must be {words}, not {number}")
+
+
+def chosen(prefix: str, settings: Any) -> None:
+    """Raise ConfigError for a field of `settings` that is none of the choices (Literal) of its annotation; `prefix` as
+    for `in_range`. Of a tuple every entry counts."""
+    kind: Any = type(settings)
+    for name, hint in _choices(kind).items():
+        build(hint, getattr(settings, name), _spelled(prefix, name))
+
+
+@functools.cache
+def _choices(kind: type) -> dict[str, Any]:
+    """The annotations of those fields of a dataclass that have choices, by name."""
+
+    def has_some(hint: Any) -> bool:
+        return typing.get_origin(hint) is Literal or any(map(has_some, typing.get_args(hint)))
+
+    return {name: hint for name, hint in typing.get_type_hints(kind).items() if has_some(hint)}
+
+
+def _spelled(prefix: str, name: str) -> str:
+    return f"{prefix}{name.replace('_', '-')}" if prefix else name
+
+
+def build(kind: Any, value: Any, where: str) -> Any:
+    """`value` (from JSON) as an instance of the annotation `kind`; `where` names the place in errors."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        if not isinstance(value, dict):
+            raise ConfigError(f"{where} must be an object, not {value!r}")
+        hints = typing.get_type_hints(kind)
+        unknown = sorted(set(value) - set(hints))
+        if unknown:
+            raise ConfigError(f"{where} has no setting called {', '.join(unknown)}; it has {', '.join(hints)}")
+        required = [f.name for f in dataclasses.fields(kind) if _required(f)]
+        missing = [name for name in required if name not in value]
+        if missing:
+            raise ConfigError(f"{where} lacks {', '.join(missing)}")
+        return kind(**{name: build(hints[name], item, f"{where}.{name}") for name, item in value.items()})
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        (inner,) = [arg for arg in args if arg is not type(None)]
+        return build(inner, value, where)
+    if origin is Literal:
+        if value not in args:
+            raise ConfigError(f"{where} must be one of {', '.join(map(str, args))}, not {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where} must be a list, not {value!r}")
+        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        if len(kinds) != len(value):
+            raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
+        return tuple(build(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ConfigError(f"{where} must be {kind.__name__}, not {value!r}")
+    return value
+
+
+def _required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING

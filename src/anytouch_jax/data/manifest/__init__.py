@@ -1,0 +1,1 @@
+"""Manifests: tables of tactile frames."""

@@ -1,0 +1,1 @@
+"""Tools that prepare a manifest for training."""

@@ -1,0 +1,99 @@
+"""What may be used commercially, row by row; and the rows that certainly may."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow.compute as pc
+
+from anytouch_jax.data.manifest.edit import select
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.errors import UserError
+
+YES, NO, UNKNOWN = 1, 0, -1
+_NO = re.compile(r"\bnc\b|non-?\s?commercial|(research|academic|educational)[\s-]+(use[\s-]+)?only", re.IGNORECASE)
+_YES = re.compile(
+    r"(mit|apache([\s-]2(\.0)?)?|bsd([\s-][0-9]-clause)?|isc|cc0([\s-]1\.0)?|cc[\s-]by([\s-]sa)?([\s-][0-9]\.[0-9])?|"
+    r"public[\s-]domain|unlicense)(\s+licen[cs]e)?",
+    re.IGNORECASE,
+)
+
+
+class Licence(NamedTuple):
+    """Rows under one licence: its name (None where none is given), YES, NO or UNKNOWN, the datasets, the rows."""
+
+    name: str | None
+    commercial: int
+    datasets: tuple[str, ...]
+    rows: int
+
+
+class Commercial(NamedTuple):
+    """The rows that may be used commercially, and how many were left out."""
+
+    manifest: Manifest
+    non_commercial: int
+    unknown: int
+
+
+def allows(licence: str | None) -> int:
+    """Whether a licence by its name allows commercial use: YES, NO or UNKNOWN (a name that is not known)."""
+    if licence is None or not licence.strip():
+        return UNKNOWN
+    if _NO.search(licence):
+        return NO
+    return YES if _YES.fullmatch(licence.strip()) else UNKNOWN
+
+
+def commercial_use(manifest: Manifest) -> np.ndarray:
+    """YES, NO or UNKNOWN for every row, i8 (rows,).
+
+    NO where the flag `commercial` or the licence's name says so; else the flag decides, else the licence's name.
+    """
+    codes = manifest.codes("license")
+    names = pc.unique(manifest.column("license")).drop_null().to_pylist()
+    verdict = np.array([*(allows(name) for name in names), UNKNOWN], np.int8)[codes]  # code -1 is the last one
+    flag = np.asarray(pc.fill_null(manifest.column("commercial").cast("int8"), UNKNOWN)).astype(np.int8)
+    return np.where((flag == NO) | (verdict == NO), NO, np.where(flag == YES, YES, verdict)).astype(np.int8)
+
+
+def commercial_only(manifest: Manifest) -> Commercial:
+    """The rows that may certainly be used commercially. Raises UserError when none is left."""
+    use = commercial_use(manifest)
+    non_commercial, unknown = int((use == NO).sum()), int((use == UNKNOWN).sum())
+    if not (use == YES).any():
+        files = ", ".join(map(str, manifest.files))
+        raise UserError(
+            f"{files}: no row may certainly be used commercially ({non_commercial} may not, {unknown} do not say); "
+            "fill in the columns 'license' and 'commercial'"
+        )
+    return Commercial(select(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
+
+
+def licences(manifest: Manifest) -> tuple[Licence, ...]:
+    """Rows under each licence, most rows first."""
+    use, name, dataset = commercial_use(manifest), manifest.codes("license"), manifest.codes("dataset")
+    found = []
+    for code, verdict in np.unique(np.stack([name, use.astype(np.int64)], 1), axis=0):
+        rows = np.flatnonzero((name == code) & (use == verdict))
+        _, first = np.unique(dataset[rows], return_index=True)
+        sets = sorted({str(value) for row in rows[first] if (value := manifest.value(row, "dataset")) is not None})
+        found.append(Licence(manifest.value(rows[0], "license"), int(verdict), tuple(sets), len(rows)))
+    return tuple(sorted(found, key=lambda licence: -licence.rows))
+
+
+def card(packed: Manifest, groups: Iterable[str]) -> str:
+    """README.md of a pack: which files make which table, for the Hub and for `datasets`, and whose terms they have."""
+    configs = "".join(f"- config_name: {group}\n  data_files: {group}/*.parquet\n" for group in groups)
+    terms = "".join(
+        f"| {one.name or 'none given'} | {one.rows} | {', '.join(one.datasets)} |\n" for one in licences(packed)
+    )
+    return (
+        f"---\nconfigs:\n{configs}---\n{len(packed)} tactile frames, content {packed.content_hash}.\n\n"
+        "`manifest.parquet` is the manifest for `anytouch`; its paths name a shard and a row.\n"
+        "The other tables are the stored files, for viewing and for other tools.\n\n"
+        f"| licence | rows | datasets |\n|---|---|---|\n{terms}"
+    )

@@ -1,0 +1,113 @@
+"""Captions to token ids: CLIP's tokenizer where its file is at hand, else a small one trained on our own captions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import tokenizers
+from tokenizers import decoders, models, normalizers, pre_tokenizers, processors, trainers
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import write_whole
+
+START, END = "<|startoftext|>", "<|endoftext|>"
+
+
+class Tokenizer:
+    """A tokenizer with CLIP's conventions: a start token first, an end token last, the end token as padding.
+
+    `vocab_size` ids in all, `end_id` the end token. The end token has the largest id, so pooling at the largest id
+    (golden Q10) finds it.
+    """
+
+    def __init__(self, inner: tokenizers.Tokenizer, name: str = "the tokenizer") -> None:
+        inner.no_padding()
+        inner.no_truncation()
+        empty = inner.encode("").ids
+        self.vocab_size: int = inner.get_vocab_size()
+        if len(empty) != 2 or empty[1] != self.vocab_size - 1:
+            raise UserError(
+                f"{name} is not of CLIP's kind: it must put a start and an end token around a text, "
+                "and the end token must have the largest id"
+            )
+        self.start_id, self.end_id = empty
+        self._inner = inner
+
+    def encode(self, texts: Sequence[str], length: int) -> tuple[np.ndarray, np.ndarray]:
+        """Texts to (ids i32 (L, length), mask bool (L, length)).
+
+        A long text keeps its first tokens and the end token; a short one is padded with the end token. The mask is
+        true on real tokens, the first end token included. Raises UserError for a length below 2.
+        """
+        if length < 2:
+            raise UserError(f"a text needs room for a start and an end token, not a length of {length}")
+        ids = np.full((len(texts), length), self.end_id, np.int32)
+        mask = np.zeros((len(texts), length), bool)
+        for row, text in enumerate(texts):
+            tokens = self._inner.encode(text).ids
+            if len(tokens) > length:
+                tokens = [*tokens[: length - 1], self.end_id]
+            ids[row, : len(tokens)] = tokens
+            mask[row, : len(tokens)] = True
+        return ids, mask
+
+    def longest(self, texts: Sequence[str]) -> int:
+        """Tokens of the longest of `texts`, start and end included; 2 without any."""
+        starts = range(0, len(texts), 10_000)
+        parts = (self._inner.encode_batch_fast(list(texts[start : start + 10_000])) for start in starts)
+        return max((len(one.ids) for part in parts for one in part), default=2)
+
+    def save(self, path: str | Path) -> None:
+        """Write a tokenizer.json that `load` reads, whole or not at all; `path` is the file or its folder."""
+        path = Path(path)
+        target = path / "tokenizer.json" if path.suffix != ".json" else path
+        write_whole(target, self._inner.to_str())
+
+
+def load(path: str | Path) -> Tokenizer:
+    """Read a `tokenizer.json`, given as the file or its folder. Raises UserError when it is missing or unfit."""
+    path = Path(path).expanduser()
+    if not path.exists() and path.name != "tokenizer.json":
+        raise UserError(f"there is no tokenizer at {path}, nor anything else; give a tokenizer.json, or its folder")
+    file = path / "tokenizer.json" if path.is_dir() else path
+    if not file.is_file():
+        raise UserError(f"there is no tokenizer {file}; give the tokenizer.json that lies beside CLIP's weights")
+    try:
+        inner = tokenizers.Tokenizer.from_file(str(file))
+    except Exception as error:  # the library raises plain Exception
+        raise UserError(f"{file} is not a tokenizer.json: {error}") from None
+    return Tokenizer(inner, str(file))
+
+
+def train(captions: Iterable[str], vocab_size: int) -> Tokenizer:
+    """A byte-level BPE tokenizer of at most `vocab_size` ids trained on `captions`; the same captions, the same ids.
+
+    Any text can be encoded (lower case, runs of space as one). Start and end token take the last two ids. Raises
+    UserError when `vocab_size` has no room for the 256 bytes and these two, or when there is no caption.
+    """
+    texts = sorted(set(captions))
+    if not texts:
+        raise UserError("a tokenizer cannot be trained without captions")
+    if vocab_size < 258:
+        raise UserError(f"a tokenizer needs room for at least 258 tokens, not {vocab_size}")
+    inner = tokenizers.Tokenizer(models.BPE())
+    inner.normalizer = normalizers.Sequence(
+        [
+            normalizers.NFC(),
+            normalizers.Replace(tokenizers.Regex(r"\s+"), " "),
+            normalizers.Strip(),
+            normalizers.Lowercase(),
+        ]
+    )
+    inner.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
+    inner.decoder = decoders.ByteLevel()
+    alphabet = pre_tokenizers.ByteLevel.alphabet()
+    trainer = trainers.BpeTrainer(vocab_size=vocab_size - 2, initial_alphabet=alphabet, show_progress=False)
+    inner.train_from_iterator(texts, trainer)
+    inner.add_special_tokens([START, END])
+    inner.post_processor = processors.TemplateProcessing(
+        single=f"{START} $A {END}", special_tokens=[(t, inner.token_to_id(t)) for t in (START, END)]
+    )
+    return Tokenizer(inner, "the trained tokenizer")

@@ -1,0 +1,1 @@
+"""Trained touch encoders: load, embed, stream, export, adapt."""

@@ -1,0 +1,219 @@
+"""A trained touch encoder as one file that jax alone can run (`anytouch export`), and its way back (`load`).
+
+The file is a `jax.export` artefact: uint8 frames and sensor rows in, features out, for any number of touches;
+normalisation and parameters are inside. A JSON beside it says how to call it and holds its checksum. `load` reads
+both without a line of the network's code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jax import export as jax_export
+
+from anytouch_jax.config import UNIVERSAL
+from anytouch_jax.encoder.names import describes
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import write_whole
+
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder, Join, Pooling
+
+FORMAT = "anytouch_jax.export.1"
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "float64": 1e-4}  # of the largest feature; the platform's own rounding
+_CHECKED = (1, 5)  # batch sizes
+_EXAMPLE = """import pathlib
+import jax
+run = jax.export.deserialize(bytearray(pathlib.Path({name!r}).read_bytes()))
+features = jax.jit(run.call)(frames, sensor)  # uint8 (B, {frames}, {size}, {size}, 3), int32 (B,)"""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """An encoder from a file. `about` is the JSON beside it; call it with touches and a sensor."""
+
+    about: dict[str, Any]
+    _run: Any = field(repr=False)
+
+    def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
+        """Features f32 (B, E) of touches u8 RGB (B, T, H, W, 3); `sensor` is a name for all, names (B,), or rows i32
+        (B,).
+
+        Raises UserError for another shape or type, and for a sensor that the model does not know.
+        """
+        frames = np.asarray(frames)
+        wanted = (self.about["frames"], self.about["image_size"], self.about["image_size"], 3)
+        if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
+            shape = ", ".join(str(size) for size in wanted)
+            raise UserError(f"touches must be uint8 RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
+        rows = np.full(len(frames), sensor) if isinstance(sensor, str) else np.asarray(sensor)
+        if rows.dtype.kind in "UO":
+            rows = np.array([self._row(name) for name in rows.reshape(-1)], np.int32).reshape(rows.shape)
+        if rows.shape != (len(frames),) or rows.dtype.kind not in "iu":
+            raise UserError(
+                f"sensor rows must be one integer for each of the {len(frames)} touches, not {rows.dtype} {rows.shape}"
+            )
+        if rows.min() < 0 or rows.max() >= len(self.about["sensors"]):
+            raise UserError(f"sensor rows must be 0 to {len(self.about['sensors']) - 1}")
+        return np.asarray(self._run(frames, rows.astype(np.int32)))
+
+    def _row(self, name: Any) -> int:
+        sensors: dict[str, int] = self.about["sensors"]
+        if str(name) not in sensors:
+            raise UserError(f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other")
+        return sensors[str(name)]
+
+
+def load(path: str | Path) -> Exported:
+    """The encoder that `export` wrote to `path`. Raises UserError when it is not whole or not for this machine."""
+    path = Path(path)
+    data, about = _read(path)
+    if _here() not in about["platforms"]:
+        raise UserError(f"{path} was exported for {', '.join(about['platforms'])}; this machine runs jax on {_here()}")
+    try:
+        module = jax_export.deserialize(bytearray(data))
+    except Exception as error:  # its bytes are right, so it is of another jax
+        raise UserError(
+            f"{path} cannot be read by jax {jax.__version__}, it was exported by {about['jax']} "
+            f"({' '.join(str(error).split())[:200]}); export it again"
+        ) from None
+    return Exported(about, jax.jit(module.call))
+
+
+def export(
+    encoder: Encoder,
+    path: str | Path,
+    *,
+    frames: int = 1,
+    platforms: Sequence[str] = ("cpu", "cuda"),
+    pooling: Pooling = "class",
+    join: Join = "mean",
+) -> dict[str, Any]:
+    """Write an encoder for touches of `frames` frames to `path`, and the JSON beside it; returns what that says.
+
+    Before anything is written the artefact is called with 1 and 5 touches and compared with the live model. Raises
+    UserError when they differ, when it cannot be compared on this machine, or when the disk does not take it.
+    """
+    from anytouch_jax.encoder.encoder import check_frames
+
+    path, model = Path(path), encoder.config.model
+    check_frames(model, frames)
+    _check_platforms(platforms)
+    if path.suffix == ".json":
+        raise UserError(f"{path} is the name of the description; name the artefact .bin")
+    # The only form of attention that every platform has and that takes any number of touches.
+    plain = replace(encoder, config=replace(encoder.config, model=replace(model, attention="xla")))
+    data = _artefact(plain, frames, platforms, pooling, join)
+    live = plain if model.attention == "cudnn" and _here() != "cuda" else encoder
+    differs, width = _worst(live, data, frames, pooling, join)
+    about = {
+        "format": FORMAT,
+        "file": path.name,
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "jax": jax.__version__,
+        "platforms": list(platforms),
+        **call_of(encoder, frames=frames, width=width, pooling=pooling, join=join),
+        "worst_difference": differs,
+        "example": _EXAMPLE.format(name=path.name, frames=frames, size=model.image_size),
+    }
+    write_whole(path, data)
+    write_whole(describes(path), json.dumps(about, indent=2) + "\n")
+    return about
+
+
+def call_of(
+    encoder: Encoder, *, frames: int, width: int, pooling: Pooling = "class", join: Join = "mean"
+) -> dict[str, Any]:
+    """How an encoder in another form is called: what goes in, what comes out, which row is which sensor."""
+    model, side = encoder.config.model, encoder.config.model.image_size
+    less = ", less the untouched gel: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
+    return {
+        "source": encoder.source,
+        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){less}; sensor: int32 (B,)",
+        "output": f"features: float32 (B, {width}), not normalised",
+        "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the shorter "
+        f"side is above {side} pixels, else INTER_LINEAR"
+        + ("; the gel is taken off before" if encoder.subtracts else ""),
+        "frames": frames,
+        "image_size": side,
+        "features": width,
+        "background": encoder.config.data.background,
+        "pooling": pooling,
+        "join": join,
+        "dtype": model.dtype,
+        "sensors": {name: row for row, name in enumerate(model.sensors)},
+        "seen": None if encoder.seen is None else list(encoder.seen),
+    }
+
+
+def _check_platforms(platforms: Sequence[str]) -> None:
+    wrong = [name for name in platforms if name not in PLATFORMS]
+    if wrong or not platforms:
+        raise UserError(f"platforms must be of {', '.join(PLATFORMS)}, not {', '.join(wrong) or 'none'}")
+    if _here() not in platforms:
+        raise UserError(
+            f"this machine runs jax on {_here()}: add it to --platforms, so that the artefact can be checked"
+        )
+
+
+def _here() -> str:
+    """The platform of this process, by its name in artefacts."""
+    return {"gpu": "cuda"}.get(jax.default_backend(), jax.default_backend())
+
+
+def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: Pooling, join: Join) -> bytes:
+    from anytouch_jax.encoder.encoder import touch_features
+
+    side, (batch,) = encoder.config.model.image_size, jax_export.symbolic_shape("b")
+    run = partial(touch_features, encoder.params, net=encoder.net, pooling=pooling, join=join)
+    touches = jax.ShapeDtypeStruct((batch, frames, side, side, 3), np.uint8)
+    rows = jax.ShapeDtypeStruct((batch,), np.int32)
+    return bytes(jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize())
+
+
+def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: Join) -> tuple[float, int]:
+    """(the largest difference from the live model, as a share of the largest feature; features of a touch)."""
+    run = jax.jit(jax_export.deserialize(bytearray(data)).call)
+    model, rng, worst, width = encoder.config.model, np.random.default_rng(0), 0.0, 0
+    for count in _CHECKED:
+        clips = rng.integers(0, 256, (count, frames, model.image_size, model.image_size, 3), np.uint8)
+        rows = rng.integers(0, len(model.sensors), count).astype(np.int32)
+        live = encoder.embed(clips, rows, pooling=pooling, join=join)
+        found = np.asarray(run(clips, rows))
+        if found.shape != live.shape or not np.isfinite(found).all():
+            raise UserError(f"the artefact gives {found.shape}, the live model {live.shape}, or what is not finite")
+        worst = max(worst, float(np.abs(found - live).max() / np.abs(live).max()))
+        width = live.shape[1]
+    if worst > TOLERANCE[model.dtype]:
+        raise UserError(f"the artefact differs from the live model by {worst:.2g} of its largest feature: not written")
+    return worst, width
+
+
+def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """The bytes of an artefact and its description, compared with each other."""
+    try:
+        data, text = path.read_bytes(), describes(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        missing = describes(path) if path.is_file() else path
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{missing} cannot be read: {reason}; an artefact is two files, FILE and FILE.json") from None
+    try:
+        about = json.loads(text)
+        known = about["format"] == FORMAT
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{describes(path)} is not the description of an exported encoder; export it again") from None
+    if not known:
+        raise UserError(f"{describes(path)} has format {about['format']!r}; this program reads {FORMAT!r}")
+    if len(data) != about.get("bytes") or hashlib.sha256(data).hexdigest() != about.get("sha256"):
+        raise UserError(f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again")
+    return data, about

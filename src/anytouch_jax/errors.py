@@ -1,0 +1,9 @@
+"""Errors that a user can mend."""
+
+
+class UserError(ValueError):
+    """A user's mistake. The message is one sentence that says what is wrong, where, and what to do."""
+
+
+class ConfigError(UserError):
+    """A configuration that cannot be read or is inconsistent. The message says what to change."""

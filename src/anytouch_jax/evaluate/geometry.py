@@ -1,0 +1,110 @@
+"""Numbers and a picture of a feature space: alignment, uniformity, silhouettes, t-SNE."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.choices import thinned
+
+Array = npt.NDArray[Any]
+MOST = 4000  # rows that pairwise figures look at
+
+
+@dataclass(frozen=True)
+class Space:
+    """Figures of one feature space; see the functions of the same names. None: not defined for these labels."""
+
+    name: str
+    alignment: float | None
+    uniformity: float
+    silhouette_sensor: float | None
+    silhouette_object: float | None
+    rows: int
+
+
+def alignment(first: Array, second: Array, *, power: float = 2.0) -> float:
+    """Mean distance, to the `power`, of the unit-norm rows of positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
+    first, second = _unit(first), _unit(second)
+    if first.shape != second.shape or not len(first):
+        raise UserError(f"alignment needs pairs of rows, not {first.shape} and {second.shape}")
+    return float(np.mean(np.linalg.norm(first - second, axis=1) ** power))
+
+
+def uniformity(features: Array) -> float:
+    """Log of the mean of exp(-2 |x - y|^2) over all pairs of unit-norm rows (Wang & Isola, 2020).
+
+    Between -8 (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are looked at.
+    """
+    x = _unit(thinned(np.asarray(features), MOST))
+    if len(x) < 2:
+        raise UserError("uniformity needs two rows or more")
+    likeness = (x @ x.T)[np.triu_indices(len(x), 1)]
+    return float(np.log(np.mean(np.exp(-2.0 * np.maximum(2 - 2 * likeness, 0.0)))))
+
+
+def silhouette(features: Array, labels: Any) -> float | None:
+    """Mean silhouette by cosine distance, -1..1: do rows lie nearer to their own label than to the next?
+
+    None when there are fewer than two labels, or as many as rows. At most MOST rows are looked at.
+    """
+    from sklearn.metrics import silhouette_score
+
+    labels = thinned(np.asarray(labels).astype(str), MOST)
+    count = len(np.unique(labels))
+    if not 2 <= count < len(labels):
+        return None
+    return float(silhouette_score(_unit(thinned(np.asarray(features), MOST)), labels, metric="cosine"))
+
+
+def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:
+    """t-SNE of features (n, d) by cosine distance, f32 (n, 2); the same for a seed. Raises UserError below 4 rows."""
+    from sklearn.manifold import TSNE
+    from threadpoolctl import threadpool_limits
+
+    x = _unit(features)
+    if len(x) < 4:
+        raise UserError(f"t-SNE needs 4 rows or more, not {len(x)}")
+    # Squared Euclidean distances of unit-norm rows are twice the cosine distances.
+    model = TSNE(perplexity=min(perplexity, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
+    with threadpool_limits(1):  # its threads wait for each other at every step: on a busy machine for ages
+        return np.asarray(model.fit_transform(x.astype(np.float32)), np.float32)
+
+
+def describe(features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features") -> Space:
+    """All figures of features (n, d); positive pairs are all rows of the same touch by different sensors.
+
+    Rows whose object is not known ("") have no part in the silhouette by object.
+    """
+    x, sensors, objects = np.asarray(features), np.asarray(sensors).astype(str), np.asarray(objects).astype(str)
+    known = objects != ""
+    first, second = _positive_pairs(sensors, np.asarray(touches).astype(str))
+    return Space(
+        name=name,
+        alignment=alignment(x[first], x[second]) if len(first) else None,
+        uniformity=uniformity(x),
+        silhouette_sensor=silhouette(x, sensors),
+        silhouette_object=silhouette(x[known], objects[known]),
+        rows=len(x),
+    )
+
+
+def _positive_pairs(sensors: Array, touches: Array) -> tuple[Array, Array]:
+    pairs: list[tuple[int, int]] = []
+    _, codes = np.unique(touches, return_inverse=True)
+    order = np.argsort(codes, kind="stable")
+    for members in np.split(order, np.cumsum(np.bincount(codes))[:-1]):
+        pairs += [(a, b) for i, a in enumerate(members) for b in members[i + 1 :] if sensors[a] != sensors[b]]
+    found = np.array(pairs, np.int64).reshape(-1, 2)
+    return found[:, 0], found[:, 1]
+
+
+def _unit(features: Array) -> Array:
+    x = np.asarray(features, np.float64)
+    if x.ndim != 2 or not np.isfinite(x).all():
+        raise UserError(f"features must be finite and (n, d); these are {x.shape}, with NaN or Inf if that is right")
+    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)

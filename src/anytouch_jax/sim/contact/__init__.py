@@ -1,0 +1,1 @@
+"""Contact mechanics of a soft gel."""

@@ -1,0 +1,176 @@
+"""Influence of a load on the surface of an elastic half-space, or of a layer bonded to a rigid plate.
+
+Lengths are in pixels and stresses in units of the composite modulus E*: a stress p on one pixel moves the surface at an
+offset of (i, j) pixels by `p / E* * pitch * coefficient(i, j)`. Coefficients are given at offsets >= 0.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from jax import Array
+
+from anytouch_jax.sim.contact.convolve import Plan
+
+Host = npt.NDArray[np.float64]
+
+FAR = 12.0  # thicknesses of the layer; beyond, a bonded layer's surface does not move (it decays exponentially)
+
+
+def normal_coefficients(rows: int, columns: int) -> Host:
+    """Normal displacement by a unit pressure on a pixel: Boussinesq's load over a square (Love 1929; Johnson 3.25)."""
+    return (_over_pixel(_xx, rows, columns) + _over_pixel(_yy, rows, columns)) / np.pi
+
+
+def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Host, Host, Host]:
+    """Tangential displacement by a unit traction on a pixel: x by x, x by y (odd in x and in y), y by y.
+
+    Cerruti's load (Johnson, Contact Mechanics, 3.75) over a square, in units of the normal modulus E*.
+    """
+    xx, yy, xy = (_over_pixel(f, rows, columns) / np.pi for f in (_xx, _yy, lambda x, y: -np.hypot(x, y)))
+    ratio = poisson / (1 - poisson)
+    return xx + yy + ratio * xx, ratio * xy, xx + yy + ratio * yy
+
+
+def _xx(x: Host, y: Host) -> Host:
+    """Double integral of x^2 / r^3; with its counterpart in y it sums to that of 1 / r."""
+    return y * np.arcsinh(x / np.abs(y))
+
+
+def _yy(x: Host, y: Host) -> Host:
+    return x * np.arcsinh(y / np.abs(x))
+
+
+def _over_pixel(integral: Callable[[Host, Host], Host], rows: int, columns: int) -> Host:
+    y, x = np.meshgrid(np.arange(rows, dtype=np.float64), np.arange(columns, dtype=np.float64), indexing="ij")
+    right, left, low, high = x + 0.5, x - 0.5, y + 0.5, y - 0.5
+    return integral(right, low) - integral(left, low) - integral(right, high) + integral(left, high)
+
+
+def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
+    """A bonded layer's compliance over the half-space's at `wave` = wave number times thickness.
+
+    For a normal load, a tangential load along the wave, and one across it (Sneddon 1951; Johnson 5.8).
+    """
+    k = 3 - 4 * poisson
+    decay = np.exp(-2 * wave)  # everything over exp(2 wave): no overflow
+    below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
+    sinh = k * (1 - decay**2)
+    return (sinh - 4 * wave * decay) / below, (sinh + 4 * wave * decay) / below, np.tanh(wave)
+
+
+def sideways_symbol(wave: Host, poisson: float) -> Host:
+    """What a normal load moves a bonded layer's surface toward its crests, over what it moves a half-space's in.
+
+    `wave` as in `layer_symbols`, derived as they are; negative where the layer is squeezed out from under the load.
+    """
+    k = 3 - 4 * poisson
+    decay = np.exp(-2 * wave)
+    below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
+    return (k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2 - 2 * wave**2 * decay) / (1 - poisson) / below
+
+
+@functools.lru_cache(maxsize=1)
+def _hankel() -> tuple[Host, Host, Host, Host, Host]:
+    """Waves and their quadrature weights, distances, and J0 and J2 of the one times the other (distances, waves)."""
+    nodes, weights = np.polynomial.legendre.leggauss(128)
+    wave, weights = 7.0 * (nodes + 1), 7.0 * weights
+    distance = np.linspace(0, FAR, 513)
+    turn = (np.arange(200) + 0.5) * np.pi / 200
+    phase = np.outer(distance, wave)[..., None] * np.sin(turn)
+    return wave, weights, distance, np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
+
+
+@functools.lru_cache(maxsize=8)
+def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
+    """Distance over thickness, and there: what the half-space's point load moves more than the layer's.
+
+    Normal, tangential (mean over directions), tangential (amplitude of cos 2 phi); units of P / (pi E* thickness).
+    """
+    wave, weights, distance, bessel0, bessel2 = _hankel()
+    normal, along, across = (1 - one for one in layer_symbols(wave, poisson))
+    across = across / (1 - poisson)
+    twofold = -bessel2 @ (weights * (along - across) / 2)
+    return distance, bessel0 @ (weights * normal), bessel0 @ (weights * (along + across) / 2), twofold
+
+
+def is_infinite(value: Any) -> bool:
+    """Whether a thickness or a modulus is known, before anything is traced, to be infinite."""
+    return isinstance(value, float | int) and bool(np.isinf(value))
+
+
+@functools.lru_cache(maxsize=8)
+def sideways_table(poisson: float) -> tuple[Host, Host, float]:
+    """Distance over thickness, there the smooth part of `sideways_kernel`, and the factor of the rest, asinh(2 / d)."""
+    wave, weights, distance, bessel0, _ = _hankel()
+    rest = (1 - 2 * poisson) / (2 * (1 - poisson))  # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
+    smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
+    return distance, bessel0 @ (weights * smooth), rest
+
+
+def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Array:
+    """(H, W) at offsets >= 0: the potential whose gradient is the sideways motion of a layer's surface by a load on a
+    pixel, in units of P / (pi E*). Beyond FAR thicknesses nothing moves."""
+    distance, table, rest = sideways_table(poisson)
+    radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))  # at 0 the mean of log r over a pixel
+    far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
+    smooth = jnp.interp(far, jnp.asarray(distance, dtype), jnp.asarray(table, dtype))
+    return jnp.where(far < FAR, smooth + rest * jnp.arcsinh(2 / far), 0)
+
+
+def _looked_up(far: Array, distance: Host, table: Host, limit: float) -> Array:
+    near = jnp.interp(far, jnp.asarray(distance, far.dtype), jnp.asarray(table, far.dtype))
+    return jnp.where(far < FAR, near, limit / jnp.maximum(far, FAR))
+
+
+def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
+    """Spectrum of the normal coefficients; `share` (E* over the gel's own modulus) of the motion is the layer's."""
+    deep = jnp.asarray(_normal_host(plan), dtype)
+    if is_infinite(thickness):
+        return deep
+    scale = jnp.asarray(pitch / thickness, dtype)
+    distance, table, _, _ = layer_tables(poisson)
+    radius = jnp.asarray(_radius(plan), dtype) * scale
+    return deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, distance, table, 1.0), 1, jnp)
+
+
+def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
+    """(3, KH, KW) spectra of the tangential coefficients xx, xy, yy; `share` as in `normal_spectrum`."""
+    deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
+    if is_infinite(thickness):
+        return deep
+    scale = jnp.asarray(pitch / thickness, dtype)
+    distance, _, mean, twofold = layer_tables(poisson)
+    radius = jnp.asarray(_radius(plan), dtype) * scale
+    ratio = poisson / (1 - poisson)
+    mean_at = share * scale / np.pi * _looked_up(radius, distance, mean, 1 + ratio / 2)
+    twofold_at = share * scale / np.pi * _looked_up(radius, distance, twofold, ratio / 2)
+    cosine, sine = (jnp.asarray(one, dtype) for one in _twice_the_angle(plan))
+    parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)
+    return deep - jnp.stack([plan.spectrum(one, p, jnp) for one, p in zip(parts, (1, -1, 1), strict=True)])
+
+
+@functools.lru_cache(maxsize=64)
+def _normal_host(plan: Plan) -> Host:
+    return plan.spectrum(normal_coefficients(plan.rows, plan.columns))
+
+
+@functools.lru_cache(maxsize=64)
+def _tangential_host(plan: Plan, poisson: float) -> Host:
+    parts = tangential_coefficients(plan.rows, plan.columns, poisson)
+    return np.stack([plan.spectrum(one, p) for one, p in zip(parts, (1, -1, 1), strict=True)])
+
+
+def _radius(plan: Plan) -> Host:
+    return np.hypot(np.arange(plan.rows)[:, None], np.arange(plan.columns)[None, :])
+
+
+def _twice_the_angle(plan: Plan) -> tuple[Host, Host]:
+    y, x = np.arange(plan.rows)[:, None], np.arange(plan.columns)[None, :]
+    squared = np.maximum(x**2 + y**2, 1)
+    return (x**2 - y**2) / squared, 2 * x * y / squared

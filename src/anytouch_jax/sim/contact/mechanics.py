@@ -1,0 +1,254 @@
+"""Frictionless normal contact of a gel with an object pressed in to a given depth: pressure, displacement, force.
+
+mm, kPa, N. The gel is a linear elastic half-space, or a layer bonded to a rigid plate where its thickness is finite;
+friction does not change the pressure (exact for an incompressible half-space under a rigid object). `sideways` is what
+pressing moves to the sides before friction holds it back (`shear`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.contact.convolve import Plan
+from anytouch_jax.sim.contact.elastic import is_infinite, normal_spectrum, sideways_kernel
+from anytouch_jax.sim.contact.solver import (
+    OWN,
+    Compliance,
+    Solution,
+    complementarity,
+    conjugate_gradients,
+    descent,
+    scaled,
+)
+
+Fidelity = Literal["exact", "fast"]
+
+KPA_MM2 = 1e-3  # N
+COARSEST = 24  # pixels; a coarser grid saves no time
+
+
+@dataclass(frozen=True)
+class Gel:
+    """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm (infinite: a half-space).
+
+    `modulus` and `thickness` may be traced arrays.
+    """
+
+    modulus: Any = 150.0
+    poisson: float = 0.48
+    thickness: Any = float("inf")
+
+    @property
+    def plane(self) -> Any:
+        """The plane strain modulus E / (1 - nu^2) in kPa."""
+        return self.modulus / (1 - self.poisson**2)
+
+
+jax.tree_util.register_dataclass(Gel, data_fields=["modulus", "thickness"], meta_fields=["poisson"])
+
+
+class Contact(NamedTuple):
+    """What a press gives: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface, force N.
+
+    A displacement is positive away from the object; it is negative where a bonded layer bulges around the contact.
+    `residual`: the largest gap where they touch, or overlap where they do not, over the largest penetration;
+    `converged`: whether it is below the tolerance; `iterations` used.
+    """
+
+    pressure: Array
+    displacement: Array
+    force: Array
+    converged: Array
+    iterations: Array
+    residual: Array
+
+
+def press(
+    surface: Array,
+    depth: Any,
+    gel: Gel,
+    pitch: Any,
+    *,
+    fidelity: Fidelity = "exact",
+    modulus_object: Any = float("inf"),
+    tolerance: float = 1e-4,
+    iterations: int | None = None,
+) -> Contact:
+    """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the flat gel.
+
+    `pitch` mm per pixel; `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf is no object. `exact`:
+    conjugate gradients on the contact set (Polonsky and Keer 1999) to `tolerance`, at most `iterations` (300). `fast`:
+    `iterations` (2) projected gradients on this grid, after twice and four times as many on coarser ones, and the
+    object where the gel still cuts it, as Taxim (Si and Yuan 2022) keeps its contact. For a batch, `jax.vmap`.
+    Raises UserError where the values are known and make no sense: a negative depth, a surface of NaN, moduli that are
+    not above 0, a gel thinner than a pixel (with `fast`: than one and a half of its coarsest grid's), whose response
+    the grid cannot hold.
+    """
+    _check(surface, depth, pitch, fidelity)
+    _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)
+    surface = jnp.asarray(surface)
+    if surface.dtype not in (jnp.float32, jnp.float64):
+        surface = surface.astype(jnp.float32)
+    dtype = surface.dtype
+    depth, pitch = jnp.asarray(depth, dtype), jnp.asarray(pitch, dtype)
+    plane = jnp.asarray(gel.plane, dtype)
+    share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))  # E* over the gel's own plane modulus
+    cut = jnp.where(jnp.isfinite(surface), surface + depth, -jnp.ones((), dtype))
+    scale = jnp.max(cut)
+    scale = jnp.where((scale > 0) & (depth >= 0), scale, 0)
+    cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)  # 1 at the deepest point
+    plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
+    compliances = [_compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)]
+    solve, most = (_fast, 2) if fidelity == "fast" else (_exact, 300)
+    found, load, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
+    moved = moved - _of_object(plans[0], load, share, modulus_object)  # both moved: the gel's part is the rest
+    pressure = found.x * (scale * plane * share / pitch)
+    force = jnp.sum(pressure) * pitch**2 * KPA_MM2
+    converged = found.residual <= tolerance
+    return Contact(pressure, moved * scale, force, converged, found.iterations, found.residual)
+
+
+def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
+    if fidelity not in ("exact", "fast"):
+        raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
+    if np.ndim(surface) != 2:
+        raise UserError(f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap for more")
+    for name, value, least in (("depth", depth, 0.0), ("pitch", pitch, 1e-12)):
+        if not isinstance(value, jax.core.Tracer) and not np.all((np.asarray(value) >= least) & np.isfinite(value)):
+            raise UserError(f"{name} must be {'at least 0' if least == 0 else 'above 0'} mm, not {value}")
+    if not isinstance(surface, jax.core.Tracer):
+        values = np.asarray(surface)
+        if np.isnan(values).any() or np.isposinf(values).any():
+            raise UserError("a surface may hold heights in mm and -inf for no object, but no NaN and no +inf")
+
+
+def _check_elastic(shape: tuple[int, ...], gel: Gel, pitch: Any, fidelity: str, modulus_object: Any) -> None:
+    if not 0 <= gel.poisson <= 0.5:
+        raise UserError(f"a gel's Poisson ratio is 0 to 0.5, not {gel.poisson}")
+    for name, value in (("modulus", gel.modulus), ("thickness", gel.thickness), ("modulus_object", modulus_object)):
+        if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
+            raise UserError(f"{name} must be above 0, not {value}")
+    if not any(isinstance(value, jax.core.Tracer) for value in (pitch, gel.thickness)):
+        least = np.asarray(pitch) * (1.5 * 2 ** (len(grids(shape)) - 1) if fidelity == "fast" else 1)
+        if np.any(np.asarray(gel.thickness) < least):
+            raise UserError(f"a gel of {gel.thickness} mm is too thin for this grid: {least:g} mm is the least")
+
+
+def grids(shape: tuple[int, ...]) -> list[Plan]:
+    """The grid of `shape` and two coarser ones, each half of the one before, as far as they divide."""
+    plans = [Plan(shape[0], shape[1])]
+    while len(plans) < 3 and all(n % 2 == 0 and n // 2 >= COARSEST for n in (plans[-1].rows, plans[-1].columns)):
+        plans.append(Plan(plans[-1].rows // 2, plans[-1].columns // 2))
+    return plans
+
+
+def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) -> Compliance:
+    spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, share, dtype)
+    return lambda pressure: plan.inverse(plan.even(plan.forward(pressure), spectrum))
+
+
+def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
+    """The object's part of the displacement by a pressure, in the units of `cut`: a half-space whatever the gel is."""
+    if is_infinite(modulus_object):
+        return 0.0
+    deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
+    return (1 - share) * plan.inverse(plan.even(plan.forward(pressure), deep))
+
+
+def _exact(
+    compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
+) -> tuple[Solution, Array, Array]:
+    """The solution, the pressure that moves the surface, and that displacement."""
+    (apply,) = compliances
+    start = jnp.maximum(cut, 0)
+    start = start * scaled(start, apply(start), cut)
+    found = conjugate_gradients(apply, cut, start, tolerance, iterations)
+    return found, found.x, found.excess + cut
+
+
+def _fast(
+    compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
+) -> tuple[Solution, Array, Array]:
+    """As `_exact`, from coarse to fine, `iterations` on the finest grid and twice as many on each coarser one."""
+    cuts = [cut]
+    for _ in compliances[1:]:
+        cuts.append(halved(cuts[-1]))
+    pressure = jnp.maximum(cuts[-1], 0)
+    for level in range(len(cuts) - 1, -1, -1):
+        apply, here = compliances[level], cuts[level]
+        pressure = jnp.where(here > 0, pressure, 0)  # a flat gel never bulges to touch what is above it
+        found = _descended(apply, here, pressure, iterations * 2**level)
+        pressure = doubled(found.x) if level else found.x
+    moved = jnp.maximum(found.excess, 0) + cut
+    return found._replace(x=_sharpened(found)), found.x, moved
+
+
+def _sharpened(found: Solution) -> Array:
+    """One more local step without a convolution, the load kept: it ends the pressure where there is a gap."""
+    local = jnp.maximum(found.x - found.excess / OWN, 0)
+    total = jnp.sum(local)
+    return jnp.where(total > 0, local * (jnp.sum(found.x) / jnp.where(total > 0, total, 1)), found.x)
+
+
+def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) -> Solution:
+    """Projected gradients from `pressure` at its best scale, and their end brought to its best scale."""
+    moved = apply(pressure)
+    factor = scaled(pressure, moved, cut)
+    found = descent(apply, lambda p: jnp.maximum(p, 0), cut, factor * pressure, iterations, moved=factor * moved)
+    factor = scaled(found.x, found.excess + cut, cut)
+    excess = factor * (found.excess + cut) - cut
+    return Solution(factor * found.x, excess, complementarity(factor * found.x, excess), found.iterations)
+
+
+def sideways(pressure: Array, gel: Gel, pitch: Any) -> Array:
+    """(H, W, 2) mm along x and y that `pressure` (H, W) kPa alone moves the surface of a bonded layer, frictionless.
+
+    A nearly incompressible layer gives way to the sides, by up to a fifth of the dent of a ball and more by a wide
+    block; a compressible one is also drawn toward the load. `shear_step` tells what friction leaves of it. By central
+    differences of a potential. Raises UserError for a gel without a thickness.
+    """
+    if is_infinite(gel.thickness):
+        raise UserError("what pressing moves sideways is that of a bonded layer: give the gel a thickness")
+    plan, pitch = Plan(*pressure.shape), jnp.asarray(pitch, pressure.dtype)
+    spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype), 1, jnp)
+    potential = plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)  # mm
+    y, x = jnp.gradient(potential)
+    return jnp.stack([x, y], -1)
+
+
+def halved(field: Array) -> Array:
+    """Means over 2 x 2 pixels of (H, W)."""
+    rows, columns = field.shape
+    return jnp.mean(field.reshape(rows // 2, 2, columns // 2, 2), (1, 3))
+
+
+def doubled(field: Array) -> Array:
+    """Linear interpolation of (H, W) to twice the size."""
+    return jax.image.resize(field, (2 * field.shape[0], 2 * field.shape[1]), "linear")
+
+
+def positions(shape: tuple[int, int], pitch: Any) -> tuple[Array, Array]:
+    """x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre, each (H, W)."""
+    pitch = jnp.asarray(pitch)
+    y, x = (pitch * (jnp.arange(n, dtype=pitch.dtype) - (n - 1) / 2) for n in shape)
+    return jnp.broadcast_to(x[None, :], shape), jnp.broadcast_to(y[:, None], shape)
+
+
+def area(pressure: Array, pitch: Any) -> Array:
+    """The contact's area in mm^2."""
+    return jnp.sum(pressure > 0, (-2, -1)) * jnp.asarray(pitch, pressure.dtype) ** 2
+
+
+def centroid(pressure: Array, pitch: Any) -> Array:
+    """The centre of pressure (H, W), (x, y) in mm from the field's centre; (0, 0) without contact."""
+    x, y = positions((pressure.shape[0], pressure.shape[1]), jnp.asarray(pitch, pressure.dtype))
+    total = jnp.sum(pressure)
+    moments = jnp.stack([jnp.sum(x * pressure), jnp.sum(y * pressure)])
+    return moments / jnp.where(total > 0, total, 1)

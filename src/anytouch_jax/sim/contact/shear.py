@@ -1,0 +1,184 @@
+"""Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial slip, full slip).
+
+The pressure is given, and friction does not change it. What pressing alone moves sideways is left out, as in
+Cattaneo's and Mindlin's solutions (on an incompressible half-space it is zero), unless it is given: a bonded layer is
+squeezed out, and the object holds it back. mm, kPa, N, rad; x to the right, y down, twist positive from x to y.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.contact.convolve import Plan
+from anytouch_jax.sim.contact.elastic import is_infinite, tangential_spectra
+from anytouch_jax.sim.contact.mechanics import KPA_MM2, Contact, Fidelity, Gel, centroid, grids, positions
+from anytouch_jax.sim.contact.solver import Compliance, descent
+
+SLIPPING = 0.999  # of the friction limit
+
+
+class Shear(NamedTuple):
+    """State of the tangential contact, carried from frame to frame.
+
+    traction (H, W, 2) kPa on the gel, along the object's motion; displacement (H, W, 2) mm of the gel's surface;
+    slipping (H, W); slip_fraction of the contact's area; force (2,) N on the gel; twist_torque N mm on the gel about
+    the centroid of the pressure. `residual`: the error of the surface's motion over the object's in this step.
+    """
+
+    traction: Array
+    displacement: Array
+    slipping: Array
+    slip_fraction: Array
+    force: Array
+    twist_torque: Array
+    converged: Array
+    iterations: Array
+    residual: Array
+
+
+def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
+    """The state before any tangential motion, on a grid of `shape`."""
+    field, zero = jnp.zeros((*shape, 2), dtype), jnp.zeros((), dtype)
+    none, yes = jnp.zeros(shape, bool), jnp.ones((), bool)
+    return Shear(field, field, none, zero, jnp.zeros(2, dtype), zero, yes, jnp.zeros((), jnp.int32), zero)
+
+
+def shear_step(
+    state: Shear | None,
+    contact: Contact,
+    motion: Any,
+    gel: Gel,
+    pitch: Any,
+    friction: Any,
+    *,
+    fidelity: Fidelity = "exact",
+    modulus_object: Any = float("inf"),
+    centre: Any = (0.0, 0.0),
+    squeezed: Array | None = None,
+    tolerance: float = 1e-3,
+    iterations: int | None = None,
+) -> Shear:
+    """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure of `contact`.
+
+    `state` is that of the frame before (None: at rest); the traction starts from there, so a reversal of the motion
+    leaves a locked-in shear. `friction` is Coulomb's coefficient. `exact`: projected gradients with the full tangential
+    influence coefficients on the grid of the pressure to `tolerance`, at most `iterations` (400). `fast`: an elastic
+    predictor, return to the friction cone, and `iterations` (6) corrections on a coarser grid. For a batch, `jax.vmap`.
+    `squeezed` (H, W, 2) mm: what this step's change of pressure moves sideways (of `mechanics.sideways`); the traction
+    is then that which also holds it back, and `displacement` that of the traction alone.
+    Raises UserError on a negative friction, where its value is known.
+    """
+    _check(contact, pitch, friction, fidelity)
+    pressure = contact.pressure
+    dtype = pressure.dtype
+    state = at_rest((pressure.shape[0], pressure.shape[1]), dtype) if state is None else state
+    pitch, friction = jnp.asarray(pitch, dtype), jnp.asarray(friction, dtype)
+    share = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(modulus_object, dtype))
+    unit = jnp.asarray(gel.plane, dtype) * share / pitch  # kPa of traction per mm
+    plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
+    times = pressure.shape[0] // plan.rows
+    coarse, before = _pooled(pressure, times), _pooled(state.traction, times) / unit * times
+    spectra = tangential_spectra(plan, pitch * times, gel.poisson, gel.thickness, share, dtype)
+    apply = _compliance(plan, spectra)
+    limit = jnp.where(coarse > 0, friction * coarse, 0) / unit * times
+    moved = _rigid(plan, pitch * times, jnp.asarray(motion, dtype), jnp.asarray(centre, dtype))
+    if squeezed is not None:
+        moved = moved - _pooled(squeezed, times)
+
+    def within(step: Array) -> Array:
+        return _returned(before + step, limit) - before
+
+    start = within(_stiffness(coarse > 0, gel.poisson) * moved)
+    scale = jnp.max(jnp.abs(moved)) + jnp.max(jnp.abs(within(jnp.zeros_like(moved))))
+    scale = jnp.where(scale > 0, scale, 1)
+    most = iterations or (6 if fidelity == "fast" else 400)
+    # In steps, not in totals: a small step is not lost in the rounding of a large traction.
+    found = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
+    total = jnp.where((limit > 0)[..., None], before + found.x, 0)  # without pressure exactly nothing
+    displacement = apply(total)
+    if not is_infinite(modulus_object):  # less the object's own part
+        deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
+        displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
+    if times > 1:
+        displacement = jax.image.resize(displacement, state.displacement.shape, "cubic")
+    per_pressure = total * unit / times / jnp.where(coarse > 0, coarse, 1)[..., None]
+    traction = _repeated(per_pressure, times) * pressure[..., None]
+    sliding = _length(total) >= SLIPPING * limit
+    slipping = _repeated(sliding, times) & (pressure > 0)
+    residual = found.residual / scale
+    force, torque, fraction = _totals(traction, slipping, pressure, pitch)
+    return Shear(
+        traction, displacement, slipping, fraction, force, torque, residual <= tolerance, found.iterations, residual
+    )
+
+
+def _check(contact: Contact, pitch: Any, friction: Any, fidelity: str) -> None:
+    if fidelity not in ("exact", "fast"):
+        raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
+    if jnp.ndim(contact.pressure) != 2:
+        raise UserError(f"shear_step takes one contact, not pressures {jnp.shape(contact.pressure)}; use jax.vmap")
+    if not isinstance(pitch, jax.core.Tracer) and not np.all(np.asarray(pitch) > 0):
+        raise UserError(f"pitch must be above 0 mm, not {pitch}")
+    if not isinstance(friction, jax.core.Tracer) and not np.all(np.asarray(friction) >= 0):
+        raise UserError(f"friction must be at least 0, not {friction}")
+
+
+def _compliance(plan: Plan, spectra: Array) -> Compliance:
+    xx, xy, yy = spectra
+
+    def apply(traction: Array) -> Array:
+        x, y = plan.forward(traction[..., 0]), plan.forward(traction[..., 1])
+        moved_x = plan.inverse(plan.even(x, xx) + plan.odd(y, xy))
+        return jnp.stack([moved_x, plan.inverse(plan.odd(x, xy) + plan.even(y, yy))], -1)
+
+    return apply
+
+
+def _rigid(plan: Plan, pitch: Array, motion: Array, centre: Array) -> Array:
+    """(H, W, 2) mm of displacement by `motion` (dx, dy, dtheta)."""
+    x, y = positions((plan.rows, plan.columns), pitch)
+    return jnp.stack([motion[0] - motion[2] * (y - centre[1]), motion[1] + motion[2] * (x - centre[0])], -1)
+
+
+def _length(field: Array) -> Array:
+    return jnp.sqrt(jnp.sum(field * field, -1))
+
+
+def _returned(traction: Array, limit: Array) -> Array:
+    """The nearest traction within Coulomb's limit: radial return."""
+    length = _length(traction)
+    return traction * jnp.where(length > limit, limit / jnp.where(length > 0, length, 1), 1)[..., None]
+
+
+def _stiffness(touching: Array, poisson: float) -> Array:
+    """Mean traction per rigid motion of a sticking circle of the same area (Mindlin 1949), dimensionless."""
+    radius = jnp.sqrt(jnp.maximum(jnp.sum(touching), 1) / jnp.pi)
+    return 4 * (1 - poisson) / (2 - poisson) / (jnp.pi * radius)
+
+
+def _pooled(field: Array, times: int) -> Array:
+    """Means over blocks of `times` x `times` pixels of (H, W, ...)."""
+    if times == 1:
+        return field
+    rows, columns, *rest = field.shape
+    return jnp.mean(field.reshape(rows // times, times, columns // times, times, *rest), (1, 3))
+
+
+def _repeated(field: Array, times: int) -> Array:
+    return field if times == 1 else jnp.repeat(jnp.repeat(field, times, 0), times, 1)
+
+
+def _totals(traction: Array, slipping: Array, pressure: Array, pitch: Array) -> tuple[Array, Array, Array]:
+    """Force (2,) N, torque N mm about the centroid of the pressure, slipping share of the contact's area."""
+    x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
+    middle = centroid(pressure, pitch)
+    area = pitch**2 * KPA_MM2
+    torque = jnp.sum((x - middle[0]) * traction[..., 1] - (y - middle[1]) * traction[..., 0]) * area
+    fraction = jnp.sum(slipping) / jnp.maximum(jnp.sum(pressure > 0), 1)
+    return jnp.sum(traction, (0, 1)) * area, torque, fraction.astype(pressure.dtype)

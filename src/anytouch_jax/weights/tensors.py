@@ -1,0 +1,90 @@
+"""Flat files of arrays: safetensors in and out (atomic), npz in. Names stay as they are in the file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import replacing
+
+
+class WeightsError(UserError):
+    """A weights file that cannot be read or does not fit; the message names the file or the keys."""
+
+
+def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Write arrays to one safetensors file, whole or not at all; `metadata` is text by name. Raises WeightsError."""
+    from safetensors.numpy import save_file
+
+    path = Path(path)
+    wrong = [name for name, value in metadata.items() if not isinstance(value, str)]
+    if wrong:
+        raise WeightsError(f"metadata of {path} must be text; {', '.join(wrong)} is not")
+    try:
+        with replacing(path) as part:
+            # the library ignores strides: a transposed view would be written in the wrong order
+            save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, part, dict(metadata))
+            umask = os.umask(0)
+            os.umask(umask)
+            os.chmod(part, 0o666 & ~umask)  # the library gives a file that only its owner may read
+    except Exception as error:  # the library wraps OSError in its own kind
+        advice = "; free some space" if "No space left" in str(error) else ""
+        raise WeightsError(f"could not write {path}: {error}{advice}") from error
+
+
+def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """(arrays in their stored types, metadata) of a safetensors file. Raises WeightsError."""
+    from safetensors import safe_open
+
+    path = existing(path)
+    try:
+        import ml_dtypes  # noqa: F401  gives numpy the name bfloat16
+
+        with safe_open(path, framework="numpy") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+    except Exception as error:  # a foreign file raises whatever its bytes suggest
+        raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """The metadata of a safetensors file, without its arrays; nothing for a file of another kind."""
+    from safetensors import safe_open
+
+    if Path(path).suffix != ".safetensors":
+        return {}
+    path = existing(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return dict(file.metadata() or {})
+    except Exception as error:
+        raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
+
+
+def read_npz(path: str | Path) -> dict[str, np.ndarray]:
+    """Arrays of an npz file; pickled objects are refused. Raises WeightsError."""
+    path = existing(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception as error:
+        raise WeightsError(f"{path} is not a whole npz file of plain arrays: {error}") from error
+
+
+def existing(path: str | Path) -> Path:
+    """`path` when it is a file. Raises WeightsError."""
+    path = Path(path)
+    if not path.is_file():
+        raise WeightsError(
+            f"there is no weights file {path}; give the path of a .safetensors, .npz, .pth, .pt or .bin file"
+        )
+    return path
+
+
+def as_float32(array: Any) -> np.ndarray:
+    """The array in float32; exact for float32, float16 and bfloat16."""
+    return np.asarray(array, dtype=np.float32)

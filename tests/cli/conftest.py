@@ -1,0 +1,68 @@
+"""The command line as a user meets it: a status, what is printed, and what is told on standard error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import pytest
+from gel_pictures import press
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.data.manifest import manifest as manifests
+
+
+class Said(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def anytouch(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    """anytouch(*words): run the command line in this process."""
+
+    def run(*words: object) -> Said:
+        capsys.readouterr()
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as stop:  # the parser's own exit
+            status = int(stop.code or 0)
+        out, err = capsys.readouterr()
+        return Said(status, out, err)
+
+    return run
+
+
+@pytest.fixture
+def mistake(anytouch: Callable[..., Said]) -> Callable[..., str]:
+    """mistake(*words): the one sentence that a user's mistake is answered with, at status 1."""
+
+    def run(*words: object) -> str:
+        said = anytouch(*words)
+        assert said.status == 1, said
+        assert said.err.startswith(f"anytouch {words[0]}: ") and "Traceback" not in said.err
+        assert len(said.err.strip().splitlines()) == 1, said.err
+        return said.err
+
+    return run
+
+
+@pytest.fixture
+def pressed(tmp_path: Path) -> Path:
+    """A manifest of one recording by a DIGIT: two background frames, four free ones, four pressed ever deeper."""
+    depths = [0, 0, 0, 0, 0, 0, 30, 50, 70, 90]
+    for i, depth in enumerate(depths):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), press(depth))
+    count = len(depths)
+    columns = {
+        "path": [f"{i}.png" for i in range(count)], "sensor": ["digit"] * count, "sequence": ["s"] * count,
+        "frame_index": list(range(count)), "split": ["background"] * 2 + ["train"] * 8, "dataset": ["mine"] * count,
+        "background_path": ["0.png"] * count, "label.force": [0.1 * depth for depth in depths],
+        "license": ["MIT"] * 6 + ["CC-BY-NC-4.0"] * 3 + [None],
+    }  # fmt: skip
+    file = tmp_path / "touch.parquet"
+    manifests.write(manifests.from_columns(columns, file), file)
+    return file

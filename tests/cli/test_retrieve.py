@@ -1,0 +1,66 @@
+"""`anytouch retrieve` and `anytouch report` on a small world of touches felt by three sensors."""
+
+import json
+
+import pytest
+from touch_world import make_touches
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.encoder import encoder
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory):
+    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 6, "val": 6, "test": 10}, each=2)
+
+
+def test_retrieval_of_a_run_beside_its_controls(touches, tiny_run, tmp_path, capsys):
+    out = tmp_path / "deep" / "found.json"
+    words = ["--run", str(tiny_run), "--data", str(touches), "--gallery", "6", "--out", str(out)]
+    assert main(["retrieve", *words]) == 0
+    table = capsys.readouterr().out
+    for name in (str(tiny_run), "random encoder", "pixels minus background", "area, centroid, force"):
+        assert f"| {name} | all | all |" in table
+    found = json.loads(out.read_text())
+    assert found["split"] == "test" and len(found["data"]) == 64
+    pooled = {one["name"]: one for one in found["results"] if one["query_sensor"] == "all" and not one["centred"]}
+    assert len(pooled) == 4
+    for one in pooled.values():
+        assert one["gallery"] == 6 and one["queries"] == 60 and one["chance1"] == pytest.approx(1 / 6)
+        assert one["low"] <= one["top1"] <= one["high"] <= one["top5_high"]
+    assert pooled["pixels minus background"]["top1"] > 0.4  # every touch has its own texture
+
+
+def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
+    shares = []
+    for more in ([], ["--by-chance"]):
+        assert main(["retrieve", "--data", str(touches), "--gallery", "6", *more]) == 0
+        line = next(x for x in capsys.readouterr().out.splitlines() if "force | all | all | no" in x)
+        shares.append(float(line.split("|")[5].split()[0]))
+    assert shares[1] > shares[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--no-controls"], "nothing to compare: give --run, or leave the controls on"),
+        (["--split", "unused"], "column 'split' has no row 'unused'"),
+        (["--run", "nowhere"], "nowhere"),
+        (["--gallery", "5000"], "5000"),
+        (["--gallery", "1"], "--gallery must be 2 or more"),
+        (["--frames", "-1"], "--frames must be 1 or more"),
+        (["--seeds", "2"], "--seeds does nothing without --by-chance"),
+    ],
+)
+def test_a_mistake_is_one_sentence(touches, capsys, monkeypatch, words, sentence):
+    monkeypatch.setattr(encoder, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
+    assert main(["retrieve", "--data", str(touches), *words]) == 1
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("anytouch retrieve: ") and sentence in said and said.count("\n") == 0
+
+
+def test_a_report_of_what_is_not_there_is_one_sentence(touches, tmp_path, capsys):
+    words = ["--data", str(touches), "--stage1", str(tmp_path / "s1"), "--stage2", str(tmp_path / "s2")]
+    assert main(["report", *words, "--out", str(tmp_path / "report")]) == 1
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("anytouch report: ") and "s1" in said and not (tmp_path / "report").exists()

@@ -1,0 +1,145 @@
+"""`anytouch embed --stream`: features of a video or a camera, kept also after Ctrl-C."""
+
+import json
+import signal
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.encoder import stream as streams
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "touch.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
+    for frame in range(6):
+        writer.write(np.full((32, 32, 3), 40 * frame, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video, tiny_run):
+    streamed, plain = tmp_path / "streamed.npz", tmp_path / "plain.npz"
+    args = ("embed", "--run", tiny_run, "--input", video, "--frames", 3, "--sensor", "digit")
+    said = anytouch(*args, "--stream", "--out", streamed)
+    assert said.status == 0 and "4 features of 12 values" in said.out
+    words = " ".join(said.err.split())
+    assert "p50 ms p99 ms decode" in words and "4 frames embedded, 0 dropped" in words
+    assert anytouch(*args, "--batch", 4, "--out", plain).status == 0
+    with np.load(streamed) as a, np.load(plain) as b:
+        np.testing.assert_allclose(a["features"], b["features"], atol=1e-5)
+        assert a["key/frame_index"].tolist() == b["key/frame_index"].tolist() == [2, 3, 4, 5]
+        np.testing.assert_allclose(a["key/time"], [0.2, 0.3, 0.4, 0.5])  # in the film of ten frames a second
+        assert str(a["about/stride"]) == "1" and "about/started" not in a
+
+    said = anytouch(*args, "--stream", "--out", "-")
+    lines = [json.loads(line) for line in said.out.splitlines()]
+    assert said.status == 0 and [line["frame"] for line in lines] == [2, 3, 4, 5]
+    assert [line["time"] for line in lines] == [0.2, 0.3, 0.4, 0.5]
+    with np.load(streamed) as a:
+        np.testing.assert_array_equal(np.asarray([line["features"] for line in lines], np.float32), a["features"])
+    assert "4 frames embedded" in said.err
+
+
+def test_what_cannot_be_streamed(mistake, tmp_path, video, tiny_run):
+    args = ("embed", "--stream", "--run", tiny_run, "--out", tmp_path / "f.npz")
+    assert "too few frames for a clip of 3 at stride 4" in mistake(
+        *args, "--input", video, "--frames", 3, "--stride", 4
+    )
+    assert "a clip needs 3 frames" in mistake(*args, "--input", video, "--frames", 2)
+    assert "no video" in mistake(*args, "--input", tmp_path / "gone.avi")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
+    """The signal comes while the camera shows nothing new and the program waits."""
+    over = threading.Event()
+
+    class Camera:
+        count = 0
+
+        def grab(self):
+            if self.count == 3:
+                signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # as a terminal does
+                assert over.wait(60)
+                return False
+            self.count += 1
+            return True
+
+        def retrieve(self):
+            return True, np.full((32, 32, 3), self.count, np.uint8)
+
+        def release(self):
+            pass
+
+    monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
+    monkeypatch.setattr(streams, "_PATIENCE", 0.01)
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # ignored, where a shell put pytest in the background
+    try:
+        said = anytouch(
+            "embed", "--stream", "--run", tiny_run, "--input", 0, "--frames", 3, "--out", tmp_path / "f.npz"
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+        over.set()
+    assert said.status == 0, said
+    with np.load(tmp_path / "f.npz") as file:
+        assert (
+            len(file["features"]) <= 1 and file["features"].ndim == 2
+        )  # the signal may come before the encoder is done
+
+
+def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
+    """A folder, and a video frame by frame: as if the camera had been held upright."""
+    rng = np.random.default_rng(0)
+    upright = [cv2.resize(rng.integers(0, 256, (4, 3, 3), np.uint8), (24, 32)) for _ in range(3)]
+    lying = [cv2.rotate(one[:, ::-1], cv2.ROTATE_90_COUNTERCLOCKWISE) for one in upright]
+    found = {}
+    for name, frames in (("upright", upright), ("lying", lying)):
+        (tmp_path / name).mkdir()
+        for number, frame in enumerate(frames):
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), frame)
+        writer = cv2.VideoWriter(
+            str(tmp_path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 10, frames[0].shape[1::-1]
+        )
+        for frame in frames:
+            writer.write(frame)
+        writer.release()
+        turn = ("--rotate", 90, "--flip", "across") if name == "lying" else ()
+        for form, more in ((name, ()), (f"{name}.avi", ("--stream",))):
+            out = tmp_path / "f.npz"
+            said = anytouch("embed", "--run", tiny_run, "--input", tmp_path / form, "--out", out, *turn, *more)
+            assert said.status == 0, said
+            with np.load(out) as file:
+                found[form] = file["features"]
+    np.testing.assert_array_equal(found["lying"], found["upright"])
+    np.testing.assert_allclose(found["lying.avi"], found["upright.avi"], atol=1e-2 * np.abs(found["upright"]).max())
+
+
+def test_a_camera_tells_when_it_began(anytouch, tmp_path, tiny_run, monkeypatch):
+    class Camera:
+        count = 0
+
+        def grab(self):
+            self.count += 1
+            return self.count < 3
+
+        def retrieve(self):
+            return True, np.zeros((32, 32, 3), np.uint8)
+
+        def release(self):
+            pass
+
+    monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
+    before = time.time()
+    said = anytouch("embed", "--stream", "--run", tiny_run, "--input", 0, "--out", tmp_path / "f.npz")
+    assert said.status == 0, said
+    with np.load(tmp_path / "f.npz") as file:
+        clock = float(str(file["about/started"])) + file["key/time"]
+    assert (before <= clock).all() and (clock <= time.time()).all()

@@ -1,0 +1,161 @@
+"""Baselines are recipes: each changes exactly what it says, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from anytouch_jax.cli import app
+from anytouch_jax.config import Config, baselines, from_json, preset, to_json
+from anytouch_jax.errors import UserError
+
+NAMES = (
+    "anytouch", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "no_text", "no_vision", "no_stage1",
+    "no_stage2", "no_matching", "no_dynamic", "no_universal", "no_text_aligned", "frame_differences", "force_heads",
+)  # fmt: skip
+OWN = {"objective.universal_end": 0.0}  # it starts at 0 anyway
+STILLS = {"data.clip_share": 0.0}
+# (name, stage) -> every field that differs from the paper's model, with its value
+CHANGED = {
+    ("anytouch", 1): {}, ("anytouch", 2): {}, ("no_stage2", 1): {}, ("no_stage1", 2): {},
+    ("no_text", 1): {}, ("no_vision", 1): {}, ("no_text_aligned", 1): {}, ("no_matching", 1): {},
+    ("frame_differences", 2): {}, ("force_heads", 2): {},
+    ("unitouch", 2): {**OWN, **STILLS, "model.text": None, "model.match_head": "none", "data.require": ("image",)},
+    ("tlv_link", 2): {
+        **OWN, **STILLS, "model.match_head": "none", "model.sensor_tokens": 0, "data.require": ("image", "text"),
+    },
+    ("t3", 1): {
+        **OWN, **STILLS, "model.patch_encoder": "sensor", "model.sensor_tokens": 0, "objective.next_frame": False,
+    },
+    ("static_only", 1): {**STILLS, "objective.next_frame": False},
+    ("static_only", 2): {**STILLS, "objective.next_frame": False},
+    ("no_dynamic", 1): {**STILLS, "objective.next_frame": False},
+    ("no_dynamic", 2): {**STILLS, "objective.next_frame": False},
+    ("no_text", 2): {"model.text": None},
+    ("no_vision", 2): {"model.image": None},
+    ("no_matching", 2): {"model.match_head": "none"},
+    ("no_universal", 1): OWN, ("no_universal", 2): OWN,
+    ("no_text_aligned", 2): {"data.aligned_text": False},
+    ("frame_differences", 1): {"objective.differences": 1.0},
+    ("force_heads", 1): {"model.force_head": True, "objective.force": 0.1},
+}  # fmt: skip
+
+
+def flat(value: object, prefix: str = "") -> dict[str, object]:
+    """Fields of the sections by their dotted names; stacks and towers are one field."""
+    sections = ("model", "objective", "optim", "data", "run")
+    fields = {f"{prefix}{f.name}": getattr(value, f.name) for f in dataclasses.fields(value)}
+    if prefix:
+        return fields
+    return {
+        name: field
+        for key, section in fields.items()
+        for name, field in (flat(section, f"{key}.").items() if key in sections else [(key, section)])
+    }
+
+
+def differences(name: str, config: Config) -> dict[str, object]:
+    before, after = flat(config), flat(baselines.apply(name, config))
+    assert before.keys() == after.keys()
+    return {key: after[key] for key in after if after[key] != before[key]}
+
+
+def test_the_names_are_those_of_the_tables() -> None:
+    assert tuple(sorted(baselines.BASELINES)) == tuple(sorted(NAMES))
+    for name, one in baselines.BASELINES.items():
+        assert one.name == name and len(one.about) > 8
+        assert {stage for known, stage in CHANGED if known == name} == set(one.stages)
+
+
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+@pytest.mark.parametrize(("name", "stage"), list(CHANGED))
+def test_a_recipe_changes_exactly_what_it_says(name: str, stage: int, recipe: str) -> None:
+    config = preset("tiny", stage=stage, recipe=recipe)
+    assert differences(name, config) == CHANGED[name, stage]
+
+
+def test_pretrained_towers_without_vision_have_no_lora() -> None:
+    config = preset("tiny", stage=2, towers="pretrained")
+    assert differences("no_vision", config) == {"model.image": None, "model.lora_rank": 0}
+
+
+def test_the_two_names_of_the_paper_for_a_static_model_are_one_recipe() -> None:
+    for stage in (1, 2):
+        config = preset("tiny", stage=stage)
+        assert baselines.apply("static_only", config) == baselines.apply("no_dynamic", config)
+
+
+@pytest.mark.parametrize("name", list(baselines.BASELINES))
+def test_a_stage_that_a_recipe_lacks_is_refused(name: str) -> None:
+    one = baselines.BASELINES[name]
+    for stage in {1, 2} - set(one.stages):
+        with pytest.raises(UserError, match=f"baseline {name} (has no stage {stage}|is not trained)"):
+            baselines.apply(name, preset("tiny", stage=stage))
+    assert one.starts_from_stage1 == (one.stages == (1, 2))
+
+
+def test_unknown_names_are_one_sentence() -> None:
+    with pytest.raises(UserError, match="no baseline is called 'clip'; choose one of anytouch, no_pretraining"):
+        baselines.apply("clip", preset("tiny"))
+
+
+def test_every_recipe_is_written_and_read() -> None:
+    for name, stage in CHANGED:
+        config = baselines.apply(name, preset("tiny", stage=stage))
+        assert from_json(to_json(config)) == config
+
+
+def test_a_configuration_from_before_these_fields_reads_as_the_paper_model() -> None:
+    config = preset("tiny", stage=2)
+    data = json.loads(to_json(config))
+    for section, names in {
+        "model": ("patch_encoder", "force_head"),
+        "objective": ("differences", "force"),
+        "data": ("require", "contact_only", "aligned_text"),
+    }.items():
+        for name in names:
+            del data[section][name]
+    assert from_json(json.dumps(data)) == config
+
+
+# The command line ----------------------------------------------------------------------------------------------------
+
+TRAIN = ["--data", "m.csv", "--run", "r"]
+
+
+def test_train_takes_a_baseline_before_the_users_own_overrides() -> None:
+    _, config = app._parse_train([*TRAIN, "--baseline", "t3"])
+    assert config.model.patch_encoder == "sensor" and config.data.clip_share == 0
+    args = [*TRAIN, "--baseline", "t3", "--model.sensor-tokens", "2", "--loader.clip-share", "0.25"]
+    _, config = app._parse_train(args)
+    assert config.model.patch_encoder == "sensor" and config.model.sensor_tokens == 2
+    assert config.data.clip_share == 0.25 and not config.objective.next_frame
+    _, config = app._parse_train([*TRAIN, "--stage", "2", "--loader.require", "image", "text"])
+    assert config.data.require == ("image", "text")
+
+
+def test_train_refuses_a_baseline_that_does_not_fit(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    def told(*args: str) -> str:
+        assert app.main(["train", *TRAIN, *args]) == 1
+        return capsys.readouterr().err
+
+    assert "no baseline is called 'moco'" in told("--baseline", "moco")
+    assert "no_pretraining is not trained" in told("--baseline", "no_pretraining")
+    assert "t3 has no stage 2" in told("--baseline", "t3", "--stage", "2")
+    init = ("--stage", "2", "--init", str(tmp_path))
+    assert "--objective.match-keep does nothing in stage 1; leave it out" in told("--objective.match-keep", "0.5")
+    for option, value in (("match-head", "cosine"), ("lora-rank", "4"), ("temperature", "0.2")):
+        assert f"--model.{option} does nothing in stage 1; leave it out" in told(f"--model.{option}", value)
+    assert "--loader.negatives does nothing in stage 1" in told("--loader.negatives", "same_sensor")
+    clip = ("--stage", "2", "--towers", "pretrained", "--clip", str(tmp_path), "--model.temperature")
+    assert "--model.temperature does nothing with --clip, whose temperature is taken" in told(*clip, "0.2")
+    assert "there is no manifest" in told(*clip, "0.07")
+    masked = ("--objective.mask-ratio", "0.5", *init)
+    assert "--objective.mask-ratio does nothing in stage 2 without --objective.reconstruct" in told(*masked)
+    for kept in (("--objective.reconstruct", *masked), ("--recipe", "release", *masked), ("--baseline", "t3")):
+        assert "there is no manifest" in told(*kept)
+    assert "no_stage1 has no stage 1: leave out --init" in told("--baseline", "no_stage1", *init)
+    assert "there is no manifest" in told("--baseline", "no_matching", *init)

@@ -1,0 +1,337 @@
+"""The configuration: the tables of presets and recipes, strict JSON, the rules over parameter names."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from itertools import product
+
+import pytest
+from tiny_models import full_model
+
+from anytouch_jax.config import (
+    SENSORS,
+    Config,
+    DataConfig,
+    LossConfig,
+    ModelConfig,
+    OptimConfig,
+    RunConfig,
+    Stack,
+    TextTower,
+    from_json,
+    preset,
+    to_json,
+)
+from anytouch_jax.errors import ConfigError, UserError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.train.optim import match_rules
+from anytouch_jax.weights.tree import flatten
+
+NAMES = ("tiny", "small", "base", "large")
+ALL = [
+    (name, stage, recipe, towers)
+    for name, stage, recipe, towers in product(NAMES, (1, 2), ("paper", "release"), ("scratch", "pretrained"))
+]
+
+# touch and image tower (width, blocks, heads), pixels, patch, embedding, decoder, text tower, batch
+TABLE = {
+    "tiny": ((192, 6, 6), 112, 14, 128, (128, 2, 4), (128, 4, 4), 64),
+    "small": ((384, 6, 6), 224, 14, 512, (512, 8, 16), (384, 6, 6), 64),
+    "base": ((768, 12, 12), 224, 16, 512, (512, 8, 16), (512, 12, 8), 256),
+    "large": ((1024, 24, 16), 224, 14, 768, (512, 8, 16), (768, 12, 12), 256),
+}
+
+
+def size(stack):
+    assert stack.mlp == 4 * stack.width
+    return stack.width, stack.depth, stack.heads
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_presets_are_the_table(name):
+    tower, pixels, patch, embed, decoder, text, batch = TABLE[name]
+    config = preset(name, stage=2)
+    model = config.model
+    assert (size(model.touch), size(model.image), size(model.decoder), size(model.text.stack)) == (
+        tower, tower, decoder, text,
+    )  # fmt: skip
+    assert (model.image_size, model.patch, model.embed, config.data.batch_size) == (pixels, patch, embed, batch)
+    assert (model.text.vocab, model.text.length) == (49408, 77)
+    assert model.patches == (pixels // patch) ** 2
+    one = preset(name)
+    assert one.model.image is None and one.model.text is None and one.model.match_head == "none"
+    assert one.towers == "none" and size(one.model.touch) == tower
+
+
+def test_what_both_recipes_have_in_common():
+    for name, stage, recipe, towers in ALL:
+        config = preset(name, stage=stage, recipe=recipe, towers=towers)
+        o, loss, data = config.optim, config.objective, config.data
+        assert (o.beta1, o.beta2, o.weight_decay, o.learning_rate) == (0.9, 0.99, 0.1, 2e-4)
+        assert (o.clip_norm, o.ema, o.accumulate) == (None, None, 1)
+        assert (loss.mask_ratio, loss.alpha_tv, loss.alpha_tl, loss.alpha_vl) == (0.75, 1.0, 1.0, 0.2)
+        assert (loss.match_weight, loss.universal_start, loss.universal_end, loss.groups) == (0.1, 0.0, 0.75, 1)
+        assert (config.model.temperature, config.model.sensor_tokens, config.model.frames) == (0.07, 5, 3)
+        assert (data.flip, data.jitter, data.rotation) == (0.5, (0.4, 0.4, 0.5, 0.3), 20.0)
+        assert config.model.sensors == SENSORS and SENSORS.index("universal") == 9
+        assert (config.model.norm_eps, config.model.decoder_norm_eps, config.model.activation) == (1e-5, 1e-12, "gelu")
+
+
+def test_the_points_on_which_the_recipes_differ():
+    paper, release = (preset("large", stage=2, recipe=r, towers="pretrained") for r in ("paper", "release"))
+    assert (paper.model.match_head, release.model.match_head) == ("mlp", "linear")
+    assert paper.objective.pair_weights == (0.5, 0.5, 0.1)
+    assert release.objective.pair_weights == (0.5, 1.0, 0.1)  # touch-text: twice the paper's
+    assert (paper.objective.reconstruct, release.objective.reconstruct) == (False, True)
+    assert (paper.data.split_steps, release.data.split_steps) == (False, True)
+    assert (paper.data.order, release.data.order) == ("alternate", "random")
+    assert (paper.optim.decay, release.optim.decay) == ("linear", "cosine")
+    assert (paper.objective.universal_shared, release.objective.universal_shared) == (False, True)
+    assert paper.model.lora_rank == release.model.lora_rank == 16 and paper.model.lora_alpha == 16
+    assert preset("large", stage=2).model.lora_rank == 0
+    one = preset("large", recipe="release")
+    assert not one.objective.reconstruct and not one.data.split_steps and one.optim.decay == "cosine"
+
+
+@pytest.mark.parametrize("args", ALL)
+def test_json_there_and_back(args):
+    name, stage, recipe, towers = args
+    config = preset(name, stage=stage, recipe=recipe, towers=towers)
+    again = from_json(to_json(config))
+    assert again == config and hash(again) == hash(config)
+    assert from_json(to_json(config.model), ModelConfig) == config.model
+
+
+def spoilt(change):
+    """The message for the JSON of a stage-2 preset after `change(data)`."""
+    data = json.loads(to_json(preset("tiny", stage=2)))
+    change(data)
+    with pytest.raises(ConfigError) as error:
+        from_json(json.dumps(data))
+    return str(error.value)
+
+
+def test_wrong_json_is_an_error_that_names_the_key():
+    def put(*path_and_value):
+        *path, last, value = path_and_value
+
+        def change(data):
+            for key in path:
+                data = data[key]
+            data[last] = value
+
+        return change
+
+    assert "config.optim has no setting called clip_nrm" in spoilt(put("optim", "clip_nrm", 1.0))
+    assert "config.model.touch lacks heads" in spoilt(lambda data: data["model"]["touch"].pop("heads"))
+    assert "config.model.patch must be int, not '14'" in spoilt(put("model", "patch", "14"))
+    assert "config.run.steps must be int, not True" in spoilt(put("run", "steps", True))
+    assert "config.run.steps must be int" in spoilt(put("run", "steps", 1.5))
+    assert "config.optim.learning_rate must be float, not True" in spoilt(put("optim", "learning_rate", True))
+    assert "config.objective.norm_pix_loss must be bool" in spoilt(put("objective", "norm_pix_loss", 1))
+    assert "config.recipe must be one of paper, release, not 'papr'" in spoilt(put("recipe", "papr"))
+    assert "config.data.jitter must have 4 entries, not 3" in spoilt(put("data", "jitter", [0.1, 0.2, 0.3]))
+    assert "config.data.jitter[1] must be float" in spoilt(put("data", "jitter", [0.1, "x", 0.3, 0.4]))
+    assert "config.model.text must be an object" in spoilt(put("model", "text", 3))
+    assert "config.model.sensors must be a list" in spoilt(put("model", "sensors", "digit"))
+    assert "twice" in spoilt(put("model", "sensors", ["digit", "digit", "universal"]))
+    for text in ("{", "", "[1,"):
+        with pytest.raises(ConfigError, match="not a JSON configuration"):
+            from_json(text)
+    with pytest.raises(ConfigError, match="config must be an object"):
+        from_json("[]")
+
+
+def test_json_takes_whole_numbers_for_floats_and_none_where_it_may_be():
+    data = json.loads(to_json(preset("tiny")))
+    data["optim"]["eps"], data["optim"]["clip_norm"] = 1, 2
+    config = from_json(json.dumps(data))
+    assert config.optim.eps == 1.0 and isinstance(config.optim.eps, float) and config.optim.clip_norm == 2.0
+    assert from_json(json.dumps({"model": data["model"]})) == Config(config.model)  # the rest has defaults
+
+
+def test_impossible_models_are_errors():
+    model = preset("tiny").model
+    for change, word in (
+        ({"patch": 13}, "multiple of patch 13"),
+        ({"sensors": ("digit", "digit", "universal")}, "twice"),
+        ({"sensors": ("digit",)}, "universal"),
+    ):
+        with pytest.raises(ConfigError, match=word):
+            replace(model, **change)
+    with pytest.raises(ConfigError, match="multiple of heads 5"):
+        Stack(192, 6, 5, 768)
+    assert issubclass(ConfigError, UserError) and issubclass(UserError, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (Stack, {"heads": 0}, "heads must be 1 or more, not 0"),
+        (Stack, {"width": -4}, "width must be 1 or more, not -4"),
+        (TextTower, {"length": 0}, "--model.text.length must be 1 or more, not 0"),
+        (ModelConfig, {"patch": 0}, "--model.patch must be 1 or more, not 0"),
+        (ModelConfig, {"temperature": 0.0}, "--model.temperature must be above 0, not 0.0"),
+        (ModelConfig, {"lora_rank": -1}, "--model.lora-rank must be 0 or more, not -1"),
+        (ModelConfig, {"decoder": Stack(18, 1, 2, 72)}, "--model.decoder.width must be a multiple of 4 .*, not 18"),
+        (LossConfig, {"groups": 0}, "--objective.groups must be 1 or more, not 0"),
+        (LossConfig, {"mask_ratio": 1.5}, "--objective.mask-ratio must be 0 to 1, not 1.5"),
+        (LossConfig, {"mask_ratio": -0.1}, "--objective.mask-ratio must be 0 to 1, not -0.1"),
+        (LossConfig, {"alpha_vl": -0.2}, "--objective.alpha-vl must be 0 or more, not -0.2"),
+        (OptimConfig, {"accumulate": 0}, "--optim.accumulate must be 1 or more, not 0"),
+        (OptimConfig, {"clip_norm": -1.0}, "--optim.clip-norm must be above 0, not -1.0"),
+        (OptimConfig, {"ema": 1.0}, "--optim.ema must be 0 or more and below 1, not 1.0"),
+        (RunConfig, {"seed": 2**32}, "--loop.seed must be 0 to 4294967295, not 4294967296"),
+        (RunConfig, {"seed": -1}, "--loop.seed must be 0 to 4294967295, not -1"),
+        (OptimConfig, {"clip_norm": 0.0}, "--optim.clip-norm must be above 0, not 0.0"),
+        (OptimConfig, {"learning_rate": float("nan")}, "--optim.learning-rate must be 0 or more, not nan"),
+        (OptimConfig, {"learning_rate": float("inf")}, "--optim.learning-rate must be 0 or more, not inf"),
+        (OptimConfig, {"learning_rate": 1e200}, r"--optim.learning-rate must be 0 or more, not 1e\+200"),
+        (OptimConfig, {"eps": 0.0}, r"--optim.eps must be 1.2e-38 or more \(float32\), not 0.0"),
+        (OptimConfig, {"beta2": 1.0}, "--optim.beta2 must be 0 or more and below 1, not 1.0"),
+        (DataConfig, {"flip": 7.0}, "--loader.flip must be 0 to 1, not 7.0"),
+        (DataConfig, {"clip_share": -1.0}, "--loader.clip-share must be 0 to 1, not -1.0"),
+        (DataConfig, {"jitter": (0.4, -0.1, 0.5, 0.3)}, "--loader.jitter must be 0 or more, not -0.1"),
+        (DataConfig, {"batch_size": 0}, "--loader.batch-size must be 1 or more, not 0"),
+        (RunConfig, {"steps": -5}, "--loop.steps must be 1 or more, not -5"),
+        (RunConfig, {"keep": 0}, "--loop.keep must be 1 or more, not 0"),
+    ],
+)
+def test_numbers_out_of_range_are_errors(kind, options, message):
+    sound = {
+        Stack: preset("tiny").model.touch,
+        ModelConfig: preset("tiny").model,
+        TextTower: TextTower(Stack(8, 1, 2, 32)),
+    }
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        replace(sound.get(kind) or kind(), **options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (
+            ModelConfig,
+            {"match_head": "cosin"},
+            "--model.match-head must be one of mlp, linear, cosine, none, not 'cosin'",
+        ),
+        (ModelConfig, {"dtype": "float16"}, "--model.dtype must be one of float32, bfloat16, float64, not 'float16'"),
+        (OptimConfig, {"decay": "cosin"}, "--optim.decay must be one of linear, cosine, not 'cosin'"),
+        (DataConfig, {"order": "alternating"}, "--loader.order must be one of alternate, random, not 'alternating'"),
+        (DataConfig, {"background": "substract"}, "--loader.background must be one of keep, subtract, not 'substract'"),
+        (DataConfig, {"require": ("image", "txt")}, r"--loader.require\[1\] must be one of image, text, not 'txt'"),
+        (DataConfig, {"require": "image"}, "--loader.require must be a list, not 'image'"),
+        (Config, {"towers": "pretraned"}, "towers must be one of none, scratch, pretrained, not 'pretraned'"),
+        (Config, {"stage": 3}, "stage must be one of 1, 2, not 3"),
+        (Config, {"stage": "2"}, "stage must be one of 1, 2, not '2'"),
+    ],
+)
+def test_choices_that_there_are_not_are_errors(kind, options, message):
+    """From Python nothing else reads them: a slip would train something else."""
+    sound = {ModelConfig: preset("tiny").model, Config: preset("tiny")}
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        replace(sound.get(kind) or kind(), **options)
+    if kind is Config:
+        for stage in (1, 2):
+            with pytest.raises(ConfigError, match=f"^{message}$"):
+                preset("tiny", **{"stage": stage, **options})
+
+
+def test_numbers_that_mean_nothing_of_it_are_not():
+    LossConfig(mask_ratio=0.0, universal_end=0.0, match_weight=0.0)
+    OptimConfig(learning_rate=0.0, warmup=0, clip_norm=None, ema=None)
+    DataConfig(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0), rotation=0.0, clip_share=0.0, threads=0, prefetch=0)
+    RunConfig(save_every=0, figure_every=0, max_skipped=0)
+    replace(preset("tiny").model, sensor_tokens=0, lora_rank=0)
+
+
+def test_wrong_presets_are_errors():
+    with pytest.raises(ConfigError, match="unknown preset 'huge'; choose one of tiny, small, base, large"):
+        preset("huge")
+    with pytest.raises(ConfigError, match="recipe must be one of paper, release, not 'papr'"):
+        preset("tiny", recipe="papr")
+    with pytest.raises(ConfigError, match="needs towers"):
+        preset("tiny", stage=2, towers="none")
+
+
+def test_rows_of_sensors():
+    model = preset("tiny").model
+    assert [model.sensor_row(name) for name in ("gelsight", "digit", "duragel", "universal")] == [0, 1, 4, 9]
+    assert model.universal_row == 9
+    with pytest.raises(ConfigError, match=r"unknown sensor 'gelsigt'; known: gelsight, digit.*--model.sensors"):
+        model.sensor_row("gelsigt")
+    with pytest.raises(ConfigError, match="'tac3d' measures a force field"):
+        model.sensor_row("tac3d")
+    assert replace(model, sensors=("universal", "mine")).universal_row == 0
+
+
+@pytest.mark.parametrize(
+    ("stage", "steps", "expected"), [(1, 1000, 50), (2, 1000, 83), (1, 19, 1), (2, 11, 1), (2, 1, 1), (2, 24, 2)]
+)
+def test_warm_up_is_a_twentieth_or_a_twelfth(stage, steps, expected):
+    config = preset("tiny", stage=stage)
+    config = replace(config, run=replace(config.run, steps=steps))
+    assert config.warmup == expected
+    assert replace(config, optim=replace(config.optim, warmup=7)).warmup == 7
+    assert replace(config, optim=replace(config.optim, warmup=0)).warmup == 0
+
+
+def test_the_keep_ratio():
+    assert LossConfig().keep_ratio == 0.25 and LossConfig(mask_ratio=1.0).keep_ratio == 0.0
+
+
+def parameters(config):
+    head = config.model.match_head
+    model = full_model(lora_rank=min(2, config.model.lora_rank), match_head=head, decoder_sensor_tokens=True)
+    return flatten(build(model).abstract())
+
+
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+def test_weight_decay_spares_vectors_only(recipe):
+    config = preset("tiny", stage=2, recipe=recipe, towers="pretrained")
+    leaves = parameters(config)
+    decay = match_rules(config.weight_decay, leaves)
+    assert set(decay.values()) == {0.0, 0.1}
+    for name, leaf in leaves.items():
+        # blocks and LoRA are stacked on axis 0: a vector of a block has two axes here
+        stacked = "/blocks/" in name or name.startswith("lora/")
+        vector = len(leaf.shape) - stacked <= 1
+        tokens = name in ("decoder/mask_token",)  # (1, 1, D) in the authors' code
+        if name != "logit_scale":
+            assert decay[name] == (0.0 if vector and not tokens else 0.1), name
+    for name in ("touch/sensor_tokens", "touch/position", "decoder/mask_token", "lora/query/a", "lora/out/b"):
+        assert decay[name] == 0.1, name
+    for name in ("touch/class_token", "touch/pre_norm/scale", "decoder/still_head/bias", "logit_scale"):
+        assert decay[name] == 0.0, name
+
+
+def frozen(towers, recipe):
+    config = preset("tiny", stage=2, recipe=recipe, towers=towers)
+    return {name for name, value in match_rules(config.frozen, parameters(config)).items() if value}
+
+
+def test_what_is_frozen():
+    for recipe in ("paper", "release"):
+        assert frozen("scratch", recipe) == {"decoder/position"}
+    paper, release = frozen("pretrained", "paper"), frozen("pretrained", "release")
+    names = parameters(preset("tiny", stage=2, towers="pretrained"))
+    text = {name for name in names if name.startswith("text/")}
+    image = {name for name in names if name.startswith("image/")}
+    blocks = {name for name in image if name.startswith("image/blocks/")}
+    assert len(text) > 10 and len(blocks) > 10 and blocks < image
+    assert paper == {"decoder/position"} | text | image
+    assert release == {"decoder/position"} | text | blocks  # embeddings, norms and projection train fully
+    one = preset("tiny")
+    assert {n for n, v in match_rules(one.frozen, flatten(build(one.model).abstract())).items() if v} == {
+        "decoder/position"
+    }
+
+
+def test_configs_are_static():
+    config = preset("tiny", stage=2)
+    with pytest.raises(AttributeError):
+        config.stage = 1
+    assert isinstance(hash(config), int)
+    assert not any(re.match("jax", name) for name in sys.modules["anytouch_jax.config"].__dict__)
+    assert TextTower(Stack(8, 1, 1, 8)).end_token is None

@@ -1,0 +1,578 @@
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from places import SHARED
+
+from anytouch_jax.data import tokenizer as text
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.loading import samples
+from anytouch_jax.data.loading.loader import Loader, SampleError
+from anytouch_jax.data.loading.samples import fill_slot
+from anytouch_jax.data.manifest.manifest import ManifestError, read, write
+from anytouch_jax.data.transforms import TOUCH, augmentation_rng, subtract_background, touch_transform
+from anytouch_jax.errors import UserError
+
+
+def _clips(sequences=3, length=7, stride=1, **extra):
+    return [
+        {"sequence": f"s{i}", "frame_index": stride * k, "stride": stride, **extra}
+        for i in range(sequences)
+        for k in range(length)
+    ]
+
+
+def _leaves(batch):
+    if batch is None:
+        return []
+    return [leaf for part in batch for leaf in (_leaves(part) if isinstance(part, tuple) or part is None else [part])]
+
+
+def _same(one, two):
+    one, two = _leaves(one), _leaves(two)
+    assert len(one) == len(two)
+    for a, b in zip(one, two, strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+# Determinism -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("stage", "recipe"), [(1, "paper"), (1, "release"), (2, "paper"), (2, "release")])
+def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, settings, rich, stage, recipe):
+    manifest = make(rich)
+    config = settings(stage, recipe, plain=False, threads=1)
+    loader = Loader(manifest, config)
+    first = list(loader.stream(0, 6))
+    assert [step for step, _, _ in first] == list(range(6))
+    for threads in (0, 2, 4):
+        other = Loader(manifest, settings(stage, recipe, plain=False, threads=threads, prefetch=2))
+        for (_, a, info_a), (_, b, info_b) in zip(first, other.stream(0, 6), strict=True):
+            _same(a, b)
+            assert info_a == info_b
+    late = Loader(manifest, config)  # a resumed run
+    for (step, a, info), (_, b, info_b) in zip(first[3:], late.stream(3, 6), strict=True):
+        _same(a, b)
+        _same(a, Loader(manifest, config).batch(step))
+        assert info == info_b
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("anytouch-data")]
+    changed = Loader(manifest, replace(config, run=replace(config.run, seed=1)))
+    assert any(not np.array_equal(a, b) for a, b in zip(_leaves(changed.batch(0)), _leaves(first[0][1]), strict=False))
+
+
+def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, monkeypatch):
+    rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
+    manifest = make(rows)
+    noise = np.random.default_rng(0)
+    for name in (*(f"f{i}" for i in range(8)), "gel0", "gel1"):
+        path = Path(manifest.file(0)).with_name(f"{name}.png")
+        assert cv2.imwrite(str(path), noise.integers(0, 255, (45, 60, 3), np.uint8))
+    read: list[str] = []
+    monkeypatch.setattr(samples, "decode", lambda path: (read.append(Path(path).name), decode(path))[1])
+    whole, counts = [], []
+    for cache in (0, 512):
+        config = settings(1, plain=False, background="subtract", cache=cache)
+        batches = [Loader(manifest, config).batch(step).clip for step in range(2)]
+        read.clear()
+        loader = Loader(manifest, config)
+        batches += [loader.batch(step).clip for step in range(2, 8)]
+        whole.append(batches)
+        counts.append(len(read))
+    for one, other in zip(*whole, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert counts[0] > 60 and counts[1] == len(set(read)) == 10
+    config = settings(1, plain=False, background="subtract")
+    rng = augmentation_rng(config.run.seed, 3, 3, TOUCH)
+    files = [decode(manifest.file(row)) for row in range(4)] + [decode(manifest.file(3, "background_path"))]
+    *seen, gel = touch_transform(files, config.model.image_size, rng, config.data)
+    made = samples.Reader(manifest, config).touch(np.arange(4), 3)
+    np.testing.assert_array_equal(made, subtract_background(seen, gel))
+
+
+def test_contrast_reads_no_third_touch_and_knows_which_pairs_are_of_one_place(make, settings, rich):
+    config = settings(2, plain=True)
+    config = replace(config, model=replace(config.model, match_head="cosine"))
+    manifest, places = make(rich), set()
+    for step in range(4):
+        match = Loader(manifest, config).batch(step).match
+        assert match.clip.any() and match.positive.any() and match.negative is match.negative_sensor is None
+        found = [manifest.codes("touch", own=True)[int(clip[-1, 0, 0, 0]) - 1] for clip in match.clip]
+        np.testing.assert_array_equal(match.place, found)
+        places |= set(found)
+    assert len(places) > 1
+
+
+def test_augmentation_does_not_depend_on_the_batch(make, settings):
+    manifest = make([{} for _ in range(6)])
+    gradient = np.tile(np.arange(0, 240, 15, dtype=np.uint8)[None, :, None], (12, 1, 3))
+    for i in range(6):
+        cv2.imwrite(str(manifest.file(i)), gradient + np.uint8(2 * i))
+    seen = {}
+    for size in (2, 3, 6):
+        loader = Loader(manifest, settings(plain=False, batch_size=size))
+        seen[size] = {frame.tobytes() for step in range(6 // size) for frame in loader.batch(step).clip}
+        assert len(seen[size]) == 6
+    assert seen[2] == seen[3] == seen[6]  # epoch 0 is the same set of six images
+    assert not seen[6] & {
+        frame.tobytes() for frame in Loader(manifest, settings(plain=False, batch_size=6)).batch(1).clip
+    }
+
+
+# Stage 1 ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch", [1, 4, 5, 10])
+def test_an_epoch_of_stills_and_of_clips_holds_every_row_once(make, settings, read_back, batch):
+    manifest = make(_clips(3, 7))
+    loader = Loader(manifest, settings(batch_size=batch, threads=0))
+    windows = [[7 * s + k + j for j in range(4)] for s in range(3) for k in range(4)]
+    counts = {"still": {(r,): 0 for r in range(21)}, "clip": {tuple(clip): 0 for clip in windows}}
+    for step in range(2 * 21):
+        count = counts[loader.kind(step)]
+        for clip in read_back(loader.batch(step).clip).tolist():
+            count[tuple(clip)] += 1
+        assert max(count.values()) - min(count.values()) <= 1  # all of one epoch come before any of the next
+    assert min(counts["still"].values()) >= 1 and min(counts["clip"].values()) >= 1
+    assert loader.steps_per_epoch == -(-21 // batch) + -(-12 // batch)
+
+
+def test_clips_cross_no_sequence_no_gap_and_no_split(make, settings, read_back):
+    rows = _clips(2, 12, stride=2)
+    for row in rows:
+        if row["frame_index"] >= 10:
+            row["frame_index"] += 2  # a gap: 8, 12
+    rows[11]["split"] = "test"
+    loader = Loader(make(rows), settings())
+    for step in range(1, 40, 2):
+        assert loader.kind(step) == "clip"
+        batch = loader.batch(step)
+        assert batch.clip.shape == (4, 4, 28, 28, 3) and batch.clip.dtype == np.uint8
+        for clip in read_back(batch.clip):
+            assert (np.diff(clip) == 1).all()
+            assert len({rows[r]["sequence"] for r in clip}) == 1
+            assert {rows[r]["frame_index"] - rows[clip[0]]["frame_index"] for r in clip} == {0, 2, 4, 6}
+            assert 11 not in clip
+
+
+def test_the_paper_takes_turns_and_the_release_draws(make, settings):
+    manifest = make(_clips())
+    paper = Loader(manifest, settings())
+    assert [paper.kind(step) for step in range(4)] == ["still", "clip", "still", "clip"]
+    release = Loader(manifest, settings(recipe="release", clip_share=0.25))
+    kinds = [release.kind(step) for step in range(400)]
+    assert 70 < kinds.count("clip") < 130
+    assert kinds != [
+        Loader(manifest, settings(recipe="release", clip_share=0.25, order="alternate")).kind(s) for s in range(400)
+    ]
+    quarter = Loader(manifest, settings(clip_share=0.25))
+    assert [quarter.kind(step) for step in range(8)] == (["still"] * 3 + ["clip"]) * 2
+    for share, kind in ((0.0, "still"), (1.0, "clip")):
+        for recipe in ("paper", "release"):
+            assert Loader(manifest, settings(recipe=recipe, clip_share=share)).kind(7) == kind
+
+
+def test_without_clips_all_batches_are_stills_and_it_is_said(make, settings):
+    loader = Loader(make([{} for _ in range(3)]), settings())
+    assert {loader.kind(step) for step in range(9)} == {"still"}
+    assert any("no clip of 4 frames" in note for note in loader.notes)
+    assert loader.batch(0).clip.shape == (4, 1, 28, 28, 3)  # fewer rows than the batch: some come again
+
+
+def test_sensors_follow_their_rows(make, settings, read_back):
+    names = ["digit", "gelslim", "9dtact", "allsight"]
+    loader = Loader(make([{"sensor": names[i % 4]} for i in range(12)]), settings())
+    ids = np.array([1, 2, 5, 6])
+    for step in range(6):
+        batch = loader.batch(step)
+        assert batch.sensor.dtype == np.int32
+        np.testing.assert_array_equal(batch.sensor, ids[read_back(batch.clip)[:, 0] % 4])
+
+
+def test_only_the_split_is_drawn(make, settings, read_back):
+    splits = ["train", "val", "background", "unused"]
+    loader = Loader(make([{"split": splits[i % 4]} for i in range(16)]), settings())
+    assert {int(r) % 4 for step in range(8) for r in read_back(loader.batch(step).clip)[:, 0]} == {0}
+    with pytest.raises(ManifestError, match=r"manifest\.csv: column 'split' has no row 'test'"):
+        Loader(make([{}]), settings(split="test"))
+
+
+def test_field_sensors_are_left_out_aloud(make, settings, read_back):
+    loader = Loader(make([{"sensor": "tac3d"}, {}, {"sensor": "tac3d"}]), settings())
+    assert (read_back(loader.batch(0).clip) == 1).all()
+    assert any("2 rows of tac3d" in note for note in loader.notes)
+    with pytest.raises(ManifestError, match=r"manifest\.csv: split 'train' has no row of a known sensor"):
+        Loader(make([{"sensor": "tac3d"}]), settings())
+
+
+def test_a_clip_holds_no_row_that_was_left_out(make, settings, read_back):
+    rows = _clips(1, 12)
+    rows[5]["sensor"] = "tac3d"
+    loader = Loader(make(rows), settings())
+    for step in range(1, 20, 2):
+        assert 5 not in read_back(loader.batch(step).clip)
+
+
+# Bad input -------------------------------------------------------------------------------------------------------
+
+
+def _truncate(path):
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def _garbage(path):
+    path.write_bytes(b"\x00" * 100)
+
+
+def _nan(path):
+    array = np.full((8, 8, 3), 0.5, np.float32)
+    array[3, 4] = np.nan
+    path.write_bytes(cv2.imencode(".tiff", array)[1].tobytes())
+
+
+def _outside_link(path):
+    outside = path.parent.parent / f"outside-{path.parent.name}.png"
+    path.rename(outside)
+    path.symlink_to(outside)
+
+
+BAD = {
+    "missing": (lambda path: path.unlink(), "there is no file"),
+    "truncated": (_truncate, "corrupt or cut short"),
+    "garbage": (_garbage, "not a PNG"),
+    "nan": (_nan, "NaN pixels"),
+    "link": (_outside_link, "leaves the folder"),
+    "path": (None, "leaves the folder"),
+}
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+@pytest.mark.parametrize("what", list(BAD))
+def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back, what, threads):
+    spoil, words = BAD[what]
+    rows = [{"path": "../escape.png" if what == "path" and i == 2 else f"f{i}.png"} for i in range(5)]
+    manifest = make(rows, folder="data")
+    if spoil:
+        spoil(manifest.file(2))
+    name = "escape.png" if what == "path" else "f2.png"
+    with pytest.raises(SampleError) as error:
+        list(Loader(manifest, settings(batch_size=5, threads=threads)).stream(0, 1))
+    message = str(error.value)
+    assert isinstance(error.value, UserError) and "\n" not in message
+    for word in ("row 2 of", "manifest.csv", "'path'", name, words):
+        assert word in message
+    skipping = settings(batch_size=5, threads=threads, on_bad_sample="skip")
+    loader = Loader(manifest, skipping)
+    ((_, batch, info),) = loader.stream(0, 1)
+    drawn = read_back(batch.clip)[:, 0]
+    assert info["skipped_samples"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
+    _same(batch, Loader(manifest, skipping).batch(0))  # the replacement is deterministic
+
+
+def test_replacements_differ_by_step_slot_and_attempt(settings):
+    bad = {3}
+
+    def replaced(step, slot):
+        tried = []
+
+        def write(index, _):
+            tried.append(index)
+            if index in bad or len(tried) < 3:
+                raise SampleError("bad")
+
+        assert fill_slot(write, 1000, step, slot, settings(on_bad_sample="skip"), 3, 0) == len(tried) - 1
+        return tuple(tried[1:])
+
+    drawn = [replaced(step, slot) for step in range(4) for slot in range(4)]
+    assert drawn == [replaced(step, slot) for step in range(4) for slot in range(4)]
+    assert len({index for pair in drawn for index in pair}) > 25
+
+
+def test_only_bad_samples_end_in_an_error(make, settings):
+    manifest = make([{}, {}])
+    for i in range(2):
+        manifest.file(i).unlink()
+    with pytest.raises(
+        SampleError, match=r"20 samples in a row .* step 0; the last one is row \d of .*there is no file"
+    ):
+        Loader(manifest, settings(on_bad_sample="skip")).batch(0)
+
+
+def test_an_unknown_sensor_is_named_or_left_out_aloud(make, settings, read_back):
+    manifest = make([{}, {"sensor": "newfinger"}, {"sensor": "newfinger", "split": "test"}])
+    with pytest.raises(ManifestError, match=r"row 1 of .*manifest\.csv.*unknown sensor 'newfinger'"):
+        Loader(manifest, settings())
+    loader = Loader(manifest, settings(on_bad_sample="skip"))
+    assert any("1 rows of the unknown sensor 'newfinger'" in note for note in loader.notes)
+    assert (read_back(loader.batch(0).clip) == 0).all()
+    Loader(make([{}, {"sensor": "newfinger", "split": "test"}]), settings())  # unseen sensors may be tested
+
+
+def test_a_bad_picture_names_its_column(make, settings):
+    manifest = make([{"image_path": f"v{i}.png"} for i in range(4)])
+    manifest.file(1, "image_path").write_bytes(b"x" * 50)
+    with pytest.raises(SampleError, match=r"row 1 of .*column 'image_path': .*v1\.png"):
+        Loader(manifest, settings(2)).batch(0)
+    _, batch, info = next(Loader(manifest, settings(2, on_bad_sample="skip")).stream(0, 1))
+    assert info["skipped_samples"] >= 1 and 1 not in batch.align.image[:, 14, 14, 0] - 1
+
+
+def test_nonsense_sizes_are_refused(make, settings):
+    with pytest.raises(UserError, match=r"--loader\.batch-size must be 1 or more, not 0"):
+        Loader(make([{}]), settings(batch_size=0))
+    with pytest.raises(UserError, match="devices must be 1 or more, not 0"):
+        Loader(make([{}]), settings(), devices=0)
+
+
+# Stage 2 ---------------------------------------------------------------------------------------------------------
+
+
+def _check_align(batch, rows, read_back, tokenizer):
+    size = len(batch.clip)
+    drawn = read_back(batch.clip)[:, -1]
+    with_image = [slot for slot, r in enumerate(drawn) if rows[r].get("image_path")]
+    with_text = [slot for slot, r in enumerate(drawn) if rows[r].get("text")]
+    used = batch.image_row[batch.image_row < size].tolist()
+    assert used == with_image and (batch.image_row[len(used) :] == size).all()
+    for place, slot in enumerate(used):
+        assert batch.image[place, 14, 14].tolist() == [drawn[slot] + 1, 200, 9]
+    used = batch.text_row[batch.text_row < size].tolist()
+    assert used == with_text and (batch.text_row[len(used) :] == size).all()
+    if len(batch.text):
+        want, mask = tokenizer.encode(
+            [rows[drawn[slot]]["text"] for slot in used] + [""] * (len(batch.text) - len(used)), batch.text.shape[1]
+        )
+        np.testing.assert_array_equal(batch.text, want)
+        np.testing.assert_array_equal(batch.text_mask, mask)
+    for name, kind in (("image_row", np.int32), ("text", np.int32), ("text_mask", bool), ("text_row", np.int32)):
+        assert getattr(batch, name).dtype == kind
+    return len(with_image), len(with_text)
+
+
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+@pytest.mark.parametrize("devices", [1, 4])
+def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, recipe, devices):
+    rows = rich
+    loader = Loader(make(rows), settings(2, recipe, batch_size=8), devices=devices)
+    alone = Loader(make(rows), settings(2, recipe, batch_size=8))
+    frames = {"still": 1, "clip": 4 if recipe == "release" else 3}
+    shapes, steps = {}, 0
+    for step, batch, info in loader.stream(0, 24):
+        if batch.align is None:
+            assert info == {"skipped_samples": 0, "images": 0, "texts": 0}
+            continue
+        steps += 1
+        assert batch.align.clip.shape[:2] == (8, frames[loader.kind(step)])
+        assert (np.diff(read_back(batch.align.clip), axis=1) == 1).all()
+        images, texts = _check_align(batch.align, rows, read_back, loader.tokenizer)
+        assert info == {"skipped_samples": 0, "images": images, "texts": texts}
+        shape = (len(batch.align.image), len(batch.align.text))
+        assert shapes.setdefault(loader.kind(step), shape) == shape  # fixed for a run
+        assert all(slots % devices == 0 for slots in shape)
+        same = alone.batch(step).align  # the devices add unused slots, and nothing else
+        np.testing.assert_array_equal(same.clip, batch.align.clip)
+        assert (images, texts) == (len(same.image), len(same.text))  # without them the slots are full
+    assert steps >= 5 and set(shapes) == {"still", "clip"}
+
+
+def test_pictures_lie_anywhere_in_the_batch(make, settings):
+    rows = [{"image_path": f"v{i}.png"} if i % 4 == 0 else {} for i in range(16)]
+    loader = Loader(make(rows), settings(2, batch_size=8))
+    places = [tuple(loader.batch(step).align.image_row) for step in range(12)]
+    assert len(set(places)) > 5 and {slot for pair in places for slot in pair} >= {0, 7}  # not the first rows only
+
+
+def test_every_row_is_aligned_although_strata_are_uneven(make, settings, read_back):
+    rows = [{"image_path": f"v{i}.png", "text": "t"} if i else {} for i in range(20)]
+    loader = Loader(make(rows), settings(2, batch_size=4))
+    seen, slots = [], set()
+    for step in range(40):
+        batch = loader.batch(step).align
+        slots.add(_check_align(batch, rows, read_back, loader.tokenizer))
+        seen += read_back(batch.clip)[:, 0].tolist()
+    assert slots == {(4, 4), (3, 3)}  # where the bare row is, a slot is unused
+    assert set(seen) == set(range(20))
+    assert seen.count(0) == pytest.approx(8, abs=1)  # the one bare row comes as often as the others
+
+
+def test_no_vision_and_no_text_give_no_slots(make, settings):
+    loader = Loader(
+        make([{"touch": f"p{i // 2}", "sensor": ["digit", "gelslim"][i % 2]} for i in range(8)]), settings(2)
+    )
+    batch = loader.batch(0).align
+    assert batch.image.shape == (0, 28, 28, 3) and batch.image_row.shape == (0,)
+    assert batch.text.shape == batch.text_mask.shape == (0, 0) and batch.text_row.shape == (0,)
+    assert loader.tokenizer is None
+    rows = [{"image_path": f"v{i}.png", "text": "words", "touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
+    config = settings(2)
+    towerless = replace(config, model=replace(config.model, image=None, text=None))
+    batch = Loader(make(rows), towerless).batch(0).align  # what has no tower is not read
+    assert batch.image.shape[0] == batch.text.shape[0] == 0
+
+
+def test_captions_are_padded_to_the_longest_in_eights_and_never_beyond_the_tower(make, settings):
+    """Positions behind the end token of every caption are work for nothing; a long caption keeps its end token."""
+    for words, length in ((["one"], 8), (["one two three four five six seven eight"], 12)):
+        manifest = make([{"text": text} for text in words * 8])
+        loader = Loader(manifest, settings(2))  # its tower has 12 positions
+        batch = loader.batch(0).align
+        assert batch.text.shape[1] == length
+        np.testing.assert_array_equal(batch.text[0], loader.tokenizer.encode(words[:1], length)[0][0])
+        assert loader.tokenizer.end_id in batch.text[0]
+    assert loader.tokenizer.longest([]) == 2
+    assert loader.tokenizer.longest(["", "one two three four five six seven eight"]) > 9
+
+
+def test_tokenizers(make, settings, tmp_path):
+    rows = [{"text": f"a rough caption number {i}"} for i in range(8)]
+    manifest, config = make(rows), settings(2)
+    loader = Loader(manifest, config)
+    assert any("trained on the captions" in note for note in loader.notes)
+    given = text.train([row["text"] for row in rows], 300)
+    given.save(tmp_path)
+    silent = Loader(make([{"image_path": f"v{i}.png"} for i in range(4)], "silent"), config, tokenizer=given)
+    assert not len(silent.batch(0).align.text)  # a manifest without captions, as CLIP's tokenizer meets it
+    first = Loader(manifest, config, tokenizer=given)
+    assert first.tokenizer is given and first.notes != loader.notes
+    second = Loader(manifest, settings(2, tokenizer=str(tmp_path)))
+    _same(first.batch(0), second.batch(0))
+    small = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=280)))
+    with pytest.raises(UserError, match=f"{given.vocab_size} tokens but the text tower only 280"):
+        Loader(manifest, small, tokenizer=given)
+    with pytest.raises(UserError, match="there is no tokenizer"):
+        Loader(manifest, settings(2, tokenizer=str(tmp_path / "none.json")))
+
+
+def _check_match(match, rows, read_back, size, frames, other_object=False):
+    anchor, positive, negative = (read_back(clip) for clip in (match.clip, match.positive, match.negative))
+    ids = {"digit": 1, "gelslim": 2}
+    for clip, sensor in (
+        (anchor, match.sensor), (positive, match.positive_sensor), (negative, match.negative_sensor)
+    ):  # fmt: skip
+        assert clip.shape == (size, frames)
+        assert (np.diff(clip, axis=1) == 1).all()
+        assert sensor.tolist() == [ids[rows[r]["sensor"]] for r in clip[:, -1]]
+    for a, p, n in zip(anchor[:, -1], positive[:, -1], negative[:, -1], strict=True):
+        assert rows[a]["touch"] == rows[p]["touch"] and rows[a]["sensor"] != rows[p]["sensor"]
+        assert rows[a]["touch"] != rows[n]["touch"]
+        assert rows[a]["object"] != rows[n]["object"] or not other_object
+    return anchor[:, -1].tolist()
+
+
+def test_matching_triples_in_both_recipes(make, settings, read_back, rich):
+    rows = rich
+    manifest = make(rows)
+    loader = Loader(manifest, settings(2, batch_size=6))
+    anchors = {"still": [], "clip": []}
+    for step, batch, _ in loader.stream(0, 16):
+        kind = loader.kind(step)
+        assert batch.align is not None
+        anchors[kind] += _check_match(batch.match, rows, read_back, 6, 1 if kind == "still" else 3)
+    assert sorted(anchors["still"]) == list(range(48)) and len(set(anchors["clip"][:32])) == 32
+    release = Loader(manifest, settings(2, "release", batch_size=6))
+    parts = []
+    for step, batch, _ in release.stream(0, 60):
+        assert (batch.align is None) != (batch.match is None)  # never both in a step
+        parts.append(batch.match is not None)
+        if batch.match is not None:
+            _check_match(batch.match, rows, read_back, 3, 1 if release.kind(step) == "still" else 3, other_object=True)
+    # align: 48/6 + 24/6 = 12 batches, match: 48/3 + 32/3 = 26.7 batches of half the size
+    assert 0.5 < np.mean(parts) < 0.85
+    assert release.steps_per_epoch == 8 + 4 + 16 + 11
+
+
+def test_joined_manifests_share_no_touch_by_accident(make, settings):
+    seen = {"text": "a caption"}
+    one = make([{"touch": "1"} | seen], "one")
+    two = make([{"touch": "1", "sensor": "gelslim"} | seen, {"touch": "2"}], "two")
+    for manifest in (one, two):
+        write(manifest, manifest.files[0])
+    loader = Loader(read([one.files[0], two.files[0]]), settings(2))
+    assert any("no cross-sensor matching" in note for note in loader.notes)
+
+
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+def test_without_pairs_there_is_no_matching_and_it_is_said(make, settings, recipe):
+    loader = Loader(make([{"touch": f"p{i}", "text": "words"} for i in range(8)]), settings(2, recipe))
+    assert any("no cross-sensor matching" in note for note in loader.notes)
+    for _, batch, _ in loader.stream(0, 6):
+        assert batch.match is None and batch.align is not None
+
+
+def test_stage_two_with_nothing_to_learn_is_refused(make, settings):
+    """Its loss would be 0 at every step, and the run would end well."""
+    bare = [{"touch": f"p{i}"} for i in range(8)]
+    twice = [{"touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
+    seen, told = [{"image_path": f"v{i}.png"} for i in range(8)], [{"text": "words"} for _ in range(8)]
+    config = settings(2)
+    no_matching = replace(config, model=replace(config.model, match_head="none"))
+    no_vision = replace(config, model=replace(config.model, image=None))
+    no_text = replace(config, model=replace(config.model, text=None))
+    for rows, one in ((bare, config), (twice, no_matching), (seen, no_vision), (told, no_text)):
+        with pytest.raises(UserError, match="stage 2 has nothing to learn from split 'train': no photograph"):
+            Loader(make(rows), one)
+    for rows, one in ((twice, config), (seen, no_matching), (told, no_vision), (bare, settings(2, "release"))):
+        assert Loader(make(rows), one).steps_per_epoch
+    assert Loader(make(bare), settings(1)).steps_per_epoch
+
+
+def test_pairs_of_stills_only_match_stills_in_clip_steps(make, settings, read_back):
+    rows = _clips(3, 6)
+    for i, row in enumerate(rows[6:]):
+        row["sequence"] += f"x{i // 2}"  # two frames a sequence: no clips
+        row |= {"touch": f"p{i // 2}", "sensor": ["digit", "gelslim"][i % 2], "object": f"o{i // 2}"}
+    loader = Loader(make(rows), settings(2))
+    assert any("matching uses stills only" in note for note in loader.notes)
+    seen = []
+    for step, batch, _ in loader.stream(0, 6):
+        assert batch.align.clip.shape[1] == (1 if loader.kind(step) == "still" else 3)
+        seen += _check_match(batch.match, rows, read_back, 4, 1)
+    assert sorted(seen[:12]) == list(range(6, 18))  # its own epoch goes on through both kinds
+
+
+def test_a_bad_partner_replaces_the_triple(make, settings, read_back, rich):
+    rows = rich
+    manifest = make(rows)
+    manifest.file(7).unlink()
+    for step in range(40):
+        _, batch, info = next(
+            Loader(manifest, settings(2, batch_size=6, on_bad_sample="skip")).stream(2 * step, 2 * step + 1)
+        )
+        _check_match(batch.match, rows, read_back, 6, 1)
+        if info["skipped_samples"]:
+            return
+    pytest.fail("no bad partner was met")
+
+
+def test_groups_that_do_not_divide_a_batch_are_refused(make, settings, rich):
+    manifest = make(rich)
+
+    def load(groups, head="mlp", recipe="paper", **data):
+        config = settings(2, recipe, **data)
+        model, objective = replace(config.model, match_head=head), replace(config.objective, groups=groups)
+        return Loader(manifest, replace(config, model=model, objective=objective))
+
+    with pytest.raises(UserError, match=r"a batch of 6 does not divide by --objective\.groups 4"):
+        load(4, batch_size=6)
+    # Of the release a batch to match has half the rows; only where these are each other's negatives must they divide.
+    with pytest.raises(UserError, match=r"2 touches to match do not divide by --objective\.groups 4"):
+        load(4, "cosine", "release")
+    for head, recipe in (("cosine", "paper"), ("linear", "release")):
+        assert load(4, head, recipe)
+
+
+REAL = SHARED / "real_touch" / "manifest.csv"
+
+
+@pytest.mark.parametrize("path", [REAL] if REAL.parent.is_dir() else [])
+def test_the_real_pack_loads_in_both_stages(settings, path):
+    manifest = read(path)
+    for stage, recipe in ((1, "paper"), (2, "paper"), (2, "release")):
+        loader = Loader(manifest, settings(stage, recipe, plain=False, batch_size=8))
+        assert all("tokenizer" in note for note in loader.notes)
+        for _, batch, info in loader.stream(0, 4):
+            assert info["skipped_samples"] == 0
+            assert all(leaf.std() > 0 for leaf in _leaves(batch) if leaf.ndim == 5)

@@ -1,0 +1,113 @@
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from anytouch_jax.data.loading import sampling as s
+
+
+def test_uniform_is_a_function_of_seed_tag_and_step():
+    steps = np.arange(20_000)
+    draw = s.uniform(3, 1, steps)
+    assert draw.min() >= 0 and draw.max() < 1
+    counts, _ = np.histogram(draw, 20, (0, 1))
+    assert np.abs(counts - 1000).max() < 5 * np.sqrt(1000)
+    assert abs(np.corrcoef(draw[1:], draw[:-1])[0, 1]) < 0.03
+    np.testing.assert_array_equal(s.uniform(3, 1, steps[500:600]), draw[500:600])
+    for seed, tag in ((4, 1), (3, 2), (-3, 1)):
+        assert abs(np.corrcoef(s.uniform(seed, tag, steps), draw)[0, 1]) < 0.03
+
+
+def test_turns_count_the_earlier_steps_of_a_kind():
+    turns = s.Turns(lambda steps: (steps * 7 % 5 < 2).astype(np.int64))
+    seen = {0: 0, 1: 0}
+    for step in [*range(50), 3000]:
+        if step == 3000:
+            seen = {k: sum((i * 7 % 5 < 2) == k for i in range(3000)) for k in (0, 1)}
+        kind, rank = turns.at(step)
+        assert kind == (step * 7 % 5 < 2) and rank == seen[kind]
+        seen[kind] += 1
+    assert s.Turns(lambda steps: steps % 3 == 0).at(3000) == (1, 1000)  # no need to walk there
+    with pytest.raises(ValueError, match="from 0"):
+        turns.at(-1)
+
+
+@pytest.mark.parametrize(("size", "batch"), [(7, 3), (5, 5), (3, 8), (1, 4), (64, 16)])
+def test_every_epoch_of_a_stream_holds_all_once(size, batch):
+    stream = s.Stream(size, 0, 9)
+    drawn = [pair for k in range(4 * size) for pair in stream.take(k * batch, batch)]
+    for epoch in range(4):
+        assert sorted(thing for thing, e in drawn if e == epoch) == list(range(size))
+    orders = {tuple(thing for thing, e in drawn if e == epoch) for epoch in range(4)}
+    assert size < 5 or len(orders) == 4
+    assert s.Stream(size, 0, 9).take(3 * batch, batch) == drawn[3 * batch : 4 * batch]
+    assert size < 5 or s.Stream(size, 1, 9).take(0, size) != drawn[:size]
+    assert s.Stream(0, 0, 9).take(0, 0) == []
+
+
+CASES = [
+    ((3, 5, 7, 9), 8, 1),
+    ((0, 0, 0, 9), 4, 1),
+    ((0, 9, 0, 0), 4, 4),
+    ((9, 0, 0, 0), 4, 1),
+    ((5, 0, 5, 0), 3, 1),
+    ((1, 0, 0, 1999), 64, 1),
+    ((0, 1999, 0, 1), 64, 1),
+    ((350, 250, 510, 450), 64, 4),
+    ((13, 2, 0, 500), 16, 8),
+    ((1, 1, 1, 1), 1, 1),
+    ((2, 3, 1, 0), 5, 2),
+]
+
+
+@pytest.mark.parametrize(("sizes", "batch", "multiple"), CASES)
+def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
+    strata = s.Strata(sizes, batch, multiple)
+    total, steps = np.zeros(4, np.int64), 6 * sum(sizes)
+    for k in range(steps):
+        before, now = strata.at(k)
+        np.testing.assert_array_equal(before, total)
+        assert now.sum() == batch and (now >= 0).all()
+        assert now[s.VISION] + now[s.BOTH] <= strata.images
+        assert now[s.TEXT] + now[s.BOTH] <= strata.texts
+        total += now
+    shares = np.array(sizes) * batch / sum(sizes)
+    assert ((total > 0) == (np.array(sizes) > 0)).all()
+    assert (total / steps >= shares / 2 - batch / steps).all()  # nobody loses more than half
+    for slots, share in ((strata.images, shares[:2].sum()), (strata.texts, shares[1:3].sum())):
+        assert share - 1e-9 <= slots <= batch
+        assert slots == batch or (slots % multiple == 0 and slots < share + multiple)
+    again = s.Strata(sizes, batch, multiple).at(steps - 1)  # straight to one step
+    np.testing.assert_array_equal(again[0] + again[1], total)
+
+
+@pytest.mark.parametrize("multiple", [1, 2, 4, 16])
+def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend_on_them(multiple):
+    alone, strata = (s.Strata((350, 250, 510, 450), 64, m) for m in (1, multiple))
+    assert (alone.images, alone.texts) == (25, 32)  # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
+    assert strata.images == -(-25 // multiple) * multiple and strata.texts % multiple == 0
+    for k in range(500):
+        before, now = strata.at(k)
+        np.testing.assert_array_equal([before, now], alone.at(k))
+        assert now[s.VISION] + now[s.BOTH] == alone.images
+        assert now[s.TEXT] + now[s.BOTH] == alone.texts
+
+
+def test_a_rare_stratum_is_visited_at_even_distances():
+    strata = s.Strata((0, 90000, 0, 110), 64)
+    visits = np.flatnonzero([strata.at(k)[1][s.NEITHER] for k in range(3000)])
+    assert np.diff([-1, *visits, 3000]).max() <= 21
+
+
+def test_shares_that_are_whole_numbers_are_met_exactly():
+    strata = s.Strata((2, 2, 2, 2), 8)
+    assert (strata.images, strata.texts) == (4, 4)
+    assert all(strata.at(k)[1].tolist() == [2, 2, 2, 2] for k in range(20))
+    long = s.Strata((1, 0, 0, 3), 2)  # one image slot; half a row of it is natural, the slot is filled
+    assert long.images == 1 and all(long.at(k)[1].tolist() == [1, 0, 0, 1] for k in range(20))
+
+
+def test_filling_moves_at_most_half_of_a_stratum():
+    shares = [Fraction(0), Fraction(1, 2), Fraction(1, 2), Fraction(1)]
+    assert sum(s._fill(shares, 1, 2)) == 2
+    assert s._fill(shares, 2, 2)[s.TEXT] >= Fraction(1, 4)

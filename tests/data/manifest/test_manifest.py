@@ -1,0 +1,308 @@
+import os
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from anytouch_jax.config import preset
+from anytouch_jax.data.manifest import manifest as m
+from anytouch_jax.errors import UserError
+
+HEAD = "path,sensor,sequence,frame_index,split"
+GOOD = f"{HEAD},stride,touch,commercial,label.slip,label.name,other\n" + (
+    'a.png,digit,s,0,train,2,,1,0,x,7\nb.png,digit,s,2,train,2,t,0,1,"y, z",\nc.png,gelslim,r,5,test,,t,,,,q\n'
+)
+
+
+def _file(tmp_path, text, name="manifest.csv"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_csv_is_typed_and_empty_cells_are_null(tmp_path):
+    got = m.read(_file(tmp_path, "\ufeff" + GOOD))
+    assert len(got) == 3
+    assert got.column("frame_index").to_pylist() == [0, 2, 5]
+    assert got.column("stride").to_pylist() == [2, 2, 1]
+    assert got.column("touch").to_pylist() == [None, "t", "t"]
+    assert got.column("commercial").to_pylist() == [True, False, None]
+    assert got.column("label.slip").to_pylist() == [0, 1, None]
+    assert got.column("label.name").to_pylist() == ["x", "y, z", None]
+    assert got.column("other").to_pylist() == ["7", None, "q"]
+    assert got.column("image_path").to_pylist() == [None] * 3
+    assert got.present("touch").tolist() == [False, True, True]
+    assert got.codes("touch").tolist() == [-1, 0, 0]
+    assert got.file(1) == tmp_path / "b.png"
+
+
+def test_csv_and_parquet_round_trip_with_one_hash(tmp_path):
+    first = m.read(_file(tmp_path, GOOD))
+    for name in ("again.csv", "again.parquet"):
+        m.write(first, tmp_path / name)
+        again = m.read(tmp_path / name)
+        assert again.table.equals(first.table)
+        assert again.content_hash == first.content_hash
+    other = m.read(_file(tmp_path, GOOD.replace("c.png", "d.png"), "other.csv"))
+    assert other.content_hash != first.content_hash
+    moved = m.read(_file(tmp_path, GOOD.replace("2,,1", "2,q,1"), "moved.csv"))
+    assert moved.content_hash != first.content_hash
+    assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    first = m.read(_file(tmp_path, GOOD))
+    before = (tmp_path / "manifest.csv").read_bytes()
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        m.write(first, tmp_path / "manifest.csv")
+    assert (tmp_path / "manifest.csv").read_bytes() == before
+    assert os.listdir(tmp_path) == ["manifest.csv"]
+
+
+def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
+    (tmp_path / "deep").mkdir()
+    first = m.read(_file(tmp_path / "deep", GOOD))
+    m.write(first, tmp_path / "up.parquet")
+    up = m.read(tmp_path / "up.parquet")
+    assert up.value(0, "path") == "deep/a.png"
+    assert up.file(0) == first.file(0)
+    with pytest.raises(m.ManifestError, match=r"row 0 of .*manifest\.csv.*is not inside .*elsewhere"):
+        m.write(first, tmp_path / "elsewhere" / "x.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD.replace(",split", ",slit"), ["lacks the column 'split'", "slit"]),
+        (GOOD.replace("s,2,train", "s,two,train"), ["row 1", "'frame_index'", "whole number", "'two'"]),
+        (GOOD.replace("s,2,train", "s,2.5,train"), ["row 1", "'frame_index'", "'2.5'"]),
+        (GOOD.replace("s,2,train", "s,1e30,train"), ["row 1", "'frame_index'", "'1e30'"]),
+        (GOOD.replace("s,2,train", "s,1_0,train"), ["row 1", "'frame_index'", "'1_0'"]),
+        (GOOD.replace("s,2,train", "s,,train"), ["row 1", "'frame_index' is empty"]),
+        (GOOD.replace("c.png", "  "), ["row 2", "'path' is empty"]),
+        (GOOD.replace("test", "tset"), ["row 2", "'split'", "tset", "background"]),
+        (GOOD.replace("train,2,t,0", "train,0,t,0"), ["row 1", "'stride'", "at least 1, is 0"]),
+        (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["row 0", "'commercial'", "0 or 1", "'yes'"]),
+        (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["cannot be read as a csv", "Expected 11 columns"]),
+        (GOOD.replace("other\n", "path\n"), ["'path' is there twice"]),
+        (HEAD + "\n", ["has no rows"]),
+        ("", ["cannot be read as a csv"]),
+    ],
+)
+def test_a_bad_table_is_named_by_file_column_and_row(tmp_path, text, words):
+    path = _file(tmp_path, text)
+    with pytest.raises(m.ManifestError) as error:
+        m.read(path)
+    assert isinstance(error.value, UserError)
+    for word in [str(path), *words]:
+        assert word in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_other_ways_to_give_no_manifest(tmp_path):
+    (tmp_path / "x.parquet").write_bytes(b"PAR1 this is not one")
+    (tmp_path / "latin.csv").write_bytes(f"{HEAD}\nf\xfcr.png,digit,s,0,train\n".encode("latin-1"))
+    for path, words in [
+        (tmp_path, "is a folder"),
+        (tmp_path / "none.csv", "there is no manifest"),
+        (tmp_path / "x.parquet", "cannot be read as a parquet"),
+        (tmp_path / "latin.csv", "cannot be read as a csv"),
+        (_file(tmp_path, GOOD, "x.txt"), "ends in .csv or .parquet"),
+        ([], "no manifest is given"),
+    ]:
+        with pytest.raises(m.ManifestError, match=words):
+            m.read(path)
+
+
+def test_a_link_into_the_cache_of_the_hub_is_told(tmp_path):
+    real = _file(tmp_path, GOOD)
+    link, cached = tmp_path / "link.csv", tmp_path / "cached.csv"
+    link.symlink_to(real)
+    assert len(m.read(link)) == 3
+    (tmp_path / "3f2a").write_text(GOOD)
+    cached.symlink_to(tmp_path / "3f2a")
+    with pytest.raises(m.ManifestError, match=r"cached.csv is a link into a cache.*--local-dir"):
+        m.read(cached)
+
+
+def test_types_in_memory_are_enforced(tmp_path):
+    good = {"path": ["a"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
+    gaps = m.from_columns({**good, "stride": [3.0], "sensor": pa.array(["digit"]).dictionary_encode()}, tmp_path / "x")
+    assert gaps.table["stride"].type == pa.int64() and gaps.value(0, "sensor") == "digit"
+    for bad in ({"sequence": [3]}, {"frame_index": [0.5]}, {"frame_index": [[1]]}, {"commercial": [2]}, {"text": [1]}):
+        with pytest.raises(m.ManifestError, match=f"column {next(iter(bad))!r}"):
+            m.from_columns({**good, **bad}, tmp_path / "x.csv")
+    for odd in ({"split": ["train", "val"]}, {"frame_index": [10**20]}):
+        with pytest.raises(m.ManifestError, match="make no table"):
+            m.from_columns({**good, **odd}, tmp_path / "x.csv")
+    for name, cell in (("a", "soft"), ("b", ["soft"])):
+        m.write(m.from_columns({**good, "label.x": [cell]}, tmp_path / f"{name}.parquet"), tmp_path / f"{name}.parquet")
+    with pytest.raises(m.ManifestError, match="cannot be joined"):
+        m.read([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+
+
+def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    one = _file(tmp_path / "one", GOOD)
+    two = _file(tmp_path / "two", GOOD.replace("label.slip", "label.grip").replace(",x,", ",3,").replace("y, z", "4"))
+    both = m.read([one, two])
+    assert len(both) == 6
+    assert both.file(4) == tmp_path / "two" / "b.png"
+    assert both.where(4) == f"row 1 of {two}"
+    assert both.column("label.grip").to_pylist() == [None, None, None, 0, 1, None]
+    assert both.column("label.name").to_pylist() == ["x", "y, z", None, "3", "4", None]
+    touch = both.codes("touch", own=True)
+    assert touch[1] == touch[2] != touch[4] == touch[5] and touch[0] == touch[3] == -1
+    assert both.clips(2).tolist() == [[0, 1], [3, 4]]
+    with pytest.raises(m.ManifestError, match="given twice"):
+        m.read([one, one])
+
+
+def test_rows_of_names_the_file_of_an_empty_split(tmp_path):
+    got = m.read(_file(tmp_path, GOOD))
+    assert got.rows_of("train").tolist() == [0, 1]
+    with pytest.raises(m.ManifestError, match=r"manifest\.csv: column 'split' has no row 'val'; it has test, train"):
+        got.rows_of("val")
+    with pytest.raises(m.ManifestError, match="unknown split 'trian'"):
+        got.rows_of("trian")
+
+
+def test_resolve_keeps_inside_the_folder(tmp_path):
+    root = tmp_path / "data"
+    (root / "in").mkdir(parents=True)
+    (tmp_path / "data2").mkdir()
+    (tmp_path / "secret.png").write_bytes(b"x")
+    (root / "link.png").symlink_to(tmp_path / "secret.png")
+    (root / "out").symlink_to(tmp_path / "data2")
+    (root / "inside.png").symlink_to(root / "in" / "a.png")
+    assert m.resolve(root, "in/../in/a.png") == root / "in" / "a.png"
+    assert m.resolve(root, "inside.png") == root / "in" / "a.png"
+    for bad in ("../secret.png", "in/../../secret.png", "../data2/x"):
+        with pytest.raises(m.ManifestError, match=r"leaves the folder of the manifest, .*/data$"):
+            m.resolve(root, bad)
+    for bad in ("link.png", "out/x.png"):
+        with pytest.raises(m.ManifestError, match=r"leaves the folder .*, by a link; put the files there, or"):
+            m.resolve(root, bad)
+    for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name"), (str(root / "a.png"), "absolute")):
+        with pytest.raises(m.ManifestError, match=words):
+            m.resolve(root, bad)
+
+
+def test_sensor_rows(tmp_path):
+    text = f"{HEAD}\na,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
+    got, model = m.read(_file(tmp_path, text)), preset("tiny").model
+    with pytest.raises(m.ManifestError, match=r"row 2 of .*manifest\.csv.*unknown sensor 'newfinger'"):
+        m.sensor_rows(got, model)
+    ids, notes = m.sensor_rows(got, model, unknown="skip")
+    assert ids.tolist() == [1, -1, -1, 6] and ids.dtype == np.int32
+    assert any("1 rows of tac3d" in note for note in notes) and any("newfinger" in note for note in notes)
+    ids, notes = m.sensor_rows(got, model, unknown="universal")
+    assert ids.tolist() == [1, -1, 9, 6] and any("universal" in note for note in notes)
+    other = m.read(_file(tmp_path, text.replace("digit", "DIGIT")))
+    for unknown in ("error", "skip", "universal"):
+        with pytest.raises(m.ManifestError, match=r"row 0 of .*column 'sensor': sensor 'DIGIT': it is called digit"):
+            m.sensor_rows(other, model, unknown=unknown)
+    ids, notes = m.sensor_rows(got, model, np.array([0, 3]))
+    assert ids.tolist() == [1, -1, -1, 6] and notes == []
+
+
+def _brute(rows, length):
+    """Clips by dictionary: the plain meaning of the words."""
+    at = {(row["sequence"], row["split"], row["frame_index"]): i for i, row in enumerate(rows)}
+    found = []
+    for row in rows:
+        keys = [
+            (row["sequence"], row["split"], row["frame_index"] - back * row["stride"])
+            for back in range(length - 1, -1, -1)
+        ]
+        if all(key in at for key in keys):
+            found.append([at[key] for key in keys])
+    return found
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4])
+@pytest.mark.parametrize("scale", [1, 10**15])
+def test_clips_are_what_the_words_say(tmp_path, length, scale):
+    rng = np.random.default_rng(length)
+    taken, rows = set(), []
+    while len(rows) < 300:
+        sequence, frame = f"s{rng.integers(6)}", int(rng.integers(-40, 40)) * scale
+        if (sequence, frame) not in taken:
+            taken.add((sequence, frame))
+            stride, split = int(rng.integers(1, 4)) * scale, str(rng.choice(["train", "train", "val"]))
+            rows.append({"path": "x", "sensor": "digit", "sequence": sequence, "frame_index": frame,
+                         "split": split, "stride": stride})  # fmt: skip
+    got = m.from_columns({name: [row[name] for row in rows] for name in rows[0]}, tmp_path / "m.csv")
+    want = _brute(rows, length)
+    assert got.clips(length).tolist() == want and len(want) > 5
+    train = [clip for clip in want if rows[clip[-1]]["split"] == "train"]
+    assert got.clips(length, "train").tolist() == train
+
+
+def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
+    got = m.read(_file(tmp_path, f"{HEAD}\na,digit,s,0,train\nb,digit,r,7,train\nc,digit,r,7,train\n"))
+    assert len(got.clips(1)) == 3
+    with pytest.raises(m.ManifestError, match=r"row 2 of .* repeats frame_index 7 of sequence 'r' \(row 1\)"):
+        got.clips(2)
+
+
+def test_clips_of_many_rows():
+    from anytouch_jax.data.manifest.clips import windows
+
+    n = 400_000
+    sequence, frame = np.repeat(np.arange(n // 100), 100), np.tile(np.arange(100), n // 100)
+    found = windows(sequence, frame, np.ones(n, np.int64), 4)
+    assert found.shape == (n // 100 * 97, 4)
+    assert (np.diff(found, axis=1) == 1).all()
+
+
+def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        rows = "".join(f"{i}.png,digit,s,{i},train,t{i},g\n" for i in range(3))
+        _file(tmp_path / name, f"{HEAD},touch,grasp_group\n{rows}")
+    both = m.read([tmp_path / "a/manifest.csv", tmp_path / "b/manifest.csv"])
+    m.write(both, tmp_path / "both.parquet")
+    one = m.read(tmp_path / "both.parquet")
+    assert len(one.clips(2)) == len(both.clips(2)) == 4
+    assert len(np.unique(one.codes("touch"))) == 6 and len(np.unique(one.codes("grasp_group"))) == 2
+
+
+def test_keys_may_be_numbers_in_joined_manifests(tmp_path):
+    head = {"sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1], "split": ["train"] * 2}
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        columns = {"path": ["0.png", "1.png"], **head, "grasp_group": [7, 8]}
+        m.write(m.from_columns(columns, tmp_path / name / "m.parquet"), tmp_path / name / "m.parquet")
+    m.write(m.read([tmp_path / "a/m.parquet", tmp_path / "b/m.parquet"]), tmp_path / "both.parquet")
+    assert len(np.unique(m.read(tmp_path / "both.parquet").codes("grasp_group"))) == 4
+
+
+def test_columns_of_any_kind_are_carried_along(tmp_path):
+    columns = {"path": ["a.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
+    one, two = (m.from_columns(columns | {"box": [[1, k]], "bytes": [b"\xff"]}, tmp_path / "m.csv") for k in (2, 3))
+    assert one.content_hash != two.content_hash
+    m.write(one, tmp_path / "m.parquet")
+    assert m.read(tmp_path / "m.parquet").column("box").to_pylist() == [[1, 2]]
+    with pytest.raises(m.ManifestError, match="cannot be written"):
+        m.write(one, tmp_path / "m.csv")
+    assert not (tmp_path / "m.csv").exists()
+
+
+def test_labels_of_a_csv_keep_what_they_say(tmp_path):
+    head = "path,sensor,sequence,frame_index,split,label.object,label.force,label.stable,label.word"
+    rows = ["a.png,digit,s,0,train,001, 1.5 ,True,True", "b.png,digit,s,1,train,007, ,false,maybe"]
+    got = m.read(_file(tmp_path, "\n".join([head, *rows, "c.png,digit,s,2,train,100,2,,"]) + "\n"))
+    assert got.column("label.object").to_pylist() == ["001", "007", "100"]  # names, whose zeros no number keeps
+    assert got.column("label.force").to_pylist() == [1.5, None, 2]
+    assert got.column("label.stable").to_pylist() == [True, False, None]  # as a Parquet manifest has it
+    assert got.column("label.word").to_pylist() == ["True", "maybe", None]
+    m.write(got, tmp_path / "again.csv")
+    again = m.read(tmp_path / "again.csv")
+    assert again.table.equals(got.table) and again.content_hash == got.content_hash
+    m.write(got, tmp_path / "other.parquet")
+    both = m.read([tmp_path / "again.csv", tmp_path / "other.parquet"])
+    assert both.column("label.object").to_pylist() == ["001", "007", "100"] * 2
+    assert both.column("label.stable").to_pylist() == [True, False, None] * 2

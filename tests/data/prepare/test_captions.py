@@ -1,0 +1,647 @@
+import base64
+import json
+import threading
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.packed import forget
+from anytouch_jax.data.prepare.captions import AnnotateError, annotate
+from anytouch_jax.data.prepare.endpoint import AnswerError, Client, Endpoint, EndpointError
+from anytouch_jax.data.prepare.prompts import Nonsense, caption_of, question
+from anytouch_jax.data.prepare.questions import find_jobs
+from anytouch_jax.data.prepare.shards import pack
+from anytouch_jax.data.prepare.sheet import sample_sheet
+from anytouch_jax.errors import UserError
+
+KEY = "sk-very-secret-0123456789"
+GOOD = {"object": "wool scarf", "caption": "Soft and fuzzy, it gives way under light pressure."}
+
+
+@pytest.fixture(autouse=True)
+def _environment(monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    yield
+    forget()
+
+
+def chat(content, **extra):
+    """A chat completion, as the protocol has it."""
+    text = content if isinstance(content, str) or content is None else json.dumps(content)
+    message = {"role": "assistant", "content": text} | extra.pop("message", {})
+    choice = {"index": 0, "message": message, "finish_reason": extra.pop("finish", "stop")}
+    return {"id": "x", "choices": [choice], "usage": {"prompt_tokens": 100, "completion_tokens": 20}} | extra
+
+
+class Server(ThreadingHTTPServer):
+    """Answers by `behave(number, body) -> (status, headers, answer)`; keeps what it was asked and told."""
+
+    daemon_threads = True
+    block_on_close = True
+
+    def __init__(self, behave):
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.behave, self.asked, self.heads = behave, [], []
+        self.lock, self.release, self.busy, self.most = threading.Lock(), threading.Event(), 0, 0
+
+    @property
+    def url(self):
+        return f"http://127.0.0.1:{self.server_port}/v1"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    def do_POST(self):
+        server = self.server
+        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        with server.lock:
+            number = len(server.asked)
+            server.asked.append(body)
+            server.heads.append((self.path, dict(self.headers)))
+            server.busy += 1
+            server.most = max(server.most, server.busy)
+        try:
+            status, headers, answer = server.behave(number, body)
+            if status == "stall":
+                server.release.wait(20)
+                return
+            data = answer if isinstance(answer, bytes) else json.dumps(answer).encode()
+            self.send_response(status)
+            for name, value in headers.items():
+                self.send_header(name, value)
+            if "Content-Length" not in headers:
+                self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data)
+        except (BrokenPipeError, ConnectionResetError):
+            pass
+        finally:
+            with server.lock:
+                server.busy -= 1
+
+    def do_GET(self):
+        self.server.heads.append((self.path, dict(self.headers)))
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_):
+        pass
+
+
+@contextmanager
+def serve(behave=lambda number, body: (200, {}, chat(GOOD))):
+    server = Server(behave)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.release.set()
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def end(server, **options):
+    return Endpoint(server.url, "gpt-4o", **{"timeout": 5.0, "wait": 0.001, "tries": 3} | options)
+
+
+def _ask(server, **options):
+    return Client(end(server, **options)).ask([{"role": "user", "content": "hello"}])
+
+
+def _rows(count=3, dataset="touch_and_go", **extra):
+    """`count` sequences of three frames."""
+    return [
+        {"sequence": f"s{i}", "frame_index": k, "dataset": dataset, "image_path": f"see{i}_{k}.png", **extra}
+        for i in range(count) for k in range(3)
+    ]  # fmt: skip
+
+
+def _run(manifest, server, folder, **options):
+    endpoint = end(server, **options.pop("endpoint", {}))
+    return annotate(manifest, endpoint, folder, **{"confirm": lambda _: True} | options)
+
+
+def _pictures(body):
+    return [part["image_url"]["url"] for part in body["messages"][1]["content"] if part["type"] == "image_url"]
+
+
+def _decoded(url):
+    head, data = url.split(",")
+    assert head == "data:image/jpeg;base64"
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def _words(body):
+    return body["messages"][1]["content"][0]["text"]
+
+
+# What is asked ----------------------------------------------------------------------------------------------------
+
+
+def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, tmp_path):
+    loose = make(_rows())
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers", threads=3)
+    assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
+    assert len(server.asked) == 3 and done.asked == 3 and (done.tokens_in, done.tokens_out) == (300, 60)
+    for body, (path, headers) in zip(server.asked, server.heads, strict=True):
+        assert path == "/v1/chat/completions" and headers["Authorization"] == f"Bearer {KEY}"
+        assert body["model"] == "gpt-4o" and body["response_format"] == {"type": "json_object"}
+        assert body["max_tokens"] == 200 and body["temperature"] == 0.0
+    # The pictures are of one colour that tells the row: rows 1, 4, 7 are the middle frames.
+    seen = sorted(round(float(_decoded(_pictures(body)[0])[..., 0].mean())) for body in server.asked)
+    assert np.abs(np.array(seen) - [2, 5, 8]).max() <= 1
+    assert "photograph" in _words(server.asked[0])
+
+
+def test_one_photograph_of_an_object_is_asked_about_once(make, tmp_path):
+    rows = [
+        row | {"dataset": "tacquad", "touch": f"place{i // 3}", "image_path": "mug.png"}
+        for i, row in enumerate(_rows())
+    ]
+    loose = make(rows)
+    told = []
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers", confirm=lambda estimate: told.append(estimate) or True)
+    assert len(server.asked) == done.asked == told[0].questions == 1
+    assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
+
+
+def test_a_touch_by_two_sensors_has_one_caption_and_pictures_are_made_small(make, tmp_path):
+    rows = _rows(2, "tacquad", touch="place")
+    rows += [{"sequence": "alone", "dataset": "tacquad", "image_path": "big.png"}]
+    loose = make(rows)
+    cv2.imwrite(str(tmp_path / "big.png"), np.zeros((300, 600, 3), np.uint8))
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers", side=128)
+    assert len(server.asked) == 2 and [len(c.job.rows) for c in done.captions] == [6, 1]
+    assert sorted(_decoded(_pictures(body)[0]).shape for body in server.asked) == [(40, 40, 3), (64, 128, 3)]
+
+
+def test_objectfolder_sends_two_photographs_and_the_touch_and_says_so(make, tmp_path):
+    loose = make(_rows(1, "objectfolder_real", image2_path="side.png"))
+    cv2.imwrite(str(tmp_path / "side.png"), np.full((20, 20, 3), 200, np.uint8))
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers")
+    (body,) = server.asked
+    first, second, touch = (_decoded(url) for url in _pictures(body))
+    assert (first.shape, second.shape, touch.shape) == ((40, 40, 3), (20, 20, 3), (12, 16, 3))
+    assert abs(second.mean() - 200) < 2
+    assert "first two pictures are photographs" in _words(body) and "last picture is the imprint" in _words(body)
+    assert [column for _, column in done.captions[0].job.pictures] == ["image_path", "image2_path", "path"]
+    with serve() as server:
+        _run(make(_rows(1, "objectfolder_real")), server, tmp_path / "other")
+    assert len(_pictures(server.asked[0])) == 2 and "first picture is a photograph" in _words(server.asked[0])
+
+
+def test_phrases_are_expanded_once_and_kept(make, tmp_path):
+    rows = _rows(2, "ssvtp", text='soft, {fuzzy} "wool"')
+    rows[3:5] = [row | {"dataset": "octopi", "image_path": None, "text": "hard"} for row in rows[3:5]]
+    rows[5] |= {"text": None}
+    loose = make(rows)
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers")
+        words = sorted(map(_words, server.asked))
+        assert len(words) == 2 and '"hard"' in words[0] and r'"soft, {fuzzy} \"wool\""' in words[1]
+        assert [len(_pictures(body)) for body in sorted(server.asked, key=_words)] == [0, 1]
+        assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 5 + [None]
+        assert done.manifest.column("phrase").to_pylist() == ['soft, {fuzzy} "wool"'] * 3 + ["hard"] * 2 + [None]
+        assert done.left_out == {"no phrase to expand": 1}
+        with pytest.raises(UserError, match=r"nothing to annotate.*5 rows: expanded before"):
+            _run(done.manifest, server, tmp_path / "answers")
+        again = find_jobs(done.manifest, overwrite=True).jobs  # of the phrases, not of what became of them
+        assert sorted(str(job.phrase) for job in again) == ["hard", 'soft, {fuzzy} "wool"']
+
+
+def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
+    rows = _rows(5)
+    for row, change in zip(rows[::3], ({"text": "had one"}, {"split": "background"}, {"dataset": "mine"},
+                                       {"image_path": None}, {}), strict=True):  # fmt: skip
+        at = rows.index(row)
+        rows[at : at + 3] = [one | change for one in rows[at : at + 3]]
+    loose = make(rows)
+    found = find_jobs(loose)
+    assert [job.rows.tolist() for job in found.jobs] == [[12, 13, 14]]
+    assert sorted(found.left_out.values()) == [3, 3, 3, 3]
+    assert any("'mine' has no prompt: give it one, such as --family mine photograph; known" in why
+               for why in found.left_out)  # fmt: skip
+    several = make([row | {"dataset": f"mine {i % 3}"} for i, row in enumerate(_rows(2))])
+    with pytest.raises(UserError, match=r"--family 'mine 2' photograph") as told:
+        find_jobs(several)
+    assert str(told.value).count("touch_and_go") == 1
+    assert len(find_jobs(loose, families={"mine": "photograph"}, overwrite=True).jobs) == 3
+    assert len(find_jobs(loose, split="train").jobs) == 1
+    with pytest.raises(UserError, match="no family of prompts 'photo'"):
+        find_jobs(loose, families={"mine": "photo"})
+
+
+def test_a_packed_manifest_is_annotated_like_a_loose_one(make, tmp_path):
+    loose = make(_rows(2))
+    again = manifests.read(pack(loose, tmp_path / "out"))
+    with serve() as server:
+        _run(loose, server, tmp_path / "answers")
+        done = _run(again, server, tmp_path / "answers")
+    assert len(server.asked) == 2 and done.asked == 0  # the same pictures: answered before
+    assert done.manifest.present("text").all()
+
+
+# Money ------------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_asked_before_it_is_confirmed(make, tmp_path):
+    estimates = []
+    with serve() as server:
+        with pytest.raises(AnnotateError, match="not confirmed"):
+            _run(make(_rows()), server, tmp_path / "answers", confirm=lambda e: estimates.append(e) or False,
+                 price_in=2.5, price_out=10.0)  # fmt: skip
+        assert not server.asked
+        _run(make(_rows()), server, tmp_path / "answers", limit=1)
+        _run(make(_rows()), server, tmp_path / "answers", confirm=lambda e: estimates.append(e) or True)
+    first, second = estimates
+    words = question("photograph", 1)
+    tokens = 3 * (len(words.system + words.text) // 4 + 85 + 170 + 20)
+    assert first == (3, 0, tokens, 240, (tokens * 2.5 + 240 * 10) / 1e6)
+    assert (second.questions, second.cached, second.cost) == (2, 1, None) and "no prices" in str(second)
+    assert len(server.asked) == 3
+
+
+def test_an_answer_is_paid_for_once(make, tmp_path):
+    loose = make(_rows(4))
+    with serve() as server:
+        first = _run(loose, server, tmp_path / "answers")
+        again = _run(loose, server, tmp_path / "answers", confirm=lambda estimate: estimate.questions == 0)
+        assert len(server.asked) == 4 and again.asked == 0
+        assert again.manifest.table.equals(first.manifest.table)
+        cv2.imwrite(str(loose.file(1, "image_path")), np.full((9, 9, 3), 7, np.uint8))
+        _run(loose, server, tmp_path / "answers")
+        assert len(server.asked) == 5  # another picture, another question
+        _run(loose, server, tmp_path / "answers", endpoint={"max_tokens": 300})
+        assert len(server.asked) == 9
+    entry = json.loads((tmp_path / "answers" / "answers.jsonl").read_text().splitlines()[0])
+    assert entry["model"] == "gpt-4o" and entry["prompt"] == question("photograph", 1).hash()
+    assert entry["caption"] == GOOD["caption"] and entry["object"] == GOOD["object"]
+
+
+def test_a_line_that_was_cut_is_asked_again(make, tmp_path):
+    loose, path = make(_rows(3)), tmp_path / "answers" / "answers.jsonl"
+    with serve() as server:
+        _run(loose, server, tmp_path / "answers", threads=1)
+        path.write_bytes(b'[]\n{"key": 3}\n\xff\xfe\n' + path.read_bytes()[:-30])
+        done = _run(loose, server, tmp_path / "answers")
+        assert len(server.asked) == 4 and len(done.captions) == 3
+        _run(loose, server, tmp_path / "answers")
+        assert len(server.asked) == 4
+
+
+def test_an_interrupted_run_goes_on(make, tmp_path):
+    loose = make(_rows(8))
+
+    def behave(number, body):
+        return (200, {}, chat(GOOD)) if number < 4 else (401, {}, {"error": {"message": "quota"}})
+
+    with serve(behave) as server, pytest.raises(EndpointError, match=r"the key is not accepted; .* 401: quota"):
+        _run(loose, server, tmp_path / "answers", threads=1)
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers")
+        assert len(server.asked) == 4 and len(done.captions) == 8
+
+
+# Failures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("status", [408, 409, 425, 429, 500, 502, 503, 504])
+def test_what_may_pass_is_tried_again(status):
+    with serve(lambda n, _: (status, {}, b"busy") if n < 2 else (200, {}, chat(GOOD))) as server:
+        assert json.loads(_ask(server).text) == GOOD
+    assert len(server.asked) == 3
+
+
+@pytest.mark.parametrize("status", [400, 413, 422])
+def test_a_question_that_is_refused_is_not_repeated(status):
+    with (
+        serve(lambda *_: (status, {}, {"error": {"message": "bad\nimage " + "x" * 999}})) as server,
+        pytest.raises(AnswerError, match=f"answers {status}: bad image x") as error,
+    ):
+        _ask(server)
+    assert len(server.asked) == 1 and len(str(error.value)) < 300 and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b"", b"<html>busy</html>", b"null", b"[]", b"{}", b'{"choices": []}', b'{"choices": [{"message": null}]}',
+     b'{"choices": {"a": 1}}', b"[" * 100_000, b"\xff\xfe\x00"],
+)  # fmt: skip
+def test_what_is_no_chat_completion_is_tried_again_and_named(answer):
+    with (
+        serve(lambda *_: (200, {}, answer)) as server,
+        pytest.raises(AnswerError, match=r"form of a chat completion \(after 3 tries\)"),
+    ):
+        _ask(server)
+    assert len(server.asked) == 3
+
+
+def test_retry_after_is_obeyed_within_bounds(monkeypatch):
+    heads = iter(["7", "999999", "-4", "Wed, 21 Oct 2015 07:28:00 GMT", "soon", "nan"])
+    waits = []
+    with serve(lambda n, _: (429, {"Retry-After": next(heads)}, b"") if n < 6 else (200, {}, chat(GOOD))) as server:
+        client = Client(end(server, tries=7, longest_wait=60.0))
+        client.stop.wait = waits.append
+        client.ask([])
+    assert waits[:4] == [7, 60, 0, 0] and len(waits) == 6 and all(0 <= wait <= 60 for wait in waits)
+
+
+def test_waits_grow(monkeypatch):
+    waits = []
+    with serve(lambda *_: (500, {}, b"")) as server:
+        client = Client(end(server, tries=6, wait=1.0, longest_wait=9.0))
+        client.stop.wait = waits.append
+        with pytest.raises(AnswerError, match="answers 500"):
+            client.ask([])
+    assert len(waits) == 5 and waits[-1] == 9.0
+    assert all(0.75 * 2**i <= wait <= 1.25 * 2**i for i, wait in enumerate(waits[:3]))
+
+
+def test_a_server_that_stalls_drips_hangs_up_or_floods_does_not_hold_us(monkeypatch):
+    with (
+        serve(lambda *_: ("stall", {}, b"")) as server,
+        pytest.raises(AnswerError, match=r"no answer within 0\.1 seconds|connection broke"),
+    ):
+        _ask(server, timeout=0.1, tries=2)
+        assert len(server.asked) == 2
+
+    clock = iter(range(0, 10_000, 4))
+    monkeypatch.setattr("anytouch_jax.data.prepare.endpoint.time.monotonic", lambda: float(next(clock)))
+    with (
+        serve(lambda *_: (200, {"Content-Length": "400000"}, bytes(400_000))) as server,
+        pytest.raises(AnswerError, match="no answer within 5 seconds"),
+    ):
+        _ask(server, tries=1)
+    monkeypatch.undo()
+    with (
+        serve(lambda *_: (200, {"Content-Length": "400"}, b"{")) as server,
+        pytest.raises(AnswerError, match=r"connection broke|form of a chat completion"),
+    ):
+        _ask(server, tries=1, timeout=0.2)
+    with serve(lambda *_: (200, {}, bytes(5 << 20))) as server, pytest.raises(AnswerError, match="longer than"):
+        _ask(server, tries=1)
+    with pytest.raises(AnswerError, match="cannot be reached"):
+        _ask(server, tries=2)  # nobody listens there any more
+
+
+def test_nonsense_is_asked_again_then_counted_and_listed(make, tmp_path):
+    answers = ["", "I'm sorry, I can't help with that.", "no JSON", {"caption": "soft"}, {"caption": "word " * 61},
+               {"caption": 7}, ["soft and warm"], {"object": "x"}]  # fmt: skip
+    loose = make(_rows(3))
+
+    def behave(number, body):
+        row = round(float(_decoded(_pictures(body)[0])[..., 0].mean()))
+        return 200, {}, chat(answers[number % len(answers)] if row < 4 else GOOD)
+
+    with serve(behave) as server:
+        done = _run(loose, server, tmp_path / "answers", threads=2)
+    assert len(server.asked) == 3 + 2 and len(done.captions) == 2 and done.asked == 5
+    (failure,) = done.failures
+    assert failure.rows == 3 and failure.where == loose.where(0) and "nonsense" in failure.reason
+    assert "(3 times)" in failure.reason
+    (line,) = (tmp_path / "answers" / "failures.jsonl").read_text().splitlines()
+    assert json.loads(line) == failure._asdict()
+    assert done.manifest.column("text").to_pylist() == [None] * 3 + [GOOD["caption"]] * 6
+
+
+@pytest.mark.parametrize(
+    ("text", "finish", "words"),
+    [
+        ("", "stop", "empty"), ("  \n", "stop", "empty"), ('{"caption": "soft and', "length", "cut off"),
+        (json.dumps(GOOD), "content_filter", "refused"), (json.dumps(GOOD), "refusal", "refused"),
+        ('{"caption": "I cannot determine what is touched here."}', "stop", "refused"),
+        ("[" * 100_000, "stop", "not JSON"),
+        ('{"caption": "... -- !!"}', "stop", "too short"), ('{"caption": "soft soft"}', "stop", "too short"),
+        (json.dumps({"caption": "soft " * 61}), "stop", "too long"),
+        (json.dumps({"caption": "ab " + "x" * 800 + " b c"}), "stop", "too long"),
+        ('{"caption": "soft \\u0007 and warm"}', "stop", "not text"), ("null", "stop", "without a caption"),
+    ],
+)  # fmt: skip
+def test_nonsense_by_kind(text, finish, words):
+    with pytest.raises(Nonsense, match=words):
+        caption_of(text, finish)
+
+
+def test_a_caption_in_a_code_fence_is_a_caption():
+    fenced = f"```json\n{json.dumps(GOOD | {'caption': ' Soft  and' + chr(10) + 'fuzzy. '})}\n```"
+    assert caption_of(fenced, "stop") == ("Soft and fuzzy.", "wool scarf")
+    assert caption_of('{"caption": "Soft and fuzzy.", "object": null}', "") == ("Soft and fuzzy.", "")
+
+
+def test_a_run_of_failures_stops_the_spending(make, tmp_path):
+    with (
+        serve(lambda *_: (400, {}, {"error": "no such image model"})) as server,
+        pytest.raises(AnnotateError, match=r"25 questions in a row failed, the last one: .*no such image model"),
+    ):
+        _run(make(_rows(60)), server, tmp_path / "answers", threads=2)
+    assert len(server.asked) < 60
+    assert threading.active_count() < 8
+
+
+def test_a_picture_that_cannot_be_read_is_a_failure_not_a_crash(make, tmp_path):
+    loose = make(_rows(3))
+    loose.file(1, "image_path").unlink()
+    loose.file(4, "image_path").write_bytes(b"no picture")
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers")
+    assert len(server.asked) == 1 and len(done.captions) == 1 and len(done.failures) == 2
+    assert "see0_1.png" in done.failures[0].reason and "not a PNG" in done.failures[1].reason
+
+
+def test_so_many_at_a_time_and_no_more(make, tmp_path):
+    gate = threading.Barrier(3, timeout=10)
+
+    def behave(number, body):
+        gate.wait()  # opens only when three are being asked at once
+        return 200, {}, chat(GOOD)
+
+    with serve(behave) as server:
+        _run(make(_rows(9)), server, tmp_path / "answers", threads=3)
+    assert server.most == 3 and len(server.asked) == 9
+
+
+# The key ----------------------------------------------------------------------------------------------------------
+
+
+def _everything_below(folder):
+    return b"".join(path.read_bytes() for path in folder.rglob("*") if path.is_file())
+
+
+def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
+    """A server that quotes the key in its answers and its errors."""
+    said = []
+
+    def behave(number, body):
+        kind = number % 3
+        if kind == 0:
+            return 200, {}, chat({"object": KEY, "caption": f"Soft as the key {KEY} in your hand."})
+        if kind == 1:
+            return 400, {}, {"error": {"message": f"Incorrect key {KEY} provided"}}
+        return 200, {}, chat(f"nonsense with {KEY}")
+
+    loose = make(_rows(9))
+    with serve(behave) as server:
+        done = _run(loose, server, tmp_path / "answers", threads=1, say=said.append)
+        sample_sheet(done.manifest, done.captions, tmp_path / "sheet.html")
+        manifests.write(done.manifest, tmp_path / "new.csv")
+    assert done.captions and done.failures and "[key]" in done.captions[0].text
+    assert KEY.encode() not in _everything_below(tmp_path)
+    shown = "".join([*said, *capfd.readouterr(), repr(done.failures), repr(end(server)), repr(Client(end(server)))])
+    assert KEY not in shown
+    for status in (401, 403, 404, 500, 400):
+        with (
+            serve(lambda *_, status=status: (status, {}, {"error": f"bad key {KEY}"})) as server,
+            pytest.raises((AnswerError, EndpointError)) as error,
+        ):
+            _ask(server, tries=1)
+        assert KEY not in str(error.value) and "[key]" in str(error.value)
+
+
+def test_the_key_does_not_follow_a_redirect():
+    for status in (301, 302, 303, 307, 308):
+        with (
+            serve() as elsewhere,
+            serve(lambda *_, s=status, u=elsewhere.url: (s, {"Location": u}, b"")) as server,
+            pytest.raises(EndpointError, match="redirects to another address"),
+        ):
+            _ask(server)
+        assert not elsewhere.heads
+
+
+@pytest.mark.parametrize(
+    ("url", "key", "words"),
+    [
+        ("https://api.example.org/v1", "", "set the environment variable OPENAI_API_KEY"),
+        ("https://api.example.org/v1", "two words", "does not hold a key"),
+        ("https://api.example.org/v1", "line\nInjected: yes", "does not hold a key"),
+        ("https://api.example.org/v1", "schlüssel", "does not hold a key"),
+        (f"https://me:{KEY}@api.example.org/v1", KEY, "not in the address"),
+        ("ftp://api.example.org", KEY, "is not an http or https address"),
+        ("api.example.org/v1", KEY, "is not an http"),
+        ("http://localhost:port/v1", KEY, "is not an http"), ("file:///etc/passwd", KEY, "is not an http"),
+    ],
+)  # fmt: skip
+def test_bad_addresses_and_keys_are_named_without_showing_the_key(monkeypatch, url, key, words):
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    with pytest.raises(EndpointError, match=words) as error:
+        Client(Endpoint(url, "m"))
+    assert "Injected" not in str(error.value) and KEY not in str(error.value)
+
+
+def test_a_local_server_needs_no_key_and_a_distant_one_is_warned_about(monkeypatch, make, tmp_path):
+    assert Endpoint("http://gpu-box:8000/v1", "m").exposes_key
+    assert not Endpoint("https://gpu-box:8000/v1", "m").exposes_key
+    assert not Endpoint("http://localhost:8000/v1", "m").exposes_key
+    monkeypatch.delenv("OPENAI_API_KEY")
+    assert not Endpoint("http://gpu-box:8000/v1", "m").exposes_key
+    with serve() as server:
+        _ask(server)
+    assert "Authorization" not in server.heads[0][1]
+    assert Endpoint("http://h/v1/chat/completions/", "m").address == "http://h/v1/chat/completions"
+
+
+def test_other_servers_can_be_spoken_to():
+    parts = {"choices": [{"message": {"content": [{"type": "text", "text": "in "}, {"text": "parts"}]}}], "usage": None}
+    with serve(lambda *_: (200, {}, parts)) as server:
+        answer = _ask(server, temperature=None, json_mode=False, token_field="max_completion_tokens", max_tokens=9)
+    assert answer == ("in parts", "", 0, 0)
+    assert set(server.asked[0]) == {"model", "messages", "max_completion_tokens"}
+    with serve(lambda *_: (200, {}, chat(None, message={"refusal": "I will not"}))) as server:
+        assert _ask(server)[:2] == ("I will not", "refusal")
+
+
+# The sheet --------------------------------------------------------------------------------------------------------
+
+
+def test_the_sheet_shows_pictures_by_relative_path_and_escapes_words(make, tmp_path):
+    loose = make(_rows(5))
+    tricky = {"object": "<script>", "caption": "Soft & <b>warm</b> to the touch."}
+    with serve(lambda *_: (200, {}, chat(tricky))) as server:
+        done = _run(loose, server, tmp_path / "answers")
+    page = sample_sheet(done.manifest, done.captions, tmp_path / "deep" / "sheet.html", count=3)
+    text = page.read_text()
+    assert text.count("<article>") == 3 and "3 of 5 captions" in text
+    assert "Soft &amp; &lt;b&gt;warm" in text and "<script>" not in text
+    sources = [part.split('"')[0] for part in text.split('src="')[1:]]
+    assert len(sources) == 6 and all(not source.startswith("/") for source in sources)
+    for source in sources:
+        assert cv2.imread(str(page.parent / source)) is not None
+    other = sample_sheet(done.manifest, done.captions, tmp_path / "b.html", count=3)
+    assert other.read_text() == text.replace("sheet_images", "b_images")
+    with pytest.raises(UserError, match="no captions"):
+        sample_sheet(done.manifest, (), tmp_path / "none.html")
+
+
+def test_many_pictures_that_cannot_be_read_bar_no_question(make, tmp_path):
+    loose = make(_rows(40))
+    for job in range(30):
+        loose.file(3 * job + 1, "image_path").write_bytes(b"")
+    with serve() as server:
+        done = _run(loose, server, tmp_path / "answers")
+    assert len(server.asked) == len(done.captions) == 10 and len(done.failures) == 30
+    assert len((tmp_path / "answers" / "failures.jsonl").read_text().splitlines()) == 30
+
+
+def test_what_failed_the_last_time_is_asked_last(make, tmp_path):
+    loose, folder = make(_rows(40)), tmp_path / "answers"
+    refuse = (400, {}, {"error": "no"})
+    with serve(lambda *_: refuse) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)
+    assert len((folder / "failures.jsonl").read_text().splitlines()) == 25
+    good = lambda number, _: (200, {}, chat(GOOD)) if number < 10 else refuse  # noqa: E731
+    with serve(good) as server:
+        assert len(_run(loose, server, folder, threads=1, limit=35).captions) == 10
+    with serve() as server:
+        assert len(_run(loose, server, folder).captions) == 40
+    assert len(server.asked) == 30
+
+
+def test_many_questions_that_are_always_refused_do_not_keep_back_the_answers(make, tmp_path):
+    loose, folder = make(_rows(60)), tmp_path / "answers"
+    answered = []
+
+    def never(number, body):  # all but ten
+        answered.append(number)
+        return (200, {}, chat(GOOD)) if len(answered) <= 10 else (400, {}, {"error": "no"})
+
+    with serve(never) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)
+    with serve(never) as server, pytest.raises(AnnotateError, match="in a row failed"):
+        _run(loose, server, folder, threads=1)  # these 25 are new
+    with serve(never) as server:
+        done = _run(loose, server, folder, threads=1)
+    assert len(done.captions) == 10 and len(done.failures) == 50
+    assert done.failures[-1].reason == "not asked again: 25 before it failed, all in the last run too"
+    assert done.manifest.present("text").sum() == 30  # three rows a touch
+
+
+def test_two_processes_do_not_pay_for_the_same_answers(make, tmp_path):
+    from anytouch_jax.files import alone
+
+    loose, folder = make(_rows(3)), tmp_path / "answers"
+    folder.mkdir()
+    with serve() as server, alone(folder / ".lock"), pytest.raises(AnnotateError, match="another process asks for"):
+        _run(loose, server, folder)
+    assert not server.asked
+    with serve() as server:
+        assert len(_run(loose, server, folder).captions) == 3
+
+
+def test_a_key_that_an_error_cuts_in_two_is_not_shown():
+    with (
+        serve(lambda *_: (400, {}, {"error": "x" * 190 + f" {KEY}"})) as server,
+        pytest.raises(AnswerError) as error,
+    ):
+        _ask(server, tries=1)
+    assert KEY[:8] not in str(error.value)

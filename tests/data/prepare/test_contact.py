@@ -1,0 +1,212 @@
+"""The contact filter on gels drawn here: a lit slope with marker dots, pressed or not, sheared or not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.prepare import contact as c
+from anytouch_jax.errors import UserError
+
+SHAPE = (96, 128)
+
+
+def gel(press=0.0, dots=True, shear=0.0, tint=(0, 0, 0), noise=0, scale=1, at=(50, 70)):
+    """A gel RGB u8 (96 scale, 128 scale, 3); `press` brightens and darkens a disc, `shear` moves the dots by pixels."""
+    height, width = SHAPE[0] * scale, SHAPE[1] * scale
+    y, x = np.mgrid[:height, :width] / scale
+    image = np.stack([90 + 0.4 * x, 110 + 0.3 * y, 120 - 0.2 * x], 2)
+    away = ((y - at[0]) ** 2 + (x - at[1]) ** 2) / 12**2
+    image += (press * np.exp(-away) * np.sign(x - at[1]))[..., None] * np.array([1, 0.2, -1])
+    if dots:
+        for row in range(8, SHAPE[0], 16):
+            for column in range(8, SHAPE[1], 16):
+                shift = shear * np.exp(-((row - at[0]) ** 2 + (column - at[1]) ** 2) / 40**2)
+                image[(y - row) ** 2 + (x - column - shift) ** 2 < 2.5**2] = 20
+    if noise:
+        image += np.random.default_rng(noise).normal(0, 4, image.shape)
+    return np.clip(image + np.array(tint), 0, 255).astype(np.uint8)
+
+
+def naive(frame, background):
+    return float(np.percentile(np.abs(frame.astype(float) - background).max(2), 98))
+
+
+def score(frame, background):
+    return c._score(c.prepare(frame), c.prepare(background))
+
+
+def test_a_press_counts_and_an_untouched_gel_does_not():
+    clean = gel()
+    assert score(clean, clean) == 0
+    assert score(gel(noise=3), clean) < 4 < naive(gel(noise=3), clean)
+    scores = [score(gel(press), clean) for press in (0, 10, 20, 40, 80)]
+    assert scores == sorted(scores) and scores[1] < c.DEFAULT_THRESHOLD < scores[3]
+    assert score(gel(40), clean) == pytest.approx(score(clean, gel(40)), rel=0.1)
+
+
+def test_sheared_dots_alone_are_no_contact():
+    clean, sheared = gel(), gel(shear=5)
+    assert naive(sheared, clean) > 5 * c.DEFAULT_THRESHOLD
+    assert score(sheared, clean) < c.DEFAULT_THRESHOLD / 2
+    assert score(gel(40, shear=5), clean) > 2 * c.DEFAULT_THRESHOLD
+    assert score(gel(40, dots=False), gel(dots=False)) > 2 * c.DEFAULT_THRESHOLD
+
+
+def test_a_change_of_exposure_or_tint_is_no_contact():
+    clean = gel()
+    tinted = gel(tint=(25, -15, 10))
+    assert naive(tinted, clean) > 20
+    assert score(tinted, clean) < 1.5
+    assert score(gel(40, tint=(25, -15, 10)), clean) > 2 * c.DEFAULT_THRESHOLD
+
+
+def test_the_score_does_not_depend_on_the_resolution_or_on_which_side_is_long():
+    small, large = (score(gel(30, scale=s), gel(scale=s)) for s in (2, 5))
+    assert large == pytest.approx(small, rel=0.1)
+    turned = [np.ascontiguousarray(np.rot90(gel(p, scale=2))) for p in (30, 0)]
+    assert score(*turned) == pytest.approx(small, rel=0.1)
+    with pytest.raises(ValueError, match="other proportions"):
+        score(gel(30), turned[1])
+
+
+def test_the_background_is_found_among_presses_at_changing_places():
+    frames = [gel(50, at=(20 + 8 * k, 20 + 12 * k)) for k in range(8)] + [gel(noise=k + 1) for k in range(6)]
+    stack = np.stack([c.prepare(one) for one in frames])
+    found = c.estimate_background(stack)
+    clean = c.prepare(gel())
+    assert c.difference(found, clean).max() < 4
+    assert min(c.difference(one, clean).max() for one in stack[:8]) > 20
+
+
+@pytest.fixture
+def world(tmp_path):
+    """world(rows): a manifest of rows (name, picture, cells); a `background_path` of "bg.png" is the untouched gel."""
+
+    def build(rows, **columns):
+        cv2.imwrite(str(tmp_path / "bg.png"), gel()[..., ::-1])
+        full = []
+        usual = {"sensor": "gelsight_mini", "sequence": "s", "split": "train"}
+        for i, (name, picture, cells) in enumerate(rows):
+            if picture is not None:
+                cv2.imwrite(str(tmp_path / name), picture[..., ::-1])
+            full.append({"path": name, "frame_index": i, **usual, **cells})
+        names = {key: None for row in full for key in row}
+        table = {key: [row.get(key) for row in full] for key in names}
+        return manifests.from_columns({**table, **columns}, tmp_path / "m.parquet")
+
+    return build
+
+
+GIVEN = {"background_path": "bg.png"}
+
+
+def test_given_backgrounds_and_broken_files(world, tmp_path):
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nxx")
+    manifest = world([
+        ("a.png", gel(40), GIVEN), ("b.png", gel(noise=1), GIVEN), ("broken.png", None, GIVEN),
+        ("gone.png", None, GIVEN),
+        ("c.png", np.rot90(gel()), GIVEN), ("d.png", gel(40), {"background_path": "lost.png"}),
+    ])  # fmt: skip
+    for workers in (1, 3):
+        scores = c.contact_scores(manifest, workers=workers)
+        assert (scores.score[:2] > c.DEFAULT_THRESHOLD).tolist() == [True, False]
+        assert np.isnan(scores.score[2:]).all()
+        assert scores.counts == {"given": 2, "none: the frame or its background cannot be read": 3,
+                                 "none: its background has other proportions": 1}  # fmt: skip
+    some = c.contact_scores(manifest, np.array([1]))
+    assert some.counts == {"not asked for": 5, "given": 1}
+    assert some.score[1] == scores.score[1]
+
+
+def test_backgrounds_are_estimated_by_unit_then_by_sequence(world):
+    free = [(f"f{k}.png", gel(noise=k + 1), {"unit": "u", "sequence": f"s{k}"}) for k in range(5)]
+    presses = [(f"p{k}.png", gel(60, at=(20 + 10 * k, 30)), {"unit": "u", "sequence": f"t{k}"}) for k in range(3)]
+    alone = [("alone.png", gel(60), {"sequence": "x"})]
+    other = [(f"o{k}.png", gel(noise=k + 9, tint=(60, 0, 0), dots=False), {"sequence": "y"}) for k in range(5)]
+    scores = c.contact_scores(world(free + presses + alone + other))
+    assert (scores.score[:5] < c.DEFAULT_THRESHOLD).all() and (scores.score[5:8] > c.DEFAULT_THRESHOLD).all()
+    assert np.isnan(scores.score[8]) and "fewer than 5 frames" in scores.reasons[8]
+    assert (scores.score[9:] < c.DEFAULT_THRESHOLD).all()
+    assert scores.counts["estimated"] == 13
+
+
+def test_background_rows_of_a_unit_are_its_untouched_gel(world):
+    pressed = [(f"p{k}.png", gel(60, noise=k + 1), {"unit": "u"}) for k in range(6)]  # held all the time
+    assert (c.contact_scores(world(pressed)).score < c.DEFAULT_THRESHOLD).all()  # as the module's docstring warns
+    row = [("free.png", gel(), {"unit": "u", "split": "background"})]
+    scores = c.contact_scores(world(pressed + row))
+    assert (scores.score[:6] > c.DEFAULT_THRESHOLD).all()
+    assert scores.score[6] < 1
+
+
+def _marked(manifest, scores, **kwargs):
+    return c.mark_contact(
+        manifest, c.ContactScores(np.array(scores, np.float32), np.full(len(scores), "given", object)), **kwargs
+    )
+
+
+def test_marks_keep_what_the_dataset_says_and_what_is_unknown(world):
+    manifest = world([(f"{k}.png", None, {"split": "background" if k == 4 else "train"}) for k in range(6)],
+                     **{"label.contact": [None, None, 1, 0, None, None]})  # fmt: skip
+    scores = [9.0, 2.0, 2.0, 9.0, 9.0, np.nan]
+    marked, report = _marked(manifest, scores)
+    assert marked.column("label.contact").to_pylist() == [1, 0, 1, 0, 0, None]
+    assert marked.column("label.contact_score").to_pylist()[:2] == [9.0, 2.0]
+    assert marked.column("label.contact_score").null_count == 1
+    assert (report.contact, report.free, report.unknown, report.dropped) == (2, 3, 1, 0)
+    kept, report = _marked(manifest, scores, drop=True)
+    assert kept.column("path").to_pylist() == ["0.png", "2.png", "4.png", "5.png"]
+    assert (len(kept), report.dropped) == (4, 2)
+    assert kept.where(1).startswith("row 2 of")  # rows keep the number they have in their file
+    manifests.write(kept, kept.files[0])
+    assert len(manifests.read(kept.files[0])) == 4
+
+
+def test_a_share_of_the_highest_score_of_the_recording_leaves_out_where_contact_is_made_and_broken(world):
+    named = ["s", "s", "s", "t", "t", "u"]
+    manifest = world([(f"{k}.png", None, {"sequence": name}) for k, name in enumerate(named)])
+    scores = [10.0, 40.0, 19.0, 8.0, np.nan, 7.0]
+    marked, _ = _marked(manifest, scores, share=0.5)
+    assert marked.column("label.contact").to_pylist() == [0, 1, 0, 1, None, 1]
+    marked, _ = _marked(manifest, scores)
+    assert marked.column("label.contact").to_pylist() == [1, 1, 1, 1, None, 1]
+    with pytest.raises(UserError, match="--share is a part of the highest score of a sequence, 0 to 1, not 60"):
+        _marked(manifest, scores, share=60)
+
+
+def test_thresholds_by_sensor_and_an_older_score(world):
+    manifest = world([(f"{k}.png", None, {"sensor": s}) for k, s in enumerate(("digit", "9dtact"))],
+                     **{"label.contact_score": [1.5, 2.5]})  # fmt: skip
+    marked, report = _marked(manifest, [5.0, 5.0])
+    assert marked.column("label.contact").to_pylist() == [0, 1]
+    assert marked.column("label.contact_score_given").to_pylist() == [1.5, 2.5]
+    assert report.thresholds == {"9dtact": 4.0, "digit": 6.5}
+    again, _ = _marked(marked, [1.0, 1.0], thresholds={"digit": 0.5})
+    assert again.column("label.contact").to_pylist() == [0, 1]  # now given, and kept
+    assert again.table.column_names.count("label.contact_score_given") == 1
+    with pytest.raises(UserError, match="sensor 'tacto', which the manifest does not have"):
+        _marked(manifest, [1, 1], thresholds={"tacto": 3})
+    with pytest.raises(UserError, match="the threshold of digit must be a number, not nan"):
+        _marked(manifest, [1, 1], thresholds={"digit": float("nan")})
+    with pytest.raises(UserError, match="nothing would be left"):
+        _marked(manifest, [0.0, 0.0], drop=True)
+    with pytest.raises(UserError, match="workers"):
+        c.contact_scores(manifest, workers=0)
+
+
+def test_one_odd_file_ends_nothing(tmp_path):
+    (tmp_path / "data").mkdir()
+    cv2.imwrite(str(tmp_path / "away.png"), gel())
+    for number in range(12):
+        cv2.imwrite(str(tmp_path / "data" / f"{number}.png"), gel(press=60.0 * (number > 8), noise=number + 1))
+    (tmp_path / "data" / "3.png").unlink()
+    (tmp_path / "data" / "3.png").symlink_to(tmp_path / "away.png")
+    cv2.imwrite(str(tmp_path / "data" / "5.png"), np.zeros((3, 180, 3), np.uint8))
+    columns = {"path": [f"{n}.png" for n in range(12)], "sensor": ["digit"] * 12, "sequence": ["s"] * 12,
+               "frame_index": list(range(12)), "split": ["train"] * 12}  # fmt: skip
+    manifest = manifests.from_columns(columns, tmp_path / "data" / "m.csv")
+    scores = c.contact_scores(manifest, workers=1)
+    assert np.flatnonzero(np.isnan(scores.score)).tolist() == [3, 5]

@@ -1,0 +1,485 @@
+import hashlib
+import json
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from anytouch_jax.data.images import ImageError, decode
+from anytouch_jax.data.loading.bounded import bounded_map
+from anytouch_jax.data.loading.loader import Loader, SampleError
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest import packed
+from anytouch_jax.data.manifest.edit import select
+from anytouch_jax.data.prepare import shards as packing
+from anytouch_jax.data.prepare.shards import PackError, pack
+from anytouch_jax.errors import UserError
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    packed.forget()
+
+
+def _rows(sequences=4, length=6):
+    """Two sensors at the same places, with pictures (one shared by a sequence), captions and a background each."""
+    return [
+        {
+            "path": f"touch {i}/ä{k}.png", "sequence": f"s{i}", "frame_index": k,
+            "sensor": "digit" if i % 2 else "gelslim", "touch": f"place{i // 2}.{k}", "object": f"o{i // 2}",
+            "image_path": f"v{i}.png" if i < 3 else None, "image2_path": "w.png" if i == 1 else None,
+            "text": f"caption {i}" if i % 2 else None, "background_path": f"touch {i}/ä0.png", "label.slip": k % 2,
+        }
+        for i in range(sequences)
+        for k in range(length)
+    ]  # fmt: skip
+
+
+def _shuffled(rows, seed=0):
+    return [rows[i] for i in np.random.default_rng(seed).permutation(len(rows))]
+
+
+def _leaves(batch):
+    if batch is None:
+        return []
+    return [leaf for part in batch for leaf in (_leaves(part) if isinstance(part, tuple) or part is None else [part])]
+
+
+def _assert_same_batches(one, two, config, steps=5):
+    one, two = Loader(one, config), Loader(two, config)
+    for (_, a, info), (_, b, other) in zip(one.stream(0, steps), two.stream(0, steps), strict=True):
+        assert info == other
+        for left, right in zip(_leaves(a), _leaves(b), strict=True):
+            assert left.dtype == right.dtype and left.tobytes() == right.tobytes()
+
+
+# What is stored ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("stage", "recipe", "threads"), [(1, "paper", 0), (2, "paper", 3), (2, "release", 2)])
+@pytest.mark.parametrize("shard_bytes", [1, 500, 1 << 30])
+def test_a_packed_manifest_gives_the_same_batches_byte_for_byte(
+    make, settings, tmp_path, stage, recipe, threads, shard_bytes
+):
+    loose = make(_shuffled(_rows()))
+    again = manifests.read(pack(loose, tmp_path / "out", shard_bytes=shard_bytes))
+    assert again.clips(3).tolist() == loose.clips(3).tolist()
+    _assert_same_batches(loose, again, settings(stage, recipe, plain=False, threads=threads))
+
+
+def test_every_file_is_stored_once_and_unchanged(make, tmp_path):
+    loose = make(_rows())
+    again = manifests.read(pack(loose, tmp_path / "out"))
+    for row in range(len(loose)):
+        for column in ("path", "image_path", "image2_path", "background_path"):
+            if loose.value(row, column) is not None:
+                assert packed.read_file(again.file(row, column)) == loose.file(row, column).read_bytes()
+    touch = pyarrow.parquet.read_table(tmp_path / "out" / "touch" / "00000.parquet")
+    shared = pyarrow.parquet.read_table(tmp_path / "out" / "shared" / "00000.parquet")
+    # A background that is also a row's touch image is not stored a second time.
+    assert (touch.num_rows, shared.num_rows) == (24, 4)
+    assert again.value(3, "background_path") == again.value(0, "path")
+    stored = touch["image"].to_pylist() + shared["image"].to_pylist()
+    assert len({entry["path"] for entry in stored}) == 28
+    for entry in stored:
+        assert entry["bytes"] == (tmp_path / entry["path"]).read_bytes()
+    same = [name for name in loose.table.column_names if not name.endswith("path")]
+    assert again.table.select(same).equals(loose.table.select(same))
+
+
+def test_a_shard_is_what_the_hub_reads(make, tmp_path):
+    loose = make(_shuffled([row | {"license": "MIT"} for row in _rows()]))
+    score = pyarrow.array(np.arange(len(loose)), pyarrow.float32())  # as `anytouch contact` writes it
+    pack(replace(loose, table=loose.table.append_column("label.contact_score", score)), tmp_path / "out")
+    shard = pyarrow.parquet.ParquetFile(tmp_path / "out" / "touch" / "00000.parquet")
+    schema = shard.schema_arrow
+    assert schema.field("image").type == pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
+    features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    assert features["image"] == {"_type": "Image"} and set(features) == set(schema.names)
+    assert features["frame_index"] == {"dtype": "int64", "_type": "Value"}
+    assert features["label.contact_score"] == {"dtype": "float32", "_type": "Value"}
+    table = shard.read()
+    order = list(zip(table["sequence"].to_pylist(), table["frame_index"].to_pylist(), strict=True))
+    assert [frame for _, frame in order] == list(range(6)) * 4  # contiguous by sequence, in time
+    assert [name for name, _ in order] == [name for name in dict.fromkeys(n for n, _ in order) for _ in range(6)]
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "data_files: touch/*.parquet" in card and "data_files: shared/*.parquet" in card
+    assert "| MIT | 24 | " in card
+
+
+def test_the_sums_are_those_of_the_files(make, tmp_path):
+    pack(make(_rows()), tmp_path / "out", shard_bytes=600)
+    lines = (tmp_path / "out" / "SHA256SUMS").read_text().splitlines()
+    there = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*/*.parquet")}
+    assert {line[66:] for line in lines} == there and len(there) > 3
+    for line in lines:
+        assert hashlib.sha256((tmp_path / "out" / line[66:]).read_bytes()).hexdigest() == line[:64]
+
+
+def test_row_groups_stay_small(make, tmp_path, monkeypatch):
+    monkeypatch.setattr(packing, "_GROUP_ROWS", 5)
+    again = manifests.read(pack(make(_rows()), tmp_path / "out"))
+    about = pyarrow.parquet.ParquetFile(tmp_path / "out" / "touch" / "00000.parquet").metadata
+    assert [about.row_group(i).num_rows for i in range(about.num_row_groups)] == [5, 5, 5, 5, 4]
+    assert decode(again.file(23)).shape == (12, 16, 3)
+
+
+def test_shards_are_cut_by_size(make, tmp_path):
+    loose = make(_rows())
+    sizes = [loose.file(row).stat().st_size for row in range(24)]
+    pack(loose, tmp_path / "out", shard_bytes=4 * max(sizes))
+    counts = [len(np.load(path)) for path in sorted((tmp_path / "out" / "touch").glob("*.index"))]
+    assert sum(counts) == 24 and max(counts) >= 4
+    for number, start in enumerate(np.cumsum([0, *counts[:-1]])):
+        assert sum(sizes[start : start + counts[number]]) <= 4 * max(sizes)
+
+
+def test_arrays_and_field_files_are_packed_too(make, tmp_path):
+    loose = make([{"path": f"{i}.png", "field_path": f"{i}.csv"} for i in range(3)])
+    pixels = np.random.default_rng(0).random((9, 7, 3)).astype(np.float32)
+    with (tmp_path / "0.png").open("wb") as file:  # an array under another name is known by its first bytes
+        np.save(file, np.asfortranarray(pixels))
+    for i in range(3):
+        (tmp_path / f"{i}.csv").write_text(f"field {i}")
+    again = manifests.read(pack(loose, tmp_path / "out"))
+    np.testing.assert_array_equal(decode(again.file(0)), np.rint(pixels * 255).astype(np.uint8))
+    assert packed.read_file(again.file(2, "field_path")) == b"field 2"
+
+
+def test_joined_manifests_keep_their_keys_apart(make, settings, tmp_path):
+    one, two = make(_rows(2), "one"), make(_rows(2), "two")
+    for name, manifest in (("one", one), ("two", two)):
+        manifests.write(manifest, tmp_path / name / "manifest.csv")
+    for row in range(12):  # another picture under the same name
+        cv2.imwrite(str(two.file(row)), np.full((12, 16, 3), 240 - row, np.uint8))
+    both = manifests.read([tmp_path / "one" / "manifest.csv", tmp_path / "two" / "manifest.csv"])
+    again = manifests.read(pack(both, tmp_path / "out"))
+    assert again.clips(3).tolist() == both.clips(3).tolist()
+    assert again.value(0, "touch") != again.value(12, "touch")
+    _assert_same_batches(both, again, settings(2))
+
+
+def test_packed_manifests_go_on_working_when_filtered_moved_or_packed_again(make, tmp_path):
+    loose = make(_rows())
+    again = manifests.read(pack(loose, tmp_path / "deep" / "out"))
+    manifests.write(select(again, np.array([20, 3])), tmp_path / "part.csv")
+    part = manifests.read(tmp_path / "part.csv")
+    assert part.value(0, "path").startswith("deep/out/touch/00000.parquet/")
+    for row, old in enumerate((20, 3)):
+        assert packed.read_file(part.file(row)) == loose.file(old).read_bytes()
+    twice = manifests.read(pack(part, tmp_path / "twice"))
+    assert packed.read_file(twice.file(1)) == loose.file(3).read_bytes()
+
+
+# Interruptions ----------------------------------------------------------------------------------------------------
+
+
+def _bytes_of(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("stop_at", range(1, 7))
+def test_a_killed_pack_goes_on_behind_the_last_whole_shard(make, tmp_path, monkeypatch, stop_at):
+    loose = make(_rows())
+    size = 9 * loose.file(0).stat().st_size
+    pack(loose, tmp_path / "whole", shard_bytes=size)
+
+    class Killed(BaseException):
+        pass
+
+    moves, real = [], os.replace
+
+    def killing(source, target):
+        # After pack.json, every shard is three moves: the shard, the sums, the index.
+        moves.append(target)
+        if len(moves) == 1 + stop_at:
+            raise Killed
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", killing)
+    with pytest.raises(Killed):
+        pack(loose, tmp_path / "out", shard_bytes=size)
+    monkeypatch.setattr(os, "replace", real)
+    assert not (tmp_path / "out" / "manifest.parquet").exists()
+    # What a kill -9 leaves behind: half of the shard that was being written.
+    (tmp_path / "out" / "touch").mkdir(exist_ok=True)
+    (tmp_path / "out" / "touch" / f"{(stop_at - 1) // 3:05d}.part").write_bytes(b"half of it")
+    read, fetch = [], packing.read_file
+    monkeypatch.setattr(packing, "read_file", lambda path: read.append(path) or fetch(path))
+    pack(loose, tmp_path / "out", shard_bytes=size)
+    assert _bytes_of(tmp_path / "out") == _bytes_of(tmp_path / "whole")
+    first = len(np.load(tmp_path / "whole" / "touch" / "00000.index"))
+    assert len(read) == 28 - (first if stop_at > 3 else 0)
+
+
+def test_a_pack_that_failed_before_its_first_shard_takes_its_folder_again(make, tmp_path):
+    loose = make(_rows())
+    gone = loose.file(3).read_bytes()
+    loose.file(3).unlink()
+    with pytest.raises(PackError, match="run anytouch verify with --repair first"):
+        pack(loose, tmp_path / "out")
+    mended = select(loose, np.delete(np.arange(len(loose)), 3))  # as --repair leaves it
+    assert pack(mended, tmp_path / "out").is_file()
+    loose.file(3).write_bytes(gone)
+    with pytest.raises(PackError, match="another manifest or shard size"):
+        pack(loose, tmp_path / "out")
+
+
+def test_a_finished_pack_is_left_alone(make, tmp_path, monkeypatch):
+    loose = make(_rows())
+    target = pack(loose, tmp_path / "out")
+    monkeypatch.setattr(packing, "read_file", lambda path: pytest.fail("it was packed again"))
+    assert pack(loose, tmp_path / "out") == target
+
+
+def test_other_folders_are_not_touched(make, tmp_path):
+    loose = make(_rows())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("years of work")
+    with pytest.raises(PackError, match="not an empty folder"):
+        pack(loose, tmp_path / "full")
+    pack(loose, tmp_path / "out")
+    with pytest.raises(PackError, match="another manifest or shard size"):
+        pack(select(loose, np.arange(5)), tmp_path / "out")
+    with pytest.raises(PackError, match="another manifest or shard size"):
+        pack(loose, tmp_path / "out", shard_bytes=7)
+    for spoiled in ('{"version"', "[1]"):
+        (tmp_path / "bad").mkdir(exist_ok=True)
+        (tmp_path / "bad" / "pack.json").write_text(spoiled)
+        with pytest.raises(PackError, match=r"pack\.json is not of a pack"):
+            pack(loose, tmp_path / "bad")
+    with pytest.raises(PackError, match="at least 1 byte"):
+        pack(loose, tmp_path / "new", shard_bytes=0)
+
+
+@pytest.mark.parametrize("harm", ["missing", "empty", "folder", "outside"])
+def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
+    loose = make(_rows())
+    file = loose.file(7)
+    file.unlink()
+    if harm == "empty":
+        file.touch()
+    elif harm == "folder":
+        file.mkdir()
+    elif harm == "outside":
+        file.symlink_to("/etc/hostname")
+    words = r"row 7 of .*manifest\.csv, column 'path': 'touch 1/ä1\.png'.*--repair"
+    with pytest.raises(PackError, match=words) as error:
+        pack(loose, tmp_path / "out")
+    assert "\n" not in str(error.value)
+    assert not list((tmp_path / "out").rglob("*.parquet")) or harm in ("empty", "folder")  # told before the packing
+    assert {file.name for file in (tmp_path / "out").rglob("*.part")} | {
+        f.name for f in (tmp_path / "out").rglob(".*")
+    } <= {".lock"}
+
+
+# Damage -----------------------------------------------------------------------------------------------------------
+
+
+def _harm(shard, how, row):
+    index = np.load(shard.with_suffix(".index"))
+    if how == "flip":
+        with shard.open("r+b") as file:
+            file.seek(int(index["offset"][row]) + 30)
+            byte = file.read(1)
+            file.seek(-1, 1)
+            file.write(bytes([byte[0] ^ 1]))
+    elif how == "cut":
+        os.truncate(shard, int(index["offset"][row]) + 10)
+    elif how == "gone":
+        shard.unlink()
+    elif how == "no index":
+        shard.with_suffix(".index").unlink()
+    elif how == "bad index":
+        shard.with_suffix(".index").write_bytes(b"\x93NUMPY garbage")
+    elif how == "short index":
+        np.save(shard.with_suffix(".npy"), index[:row])
+        shard.with_suffix(".npy").rename(shard.with_suffix(".index"))
+    elif how == "other index":
+        with shard.with_suffix(".index").open("wb") as file:
+            np.save(file, np.arange(9))
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("flip", "row 7 of the shard is damaged"), ("cut", "row 7 of the shard is cut short"),
+        ("gone", "there is no shard"),
+        ("no index", "the shard's index"), ("bad index", "is damaged"), ("short index", "7 rows, no row 7"),
+        ("other index", "is not the index of a shard"),
+    ],
+)  # fmt: skip
+def test_damage_is_one_sentence_with_shard_and_row(make, settings, tmp_path, how, words):
+    again = manifests.read(pack(make(_rows()), tmp_path / "out"))
+    _harm(tmp_path / "out" / "touch" / "00000.parquet", how, 7)
+    with pytest.raises(ImageError, match=words) as error:
+        decode(again.file(7))
+    assert "touch/00000.parquet/7" in str(error.value) and "\n" not in str(error.value)
+    if how in ("flip", "cut"):
+        assert decode(again.file(6)).shape == (12, 16, 3)
+        loader = Loader(again, settings(1, threads=2, batch_size=24, clip_share=0.0))
+        with pytest.raises(SampleError, match=r"row \d+ of .*manifest\.parquet, column 'path': .*00000\.parquet/"):
+            list(loader.stream(0, 1))
+        loader = Loader(again, settings(1, threads=2, batch_size=24, clip_share=0.0, on_bad_sample="skip"))
+        ((_, _, info),) = loader.stream(0, 1)
+        assert info["skipped_samples"] >= 1
+
+
+def test_a_shard_that_leads_out_of_the_folder_is_refused(make, tmp_path):
+    again = manifests.read(pack(make(_rows()), tmp_path / "out"))
+    shard = tmp_path / "out" / "touch" / "00000.parquet"
+    shard.rename(tmp_path / "moved.parquet")
+    shard.symlink_to(tmp_path / "moved.parquet")
+    with pytest.raises(manifests.ManifestError, match="leaves the folder"):
+        again.file(0)
+
+
+# Reading ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_random_file_costs_one_read_of_its_length(make, tmp_path, monkeypatch):
+    again = manifests.read(pack(make(_rows()), tmp_path / "out"))
+    decode(again.file(0))
+    sizes, real = [], os.pread
+    monkeypatch.setattr(os, "pread", lambda file, size, offset: sizes.append(size) or real(file, size, offset))
+    monkeypatch.setattr(os, "open", lambda *_: pytest.fail("a file was opened"))
+    data = packed.read_file(again.file(13))
+    assert sizes == [len(data)]
+
+
+def test_a_read_that_comes_in_pieces_is_put_together(make, tmp_path, monkeypatch):
+    again = manifests.read(pack(make(_rows()), tmp_path / "out"))
+    whole = packed.read_file(again.file(5))
+    real = os.pread
+    monkeypatch.setattr(os, "pread", lambda file, size, offset: real(file, min(size, 10), offset))
+    assert packed.read_file(again.file(5)) == whole
+
+
+def test_few_shards_are_open_at_once_and_threads_do_not_mind(make, tmp_path, monkeypatch):
+    loose = make(_rows())
+    again = manifests.read(pack(loose, tmp_path / "out", shard_bytes=1))
+    monkeypatch.setattr(packed, "_shard", lru_cache(2)(packed._Shard))
+    before = len(os.listdir("/proc/self/fd"))
+    rows = np.random.default_rng(0).integers(24, size=600)
+    with ThreadPoolExecutor(8) as pool:
+        got = list(pool.map(lambda row: packed.read_file(again.file(row)), rows.tolist()))
+    want = [loose.file(row).read_bytes() for row in range(24)]
+    assert all(data == want[row] for data, row in zip(got, rows, strict=True))
+    assert packed._shard.cache_info().currsize == 2 and len(os.listdir("/proc/self/fd")) <= before + 2
+
+
+def test_what_is_a_row_of_a_shard_and_what_is_a_file(tmp_path):
+    for name in ("a.parquet/x.png", "a/7", "a.parquet/7.png", "a.parquet/٣", "a.parquet", "7"):
+        assert packed.split_packed(tmp_path / name) is None, name
+    assert packed.split_packed(tmp_path / "a.parquet" / "7") == (tmp_path / "a.parquet", 7)
+
+
+def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "pipe.png")
+    with pytest.raises(ImageError, match="not a regular file"):
+        decode(tmp_path / "pipe.png")
+    (tmp_path / "loop.png").symlink_to("loop.png")
+    with pytest.raises(ImageError, match="cannot be read"):
+        decode(tmp_path / "loop.png")
+    (tmp_path / "big.png").write_bytes(bytes(11))
+    monkeypatch.setattr(packed, "MAX_BYTES", 10)
+    with pytest.raises(ImageError, match="11 bytes, more than the limit of 10"):
+        decode(tmp_path / "big.png")
+
+
+# The map ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("threads", [0, 1, 4])
+def test_a_bounded_map_keeps_order_and_stays_close(threads):
+    taken = []
+
+    def items():
+        for i in range(50):
+            taken.append(i)
+            yield i
+
+    done = 0
+    for i, result in enumerate(bounded_map(lambda x: x * x, items(), threads, 6)):
+        assert result == i * i and len(taken) <= i + 6 + 1
+        done += 1
+    assert done == 50
+
+
+def test_a_bounded_map_raises_the_first_error_and_ends_its_threads():
+    before = threading.active_count()
+    results = bounded_map(lambda x: 1 // (x - 3), range(100), 3)
+    assert [next(results) for _ in range(3)] == [-1, -1, -1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+    early = bounded_map(str, range(100), 3)
+    next(early)
+    early.close()
+    assert threading.active_count() == before
+
+
+def test_errors_are_the_users():
+    assert issubclass(PackError, UserError)
+
+
+def test_other_pictures_under_the_same_table_are_another_pack(make, tmp_path):
+    loose = make(_rows())
+    target = pack(loose, tmp_path / "out")
+    picture = loose.file(0)
+    picture.write_bytes(picture.read_bytes() + b"more")
+    with pytest.raises(PackError, match="are others than when"):
+        pack(loose, tmp_path / "out")
+    for row in range(len(loose)):
+        loose.file(row).unlink(missing_ok=True)  # packed and done with
+    assert pack(loose, tmp_path / "out") == target
+
+
+def test_two_processes_do_not_pack_into_one_folder(make, tmp_path):
+    from anytouch_jax.files import alone
+
+    source, out = make(_rows()), tmp_path / "packed"
+    pack(source, out)
+    (out / "README.md").unlink()  # as if it were still under way
+    with alone(out / ".lock"), pytest.raises(PackError, match=r"another process packs into .*: wait for it"):
+        pack(source, out)
+    assert pack(source, out).is_file()
+    assert not (out / ".lock").exists()
+
+
+def test_a_pack_under_way_is_not_taken_over_before_its_first_shard(make, tmp_path, monkeypatch):
+    source, out = make(_rows()), tmp_path / "packed"
+    first, other = [], []
+
+    def fetched(*args):
+        first.append(args)
+        if len(first) == 1:  # while the first file is read, another plan wants the folder
+            with pytest.raises(PackError, match="another process packs into"):
+                pack(source, out, shard_bytes=100)
+            other.append(args)
+        return packed.read_file(*args)
+
+    monkeypatch.setattr("anytouch_jax.data.prepare.shards.read_file", fetched)
+    pack(source, out, threads=1)
+    assert other
+    for line in (out / "SHA256SUMS").read_text().splitlines():
+        digest, name = line.split("  ")
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
+
+
+@pytest.mark.parametrize("left", [b"", b"\x93NUMPY\x01"])
+def test_a_shard_whose_index_was_cut_is_packed_again(make, tmp_path, left):
+    source, out = make(_rows()), tmp_path / "packed"
+    pack(source, out)
+    (out / "README.md").unlink()
+    index = out / "touch/00000.index"
+    whole = index.read_bytes()
+    index.write_bytes(left)
+    pack(source, out)
+    assert index.read_bytes() == whole

@@ -1,0 +1,258 @@
+"""`anytouch adapt`: one row of tokens is fitted, nothing else moves, and the sensor is served better."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from runs import run_config, train
+from touch_world import make_touches
+
+from anytouch_jax.cli import app
+from anytouch_jax.config import baselines, from_json, to_json
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.adapt import adapt, choose, save
+from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.weights import checkpoint
+from anytouch_jax.weights.tree import flatten
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Three sensors at the same places: digit and gelsight are known, gelslim stands for the new one."""
+    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 12, "val": 4}, frames=2, each=3)
+
+
+@pytest.fixture(scope="module")
+def table(data):
+    return manifests.read(data)
+
+
+def column(table, name):
+    return np.array(table.column(name).to_pylist())
+
+
+def stored(folder, config, params, **metadata):
+    saver = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=to_json(config), metadata=metadata)
+    saver.save(3, {"trainable": params}, {"loss": 1.0})
+    saver.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, data, compiled_once):
+    """A stage-1 run whose tokens matter: larger than at the start of training."""
+    config = run_config(data)
+    params = build(config.model).init(jax.random.key(0))
+    params["touch"]["sensor_tokens"] = params["touch"]["sensor_tokens"] * 20
+    return stored(tmp_path_factory.mktemp("runs") / "stage1", config, params, seen=["gelsight", "digit"])
+
+
+@pytest.fixture(scope="module")
+def fitted(run, table):
+    said = []
+    return adapt(run, table, "gelslim", frames=8, steps=40, say=said.append), said
+
+
+def test_only_the_row_of_the_new_sensor_changes(fitted, run):
+    adapted, said = fitted
+    before, after = flatten(checkpoint.load_params(run)[0]), flatten(adapted.params)
+    assert said == [] and before.keys() == after.keys()
+    for name, array in before.items():
+        if name != "touch/sensor_tokens":
+            np.testing.assert_array_equal(np.asarray(after[name]), np.asarray(array), err_msg=name)
+    tokens, old = np.asarray(after["touch/sensor_tokens"]), np.asarray(before["touch/sensor_tokens"])
+    changed = np.flatnonzero(np.any(tokens != old, axis=(1, 2)))
+    assert changed.tolist() == [2]  # gelslim: a row of the table, but never seen
+    assert np.abs(tokens[2] - old[9]).max() > 0.01  # it left the universal tokens
+
+
+def test_the_reconstruction_loss_falls_on_frames_that_were_not_fitted(fitted):
+    adapted, _ = fitted
+    assert adapted.measured == "val" and adapted.after < adapted.before
+    assert len(adapted.losses) == 40 and np.isfinite(adapted.losses).all()
+
+
+def test_the_same_seed_gives_the_same_tokens(fitted, run, table):
+    again = adapt(run, table, "gelslim", frames=8, steps=40)
+    np.testing.assert_array_equal(again.params["touch"]["sensor_tokens"], fitted[0].params["touch"]["sensor_tokens"])
+    assert again.losses == fitted[0].losses
+
+
+def test_the_result_is_a_run_that_embeds(fitted, run, tmp_path):
+    adapted, _ = fitted
+    save(adapted, run, tmp_path / "out")
+    encoder = load_encoder(tmp_path / "out")
+    stills = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
+    np.testing.assert_array_equal(
+        encoder.params["touch"]["sensor_tokens"][2], adapted.params["touch"]["sensor_tokens"][2]
+    )
+    assert np.abs(encoder.embed(stills, "gelslim") - encoder.embed(stills, "universal")).max() > 1e-4
+    before = load_encoder(run)
+    for sensor in ("digit", "universal", "duragel"):
+        row = np.full(len(stills), before.config.model.sensors.index(sensor))
+        np.testing.assert_array_equal(encoder.embed(stills, row), before.embed(stills, row))
+    about = checkpoint.read_metadata(tmp_path / "out")
+    assert about["seen"] == ["gelsight", "digit", "gelslim"] and about["source"]["frames"] == 8
+    assert from_json((tmp_path / "out" / "config.json").read_text()) == adapted.config
+    lines = [json.loads(line) for line in (tmp_path / "out" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == list(range(40)) and all(line["loss"] > 0 for line in lines)
+    with pytest.raises(UserError, match="is not empty; give another --out"):
+        save(adapted, run, tmp_path / "out")
+
+
+def test_a_sensor_outside_the_table_gets_a_new_row(run, table, tmp_path):
+    adapted = adapt(run, table, "my_gel", frames=0)
+    assert adapted.config.model.sensors[-1] == "my_gel" and adapted.config.model.universal_row == 9
+    tokens = np.asarray(adapted.params["touch"]["sensor_tokens"])
+    assert tokens.shape[0] == 11
+    np.testing.assert_array_equal(tokens[10], tokens[9])  # no frames: the universal tokens as they are
+    save(adapted, run, tmp_path / "out")
+    stills = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
+    encoder = load_encoder(tmp_path / "out")
+    np.testing.assert_array_equal(encoder.embed(stills, "my_gel"), encoder.embed(stills, "universal"))
+
+
+def test_a_model_without_universal_tokens_starts_from_the_mean_of_its_sensors(run, table, tmp_path):
+    params, text, _ = checkpoint.load_params(run)
+    config = baselines.apply("no_universal", from_json(text))
+    other = stored(tmp_path / "own", config, params, seen=["gelsight", "digit"])
+    tokens = np.asarray(adapt(other, table, "my_gel", frames=0).params["touch"]["sensor_tokens"])
+    np.testing.assert_allclose(tokens[10], params["touch"]["sensor_tokens"][:2].mean(0), rtol=1e-6)
+    np.testing.assert_array_equal(tokens[9], params["touch"]["sensor_tokens"][9])  # of others nothing changes
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"steps": -3}, {"frames": -1}])
+def test_numbers_that_make_no_sense_are_refused(run, table, wrong):
+    with pytest.raises(UserError, match="frames are 0 or more and steps 1 or more"):
+        adapt(run, table, "gelslim", **wrong)
+
+
+def test_frames_come_from_as_many_recordings_as_there_are(table):
+    rows = choose(table, "gelslim", "train", 12)
+    sequence = [table.value(row, "sequence") for row in rows]
+    assert len(set(sequence)) == 12 and all(name.endswith("gelslim") for name in sequence)
+    rows = choose(table, "gelslim", "train", 15, seed=1)
+    assert len(set(rows.tolist())) == 15 and len({table.value(row, "sequence") for row in rows}) == 12
+    assert not np.array_equal(choose(table, "gelslim", "train", 5), choose(table, "gelslim", "train", 5, seed=1))
+    with pytest.raises(UserError, match=r"30 frames of gelslim are wanted, but split 'train' has 24"):
+        choose(table, "gelslim", "train", 30)
+
+
+def test_rows_without_a_label_are_never_chosen(table):
+    train = np.flatnonzero((column(table, "sensor") == "gelslim") & (column(table, "split") == "train"))
+    classes = np.full(len(table), -1, np.int32)
+    classes[train[::2]] = 0
+    for seed in range(3):
+        assert np.isin(choose(table, "gelslim", "train", 6, classes, seed), train[::2]).all()
+    np.testing.assert_array_equal(choose(table, "gelslim", "train", len(train[::2]), classes), train[::2])
+    with pytest.raises(UserError, match=r"split 'train' has 12 that can be used"):
+        choose(table, "gelslim", "train", 13, classes)
+
+
+# With labels ---------------------------------------------------------------------------------------------------------
+
+
+def test_labels_draw_the_new_sensor_to_the_classes_of_the_known_ones(run, table):
+    train = table.rows_of("train")  # without frames in val the loss is measured on those that were fitted
+    part = replace(table, table=table.table.take(train), source=table.source[train], number=table.number[train])
+    adapted = adapt(run, part, "gelslim", frames=4, labels="hardness", steps=40, rate=2e-2)
+    assert adapted.measured == "fitted" and adapted.after < adapted.before - 1e-3
+    before, after = flatten(checkpoint.load_params(run)[0]), flatten(adapted.params)
+    assert {n for n in before if not np.array_equal(before[n], after[n])} == {"touch/sensor_tokens"}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"labels": "colour"}, "no column 'colour' or 'label.colour' for --labels"),
+        ({"labels": "force"}, "a column of measurements"),
+        ({"labels": "split"}, "must name classes"),
+        ({"sensor": "digit"}, "was trained on digit"),
+        ({"sensor": "tac3d"}, "no images"),
+        ({"sensor": "universal"}, "serve all"),
+        ({"sensor": "my_gel"}, "4 frames of my_gel are wanted, but split 'train' has 0"),
+    ],
+)
+def test_mistakes_are_one_sentence(run, table, change, told):
+    options = {"sensor": "gelslim", "frames": 4} | change
+    with pytest.raises(UserError, match=told) as error:
+        adapt(run, table, **options)
+    assert "\n" not in str(error.value)
+
+
+def test_models_that_cannot_be_adapted_say_so(run, table, tmp_path):
+    params, text, _ = checkpoint.load_params(run)
+    config = from_json(text)
+    only = stored(tmp_path / "bare", config, {"touch": params["touch"]})
+    with pytest.raises(UserError, match="holds no touch encoder and decoder"):
+        adapt(only, table, "gelslim")
+    t3 = baselines.apply("t3", config)
+    other = stored(tmp_path / "t3", t3, build(t3.model).init(jax.random.key(0)), seen=["digit"])
+    with pytest.raises(UserError, match="by other means than tokens"):
+        adapt(other, table, "gelslim")
+
+
+def test_an_adapted_run_is_written_whole_or_not_at_all(run, table, tmp_path, monkeypatch):
+    adapted = adapt(run, table, "gelslim", frames=2, steps=1)
+
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "out").mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 100}))
+        with pytest.raises(UserError, match="MB left; free some space"):
+            save(adapted, run, tmp_path / "deep" / "new")
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.Checkpoints, "save", full)
+        for name in ("out", "new"):
+            with pytest.raises(OSError, match="No space left"):
+                save(adapted, run, tmp_path / name)
+    assert list(tmp_path.iterdir()) == [tmp_path / "out"] and not any((tmp_path / "out").iterdir())
+    save(adapted, run, tmp_path / "out")  # the same command again
+    assert checkpoint.load_params(tmp_path / "out")[1]
+
+
+def test_a_run_that_does_not_tell_what_it_saw_is_taken_at_its_word(run, table, tmp_path):
+    params, text, _ = checkpoint.load_params(run)
+    said = []
+    old = stored(tmp_path / "old", from_json(text), params)
+    adapted = adapt(old, table, "gelslim", frames=0, say=said.append)
+    assert "does not tell on which sensors it was trained" in said[0] and "seen" not in adapted.about
+    config = replace(from_json(text), stage=2)
+    stored(tmp_path / "two", config, params, seen=["digit"])
+    said.clear()
+    adapt(tmp_path / "two", table, "gelslim", frames=2, steps=1, say=said.append)
+    assert "this stage 2 did not train the decoder" in said[0]
+
+
+@pytest.mark.slow
+def test_what_training_saw_is_written_down(world, tiny_run, tmp_path, compiled_once):
+    assert checkpoint.read_metadata(tiny_run)["seen"] == ["digit", "gelsight_mini"]
+    rows = [line for line in world.read_text().splitlines() if "gelsight_mini" not in line]
+    (world.parent / "digit_only.csv").write_text("\n".join(rows))
+    config = run_config(world.parent / "digit_only.csv", 2)
+    train(config, tmp_path / "r", init=tiny_run, stop_after=1)  # what stage 1 saw counts too
+    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == ["digit", "gelsight_mini"]
+    train(config, tmp_path / "r", stop_after=2)  # and is not forgotten by a run that goes on without --init
+    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == ["digit", "gelsight_mini"]
+
+
+def test_the_command(run, data, tmp_path, capsys, compiled_once):
+    args = ["adapt", "--run", run, "--data", data, "--sensor", "gelslim", "--frames", 8, "--steps", 40, "--out"]
+    assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 0
+    assert "tokens of gelslim fitted to 8 frames; loss on frames of split val" in capsys.readouterr().out
+    assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 1
+    assert "is not empty" in capsys.readouterr().err
+    args[args.index("--frames") + 1] = 0
+    del args[args.index("--steps") : args.index("--steps") + 2]
+    assert app.main([str(arg) for arg in [*args, tmp_path / "none"]]) == 0
+    assert "gelslim has the universal tokens" in capsys.readouterr().out

@@ -1,0 +1,382 @@
+"""Encoders and the features they give: of arrays, of a manifest, from a run, from weights, at random."""
+
+import zipfile
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from runs import run_config
+from tiny_models import touch_model
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.config import Config, DataConfig, from_json, to_json
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.transforms import touch_evaluation
+from anytouch_jax.encoder.encoder import (
+    Encoder,
+    Features,
+    Sight,
+    embed_rows,
+    load_encoder,
+    plain_column,
+    random_encoder,
+    save_npz,
+    text_column,
+)
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.weights import checkpoint, release
+
+RNG = np.random.default_rng(0)
+CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def encoder(tiny_run):
+    return load_encoder(tiny_run)
+
+
+def test_shapes_of_what_is_embedded(encoder):
+    still = CLIPS[:, 0]
+    z = encoder.embed(still, "digit")
+    assert z.shape == (2, 12) and z.dtype == np.float32 and np.isfinite(z).all()
+    np.testing.assert_array_equal(encoder.embed(still[:, None], "digit"), z)
+    np.testing.assert_allclose(encoder.embed(still[0], "digit"), z[:1], atol=1e-5)
+    mean = encoder.embed(still, "digit", pooling="mean")
+    assert mean.shape == (2, 12) and np.abs(mean - z).max() > 1e-3
+    both = encoder.embed(still, "digit", pooling="both")
+    np.testing.assert_allclose(both, np.concatenate([z, mean], axis=1), atol=1e-6)
+    assert encoder.embed(still[:0], "digit").shape == (0, 12)
+
+
+def test_a_still_equals_the_clip_that_repeats_it(encoder):
+    still = CLIPS[:, :1]
+    clip = encoder.embed(np.repeat(still, 3, axis=1), np.asarray([1, 1]))
+    np.testing.assert_allclose(clip, encoder.embed(still, "digit"), atol=2e-5)
+
+
+@pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
+def test_long_clips_are_segments_of_three(encoder, join, width):
+    parts = [encoder.embed(CLIPS[:, s : s + 3], "digit") for s in (0, 3, 4)]  # the last one ends with the last frame
+    wanted = {"mean": np.mean(parts, 0), "sum": np.sum(parts, 0), "concat": np.concatenate(parts, 1)}[join]
+    z = encoder.embed(CLIPS, "digit", join=join)
+    assert z.shape == (2, width)
+    np.testing.assert_allclose(z, wanted, atol=2e-5)
+
+
+def test_what_cannot_be_embedded_is_one_sentence(encoder):
+    for clips, word in (
+        (CLIPS.astype(np.float32), "float32"),
+        (CLIPS[:, :, :27], "28 x 28"),
+        (CLIPS[..., :1], r"see = Sight\(encoder\)"),
+        (CLIPS[:, :0], "a clip needs 3 frames"),
+        (CLIPS[:, :2], "a clip needs 3 frames"),
+        (CLIPS[0, 0, 0], "28 x 28"),
+    ):
+        with pytest.raises(UserError, match=word):
+            encoder.embed(clips, "digit")
+    for ids, word in (([0, 10], "0 to 9"), ([-1, 0], "0 to 9"), ([0], "2 touches")):
+        with pytest.raises(UserError, match=word):
+            encoder.embed(CLIPS[:, 0], np.asarray(ids))
+
+
+def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
+    said = []
+    assert encoder.sensor_row("digit", said.append) == 1 and said == []
+    assert encoder.sensor_row("my_sensor", said.append) == 9
+    assert len(said) == 1 and "'my_sensor'" in said[0] and "universal tokens" in said[0]
+    still = CLIPS[:, 0]
+    with pytest.warns(UserWarning, match="'my_sensor'"):  # from Python it is said as a warning
+        served = encoder.embed(still, "my_sensor")
+    np.testing.assert_array_equal(served, encoder.embed(still))
+    assert np.abs(encoder.embed(still) - encoder.embed(still, "digit")).max() > 1e-4
+    np.testing.assert_allclose(
+        encoder.embed(still, np.asarray([9, 1])),
+        [encoder.embed(still)[0], encoder.embed(still, "digit")[1]],
+        atol=1e-6,
+    )
+
+
+def test_a_sensor_of_the_table_that_training_never_saw_is_told_of(encoder, tmp_path):
+    assert encoder.seen == ("digit", "gelsight_mini") and encoder.universal_drawn
+    said = []
+    assert [encoder.sensor_row(name, said.append) for name in ("digit", "universal", "tacto")] == [1, 9, 7]
+    (line,) = said
+    assert "'tacto' was not drawn in training (that saw digit, gelsight_mini): using the universal tokens" in line
+    with pytest.warns(UserWarning, match="'tacto'"):
+        np.testing.assert_array_equal(encoder.embed(CLIPS[:, 0], "tacto"), encoder.embed(CLIPS[:, 0]))
+    # without universal tokens the mean of the others serves, also where the universal ones are asked for
+    own, said = replace(encoder, universal_drawn=False), []
+    assert [own.sensor_row(name, said.append) for name in ("digit", "tacto", "universal", "mine")] == [1, 7, 9, 9]
+    assert len(said) == 3 and all("using the mean of the tokens that training saw" in line for line in said)
+    about = {release.MODEL_KEY: to_json(encoder.config.model), release.SEEN_KEY: "digit"}
+    params = build(encoder.config.model).init(jax.random.key(0))
+    release.write_safetensors(tmp_path / "w.safetensors", release.to_release(params, encoder.config.model), about)
+    assert load_encoder(tmp_path / "w.safetensors").seen == ("digit",)
+
+
+# Where encoders come from -------------------------------------------------------------------------------------------
+
+
+def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
+    params, _, _ = checkpoint.load_params(tiny_run)
+    assert set(encoder.params) == {"touch"} and encoder.source == str(tiny_run)
+    tokens, stored = encoder.params["touch"]["sensor_tokens"], params["touch"]["sensor_tokens"]
+    np.testing.assert_array_equal(tokens[[1, 3, 9]], stored[[1, 3, 9]])  # digit, gelsight_mini, universal
+    for row in (0, 2, 4, 5, 6, 7, 8):  # sensors that the run has not seen
+        np.testing.assert_array_equal(tokens[row], stored[9])
+    assert "array" not in repr(encoder) and "kernel" not in repr(encoder)
+    wanted = load_encoder(tiny_run / "checkpoints", step=2).embed(CLIPS[:, 0], "digit")
+    np.testing.assert_array_equal(wanted, encoder.embed(CLIPS[:, 0], "digit"))
+
+
+def test_an_encoder_of_a_weights_file(tmp_path):
+    """The shapes of the authors' files tell heads of width 64, unless our own metadata tells the model."""
+    wide = replace(touch_model().touch, width=64, heads=1)
+    model = touch_model(touch=wide, decoder=replace(touch_model().decoder, width=32, heads=1))
+    for heads, about in ((1, False), (4, True)):
+        here = replace(model, touch=replace(wide, heads=heads))
+        made = random_encoder(Config(here), seed=3)
+        params = build(here).init(jax.random.key(1))
+        metadata = {release.MODEL_KEY: to_json(here)} if about else {}
+        path = tmp_path / f"{heads}.safetensors"
+        release.write_safetensors(path, release.to_release(params, here), metadata)
+        found = load_encoder(path)
+        np.testing.assert_array_equal(found.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
+        assert found.config.model.touch == here.touch
+        wanted = Encoder(made.config, {"touch": params["touch"]}, "").embed(CLIPS[:, 0], "digit")
+        np.testing.assert_allclose(found.embed(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
+
+
+def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_tokens(tmp_path):
+    """The release trained rows 0 to 4 of its table and the universal one; 5 to 8 are as they were drawn."""
+    params = build(touch_model()).init(jax.random.key(1))
+    stored = np.asarray(params["touch"]["sensor_tokens"])
+    authors, ours = release.to_release(params, touch_model()), {release.MODEL_KEY: to_json(touch_model())}
+    release.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
+    release.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
+    encoder, untold = (load_encoder(tmp_path / f"{name}.safetensors") for name in ("authors", "untold"))
+    assert encoder.seen == ("gelsight", "digit", "gelslim", "gelsight_mini", "duragel") and untold.seen is None
+    tokens = encoder.params["touch"]["sensor_tokens"]
+    for row in range(10):
+        np.testing.assert_array_equal(tokens[row], stored[row if row < 5 else 9])
+    np.testing.assert_array_equal(untold.params["touch"]["sensor_tokens"], stored)
+    said: list[str] = []
+    assert encoder.sensor_row("9dtact", said.append) == 5 and "was not drawn in training" in said[0]
+    # through `convert` the numbers of the file stay, and what they are of is told
+    assert main(["convert", str(tmp_path / "authors.safetensors"), str(tmp_path / "again.safetensors")]) == 0
+    again = release.read_weights(tmp_path / "again.safetensors")
+    np.testing.assert_array_equal(again["sensor_token"], stored)
+    found = load_encoder(tmp_path / "again.safetensors")
+    assert found.seen == encoder.seen
+    np.testing.assert_array_equal(found.params["touch"]["sensor_tokens"], tokens)
+
+
+def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
+    with pytest.raises(UserError, match="no run folder or weights file"):
+        load_encoder(tmp_path / "gone")
+    with pytest.raises(UserError, match="checkpoint"):
+        load_encoder(tmp_path)
+    with pytest.raises(UserError, match="unknown type"):
+        load_encoder(world)
+    np.savez(tmp_path / "features.npz", values=np.zeros((2, 3), np.float32), path=np.array(["a.png", "b.png"]))
+    with pytest.raises(UserError, match=r"features\.npz holds no weights: path is <U5, not numbers"):
+        load_encoder(tmp_path / "features.npz")
+
+
+def test_weights_that_are_not_finite_embed_nothing(tmp_path, tiny_run):
+    params, text, _ = checkpoint.load_params(tiny_run)
+    params["touch"]["class_token"] = np.full_like(params["touch"]["class_token"], np.nan)
+    about = {release.MODEL_KEY: to_json(from_json(text).model)}
+    checkpoint.export_safetensors(tmp_path / "w.safetensors", params, about)
+    with pytest.raises(UserError, match="weights that are not finite: its training diverged"):
+        load_encoder(tmp_path / "w.safetensors")
+
+
+def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):
+    config = run_config(world, 2)
+    a, b, c = (random_encoder(config, seed).embed(CLIPS[:, 0], "digit") for seed in (0, 0, 1))
+    assert a.shape == encoder.embed(CLIPS[:, 0], "digit").shape
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 1e-3
+    model = random_encoder(config).config.model
+    assert model.image is None and model.text is None and model.match_head == "none"
+
+
+# Manifests ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_manifest_gives_what_its_pictures_give(encoder, world):
+    manifest, said = manifests.read(world), []
+    rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, say=said.append)
+    order = np.argsort(rows)
+    assert rows[order].tolist() == [0, 5, 9] and said == []
+    for row, value in zip(rows, values, strict=True):
+        image = touch_evaluation([decode(manifest.file(int(row)))], 28)
+        wanted = encoder.embed(image[None], manifest.value(int(row), "sensor"))
+        np.testing.assert_allclose(value, wanted[0], atol=1e-5)
+
+
+def test_every_touch_may_have_a_sensor_of_its_own(encoder):
+    side, names = encoder.config.model.image_size, encoder.config.model.sensors
+    frames = np.random.default_rng(0).integers(0, 256, (3, side, side, 3), np.uint8)
+    told = ["gelsight_mini", "digit", "gelsight_mini"]
+    found = encoder.embed(frames, told)
+    np.testing.assert_array_equal(found, encoder.embed(frames, np.array([names.index(name) for name in told])))
+    np.testing.assert_array_equal(found, encoder.embed(frames, np.array(told)))
+    with pytest.raises(UserError, match="one integer for each of the 3 touches"):
+        encoder.embed(frames, told[:2])
+
+
+def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
+    manifest = manifests.read(world)
+    rows, values = embed_rows(encoder, manifest, np.asarray([3, 6]), 3, "both", batch=8)
+    assert rows.tolist() == [3, 6] and values.shape == (2, 24)
+    clip = touch_evaluation([decode(world.parent / f"a{i}.png") for i in (1, 2, 3)], 28)
+    np.testing.assert_allclose(values[0], encoder.embed(clip[None], "digit", pooling="both")[0], atol=1e-5)
+    with pytest.raises(UserError, match="clip of 3 frames"):
+        embed_rows(encoder, manifest, np.asarray([1]), 3)
+    with pytest.raises(UserError, match="no rows"):
+        embed_rows(encoder, manifest, np.asarray([], np.int64))
+
+
+def test_an_unknown_sensor_of_a_manifest_is_said_once(encoder, world):
+    known = replace(encoder.config.model, sensors=("gelsight", "digit", "universal"))
+    params = {"touch": encoder.params["touch"] | {"sensor_tokens": encoder.params["touch"]["sensor_tokens"][[0, 1, 9]]}}
+    small, said = Encoder(replace(encoder.config, model=known), params, "small"), []
+    manifest = manifests.read(world)
+    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, say=said.append)
+    assert len(said) == 1 and "'gelsight_mini'" in said[0]
+    image = touch_evaluation([decode(world.parent / "b0.png")], 28)[None]
+    np.testing.assert_allclose(values[0], encoder.embed(image)[0], atol=1e-5)
+
+
+def test_a_text_column_has_no_nulls(world):
+    manifest = manifests.read(world)
+    column = text_column(manifest, "text")
+    assert column.shape == (12,) and column[0] == "a round thing, a" and column[1] == ""
+
+
+# Files --------------------------------------------------------------------------------------------------------------
+
+
+def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    features = Features(np.ones((2, 3), np.float32), np.asarray([4, 7]), {"path": np.asarray(["a.png", "b.png"])})
+    path = tmp_path / "f.npz"
+    save_npz(path, features, {"encoder": "runs/one"})
+    with np.load(path) as file:
+        assert set(file.files) == {"features", "rows", "key/path", "about/encoder"}
+        np.testing.assert_array_equal(file["features"], features.values)
+        assert file["rows"].tolist() == [4, 7] and file["key/path"].tolist() == ["a.png", "b.png"]
+        assert str(file["about/encoder"]) == "runs/one"
+    assert zipfile.is_zipfile(path) and [p.name for p in tmp_path.iterdir()] == ["f.npz"]
+    before = path.read_bytes()
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match=r"No space left .*f\.npz"):
+        save_npz(path, features, {})
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["f.npz"]
+
+
+def test_two_processes_may_write_the_same_file(tmp_path, monkeypatch):
+    values = np.zeros((1, 2), np.float32)
+    features = Features(values, np.array([0]), {})
+    write, process = np.savez, iter((1, 2))
+    monkeypatch.setattr("os.getpid", lambda: next(process))
+
+    def meanwhile(file, **arrays):  # another process writes the whole of it while this one has begun
+        monkeypatch.setattr(np, "savez", write)
+        save_npz(tmp_path / "f.npz", features, {"by": "other"})
+        write(file, **arrays)
+
+    monkeypatch.setattr(np, "savez", meanwhile)
+    save_npz(tmp_path / "f.npz", features, {"by": "this"})
+    with np.load(tmp_path / "f.npz") as file:
+        assert str(file["about/by"]) == "this"
+    assert [path.name for path in tmp_path.iterdir()] == ["f.npz"]
+
+
+def test_a_run_of_cudnn_can_be_used_where_there_is_none(encoder, monkeypatch, tiny_run):
+    """The configuration of a run trained on a GPU asks for cuDNN's attention."""
+    stored = replace(encoder.config, model=replace(encoder.config.model, attention="cudnn"))
+    real = checkpoint.load_params
+    monkeypatch.setattr(checkpoint, "load_params", lambda *a: (real(*a)[0], to_json(stored), real(*a)[2]))
+    found = load_encoder(tiny_run)
+    assert found.config.model.attention == "auto"
+    np.testing.assert_array_equal(found.embed(CLIPS[:, 0], "digit"), encoder.embed(CLIPS[:, 0], "digit"))
+
+
+def test_a_run_that_keeps_an_average_is_used_by_it(tmp_path):
+    saver = checkpoint.Checkpoints(tmp_path / "checkpoints", keep=1, config_json="{}", metadata={})
+    state = {
+        "trainable": {"touch": {"a": np.ones(3, "f4")}},
+        "frozen": {"decoder": {"b": np.full(2, 5, "f4")}},
+        "opt_state": {"ema": {"touch": {"a": np.full(3, 7, "f4")}}, "mu": {"x": np.zeros(3, "f4")}},
+    }
+    saver.save(1, state, {"loss": 1})
+    saver.close()
+    params, _, _ = checkpoint.load_params(tmp_path)
+    assert params["touch"]["a"].tolist() == [7, 7, 7] and params["decoder"]["b"].tolist() == [5, 5]
+    assert set(params) == {"touch", "decoder"}
+
+
+def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
+    manifest = manifests.read(world)
+    lenient = replace(encoder, config=replace(encoder.config, data=replace(encoder.config.data, on_bad_sample="skip")))
+    blind = replace(lenient, config=replace(lenient.config, data=replace(lenient.config.data, background="subtract")))
+    with pytest.raises(UserError, match="background_path"):  # however it was trained
+        embed_rows(blind, manifest, np.array([0, 1]))
+    with pytest.raises(UserError, match=r"none of the 2 rows can be read; `anytouch verify` says"):
+        embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip")
+
+
+def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
+    """OpenCV writes a resized frame of another type elsewhere, and leaves what was in memory."""
+    encoder = load_encoder(tiny_run)
+    see = Sight(encoder)
+    rgb = np.random.default_rng(0).integers(0, 256, (40, 52, 3), np.uint8)
+    grey = rgb[..., :1]
+    alpha = np.concatenate([rgb, grey], -1)
+    wanted, of_grey = see(rgb), see(np.repeat(grey, 3, -1))
+    for other in (alpha, rgb.astype(np.uint16) * 257, rgb.astype(np.float32) / 255, rgb / 255.0, rgb.tolist()):
+        other = np.asarray(other, np.uint8) if isinstance(other, list) else other
+        np.testing.assert_array_equal(see(other), wanted)
+    for other in (grey, grey[..., 0], grey[..., 0].astype(np.float64) / 255):
+        np.testing.assert_array_equal(see(other), of_grey)
+    for bad in (rgb.astype(np.float32), rgb.astype(np.int32), rgb[None], np.zeros((0, 4, 3), np.uint8)):
+        with pytest.raises(UserError, match="the frame has"):
+            see(bad)
+    less = Sight(replace(encoder, config=replace(encoder.config, data=DataConfig(background="subtract"))), grey[..., 0])
+    assert (less(grey) == 128).all()
+    for bad in (grey, alpha, rgb.astype(np.float32)):
+        with pytest.raises(UserError, match="a frame must be RGB uint8"):
+            touch_evaluation([bad], 28)
+
+
+def test_names_of_pooling_and_join_and_rows_are_checked(tiny_run):
+    encoder = load_encoder(tiny_run)
+    with pytest.raises(UserError, match="pooling is one of class, mean, both, not 'cls'"):
+        encoder.embed(CLIPS, "digit", pooling="cls")
+    with pytest.raises(UserError, match="join is one of mean, sum, concat, not 'max'"):
+        encoder.embed(CLIPS, "digit", join="max")
+    with pytest.raises(UserError, match="one integer for each"):
+        encoder.embed(CLIPS, np.full(len(CLIPS), 0.5))
+
+
+def test_a_column_of_a_manifest_becomes_an_array_without_objects(tmp_path):
+    columns = {
+        "path": ["a.png", "b.png"], "sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1],
+        "split": ["train"] * 2, "label.force": [1.5, None], "label.count": [3, 4], "label.slip": [True, None],
+        "label.pose": [[1.0, 2.0], [3.0]],
+    }  # fmt: skip
+    table = manifests.from_columns(columns, tmp_path / "m.parquet")
+    force, count = plain_column(table, "label.force"), plain_column(table, "label.count")
+    assert force[0] == 1.5 and np.isnan(force[1]) and count.tolist() == [3, 4] and count.dtype.kind == "i"
+    assert plain_column(table, "label.slip").tolist() == ["True", ""]
+    assert plain_column(table, "label.pose").tolist() == ["[1.0, 2.0]", "[3.0]"]

@@ -1,0 +1,204 @@
+"""Exported encoders: the live model's features, any number of touches, and files that are refused."""
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from tiny_models import touch_model
+
+from anytouch_jax.config import Config
+from anytouch_jax.encoder import export as exports
+from anytouch_jax.encoder.encoder import load_encoder, random_encoder
+from anytouch_jax.encoder.export import export, load
+from anytouch_jax.encoder.names import describes
+from anytouch_jax.errors import UserError
+
+RNG = np.random.default_rng(0)
+CLIPS = RNG.integers(0, 256, (5, 3, 28, 28, 3), np.uint8)
+ROWS = np.asarray([1, 0, 9, 3, 1], np.int32)
+
+
+@pytest.fixture(scope="module")
+def encoder(tiny_run):
+    return load_encoder(tiny_run)
+
+
+@pytest.fixture(scope="module")
+def artefact(tmp_path_factory, encoder):
+    """(path, what `export` gave back) of clips of three frames for two platforms."""
+    path = tmp_path_factory.mktemp("export") / "model.bin"
+    return path, export(encoder, path, frames=3, platforms=("cpu", "cuda"))
+
+
+@pytest.fixture
+def copied(artefact, tmp_path):
+    """The artefact where a test may damage it."""
+    for path in (artefact[0], describes(artefact[0])):
+        shutil.copy(path, tmp_path)
+    return tmp_path / "model.bin"
+
+
+# Round trip ---------------------------------------------------------------------------------------------------------
+
+
+def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, encoder):
+    path, about = artefact
+    run = load(path)
+    for count in (1, 2, 5):
+        live = encoder.embed(CLIPS[:count], ROWS[:count])
+        found = run(CLIPS[:count], ROWS[:count])
+        assert found.shape == (count, 12) and found.dtype == np.float32
+        np.testing.assert_allclose(found, live, atol=1e-5)
+    np.testing.assert_allclose(run(CLIPS, "digit"), encoder.embed(CLIPS, "digit"), atol=1e-5)
+    np.testing.assert_allclose(run(CLIPS), encoder.embed(CLIPS), atol=1e-5)  # the universal tokens
+    assert np.abs(run(CLIPS) - run(CLIPS, "digit")).max() > 1e-4
+    names = list(encoder.config.model.sensors)
+    for each in ([names[row] for row in ROWS], np.array(names, object)[ROWS]):  # as `Encoder.embed` takes them
+        np.testing.assert_array_equal(run(CLIPS, each), run(CLIPS, ROWS))
+    assert 0 <= about["worst_difference"] < 1e-4
+
+
+def test_the_description_tells_how_to_call_it(artefact, encoder, monkeypatch):
+    path, about = artefact
+    assert json.loads(describes(path).read_text()) == about
+    assert about["platforms"] == ["cpu", "cuda"] and about["frames"] == 3 and about["image_size"] == 28
+    assert about["features"] == 12 and about["sensors"]["digit"] == 1 and about["sensors"]["universal"] == 9
+    assert about["bytes"] == path.stat().st_size
+    assert "to 28 x 28, its shape not kept: OpenCV's INTER_AREA" in about["resize"] and "gel" not in about["resize"]
+    monkeypatch.chdir(path.parent)
+    space = {"frames": CLIPS, "sensor": ROWS}
+    exec(about["example"], space)  # what a reader would copy
+    np.testing.assert_allclose(space["features"], encoder.embed(CLIPS, ROWS), atol=1e-5)
+
+
+def test_platforms_are_in_the_artefact(artefact, encoder, tmp_path):
+    module = jax.export.deserialize(bytearray(artefact[0].read_bytes()))
+    assert module.platforms == ("cpu", "cuda")
+    assert [str(shape.shape[0]) for shape in module.in_avals] == ["b", "b"]
+    export(encoder, tmp_path / "one.bin", platforms=("cpu",))
+    module = jax.export.deserialize(bytearray((tmp_path / "one.bin").read_bytes()))
+    assert module.platforms == ("cpu",) and module.in_avals[0].shape[1:] == (1, 28, 28, 3)
+    assert module.in_avals[0].dtype == np.uint8
+    np.testing.assert_allclose(
+        load(tmp_path / "one.bin")(CLIPS[:, :1], "digit"), encoder.embed(CLIPS[:, 0], "digit"), atol=1e-5
+    )
+
+
+def test_long_clips_other_poolings_and_bfloat16(tmp_path):
+    encoder = random_encoder(Config(touch_model(dtype="bfloat16")), seed=1)
+    long = np.concatenate([CLIPS, CLIPS[:, :1]], axis=1)
+    about = export(encoder, tmp_path / "m.bin", frames=4, platforms=("cpu",), pooling="both", join="concat")
+    found = load(tmp_path / "m.bin")(long, ROWS)
+    assert found.shape == (5, 48) and about["features"] == 48 and found.dtype == np.float32
+    live = encoder.embed(long, ROWS, pooling="both", join="concat")
+    np.testing.assert_allclose(found, live, atol=0.05 * np.abs(live).max())
+
+
+@pytest.mark.parametrize("attention", ["cudnn", "mapped"])
+def test_attention_of_one_platform_is_exported_for_all(tmp_path, encoder, attention):
+    model = replace(encoder.config.model, attention=attention)
+    export(replace(encoder, config=replace(encoder.config, model=model)), tmp_path / "m.bin", frames=3)
+    np.testing.assert_allclose(load(tmp_path / "m.bin")(CLIPS, ROWS), encoder.embed(CLIPS, ROWS), atol=1e-5)
+
+
+def test_an_artefact_needs_no_code_of_the_network(artefact):
+    code = (
+        "import sys, numpy as np; from anytouch_jax.encoder.export import load\n"
+        f"z = load({str(artefact[0])!r})(np.zeros((2, 3, 28, 28, 3), np.uint8), 'digit')\n"
+        "assert z.shape == (2, 12)\n"
+        "ours = {m for m in sys.modules if m.startswith(('anytouch_jax.nn', 'anytouch_jax.objectives', 'flax'))}\n"
+        "assert not ours, ours"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+# What is refused ----------------------------------------------------------------------------------------------------
+
+
+def test_wrong_touches_and_sensors_are_one_sentence(artefact):
+    run = load(artefact[0])
+    for clips, sensor, word in (
+        (CLIPS.astype(np.float32), ROWS, "float32"),
+        (CLIPS[:, :2], ROWS, r"\(B, 3, 28, 28, 3\)"),
+        (CLIPS[:, :, :27], ROWS, r"\(B, 3, 28, 28, 3\)"),
+        (CLIPS[:0], ROWS[:0], "at least one"),
+        (CLIPS, ROWS[:4], "one integer for each of the 5 touches"),
+        (CLIPS, ROWS.astype(float), r"one integer for each of the 5 touches, not float64 \(5,\)"),
+        (CLIPS, ["digit"] * 4, "one integer for each of the 5 touches"),
+        (CLIPS, ["digit"] * 4 + ["nobody"], "sensor 'nobody' is not one of .*; universal serves any other"),
+        (CLIPS, ROWS - 1, "0 to 9"),
+        (CLIPS, ROWS + 1, "0 to 9"),
+        (CLIPS, "nobody", "universal serves any other"),
+    ):
+        with pytest.raises(UserError, match=word):
+            run(clips, sensor)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
+def test_a_damaged_artefact_is_refused(copied, damage):
+    data = bytearray(copied.read_bytes())
+    data[len(data) // 2] ^= 1
+    copied.write_bytes({"cut": data[:-1], "flipped": data, "empty": b""}[damage])
+    with pytest.raises(UserError, match=r"model\.bin is damaged: its checksum"):
+        load(copied)
+
+
+def test_a_damaged_or_missing_description_is_refused(copied):
+    about = json.loads(describes(copied).read_text())
+    for text in ("{", "[1]", "{}", '{"format": 3}', json.dumps(about | {"format": "other.2"})):
+        describes(copied).write_text(text)
+        with pytest.raises(UserError, match=r"model\.bin\.json"):
+            load(copied)
+    describes(copied).unlink()
+    with pytest.raises(UserError, match=r"model\.bin\.json cannot be read: No such file"):
+        load(copied)
+    copied.unlink()
+    with pytest.raises(UserError, match=r"model\.bin cannot be read: No such file"):
+        load(copied)
+
+
+def test_an_artefact_for_another_machine_or_another_jax_is_refused(copied):
+    about = json.loads(describes(copied).read_text())
+    describes(copied).write_text(json.dumps(about | {"platforms": ["tpu"]}))
+    with pytest.raises(UserError, match="was exported for tpu; this machine runs jax on cpu"):
+        load(copied)
+    foreign = b"another format"
+    copied.write_bytes(foreign)
+    renamed = {"bytes": len(foreign), "sha256": hashlib.sha256(foreign).hexdigest(), "jax": "9.9"}
+    describes(copied).write_text(json.dumps(about | renamed))
+    with pytest.raises(UserError, match=r"it was exported by 9\.9"):
+        load(copied)
+
+
+def test_what_cannot_be_exported_is_one_sentence(encoder, tmp_path):
+    for options, word in (
+        ({"platforms": ("cuda",)}, "runs jax on cpu: add it to --platforms"),
+        ({"platforms": ("cpu", "metal")}, "not metal"),
+        ({"platforms": ()}, "not none"),
+        ({"frames": 2}, "a clip needs 3 frames"),
+    ):
+        with pytest.raises(UserError, match=word):
+            export(encoder, tmp_path / "m.bin", **options)
+    with pytest.raises(UserError, match=r"name the artefact \.bin"):
+        export(encoder, tmp_path / "m.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_artefact_that_differs_from_the_live_model_is_not_written(encoder, tmp_path, monkeypatch):
+    other, honest = random_encoder(encoder.config, seed=5), exports._artefact
+    monkeypatch.setattr(exports, "_artefact", lambda _, *rest: honest(other, *rest))
+    with pytest.raises(UserError, match="differs from the live model"):
+        export(encoder, tmp_path / "m.bin", platforms=("cpu",))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_sentence(encoder, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        export(encoder, tmp_path / "file" / "m.bin", platforms=("cpu",))

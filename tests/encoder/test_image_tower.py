@@ -1,0 +1,77 @@
+"""No tactile pre-training: the image tower as a touch encoder gives what the tower gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from runs import run_config, train
+from tiny_models import full_model
+
+from anytouch_jax.config import to_json
+from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.weights import checkpoint, release
+
+RNG = np.random.default_rng(0)
+STILLS = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
+
+
+def stored(folder, config, params):
+    saver = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=to_json(config), metadata={})
+    saver.save(1, {"trainable": params}, {"loss": 1.0})
+    saver.close()
+    return folder
+
+
+@pytest.mark.parametrize("rank", [0, 2])
+def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
+    config = run_config(tmp_path, 2, towers="pretrained" if rank else "scratch")
+    net = build(config.model)
+    params = net.init(jax.random.key(3))
+    if rank:  # LoRA as if trained: it must be merged
+        params["lora"] = jax.tree.map(lambda x: np.asarray(RNG.standard_normal(x.shape), np.float32), params["lora"])
+    encoder = image_tower_encoder(stored(tmp_path, config, params))
+    wanted = net.apply(params, "embed_image", normalise_touch(STILLS))
+    np.testing.assert_allclose(encoder.embed(STILLS, "digit"), wanted, atol=2e-5)
+    for sensor in ("universal", "gelsight"):  # it knows no sensors
+        np.testing.assert_array_equal(encoder.embed(STILLS, sensor), encoder.embed(STILLS, "digit"))
+    assert "image tower" in encoder.source
+
+
+def test_a_clip_gives_the_embedding_of_its_mean_frame(tmp_path):
+    config = run_config(tmp_path, 2)
+    params = build(config.model).init(jax.random.key(3))
+    encoder = image_tower_encoder(stored(tmp_path, config, params))
+    clip = np.stack([STILLS // 4 * 3, STILLS // 4 * 3 + 3, STILLS // 4 * 3 + 6], axis=1).astype(np.uint8)
+    np.testing.assert_allclose(encoder.embed(clip), encoder.embed(clip[:, 1]), atol=2e-5)
+
+
+def test_the_tower_of_clip_weights(tmp_path):
+    model = replace(full_model(), match_head="linear")
+    params = build(model).init(jax.random.key(9))
+    full = release.to_release(params, model)
+    keys = release.release_names(model, "clip")
+    file = tmp_path / "clip.safetensors"
+    release.write_safetensors(file, {key: full[key] for key in keys}, {release.MODEL_KEY: to_json(model)})
+    wanted = build(model).apply(params, "embed_image", normalise_touch(STILLS))
+    np.testing.assert_allclose(image_tower_encoder(file).embed(STILLS), wanted, atol=2e-5)
+
+
+def test_a_run_without_an_image_tower_is_one_sentence(tmp_path):
+    config = run_config(tmp_path)
+    run = stored(tmp_path / "r", config, build(config.model).init(jax.random.key(0)))
+    with pytest.raises(UserError, match="holds no image tower; give a stage-2 run"):
+        image_tower_encoder(run)
+    with pytest.raises(UserError, match="no run folder or weights file"):
+        image_tower_encoder(tmp_path / "gone")
+
+
+@pytest.mark.slow
+def test_the_tower_of_a_run_that_was_trained(world, tmp_path, compiled_once):
+    train(run_config(world, 2), tmp_path / "r", stop_after=1)
+    assert image_tower_encoder(tmp_path / "r").embed(STILLS).shape == (2, 12)

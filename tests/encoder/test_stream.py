@@ -1,0 +1,356 @@
+"""Streams: every frame of a video, the newest of a camera, and where the time went."""
+
+import os
+import signal
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.data.images import frames_from_video
+from anytouch_jax.data.transforms import touch_evaluation
+from anytouch_jax.encoder import stream as streams
+from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.encoder.stream import PARTS, Clip, Embedded, Mailbox, Result, budget, collect, open_source, stream
+from anytouch_jax.errors import UserError
+
+DIGIT = 1
+
+
+@pytest.fixture(scope="module")
+def encoder(tiny_run):
+    return load_encoder(tiny_run)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "touch.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (40, 32))
+    rng = np.random.default_rng(0)
+    for frame in range(8):
+        blue_to_red = np.full((32, 40, 3), (20, 30 * frame, 200), np.uint8)
+        writer.write(blue_to_red + rng.integers(0, 30, blue_to_red.shape, np.uint8))
+    writer.release()
+    return path
+
+
+class Camera:
+    """A camera whose frames come when the test says so: frame i is all of value 10 i, BGR with an offset by channel."""
+
+    def __init__(self, ready: int = 0) -> None:
+        self.allowed, self.shown, self.waiting, self.ended, self.released = ready, 0, False, False, False
+        self.changed = threading.Condition()
+        self.seen: list[int] = []
+
+    def grab(self) -> bool:
+        with self.changed:
+            self.waiting = True
+            self.changed.notify_all()
+            self.changed.wait_for(lambda: self.shown < self.allowed or self.ended)
+            self.waiting = False
+            self.shown += not self.ended
+            return not self.ended
+
+    def retrieve(self):
+        self.seen.append(self.shown - 1)
+        return True, self.frame(self.shown - 1)
+
+    @staticmethod
+    def frame(number: int) -> np.ndarray:
+        return np.full((32, 40, 3), (0, 1, 2), np.uint8) + np.uint8(10 * number)
+
+    def release(self) -> None:
+        self.released = True
+
+    def show(self, count: int) -> None:
+        """Let `count` more frames come, and wait until the reader asks for the one after them."""
+        with self.changed:
+            self.allowed += count
+            self.changed.notify_all()
+            assert self.changed.wait_for(lambda: self.waiting and self.shown == self.allowed, timeout=60)
+
+    def end(self) -> None:
+        with self.changed:
+            self.ended = True
+            self.changed.notify_all()
+
+
+def features_of(encoder, frames, numbers):
+    """What `embed` gives of clips that end at frame i: frames RGB, numbers of the frames of each clip."""
+    small = touch_evaluation(frames, encoder.config.model.image_size)
+    return encoder.embed(np.stack([small[list(one)] for one in numbers]), "digit")
+
+
+# Videos -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frames", "stride", "clips"),
+    [
+        (1, 1, [(i,) for i in range(8)]),
+        (3, 1, [(i - 2, i - 1, i) for i in range(2, 8)]),
+        (3, 2, [(i - 4, i - 2, i) for i in range(4, 8)]),
+    ],
+)
+def test_every_frame_of_a_video_in_order(encoder, video, frames, stride, clips):
+    source, live = open_source(video)
+    assert not live
+    found = list(stream(encoder, source, live=live, sensor=DIGIT, frames=frames, stride=stride))
+    assert [one.number for one in found] == [clip[-1] for clip in clips]
+    wanted = features_of(encoder, list(frames_from_video(video)), clips)
+    np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
+    times = [one.at for one in found]
+    assert times == sorted(times) and all(min(one.seconds) >= 0 for one in found)
+    assert all(one.age >= sum(one.seconds[2:]) for one in found)  # copy and encoder lie between frame and features
+    assert not source.isOpened()
+
+
+def test_a_slow_reader_of_a_video_loses_nothing(encoder, video):
+    """The mailbox has one slot: the reader waits with its next clip while nobody takes."""
+    source, _ = open_source(video)
+    seen = []
+    retrieve = source.retrieve
+
+    class Counted:
+        grab, release = source.grab, source.release
+
+        def retrieve(self):
+            seen.append(len(seen))
+            return retrieve()
+
+    embedded = stream(encoder, Counted(), live=False, sensor=DIGIT)
+    first = next(embedded)
+    assert len(seen) <= 3  # one embedded, one in the slot, one that waits for the slot
+    assert [first.number, *(one.number for one in embedded)] == list(range(8))
+
+
+def test_pooling_and_join_are_those_of_embed(encoder, video):
+    source, live = open_source(video)
+    found = list(stream(encoder, source, live=live, sensor=DIGIT, frames=6, pooling="both", join="concat"))
+    small = touch_evaluation(list(frames_from_video(video)), 28)
+    wanted = encoder.embed(np.stack([small[:6], small[1:7], small[2:]]), "digit", pooling="both", join="concat")
+    assert wanted.shape == (3, 48)
+    np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
+
+
+# Cameras ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
+    camera = Camera(ready=3)
+    embedded = stream(encoder, camera, live=True, sensor=DIGIT, frames=3)
+    found = [next(embedded)]
+    assert found[0].number == 2
+    camera.show(5)  # nobody takes meanwhile, and the camera is read all the same
+    assert camera.seen == list(range(8))
+    found.append(next(embedded))
+    camera.show(1)
+    found.append(next(embedded))
+    assert [one.number for one in found] == [2, 7, 8]
+    frames = [camera.frame(i)[..., ::-1] for i in range(9)]
+    wanted = features_of(encoder, frames, [(0, 1, 2), (5, 6, 7), (6, 7, 8)])  # consecutive, whatever was dropped
+    np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
+    camera.end()
+    assert list(embedded) == [] and camera.released
+
+
+def test_the_encoder_is_compiled_once_before_the_first_frame(encoder, monkeypatch):
+    happened, camera = [], Camera(ready=1)
+    compile_for_one, grab = streams.compile_for_one, camera.grab
+    monkeypatch.setattr(
+        streams, "compile_for_one", lambda *a, **k: (happened.append("compile"), compile_for_one(*a))[1]
+    )
+    camera.grab = lambda: (happened.append("grab"), grab())[1]
+    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
+    assert happened == ["compile"]
+    next(embedded)
+    camera.show(2)
+    next(embedded)
+    camera.end()
+    assert list(embedded) == []
+    assert happened[0] == "compile" and set(happened[1:]) == {"grab"} and len(happened) == 5
+
+
+def test_a_stream_that_is_left_lets_its_camera_go(encoder):
+    camera = Camera(ready=1)
+    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
+    next(embedded)
+    camera.end()
+    embedded.close()
+    assert camera.released
+
+
+def test_a_camera_that_hangs_does_not_hold_the_program(encoder, monkeypatch):
+    monkeypatch.setattr(streams, "_PATIENCE", 0.01)
+    camera = Camera(ready=1)
+    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
+    next(embedded)
+    embedded.close()  # the reader still waits in grab()
+    assert not camera.released
+    camera.end()
+
+
+def test_what_the_reader_fails_with_reaches_the_caller(encoder):
+    camera = Camera(ready=9)
+    camera.retrieve = lambda: (True, np.zeros((32, 40), np.uint8))
+    with pytest.raises(UserError, match=r"frame 0 has shape \(32, 40\)"):
+        next(stream(encoder, camera, live=True, sensor=DIGIT))
+    assert camera.released
+
+    def broken():
+        raise OSError("the cable")
+
+    camera = Camera(ready=9)
+    camera.retrieve = broken
+    with pytest.raises(OSError, match="the cable"):
+        next(stream(encoder, camera, live=False, sensor=DIGIT))
+
+
+def test_a_frame_that_cannot_be_decoded_ends_the_stream(encoder):
+    camera = Camera(ready=9)
+    camera.retrieve = lambda: (False, None)
+    assert list(stream(encoder, camera, live=True, sensor=DIGIT)) == []
+
+
+def test_what_cannot_be_streamed_is_one_sentence(encoder, tmp_path):
+    with pytest.raises(UserError, match="a clip needs 3 frames"):
+        stream(encoder, Camera(), live=True, sensor=DIGIT, frames=2)
+    with pytest.raises(UserError, match="stride of a clip must be at least 1, not 0"):
+        stream(encoder, Camera(), live=True, sensor=DIGIT, frames=3, stride=0)
+    with pytest.raises(UserError, match=r"no video .*gone\.avi; a camera is given by its number"):
+        open_source(tmp_path / "gone.avi")
+    text = tmp_path / "text.avi"
+    text.write_text("no video")
+    with pytest.raises(UserError, match=r"text\.avi is not a video"):
+        open_source(text)
+
+
+def test_a_number_is_a_camera_unless_a_file_has_that_name(monkeypatch, tmp_path):
+    asked = []
+
+    class Opened:
+        def __init__(self, name):
+            asked.append(name)
+
+        def isOpened(self):
+            return asked[-1] != 7
+
+        def set(self, *_):
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Opened)
+    monkeypatch.chdir(tmp_path)
+    assert open_source("0")[1] and asked == [0]
+    with pytest.raises(UserError, match="camera 7 cannot be opened"):
+        open_source("7")
+    (tmp_path / "3").write_bytes(b"")
+    assert not open_source("3")[1] and asked[-1] == "3"
+
+
+# The mailbox --------------------------------------------------------------------------------------------------------
+
+
+def clip(number: int) -> Clip:
+    return Clip(number, np.zeros(0), 0.0, 0.0, 0.0)
+
+
+def test_a_newer_clip_takes_the_place_of_an_older_one():
+    mailbox = Mailbox(replace=True)
+    assert mailbox.put(clip(0)) and mailbox.put(clip(1))
+    assert mailbox.take().number == 1
+
+
+def test_what_lies_in_the_mailbox_is_taken_after_the_end():
+    for replace in (True, False):
+        mailbox = Mailbox(replace=replace)
+        assert mailbox.put(clip(0))
+        mailbox.close()
+        assert mailbox.take().number == 0 and mailbox.take() is None and not mailbox.put(clip(1))
+        assert mailbox.take() is None
+
+
+def test_a_failure_comes_after_what_was_read_before_it():
+    mailbox = Mailbox(replace=False)
+    mailbox.put(clip(0))
+    mailbox.close(OSError("first"))
+    mailbox.close(OSError("second"))
+    assert mailbox.take().number == 0
+    with pytest.raises(OSError, match="first"):
+        mailbox.take()
+
+
+def test_a_reader_that_waits_for_the_slot_goes_on_when_the_stream_is_left():
+    mailbox, answers = Mailbox(replace=False), []
+    mailbox.put(clip(0))
+    reader = threading.Thread(target=lambda: answers.append(mailbox.put(clip(1))))
+    reader.start()
+    mailbox.close()
+    reader.join(60)
+    assert answers == [False] and mailbox.take().number == 0
+
+
+# Results ------------------------------------------------------------------------------------------------------------
+
+
+def some(count: int):
+    for i in range(count):
+        yield Embedded(i, 0.1 * i, np.full(3, i, np.float32), (0.001, 0.002, 0.003, 0.004), 0.02)
+
+
+def test_an_interrupt_keeps_what_there_is():
+    closed = []
+
+    def interrupted():
+        try:
+            yield from some(2)
+            raise KeyboardInterrupt
+        finally:
+            closed.append(True)
+
+    result = collect(interrupted())
+    assert result.interrupted and closed == [True]
+    assert result.values.tolist() == [[0, 0, 0], [1, 1, 1]] and result.numbers.tolist() == [0, 1]
+    assert result.seconds.shape == (2, len(PARTS)) and result.age.tolist() == [0.02, 0.02]
+
+    def stop(one):
+        if one.number == 3:
+            raise KeyboardInterrupt
+
+    result = collect(some(9), stop)
+    assert result.interrupted and result.numbers.tolist() == [0, 1, 2] and result.values.shape == (3, 0)
+    assert not collect(some(2)).interrupted
+
+
+def test_sigterm_keeps_what_there_is_and_a_long_stream_only_its_last_times(monkeypatch):
+    def terminated():
+        yield from some(2)
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield from some(1)
+
+    result = collect(terminated())
+    assert result.interrupted and len(result.values) >= 2
+    monkeypatch.setattr("anytouch_jax.encoder.stream.KEPT", 3)
+    result = collect(some(9), lambda one: None)
+    assert result.total == 9 and result.numbers.tolist() == [6, 7, 8]
+    assert budget(result)[-1].startswith("9 frames embedded; of the last 3: 0 dropped")
+    assert len(collect(some(9)).values) == 9, "features are all kept"
+
+
+def test_nothing_is_a_result_too():
+    result = collect(some(0))
+    assert result.values.shape == (0, 0) and result.seconds.shape == (0, 4)
+    assert budget(result)[-1] == "0 frames embedded, 0 dropped, nan frames/s"
+
+
+def test_the_budget_names_each_part():
+    seconds = np.zeros((101, 4))
+    seconds[:, 3] = np.arange(101) / 1000  # 0 .. 100 ms
+    seconds[:, 1] = 0.002
+    numbers = np.arange(101) * 2
+    result = Result(np.zeros((101, 3)), numbers, np.arange(101) / 25, seconds, np.full(101, 0.05), 101, False)
+    lines = {line.rsplit(maxsplit=2)[0]: line.split()[-2:] for line in budget(result)[1:-1]}
+    assert list(lines) == [*PARTS, "frame to features"]
+    assert lines["encoder"] == ["50.00", "99.00"] and lines["resize"] == ["2.00", "2.00"]
+    assert lines["frame to features"] == ["50.00", "50.00"]
+    assert budget(result)[-1] == "101 frames embedded, 100 dropped, 25.0 frames/s"

@@ -1,0 +1,100 @@
+"""Alignment, uniformity, silhouettes and t-SNE on spaces whose figures are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import geometry
+from anytouch_jax.evaluate.geometry import alignment, describe, silhouette, tsne, uniformity
+
+
+def noise(count: int, width: int = 8, seed: int = 0) -> Any:
+    return np.random.default_rng(seed).normal(size=(count, width))
+
+
+def test_alignment_by_hand() -> None:
+    right, up = np.array([[2.0, 0.0]]), np.array([[0.0, 0.5]])
+    assert alignment(right, 7 * right) == 0.0  # lengths say nothing
+    assert alignment(right, up) == pytest.approx(2.0)
+    assert alignment(right, -right) == pytest.approx(4.0)
+    assert alignment(right, up, power=1) == pytest.approx(np.sqrt(2))
+    with pytest.raises(UserError, match="pairs"):
+        alignment(right, np.ones((2, 2)))
+
+
+def test_uniformity_by_hand() -> None:
+    assert uniformity(np.ones((5, 3))) == pytest.approx(0.0)
+    assert uniformity(np.array([[1.0, 0.0], [-1.0, 0.0]])) == pytest.approx(-8.0)
+    three = np.array([[1.0, 0.0], [0.0, 1.0], [-3.0, 0.0]])
+    assert uniformity(three) == pytest.approx(np.log((2 * np.exp(-4) + np.exp(-8)) / 3))
+    spread, narrow = noise(300), noise(300) * 0.1 + 1
+    assert uniformity(spread) < uniformity(narrow) < 0
+    with pytest.raises(UserError, match="two rows"):
+        uniformity(np.ones((1, 3)))
+
+
+def test_silhouettes_know_the_labels_that_made_the_space() -> None:
+    labels = np.repeat(["a", "b", "c"], 30)
+    centres = 10 * np.eye(8)[np.repeat([0, 1, 2], 30)]
+    features = noise(90) * 0.3 + centres
+    assert silhouette(features, labels) > 0.9
+    assert abs(silhouette(features, np.tile(["x", "y"], 45))) < 0.05
+    assert silhouette(features, np.roll(labels, 15)) < 0.3
+    assert silhouette(features, ["a"] * 90) is None and silhouette(features, np.arange(90)) is None
+
+
+def test_large_spaces_are_thinned_alike(monkeypatch: Any) -> None:
+    features = noise(400)
+    whole = uniformity(features)
+    monkeypatch.setattr(geometry, "MOST", 200)
+    assert uniformity(features) == pytest.approx(whole, abs=0.05) and uniformity(features) != whole
+    assert silhouette(features, np.arange(400) % 2) == silhouette(features, np.arange(400) % 2)
+
+
+def test_a_space_in_figures() -> None:
+    """Two sensors feel thirty touches of ten objects: once the sensor decides where they lie, once the object."""
+    sensors, touches = np.repeat(["digit", "gelslim"], 30), np.tile(np.arange(30), 2)
+    objects = touches // 3
+    by_sensor = noise(60) * 0.3 + 5 * np.eye(8)[np.repeat([0, 1], 30)]
+    by_object = noise(10, seed=1)[objects] + 0.01 * noise(60, seed=2)
+    first, second = (describe(x, sensors, objects, touches, name="x") for x in (by_sensor, by_object))
+    assert first.silhouette_sensor > 0.8 > 0.1 > second.silhouette_sensor
+    assert second.silhouette_object > 0.8 > 0.1 > first.silhouette_object
+    assert second.alignment < 0.01 < 1.5 < first.alignment
+    pairs = alignment(by_sensor[:30], by_sensor[30:])
+    assert first.alignment == pytest.approx(pairs) and first.rows == 60
+    assert describe(by_sensor, ["digit"] * 60, objects, touches).alignment is None  # no pair by two sensors
+
+
+def test_tsne_keeps_clusters_apart_and_repeats_itself() -> None:
+    labels = np.repeat([0, 1, 2], 20)
+    features = noise(60) * 0.2 + 5 * np.eye(8)[labels]
+    points = tsne(features)
+    assert points.shape == (60, 2) and points.dtype == np.float32
+    away = np.linalg.norm(points[:, None] - points[None], axis=-1) + 1e9 * np.eye(60)
+    assert (labels[away.argmin(1)] == labels).all()
+    np.testing.assert_array_equal(tsne(features), points)
+    assert tsne(noise(4)).shape == (4, 2)
+    with pytest.raises(UserError, match="4 rows"):
+        tsne(noise(3))
+
+
+def test_nan_is_refused() -> None:
+    bad = noise(9)
+    bad[2, 3] = np.nan
+    for figure in (uniformity, tsne, lambda x: silhouette(x, np.arange(9) % 2)):
+        with pytest.raises(UserError, match="finite"):
+            figure(bad)
+
+
+def test_rows_of_no_known_object_are_no_object() -> None:
+    x = np.random.default_rng(0).normal(size=(60, 4))
+    x[20:40] += 3
+    names = np.array(["a"] * 20 + ["b"] * 20 + [""] * 20)
+    touches = np.arange(60).astype(str)
+    found = geometry.describe(x, names, names, touches).silhouette_object
+    assert found == pytest.approx(geometry.silhouette(x[:40], names[:40]))

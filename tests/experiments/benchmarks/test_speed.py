@@ -1,0 +1,390 @@
+"""
+
+
+def test_communicated_bytes_by_hand():
+    sent, counts, exact = memory.communicated(HLO, 4)
+    assert counts == {"all-reduce": 1, "all-gather": 3, "reduce-scatter": 3, "collective-permute": 1} and exact
+    assert sent == {
+        "all-reduce": (40 + 12) * 2 * 1 / 2,
+        "all-gather": 3 * 128 * 1 / 2,
+        "reduce-scatter": 3 * 32 * 3,  # the result is a quarter of what is cut up
+        "collective-permute": 16,
+    }
+    assert not memory.communicated(HLO.replace("known_trip_count", "unknown"), 4)[2]
+    assert memory.communicated("ENTRY %main () -> f32[] {\n}\n", 1) == ({}, {}, True)
+
+
+def test_data_parallel_sends_every_gradient_once_around_and_sharding_halves_the_state():
+    still = replace(STAGE1, frames=1)
+    shared, cut = (memory.layout_of(still, 2, fsdp) for fsdp in (1, 2))
+    params = build(STAGE1.config.model).abstract()
+    size = lambda tree: sum(x.size for x in jax.tree.leaves(tree))  # noqa: E731
+    fixed = size(params["decoder"]["clip_head"]) + size(params["decoder"]["position"])  # no gradient from stills
+    kernels = size(params["touch"]["patch"]) * 2 // 3  # the three share the gradient of their sum
+    assert shared.batch_per_device == 2
+    assert (
+        shared.sent == pytest.approx(4 * (size(params) - fixed - kernels), rel=0.02) and shared.exact
+    )  # 2 N (n - 1) / n = N
+    assert cut.state <= shared.state
+    table = memory.to_markdown([shared, replace(cut, kinds={}, exact=False)])
+    assert "| 2 | 2 x 1 | 4 |" in table and "| 2 | 1 x 2 | 4 |" in table
+    assert "all-reduce" in table and "| none |" in table and "at least" in table
+
+
+def test_what_a_child_process_says_is_told(tmp_path):
+    with pytest.raises(UserError, match="unknown preset"):
+        memory.ask("startup", json.dumps(["stage1", "stage1 clips", "paper", "huge", 1, False, str(tmp_path), 0.0]))
+
+
+# The accelerator's path ---------------------------------------------------------------------------------------------
+
+_BARE ="""
+
+from places import ROOT
+
+"""Speed against error: what is counted, what is compared, what is read from a compiled program."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_models import tiny_config
+
+from anytouch_jax import objectives
+from anytouch_jax.config import preset
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+from experiments.benchmarks import flops, machine, speed, speed_report, variants
+from experiments.benchmarks.workloads import (
+    Workload,
+    abstract_state,
+    make_batch,
+    normalised,
+    step_of,
+    values_of,
+    workloads,
+)
+
+STAGE1 = Workload("stage1 clips", tiny_config(1), 4, 4)
+ALIGN = Workload("stage2 align", tiny_config(2, "release"), 8, 4)
+MATCH = Workload("stage2 match", tiny_config(2, "release"), 4, 3)
+EMBED = Workload("embed clips", tiny_config(1), 2, 3)
+FAST = (variants.BASELINE, variants.Variant("bfloat16", variants.BFLOAT16))
+
+
+def shallow(config):
+    """One block a stack: XLA counts the body of a loop once, however often it runs."""
+    one = lambda stack: None if stack is None else replace(stack, depth=1)  # noqa: E731
+    model = config.model
+    text = None if model.text is None else replace(model.text, stack=one(model.text.stack))
+    parts = {name: one(getattr(model, name)) for name in ("touch", "decoder", "image")}
+    return replace(config, model=replace(model, **parts, text=text))
+
+
+def counted(function, *args):
+    """Operations of a program as XLA counts them, before it optimises."""
+    return jax.jit(function).lower(*args).cost_analysis()["flops"]
+
+
+def shapes(tree):
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+
+
+def noise_of(work):
+    return jnp.zeros((work.samples, work.config.model.patches))
+
+
+# Useful operations --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_the_formula_of_stage_1_is_what_xla_counts(frames):
+    config = shallow(preset("small"))
+    work = Workload("stage1", config, 2, frames)
+    batch, net = normalised(make_batch(work)), build(config.model)
+    terms = partial(objectives.stage1_terms, net=net, config=config)
+    step = jax.value_and_grad(lambda p: terms(p, batch.clip, batch.sensor, noise_of(work))[0])
+    assert 1 < counted(step, net.abstract()) / work.operations < 1.06  # the rest: norms, softmax, GELU, the loss
+
+
+@pytest.mark.parametrize("name", ["align", "match"])
+def test_the_formula_of_stage_2_is_what_xla_counts(name):
+    two = preset("small", stage=2, recipe="release")
+    config = shallow(replace(two, objective=replace(two.objective, reconstruct=False)))
+    work = Workload(f"stage2 {name}", config, 4, 3)
+    batch, net = normalised(make_batch(work)), build(config.model)
+    terms = partial(objectives.stage2_terms, net=net, config=config)
+    step = jax.value_and_grad(lambda p: terms(p, batch, None)[0])
+    assert 1 < counted(step, net.abstract()) / work.operations < 1.06
+
+
+def test_the_formula_of_an_embedding_is_what_xla_counts():
+    for frames in (1, 3):
+        config = shallow(preset("small"))
+        net, work = build(config.model), Workload("embed", config, 2, frames)
+        encode = lambda p, b, net=net: net.apply(p, "encode", b.clip, b.sensor)  # noqa: E731
+        ratio = counted(encode, net.abstract(), normalised(make_batch(work))) / work.operations
+        assert 1 < ratio < 1.02
+
+
+def test_operations_grow_with_depth_and_batch_as_the_products_do():
+    config = preset("small")
+    one, two = flops.stage1(config, 1, 4), flops.stage1(config, 2, 4)
+    assert two == pytest.approx(2 * one)
+    deep = replace(config, model=replace(config.model, touch=replace(config.model.touch, depth=12)))
+    encoder = flops.encoder(config.model, 1, 4, 64) - 2 * 2 * 64 * 3 * 588 * 384  # without the patches
+    assert flops.stage1(deep, 1, 4) - one == pytest.approx(encoder)
+
+
+@pytest.mark.parametrize("name", ["tiny", "small", "base", "large"])
+def test_stage_1_encodes_about_a_quarter_of_the_sequence(name):
+    config = preset(name)
+    model, decoder_alone = config.model, replace(config.model, touch=replace(config.model.touch, depth=0))
+    all_seen = flops.encoder(model, 1, 4, model.patches)
+    rest = flops.stage1(replace(config, model=decoder_alone), 1, 4) - flops.encoder(
+        decoder_alone, 1, 4, model.patches // 4
+    )
+    limit = {"tiny": 0.32, "base": 0.28}.get(name, 0.27)  # six special tokens weigh more on a small grid
+    assert flops.stage1(config, 1, 4) - rest <= limit * all_seen
+
+
+def test_the_compiled_encoder_of_preset_large_costs_at_most_27_percent_of_the_unmasked_one():
+    config = shallow(preset("large"))
+    model, net = config.model, build(config.model)
+    clip = jax.ShapeDtypeStruct((1, 3, 224, 224, 3), jnp.float32)
+    kept = jax.ShapeDtypeStruct((1, model.patches // 4), jnp.int32)
+    sensor = jax.ShapeDtypeStruct((1,), jnp.int32)
+    hidden = lambda p, c, s, k=None: net.apply(p, "touch.hidden", c, s, k)  # noqa: E731
+    masked, whole = counted(hidden, net.abstract(), clip, sensor, kept), counted(hidden, net.abstract(), clip, sensor)
+    assert 0.2 < masked / whole <= 0.27
+
+
+def test_a_batch_without_vision_costs_nothing_for_the_image_tower():
+    config = shallow(preset("tiny", stage=2))
+    work, net = Workload("stage2 align", config, 4, 3), build(config.model)
+    batch = normalised(make_batch(work)).align
+    blind = batch._replace(image=batch.image[:0], image_row=batch.image_row[:0])
+    terms = lambda p, b: objectives.stage2_terms(p, objectives.Stage2Batch(b, None), None, net=net, config=config)[0]  # noqa: E731
+    costs = [counted(jax.grad(terms), net.abstract(), b) for b in (batch, blind)]
+    assert costs[0] - costs[1] >= flops.image_tower(config.model, 1)
+    model = replace(config.model, image=None)
+    assert flops.align(replace(config, model=model), 4, 3, 0, 2, 77) == flops.align(config, 4, 3, 0, 2, 77)
+
+
+def test_a_still_is_projected_as_one_frame():
+    model, net = preset("small").model, build(preset("small").model)
+    args = (jax.ShapeDtypeStruct((16, 1, 224, 224, 3), jnp.float32), jax.ShapeDtypeStruct((16,), jnp.int32))
+    one_frame = 2 * 16 * model.patches * 588 * 384
+    summed, positions = 3 * 588 * 384, 8 * 16 * 262 * 384  # adding kernels and tables is no projection
+    assert one_frame < counted(lambda p, *a: net.apply(p, "touch.tokens", *a), net.abstract(), *args)
+    assert (
+        counted(lambda p, *a: net.apply(p, "touch.tokens", *a), net.abstract(), *args) < one_frame + summed + positions
+    )
+
+
+# Batches ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_batch_is_the_same_for_the_same_seed_and_has_the_shares_it_says():
+    one, again = make_batch(ALIGN).align, make_batch(ALIGN).align
+    jax.tree.map(np.testing.assert_array_equal, one, again)
+    assert one.image_row.tolist() == [0, 4] and len(one.text_row) == 4 and one.clip.shape == (8, 4, 28, 28, 3)
+    assert (one.text.argmax(1) == one.text_mask.sum(1) - 1).all()  # the end token is the last readable one
+    names = {w.name: w for what in ("stage1", "stage2", "embed") for w in workloads(what, "tiny", 8)}
+    assert names["stage2 match"].samples == 4 and names["embed one still"].samples == 1
+    assert make_batch(names["stage1 stills"]).clip.shape == (8, 1, 112, 112, 3)
+
+
+def test_dense_slots_give_the_same_loss_and_the_same_useful_operations():
+    dense = replace(ALIGN, dense=True)
+    assert make_batch(dense).align.image.shape[0] == 8 and dense.operations == ALIGN.operations
+    params, noise = build(ALIGN.config.model).init(jax.random.key(0)), noise_of(ALIGN)
+    batches = [normalised(make_batch(w)) for w in (ALIGN, dense)]
+    np.testing.assert_array_equal(batches[1].align.image[4], batches[0].align.image[1])
+    terms = jax.jit(partial(objectives.stage2_terms, net=build(ALIGN.config.model), config=ALIGN.config))
+    losses = [terms(params, batch, noise)[0] for batch in batches]
+    np.testing.assert_allclose(*losses, rtol=1e-6)
+
+
+# Errors -------------------------------------------------------------------------------------------------------------
+
+
+def test_relative_is_the_norm_of_the_difference():
+    exact = [np.array([3.0, 0.0]), np.array([[4.0]])]
+    assert speed.relative([np.array([3.0, 1.0]), np.array([[4.0]])], exact) == pytest.approx(0.2)
+    assert speed.relative(exact, exact) == 0 and speed.relative([np.ones(4)], [np.zeros(4)]) == 2
+
+
+@pytest.mark.parametrize("work", [pytest.param(STAGE1, marks=pytest.mark.slow), MATCH], ids=lambda w: w.name)
+def test_errors_are_rounding_in_float32_and_coarser_in_bfloat16(work):
+    params = build(work.config.model).init(jax.random.key(0))
+    single, half = speed.errors(FAST, work, params)
+    assert set(single) == {"output", "loss", "gradient"}
+    assert all(0 <= value < 5e-6 for value in single.values()) and single["gradient"] > 0
+    assert all(1e-5 < half[name] < 0.1 for name in ("output", "gradient"))
+
+
+def test_the_reference_is_float64_and_nothing_else_becomes_so():
+    params, noise = build(EMBED.config.model).init(jax.random.key(0)), np.asarray(noise_of(EMBED))
+    wide = replace(variants.BASELINE, model={"dtype": "float64"})
+    dtypes = [speed._values(v, EMBED, params, noise)["output"][0].dtype for v in (wide, variants.BASELINE)]
+    assert dtypes == [np.float64, np.float32] and not jax.config.jax_enable_x64
+    assert [speed.widened(np.zeros(1, kind)).dtype for kind in (np.float32, np.int32)] == [np.float64, np.int32]
+
+
+def test_the_output_of_stage_1_belongs_to_its_loss():
+    params = build(STAGE1.config.model).init(jax.random.key(0))
+    batch, noise = normalised(make_batch(STAGE1)), jnp.asarray(np.random.default_rng(0).random((4, 16)), jnp.float32)
+    values = jax.jit(values_of(STAGE1.config))(params, batch, noise)
+    assert "position" not in values["gradient"]["decoder"]  # a fixed table
+    flat = batch.clip.reshape(4, 4, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(4, 16, 4, -1)
+    error = ((np.asarray(values["output"]) - flat) ** 2).mean(-1)
+    hidden = np.argsort(np.argsort(np.asarray(noise), 1), 1) >= 4
+    np.testing.assert_allclose(values["loss"], error[..., :3].mean(-1)[hidden].mean() + error[..., 3].mean(), rtol=1e-5)
+
+
+def test_the_other_gelu_is_another_program_only_while_it_is_traced():
+    args = abstract_state(STAGE1.config), shapes(make_batch(STAGE1)), jax.eval_shape(lambda: jax.random.key(0))
+
+    def text():
+        return str(jax.make_jaxpr(step_of(STAGE1.config))(*args))
+
+    own = text()
+    with variants.traced_as(variants.Variant("jax", activation="jax")):
+        theirs = text()
+    after = text()
+    assert " erfc " in theirs and " erfc " not in own and " erfc " not in after and " erf " in after
+
+
+# Timing -------------------------------------------------------------------------------------------------------------
+
+
+def test_all_take_turns_and_each_round_begins_with_another():
+    seen = []
+    times = speed.interleaved([partial(seen.append, i) for i in range(3)], 2, [1, 2, 1])
+    assert "".join(map(str, seen)) == "01201121120"  # a warm-up, then two rounds
+    assert [t.shape for t in times] == [(2, 1), (2, 2), (2, 1)] and all((t > 0).all() for t in times)
+    with pytest.raises(UserError, match="at least one round"):
+        speed.interleaved([print], 0)
+
+
+NOWHERE = {"dtype": "float7"}
+
+
+def test_a_variant_that_fails_when_it_is_run_is_a_row_with_a_note(monkeypatch):
+    """As a GPU does that runs out of memory at the first call: the others are measured."""
+    whole = speed.compiled
+
+    def broken(variant, work, state):
+        program = whole(variant, work, state)
+
+        def fail(*_):
+            raise RuntimeError("RESOURCE_EXHAUSTED: out of memory\nand more")
+
+        return replace(program, call=fail) if variant.name == "large" else program
+
+    monkeypatch.setattr(speed, "compiled", broken)
+    tried = (*FAST[:1], variants.Variant("large", {"remat": True}))
+    base, large = speed.measure(STAGE1, tried, rounds=1, with_errors=False, peak_size=64)
+    assert base.calls == 1 and base.ratio == 1 and large.note == "RuntimeError: RESOURCE_EXHAUSTED: out of memory"
+
+
+def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
+    tried = (*FAST[:1], variants.Variant("donated", donate=True), variants.Variant("seven bits", NOWHERE))
+    rows = speed.measure(STAGE1, tried, rounds=2, with_errors=False, peak_size=64)
+    base, donated, absent = rows
+    assert base.ratio == 1 and base.ratio_iqr == 0 and base.calls == 2 and base.error_loss is None
+    assert base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
+    assert donated.peak_bytes > donated.temp_bytes > 0 and donated.ratio > 0 and donated.copies >= base.copies > 0
+    assert absent.note and np.isnan(absent.ratio) and absent.variant == "seven bits"
+    text = speed_report.to_markdown(rows)
+    assert absent.note.replace("|", "/") in text and "| donated | 4 |" in text
+    assert speed_report.as_dict(absent)["seconds"] is None
+    json.dumps([speed_report.as_dict(row) for row in rows], allow_nan=False)
+
+
+def test_an_embedding_is_measured_from_pixels_on_the_host():
+    one = EMBED.resized(1)
+    rows = speed.measure(one, FAST, rounds=2, peak_size=64)
+    assert rows[0].calls == 40 and rows[0].p50 <= rows[0].p99 and rows[0].error_gradient is None
+    assert rows[0].error_output < 1e-5 < rows[1].error_output
+    assert "latency of one sample" in speed_report.to_markdown(rows)
+    assert set(speed_report.points(rows)) == {"float32", "bfloat16"}
+
+
+def test_the_peak_is_that_of_a_square_product():
+    run, operations = machine.matmul("float32", 32)
+    assert run()[0].shape == (32, 32) and operations == 2 * 32**3
+    (product,) = machine.matmul("bfloat16", 32)[0]()
+    assert product.dtype == jnp.float32  # the one form of it that a CPU computes fast
+    assert machine.describe().cores >= 1 and "jax" in machine.describe().sentence()
+
+
+def test_a_report_is_whole_or_not_there(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        speed_report.write(tmp_path / "file", "speed", "text", {})
+    path = speed_report.write(tmp_path / "new", "speed", "text", {"a": None})
+    assert path.read_text() == "text" and [p.name for p in sorted(path.parent.iterdir())] == ["speed.json", "speed.md"]
+
+
+# Many devices -------------------------------------------------------------------------------------------------------
+
+HLO = """HloModule step
+
+%add (a: f32[], b: f32[]) -> f32[] {
+  ROOT %c = f32[] add(f32[] %a, f32[] %b)
+}
+
+%body (p: (s32[], f32[8,4])) -> (s32[], f32[8,4]) {
+  %gathered = f32[8,4]{1,0} all-gather(f32[4,4]{1,0} %x), channel_id=1, replica_groups=[2,2]<=[4], dimensions={0}
+  %scattered = f32[2,4]{1,0} reduce-scatter(%y), replica_groups={{0,1,2,3}}, dimensions={0}, to_apply=%add
+}
+
+%cond (p: (s32[], f32[8,4])) -> pred[] {
+  ROOT %less = pred[] compare(%i, %n), direction=LT
+}
+
+ENTRY %main (p: f32[10]) -> f32[10] {
+  %loop = (s32[], f32[8,4]) while(%init), condition=%cond, body=%body, backend_config={"known_trip_count":{"n":"3"}}
+  %sum = (f32[10]{0}, bf16[6]{0}) all-reduce(%p, %q), channel_id=2, replica_groups={{0,1},{2,3}}, to_apply=%add
+  %moved = u8[16]{0} collective-permute(%r), source_target_pairs={{0,1},{1,0}}
+}
+import sys
+for name in ("tyro", "pyarrow", "cv2", "matplotlib", "sklearn", "tokenizers", "safetensors", "taxim", "threadpoolctl"):
+    sys.modules[name] = None  # an import of it fails
+sys.argv = "bench_gpu.py embed --preset tiny --batch 1 --rounds 1 --peak-size 64 --out".split() + [{out!r}]
+import runpy
+runpy.run_path({script!r}, run_name="__main__")
+ours = sorted(name for name in sys.modules if name.startswith("anytouch_jax."))
+print("OURS", *ours)
+"""
+
+
+def test_the_accelerator_benchmark_needs_jax_flax_optax_and_numpy_alone(tmp_path):
+    code = _BARE.format(out=str(tmp_path), script=str(ROOT / "experiments" / "bench_gpu.py"))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    rooms = {name.split(".")[1] for name in done.stdout.splitlines()[-1].split()[1:]}
+    assert rooms <= {
+        "nn",
+        "ops",
+        "train",
+        "evaluate",
+        "objectives",
+        "batch",
+        "config",
+        "strict_json",
+        "io",
+        "model",
+        "whole",
+    }
+    assert "anytouch_jax.weights.checkpoint" not in done.stdout
+    assert json.loads((tmp_path / "gpu.json").read_text())["rows"][0]["variant"] == "float32"
+    assert "| float32 | 1 |" in (tmp_path / "gpu.md").read_text()

@@ -1,0 +1,177 @@
+"""Running the plan with a trainer that only takes notes: order, sharing, resumption, the budget, failures."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+
+import pytest
+
+from anytouch_jax.errors import UserError
+from experiments.tables import budget, plan
+from experiments.tables.execute import PAUSE, execute
+from experiments.tables.work import Work
+
+LEAVES = [
+    leaf
+    for leaf in plan.leaves(plan.FULL)
+    if leaf.seed == 0 and leaf.question in ("q2", "ablations") and leaf.model and leaf.name != "matched_mlp"
+]
+
+
+class Notes:
+    """A worker that takes, on its own clock, as long as the plan says (times `slow`)."""
+
+    def __init__(self, slow: float = 1.0, fail: str = "", stop_at: str = "") -> None:
+        self.done: set[str] = set()
+        self.calls: list[str] = []
+        self.time, self.slow, self.fail, self.stop_at = 0.0, slow, fail, stop_at
+        self.elsewhere: set[str] = set()  # what another process works on
+
+    def claim(self, name):
+        return nullcontext(name not in self.elsewhere)
+
+    def ready(self, leaf):
+        return self.done
+
+    def make(self, one, size):
+        self._did(one.name, budget.of_scenes(one, size))
+
+    def train(self, one):
+        assert one.init is None or one.init.key in self.done
+        if one.key == self.stop_at:
+            self.stop_at = ""
+            raise KeyboardInterrupt
+        self._did(one.key, budget.of_training(one))
+
+    def score(self, leaf):
+        assert all(one.key in self.done for one in leaf.trainings)
+        if leaf.name == self.fail:
+            raise UserError("no such column")
+        self.time += self.slow * budget.of_scores(leaf)
+        self.calls.append(leaf.file)
+        return {"rows": []}
+
+    def _did(self, name, seconds):
+        assert name not in self.done, "made twice"
+        self.calls.append(name)
+        self.done.add(name)
+        self.time += self.slow * seconds
+
+    def clock(self):
+        return self.time
+
+
+def run(work, out, **options):
+    said: list[str] = []
+    result = execute(options.pop("leaves", LEAVES), work, out, say=said.append, clock=work.clock, **options)
+    return result, said
+
+
+def test_each_training_is_made_once_and_every_run_leaves_a_file(tmp_path):
+    work = Notes()
+    result, _ = run(work, tmp_path)
+    assert result.made == [leaf.file for leaf in LEAVES] == [name for name in work.calls if name.endswith(".json")]
+    keys = {one.key for leaf in LEAVES for one in leaf.trainings}
+    assert sorted(set(work.calls) & keys) == sorted(keys) and work.calls[:4] == ["own", "fine", "coarse", "other"]
+    stored = json.loads((tmp_path / LEAVES[0].file).read_text())
+    assert stored["identity"] == LEAVES[0].identity and stored["seed"] == 0 and stored["question"] == LEAVES[0].question
+
+
+def test_a_finished_run_is_not_repeated_and_a_broken_file_is(tmp_path):
+    run(Notes(), tmp_path)
+    work = Notes()
+    result, said = run(work, tmp_path)
+    assert not result.made and not work.calls and not said and len(result.found) == len(LEAVES)
+    (tmp_path / LEAVES[2].file).write_text('{"identity": "of other settings"}')
+    (tmp_path / LEAVES[3].file).write_text("{")
+    result, _ = run(Notes(), tmp_path)
+    assert result.made == [LEAVES[2].file, LEAVES[3].file]
+
+
+def test_a_half_done_run_is_gone_on_with(tmp_path):
+    last = LEAVES[1].trainings[-1].key
+    work = Notes(stop_at=last)
+    with pytest.raises(KeyboardInterrupt):
+        run(work, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [LEAVES[0].file]
+    first = list(work.calls)
+    result, _ = run(work, tmp_path)
+    assert result.found == [LEAVES[0].file] and result.made == [leaf.file for leaf in LEAVES[1:]]
+    assert work.calls[len(first)] == last  # nothing that was there is made again
+
+
+def test_it_stops_before_a_run_that_does_not_fit_and_goes_on_later(tmp_path):
+    work, files = Notes(), []
+    for _ in range(20):
+        began = work.time
+        result, said = run(work, tmp_path, minutes=40)
+        assert work.time - began <= 40 * 60
+        files += result.made
+        if not result.left:
+            break
+        assert "left for the next call" in said[-1] and result.left == [leaf.file for leaf in LEAVES][len(files) :]
+    assert files == [leaf.file for leaf in LEAVES]
+
+
+def test_a_slow_machine_is_noticed(tmp_path):
+    quick, _ = run(Notes(), tmp_path / "a", minutes=40)
+    slow, _ = run(Notes(slow=1.5), tmp_path / "b", minutes=40)
+    assert 0 < len(slow.made) < len(quick.made)
+    for minutes in range(25, 61):
+        work = Notes(slow=1.5)
+        run(work, tmp_path / str(minutes), minutes=minutes)
+        assert work.time <= 60 * minutes
+
+
+def test_waiting_for_others_is_no_slow_machine(tmp_path):
+    by_itself, work, leaves = Notes(), Notes(), LEAVES[:2]
+    work.elsewhere = {leaves[1].file}
+
+    def pause(seconds):  # the other process is lost after an hour, with nothing done
+        work.time += 60 * 60
+        work.elsewhere = set()
+
+    run(by_itself, tmp_path / "a", leaves=leaves)
+    result, _ = run(work, tmp_path / "b", leaves=leaves, minutes=by_itself.time / 60 + 61, pause=pause)
+    assert not result.left
+
+
+def test_a_budget_for_nothing_is_a_sentence(tmp_path):
+    with pytest.raises(UserError, match=r"takes about \d+ minutes .* MINUTES is 1; give more"):
+        run(Notes(), tmp_path, minutes=1)
+
+
+def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path):
+    result, said = run(Notes(fail="no_text"), tmp_path)
+    assert list(result.failed.values()) == ["no such column"] and "no_text-0.json failed" in "\n".join(said)
+    assert len(result.made) == len(LEAVES) - 1 and not (tmp_path / "ablations-no_text-0.json").exists()
+
+
+def test_what_another_process_works_on_is_left_to_it(tmp_path):
+    work, training = Notes(), LEAVES[0].trainings[0]
+    need = [leaf for leaf in LEAVES if training in leaf.trainings]
+    work.elsewhere = {"coarse", training.key, LEAVES[-1].file}
+
+    def pause(seconds):  # meanwhile the other one finishes a thing
+        assert seconds == PAUSE and work.elsewhere
+        name = "coarse" if "coarse" in work.elsewhere else min(work.elsewhere)
+        work.elsewhere.remove(name)
+        if name == LEAVES[-1].file:
+            (tmp_path / name).write_text(json.dumps({"identity": LEAVES[-1].identity}))
+        else:
+            work.done.add(name)
+
+    result, _ = run(work, tmp_path, pause=pause)
+    assert 1 < len(need) < len(LEAVES) - 1 and LEAVES[-1] not in need
+    assert result.found == [LEAVES[-1].file] and sorted(result.made) == sorted(leaf.file for leaf in LEAVES[:-1])
+    assert not {"coarse", training.key, LEAVES[-1].file} & set(work.calls)
+    assert {leaf.file for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
+
+
+def test_a_claim_is_one_process_alone_and_ends_with_it(tmp_path):
+    one, other = Work(tmp_path), Work(tmp_path)
+    with one.claim("own") as first, other.claim("own") as second, other.claim("coarse") as third:
+        assert first and not second and third
+    with other.claim("own") as again:
+        assert again

@@ -1,0 +1,158 @@
+"""The graph of the matrix: what is shared, what a run's result hangs on, what it costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import statistics
+
+import pytest
+from places import EXPERIMENTS
+
+from anytouch_jax.config import Stack
+from experiments.tables import budget, plan
+from experiments.tables.paper import TABLE1, TABLE6
+
+LEAVES = plan.leaves(plan.FULL)
+BY_NAME = {(leaf.question, leaf.name, leaf.seed): leaf for leaf in LEAVES}
+
+
+def stages(question: str, name: str, seed: int = 0) -> dict[int, str]:
+    return {one.config.stage: one.key for one in BY_NAME[question, name, seed].trainings}
+
+
+def test_one_stage_1_serves_all_that_start_from_it():
+    whole = stages("q3", "anytouch")
+    for name in ("anytouch", "no_text", "no_vision", "no_text_aligned", "no_matching", "no_stage2"):
+        assert stages("ablations", name)[1] == whole[1], name
+    assert stages("q2", "masked") == {1: whole[1]} and stages("q2", "matched") == whole
+    assert stages("q3", "static_only") == stages("ablations", "no_dynamic")  # one model under the names of two tables
+    for other in (stages("ablations", "no_universal"), stages("ablations", "no_dynamic"), stages("q3", "t3")):
+        assert other[1] != whole[1]
+    assert stages("q3", "anytouch", 1)[1] != whole[1]
+    second = {stages("ablations", name)[2] for name in ("anytouch", "no_text", "no_vision", "no_matching", "no_stage1")}
+    assert len(second) == 5
+
+
+def test_recipes_train_the_stages_that_they_say():
+    assert set(stages("q3", "t3")) == {1} and set(stages("q3", "unitouch")) == {2} == set(
+        stages("ablations", "no_stage1")
+    )
+    assert BY_NAME["q3", "no_pretraining", 0].tower and not stages("q3", "untrained")
+    for leaf in LEAVES:
+        for before, after in zip(leaf.trainings, leaf.trainings[1:], strict=False):
+            assert after.init is before and (before.config.stage, after.config.stage) == (1, 2)
+
+
+def test_the_unseen_sensor_is_in_no_training_but_one():
+    for leaf in LEAVES:
+        for one in leaf.trainings:
+            names = [*one.config.data.manifests, *one.config.model.sensors]
+            assert any(plan.UNSEEN in name for name in names) == (leaf.name == "seen"), leaf.file
+
+
+def test_table_1_adds_sensors_without_touches_felt_twice():
+    for name in list(TABLE1)[1:]:
+        one = BY_NAME["q1", name, 0].model
+        assert one.config.data.manifests == tuple(f"own/{sensor}" for sensor in name.split("+"))
+        assert one.config.model.sensors == (*name.split("+"), "universal") and not budget.matches(one)
+    rivals = [BY_NAME["restricted", name, 0].model.config for name in ("unitouch", "no_matching")]
+    assert rivals[0].data.manifests == rivals[1].data.manifests and rivals[0].model.sensors == rivals[1].model.sensors
+
+
+def test_claims_have_three_seeds():
+    for question, names in (("ablations", TABLE6), ("q1", TABLE1), ("q2", ("masked", "aligned", "matched"))):
+        for name in names:
+            assert {seed for q, n, seed in BY_NAME if (q, n) == (question, name)} == {0, 1, 2}
+
+
+def test_files_and_identities_are_of_one_run_each():
+    assert len({leaf.file for leaf in LEAVES}) == len({leaf.identity for leaf in LEAVES}) == len(LEAVES)
+    again = {leaf.file: leaf.identity for leaf in plan.leaves(plan.FULL)}
+    assert plan.chosen(plan.training(plan.FULL, "anytouch", 0).config)["run"]["steps"] == plan.FULL.steps2
+    longer = {leaf.file: leaf.identity for leaf in plan.leaves(dataclasses.replace(plan.FULL, steps1=181))}
+    assert all(again[leaf.file] == leaf.identity for leaf in LEAVES)
+    assert not set(longer.values()) & set(again.values())
+
+
+def test_a_result_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypatch):
+    again = {leaf.file: leaf.identity for leaf in LEAVES}
+    named = plan.leaves(dataclasses.replace(plan.FULL, name="changed", seeds=(0, 1, 2, 3)))
+    assert again.items() <= {leaf.file: leaf.identity for leaf in named}.items()
+    monkeypatch.setattr("anytouch_jax.sim.dataset.VERSION", plan.simulator() + 1)
+    later = {leaf.identity for leaf in plan.leaves(plan.FULL)}
+    assert not later & set(again.values())
+
+
+def test_a_result_hangs_on_how_its_question_is_scored(monkeypatch):
+    again = {leaf.file: leaf.identity for leaf in LEAVES}
+    monkeypatch.setitem(plan.SCORING, "q2", 7)
+    for leaf in plan.leaves(plan.FULL):
+        assert (leaf.identity == again[leaf.file]) == (leaf.question != "q2")
+
+
+def test_without_real_data_there_is_no_real_run():
+    assert {leaf.question for leaf in LEAVES} - {leaf.question for leaf in plan.leaves(plan.FULL, real=False)} == {
+        "real"
+    }
+    assert plan.REAL in BY_NAME["real", "anytouch", 0].model.config.data.manifests
+
+
+def test_the_matrix_fits_in_its_hours():
+    assert 3 * 3600 < sum(budget.costs(LEAVES)) / 1.35 < 4.1 * 3600
+    assert sum(budget.costs(plan.leaves(plan.QUICK))) < 16 * 60
+    assert max(budget.costs(LEAVES)) < 75 * 60
+
+
+def test_cost_counts_what_is_shared_once():
+    anytouch, text = BY_NAME["ablations", "anytouch", 0], BY_NAME["ablations", "no_text", 0]
+    data = {one.name for one in plan.scenes(plan.FULL)}
+    alone = budget.cost(text, data)
+    after = budget.cost(text, data | {one.key for one in anytouch.trainings})
+    assert alone - after == pytest.approx(budget.of_training(text.trainings[0]))
+    assert budget.cost(text, ()) - alone == pytest.approx(
+        sum(budget.of_scenes(one, plan.FULL) for one in plan.scenes(plan.FULL))
+    )
+    assert budget.costs([anytouch, anytouch])[1] == budget.of_scores(anytouch)
+
+
+def test_rates_are_those_of_the_page():
+    whole = {"image": 112, "stack": Stack(192, 6, 6, 768), "match_head": "mlp", "match_keep": 1.0}
+    size = dataclasses.replace(plan.FULL, steps1=100, batch1=64, steps2=100, batch2=32, **whole)
+    one = plan.training(size, "anytouch", 0)
+    assert budget.of_training(one) == pytest.approx(25 + 470)
+    assert budget.of_training(one.init) == pytest.approx(25 + 115)
+
+
+def test_rates_are_what_the_committed_runs_took():
+    taken: dict[str, float] = {}
+    for path in (EXPERIMENTS / "results" / "matrix").glob("*.json"):
+        taken |= {one["key"]: one["seconds"] for one in json.loads(path.read_text())["trained"]}
+    found = {one.key: one for leaf in LEAVES for one in leaf.trainings if one.key in taken}
+    if not found:
+        pytest.skip("no run of today's plan is committed")
+    ratios = [taken[key] / budget.of_training(one) for key, one in found.items()]
+    assert 0.5 < statistics.median(ratios) < 2.5  # from one day to another these machines differ by a factor of two
+
+
+@pytest.mark.parametrize("of", [1, 3, 8])
+def test_chunks_are_all_runs_once_and_in_order(of):
+    parts = [budget.chunk(LEAVES, number, of) for number in range(1, of + 1)]
+    assert [leaf for part in parts for leaf in part] == LEAVES
+    whole = sum(budget.costs(LEAVES))
+    for part in parts:
+        assert sum(budget.costs(part)) < whole / of + 30 * 60  # what it makes again
+        assert of < 8 or sum(budget.costs(part)) < 75 * 60
+
+
+def test_a_chunk_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="count from 1"):
+        budget.chunk(LEAVES, 0, 3)
+
+
+def test_the_plan_in_words():
+    first = LEAVES[0].file
+    lines = budget.lines(LEAVES, {first})
+    assert len(lines) == len(LEAVES) + 1 and " done " in lines[0] and "min" in lines[1]
+    assert "1 to train, 1 shared" in next(line for line in lines if "no_text " in line)
+    assert f"{len(LEAVES)} runs" in lines[-1] and "left" in lines[-1]

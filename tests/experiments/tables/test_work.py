@@ -1,0 +1,130 @@
+"""What of a folder counts as finished: data sets by size and simulator, trainings by the data they saw."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from anytouch_jax.data.manifest import manifest as manifests
+from experiments.tables import adaptation, plan
+from experiments.tables import work as works
+from experiments.tables.work import DONE, Work
+
+LEAF = next(leaf for leaf in plan.leaves(plan.QUICK) if leaf.name == "+".join(plan.SENSORS[:2]))
+FIRST = LEAF.trainings[0]
+
+
+def write_data(folder, text):
+    """Both sensors' manifests with a row of `text`, and every data set marked as made."""
+    for name in LEAF.model.manifests:
+        path = folder / f"{name}.parquet"
+        columns = {"path": ["a.jpg"], "sensor": ["digit"], "sequence": ["a"], "frame_index": [0], "split": ["train"]}
+        manifests.write(manifests.from_columns(columns | {"text": [text]}, path), path)
+    for one in plan.scenes(LEAF.size):
+        (folder / one.name).mkdir(exist_ok=True)
+        (folder / one.name / DONE).write_text(json.dumps({"of": works._of(one, LEAF.size), "seconds": 1}))
+
+
+class Trainer:
+    """Stands for `pretrain`: takes ten seconds of a clock of its own, is interrupted when told."""
+
+    def __init__(self, patch):
+        self.calls, self.time, self.stop = [], 0.0, False
+        patch.setattr(works, "pretrain", self)
+        patch.setattr(works.time, "perf_counter", lambda: self.time)
+
+    def __call__(self, config, run, *, init, say):
+        self.calls.append((run.name, (run / "weights").exists()))
+        (run / "weights").touch()
+        self.time += 10
+        return SimpleNamespace(interrupted=7 if self.stop else None, resumed=0)
+
+
+@pytest.fixture
+def trainer(monkeypatch):
+    return Trainer(monkeypatch)
+
+
+@pytest.fixture
+def work(tmp_path):
+    write_data(tmp_path, "one")
+    said = []
+    found = Work(tmp_path, say=said.append)
+    found.said = said
+    return found
+
+
+def test_a_training_on_other_data_is_not_finished_and_is_begun_anew(work, trainer):
+    sets = {"own", "fine", "coarse", "other"}
+    assert work.ready(LEAF) == sets
+    for one in LEAF.trainings:
+        work.train(one)
+    assert work.ready(LEAF) == sets | {one.key for one in LEAF.trainings}
+    write_data(work.folder, "two")
+    assert work.ready(LEAF) == sets
+    work.train(FIRST)
+    assert trainer.calls[-1] == (FIRST.key, False)  # nothing is left of the first one
+    assert f"  {FIRST.key} was trained on other data: it is begun anew" in work.said
+    assert work.ready(LEAF) == sets | {FIRST.key}
+
+
+def test_what_does_not_say_of_what_it_is_counts_for_nothing(work, trainer):
+    work.train(FIRST)
+    for path in (work.run_of(FIRST) / DONE, work.folder / "other" / DONE):
+        about = json.loads(path.read_text())
+        del about["of"]
+        path.write_text(json.dumps(about))
+    assert work.ready(LEAF) == {"own", "fine", "coarse"}
+
+
+def test_the_time_of_an_interrupted_training_is_that_of_all_its_parts(work, trainer):
+    trainer.stop = True
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            work.train(FIRST)
+    trainer.stop = False
+    work.train(FIRST)
+    assert [there for _, there in trainer.calls] == [False, True, True]  # gone on with
+    about = json.loads((work.run_of(FIRST) / DONE).read_text())
+    assert (about["seconds"], about["parts"]) == (30.0, 3)
+
+
+def test_a_record_names_the_data_that_were_learned_from(work, trainer, monkeypatch):
+    monkeypatch.setattr(works.scores, "score", lambda leaf, work: {"rows": [], "data": ["own/digit"]})
+    for name in ("digit", "gelsight_mini"):  # scored alone
+        (work.folder / "own" / f"{name}.parquet").write_bytes((work.folder / "own" / "gelsight.parquet").read_bytes())
+    for one in LEAF.trainings:
+        work.train(one)
+    learned = work._contents(LEAF.model)
+    write_data(work.folder, "two")
+    found = work.score(LEAF)
+    assert {name: found["data"][name] for name in learned} == learned and "own/digit" in found["data"]
+    assert all("of" not in one and one["seconds"] == 10.0 for one in found["trained"])
+
+
+def test_adapted_runs_are_made_again_for_other_data_or_weights(tmp_path, monkeypatch):
+    made, weights = [], ["first"]
+    monkeypatch.setattr(adaptation, "load_encoder", lambda run: weights[0])
+    monkeypatch.setattr(adaptation, "digest", str)
+    monkeypatch.setattr(adaptation.cuts, "content_hash", lambda path: path.read_text())
+
+    def command(words):
+        (tmp_path / "work" / "trained" / "run-told2").mkdir(parents=True)
+        made.append(words)
+        return 0
+
+    monkeypatch.setattr(adaptation, "main", command)
+    table = SimpleNamespace(column=lambda name: np.array(["train" if name == "split" else plan.UNSEEN] * 3))
+    monkeypatch.setattr(adaptation.manifests, "read", lambda path: table)
+    data, here = tmp_path / "new2.parquet", SimpleNamespace(folder=tmp_path / "work")
+    monkeypatch.setattr(adaptation, "text_column", lambda table, name: table.column(name))
+    counts = []
+    for text, weight in (("a", "first"), ("a", "first"), ("b", "first"), ("b", "second")):
+        data.write_text(text)
+        weights[0] = weight
+        out = adaptation.adapted(here, tmp_path / "run", data, 2, adaptation.TOLD)
+        counts.append(len(made))
+    assert counts == [1, 1, 2, 3] and out == tmp_path / "work" / "trained" / "run-told2"

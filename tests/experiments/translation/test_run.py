@@ -1,0 +1,121 @@
+"""`anytouch translate`: train a translation, use it, and what is answered to mistakes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pair_world import make_pairs
+
+from anytouch_jax.cli.app import main
+from experiments.translation.generator import load
+
+FIT = ("--steps", 2, "--batch", 4)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(compiled_once):
+    """The command keeps compiled programs: not in the home of whoever runs the tests."""
+
+
+@pytest.fixture(scope="module")
+def world_of_pairs(tmp_path_factory):
+    return make_pairs(tmp_path_factory.mktemp("pairs"), {"train": 6, "test": 3})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, tiny_run, world_of_pairs):
+    """A run that knows gelsight_mini -> duragel and digit -> tac3d."""
+    folder = tmp_path_factory.mktemp("run") / "stage1"
+    shutil.copytree(tiny_run, folder)
+    for source, target in (("gelsight_mini", "duragel"), ("digit", "tac3d")):
+        words = ["translate", "--fit", "--data", world_of_pairs, "--run", folder, "--from", source, "--to", target]
+        assert main([str(word) for word in (*words, *FIT)]) == 0
+    return folder
+
+
+def picture(world: Path, number: int = 0) -> Path:
+    return world.parent / f"test{number}_1_gelsight_mini.png"
+
+
+def test_a_translation_is_trained_scored_and_kept(run, world_of_pairs):
+    home = run / "generators" / "gelsight_mini-duragel"
+    report = json.loads((home / "report.json").read_text())
+    assert report["test pairs"] == 6 and report["error"] > 0 and report["mean target"] > 0
+    assert len(report["losses"]) == 2 and cv2.imread(str(home / "pairs.png")) is not None
+    design = load(home).design
+    assert (design.source, design.target, design.pairs, design.fit.batch) == ("gelsight_mini", "duragel", 12, 4)
+
+
+def test_an_image_becomes_an_image(run, world_of_pairs, anytouch, tmp_path):
+    out = tmp_path / "new" / "a.png"
+    said = anytouch("translate", "--run", run, "--from", "gelsight_mini", "--to", "duragel", picture(world_of_pairs),
+                    "--out", out)  # fmt: skip
+    assert said.status == 0 and said.out.strip() == str(out)
+    made = cv2.imread(str(out))[..., ::-1]
+    given = cv2.imread(str(picture(world_of_pairs)))[..., ::-1]
+    np.testing.assert_array_equal(made, load(run / "generators" / "gelsight_mini-duragel")(given[None])[0])
+
+
+def test_several_images_and_fields(run, world_of_pairs, anytouch, tmp_path):
+    images = [picture(world_of_pairs, k) for k in range(2)]
+    said = anytouch("translate", *images, "--run", run, "--out", tmp_path)
+    assert said.status == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == [f"{image.stem}_duragel.png" for image in images]
+    said = anytouch("translate", images[0], "--run", run, "--from", "digit", "--to", "tac3d", "--out", tmp_path)
+    assert said.status == 0
+    field = np.load(tmp_path / f"{images[0].stem}_tac3d.npy")
+    assert field.shape == (20, 20, 6) and field.dtype == np.float32
+
+
+def test_a_generator_of_its_own_place(run, world_of_pairs, anytouch, tmp_path):
+    words = ("--from", "gelsight_mini", "--to", "tac3d")
+    home = tmp_path / "mine"
+    said = anytouch("translate", "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
+    assert said.status == 0 and "objects never seen" in said.out
+    said = anytouch("translate", picture(world_of_pairs), "--generator", home, *words, "--out", tmp_path / "f.npy")
+    assert said.status == 0 and np.load(tmp_path / "f.npy").shape == (20, 20, 6)
+    said = anytouch("translate", "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
+    assert said.status == 1 and "mine holds a translation already; remove it" in said.err
+
+
+def test_mistakes(run, world_of_pairs, mistake, tmp_path):
+    image, data = picture(world_of_pairs), ("--data", world_of_pairs)
+    home = run / "generators" / "gelsight_mini-duragel"
+    words = tmp_path / "notes.png"
+    words.write_text("no picture")
+    pair = ("--from", "digit", "--to", "duragel")
+    cases = [
+        ((image,), "give --run"),
+        ((image, "--run", tmp_path / "none"), "no run folder"),
+        ((image, "--run", run, *pair), "there is no generator in"),
+        ((image, "--generator", home, *pair), "translates gelsight_mini to duragel, not digit to duragel"),
+        (("--run", run), "give an image"),
+        ((tmp_path / "none.png", "--run", run), "there is no file"),
+        ((words, "--run", run, "--out", tmp_path), "notes.png"),
+        ((image, picture(world_of_pairs, 1), "--run", run, "--out", tmp_path / "a.png"), "one file for 2 images"),
+        ((image, "--run", run, "--out", tmp_path / "a.npy"), "must end in .png"),
+        ((image, image, "--run", run, "--out", tmp_path), "same name"),
+        ((image, "--run", run, "--out", image), "an image that is read"),
+        ((image, "--fit", *data, "--run", run), "--fit takes its images"),
+        (("--fit", "--run", run), "the pairs of --data"),
+        (
+            ("--fit", *data, "--run", run, "--from", "digit", "--to", "tac3d", "--adversarial", 0.5),
+            "--adversarial does nothing to tac3d, whose fields have no critic",
+        ),
+        ((image, "--run", run, "--steps", 9, "--tune", "fine"), "--steps, --tune do nothing without --fit"),
+        (("--fit", *data, "--run", run, "--background", image), "--background does nothing with --fit"),
+        (("--fit", *data, "--run", run, "--out", tmp_path / "new", "--generator", home), "--generator does nothing"),
+        ((image, "--run", run, "--generator", home), "--run does nothing beside --generator"),
+        ((image, "--run", run, "--background", words, "--out", words), "notes.png is an image that is read"),
+        (("--fit", *data, "--run", run, "--to", "allsight"), "no rows of sensor 'allsight'"),
+        (("--fit", *data, "--run", run, "--from", "tac3d"), "measures a field"),
+        (("--fit", *data, "--run", run, "--steps", 0, "--out", tmp_path / "new"), "at least 1"),
+    ]
+    for given, says in cases:
+        assert says in mistake("translate", *given), given
+    assert not list(tmp_path.glob("*.npy"))

@@ -1,0 +1,314 @@
+"""Normal contact against Hertz, a punch, a line load, and cases that break solvers. One grid for all: 64 x 64."""
+
+from __future__ import annotations
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.contact import elastic, mechanics
+from anytouch_jax.sim.contact.convolve import Plan
+from anytouch_jax.sim.contact.mechanics import Gel, press
+
+N = 64
+PLANE = 150.0 / (1 - 0.48**2)
+INF = float("inf")
+
+
+def grid(pitch=1.0):
+    axis = (np.arange(N) - (N - 1) / 2) * pitch
+    return np.meshgrid(axis, axis)
+
+
+@jax.jit
+def exact(surface, depth, pitch, modulus_object=INF):
+    return press(surface, depth, Gel(), pitch, modulus_object=modulus_object, tolerance=2e-5)
+
+
+@jax.jit
+def fast(surface, depth, pitch):
+    return press(surface, depth, Gel(), pitch, fidelity="fast")
+
+
+def solved(surface, depth, pitch, modulus_object=INF):
+    found = exact(jnp.asarray(surface, jnp.float32), depth, pitch, modulus_object)
+    assert found.converged
+    return jax.tree.map(np.asarray, found)
+
+
+def ball(pitch, radius=8.0, at=(0.0, 0.0)):
+    x, y = grid(pitch)
+    return -((x - at[0] * pitch) ** 2 + (y - at[1] * pitch) ** 2) / (2 * radius)
+
+
+def rough(pitch, seed=0, spread=0.03):
+    x, y = grid(pitch)
+    rng = np.random.default_rng(seed)
+    waves, turns, phases = rng.uniform(1.2, 2.6, 80), rng.uniform(0, 2 * np.pi, 80), rng.uniform(0, 2 * np.pi, 80)
+    field = sum(
+        np.cos(k * (x * np.cos(a) + y * np.sin(a)) / pitch + b) for k, a, b in zip(waves, turns, phases, strict=True)
+    )
+    return (field - field.max()) / np.sqrt(40) * spread
+
+
+@pytest.mark.parametrize("depth", [0.01, 0.03, 0.1, 0.3, 1.0])
+def test_hertz_sphere(depth):
+    """Force, radius and peak pressure within 1 % over two decades of depth; the grid is chosen for each."""
+    radius = 8.0
+    a = np.sqrt(radius * depth)
+    pitch = 3.2 * a / N
+    found = solved(ball(pitch, radius), depth, pitch)
+    assert found.force == pytest.approx(4 / 3 * PLANE * np.sqrt(radius) * depth**1.5 * 1e-3, rel=0.01)
+    assert np.sqrt(mechanics.area(found.pressure, pitch) / np.pi) == pytest.approx(a, rel=0.01)
+    assert found.pressure.max() == pytest.approx(2 * PLANE * np.sqrt(depth / radius) / np.pi, rel=0.01)
+    assert found.displacement.max() == pytest.approx(depth, rel=2e-3)
+    x, y = grid(pitch)
+    far = np.hypot(x, y) > 1.2 * a
+    r = np.hypot(x, y)[far] / a
+    outside = depth / np.pi * ((2 - r**2) * np.arcsin(1 / r) + np.sqrt(r**2 - 1))  # Johnson 3.42a
+    np.testing.assert_allclose(found.displacement[far], outside, rtol=0.01)
+
+
+def test_cylinder_on_its_line_load():
+    """Half width 2 sqrt(P' R / (pi E*)), peak 2 P' / (pi a) at the middle section; P' is the load found there.
+
+    The ends of a finite cylinder raise the load near them but change the middle only by (a / length)^2.
+    """
+    radius, pitch = 4.0, 0.1
+    x, _ = grid(pitch)
+    found = solved(-(x**2) / (2 * radius), 0.14, pitch)
+    section = found.pressure[N // 2 - 4 : N // 2 + 4].mean(0)
+    line = section.sum() * pitch
+    half_width = 2 * np.sqrt(line * radius / (np.pi * PLANE))
+    assert 4 < half_width / pitch < 8
+    inside = np.abs(x[0]) < 0.85 * half_width
+    slope, peak = np.polyfit(x[0][inside] ** 2, section[inside] ** 2, 1)  # p^2 = p0^2 (1 - x^2 / a^2)
+    assert np.sqrt(-peak / slope) == pytest.approx(half_width, rel=0.02)
+    assert np.sqrt(peak) == pytest.approx(2 * line / (np.pi * half_width), rel=0.02)
+
+
+def test_flat_punch():
+    """F = 2 a E* d; the pressure at the centre is E* d / (pi a)."""
+    radius, pitch, depth = 2.4, 0.1, 0.2
+    x, y = grid(pitch)
+    inside = np.hypot(x, y) <= radius
+    found = solved(np.where(inside, 0.0, -INF), depth, pitch)
+    a = np.sqrt(inside.sum() * pitch**2 / np.pi)
+    assert found.force == pytest.approx(2 * a * PLANE * depth * 1e-3, rel=0.02)
+    assert found.pressure[N // 2, N // 2] == pytest.approx(PLANE * depth / (np.pi * a), rel=0.02)
+    assert not found.pressure[~inside].any()
+    np.testing.assert_allclose(found.displacement[inside], depth, rtol=1e-4)
+
+
+@pytest.mark.parametrize("shape", ["ball", "rough"])
+def test_force_is_the_slope_of_the_energy(shape):
+    """The sum of the pressure against the load that does the work: dU / dd, U = half of pressure times motion."""
+    pitch = 0.1
+    surface = ball(pitch) if shape == "ball" else rough(pitch)
+    depths, energies = (0.28, 0.3, 0.32), []
+    for depth in depths:
+        found = solved(surface, depth, pitch)
+        energies.append(0.5 * np.sum(found.pressure * found.displacement, dtype=np.float64) * pitch**2 * 1e-3)
+    work = (energies[2] - energies[0]) / (depths[2] - depths[0])
+    assert work == pytest.approx(solved(surface, 0.3, pitch).force, rel=2e-3)
+
+
+@pytest.mark.parametrize("solve", [exact, fast])
+def test_zero_depth_is_exactly_nothing(solve):
+    for surface in (ball(0.1), rough(0.1), np.zeros((N, N)), np.full((N, N), -INF)):
+        found = solve(jnp.asarray(surface, jnp.float32), 0.0, 0.1)
+        assert not np.asarray(found.pressure).any() and not np.asarray(found.displacement).any()
+        assert found.force == 0 and found.converged
+
+
+@pytest.mark.parametrize("solve", [exact, fast])
+def test_moves_and_turns_with_the_object(solve):
+    pitch = 0.1
+    surface = np.maximum(ball(pitch, 2.0, at=(-6, 3)), ball(pitch, 1.0, at=(4, -8)) - 0.05)
+    # the fast path has grids of 16 and 32 behind it: it moves with whole coarse pixels
+    first = solve(jnp.asarray(surface, jnp.float32), 0.2, pitch)
+    turned = solve(jnp.asarray(np.rot90(surface), jnp.float32), 0.2, pitch)
+    other = np.maximum(ball(pitch, 2.0, at=(2, -1)), ball(pitch, 1.0, at=(12, -12)) - 0.05)
+    moved = solve(jnp.asarray(other, jnp.float32), 0.2, pitch)
+    np.testing.assert_allclose(turned.displacement, np.rot90(first.displacement), atol=1e-5)
+    inner = np.asarray(moved.displacement)[: N - 4, 8:]
+    np.testing.assert_allclose(inner, np.asarray(first.displacement)[4:, : N - 8], atol=2e-4 if solve is fast else 1e-5)
+    assert moved.force == pytest.approx(float(first.force), rel=1e-3)
+
+
+@pytest.mark.parametrize("solve", [exact, fast])
+def test_force_grows_with_depth(solve):
+    for surface in (ball(0.1), rough(0.1), ball(0.1) + 20 * rough(0.1, 1)):
+        forces = [float(solve(jnp.asarray(surface, jnp.float32), depth, 0.1).force) for depth in (0.05, 0.1, 0.2, 0.4)]
+        assert forces[0] > 0 and np.all(np.diff(forces) > 0)
+
+
+def test_batch_equals_single():
+    surfaces = jnp.asarray(np.stack([ball(0.1), rough(0.1), np.full((N, N), -INF)]), jnp.float32)
+    depths = jnp.array([0.2, 0.1, 0.3])
+    for solve in (exact, fast):
+        batch = jax.vmap(solve, (0, 0, None))(surfaces, depths, 0.1)
+        for row in range(3):
+            single = solve(surfaces[row], depths[row], 0.1)
+            assert int(batch.iterations[row]) == int(single.iterations)
+            np.testing.assert_allclose(batch.displacement[row], single.displacement, atol=2e-5)
+            np.testing.assert_allclose(batch.force[row], single.force, rtol=1e-4)
+
+
+def cone(pitch):
+    x, y = grid(pitch)
+    return -np.hypot(x, y) * 1.5
+
+
+def tip(pitch):
+    surface = np.full((N, N), -INF)
+    surface[20, 31] = 0.0
+    return surface
+
+
+def square(pitch):
+    x, y = grid(pitch)
+    return np.where((abs(x) < 2) & (abs(y) < 1.5), 0.0, -3.0)
+
+
+@pytest.mark.parametrize("shape", [cone, tip, square, rough, ball, lambda pitch: np.zeros((N, N))])
+@pytest.mark.parametrize("depth", [1e-7, 0.02, 1.0, 50.0])
+def test_hard_cases_converge_and_stay_finite(shape, depth):
+    surface = jnp.asarray(shape(0.1), jnp.float32)
+    found = exact(surface, depth, 0.1)
+    assert found.converged and found.residual <= 2e-5
+    for result in (found, fast(surface, depth, 0.1)):
+        assert all(np.isfinite(np.asarray(field)).all() for field in result)
+        assert (np.asarray(result.pressure) >= 0).all()
+        highest = max(float(jnp.max(jnp.where(jnp.isfinite(surface), surface, -1))) + depth, 0)  # apex between pixels
+        assert np.asarray(result.displacement).max() <= highest * 1.35 + 1e-12
+        assert (float(result.force) > 0) == (highest > 0)
+
+
+def test_hundreds_of_islands():
+    surface = rough(0.1, spread=0.3)
+    found = solved(surface, -1.2 * surface.mean(), 0.1)
+    islands = cv2.connectedComponents((found.pressure > 0).astype(np.uint8), connectivity=4)[0] - 1
+    assert islands > 200
+    assert found.iterations < 100
+
+
+def test_says_when_it_did_not_converge():
+    found = press(jnp.asarray(rough(0.1), jnp.float32), 0.1, Gel(), 0.1, iterations=2)
+    assert not found.converged and found.residual > 1e-4 and found.iterations == 2
+    assert np.isfinite(np.asarray(found.displacement)).all()
+
+
+def test_double_precision_in_double_precision_out():
+    with jax.enable_x64(True):
+        found = press(jnp.asarray(ball(0.1)), 0.2, Gel(), 0.1, tolerance=1e-10)
+        assert found.pressure.dtype == found.force.dtype == jnp.float64
+        assert found.converged and found.residual <= 1e-10
+    single = exact(jnp.asarray(ball(0.1), jnp.float32), 0.2, 0.1)
+    assert single.pressure.dtype == single.displacement.dtype == single.force.dtype == jnp.float32
+    np.testing.assert_allclose(single.displacement, np.asarray(found.displacement), atol=2e-5)
+
+
+def test_an_elastic_object_shares_the_deformation():
+    rigid, soft = solved(ball(0.1), 0.3, 0.1), solved(ball(0.1), 0.3, 0.1, PLANE)
+    np.testing.assert_allclose(soft.pressure, rigid.pressure / 2, atol=2e-2)
+    np.testing.assert_allclose(soft.displacement, rigid.displacement / 2, atol=1e-5)
+
+
+def test_a_thinner_layer_is_stiffer():
+    def on(thickness):
+        return press(surface, 0.3, Gel(thickness=thickness), 0.1, tolerance=1e-4)
+
+    surface = jnp.asarray(ball(0.1), jnp.float32)
+    force = jax.jit(lambda thickness: on(thickness).force)
+    forces = [float(force(thickness)) for thickness in (1.0, 2.0, 4.0, 400.0)]
+    assert np.all(np.diff(forces) < 0)
+    assert forces[-1] == pytest.approx(float(exact(surface, 0.3, 0.1).force), rel=5e-3)
+    assert np.asarray(on(2.0).displacement)[0, 0] < 0.1 * np.asarray(exact(surface, 0.3, 0.1).displacement)[0, 0]
+
+
+def test_on_a_bonded_layer_an_elastic_object_moves_as_a_half_space_and_the_gel_as_a_layer():
+    pitch, soft, gel = 0.25, PLANE / 3, Gel(thickness=2.0)
+    surface = jnp.asarray(ball(pitch), jnp.float32)
+    found = press(surface, 0.6, gel, pitch, modulus_object=soft, tolerance=1e-5)
+    plan = Plan(N, N)
+
+    def moves(thickness, modulus):
+        spectrum = elastic.normal_spectrum(plan, pitch, gel.poisson, thickness, 1.0, jnp.float32)
+        return np.asarray(plan.inverse(plan.even(plan.forward(found.pressure * (pitch / modulus)), spectrum)))
+
+    layer, object_ = moves(2.0, PLANE), moves(INF, soft)
+    np.testing.assert_allclose(found.displacement, layer, atol=2e-4)
+    touching = np.asarray(found.pressure) > 0
+    np.testing.assert_allclose((layer + object_)[touching], (np.asarray(surface) + 0.6)[touching], atol=1e-3)
+    assert abs(found.displacement[N // 2, 2]) < 0.02 * np.max(found.displacement)  # no dent like 1 / r far away
+    quick = press(surface, 0.6, gel, pitch, fidelity="fast", modulus_object=soft).displacement
+    assert np.sqrt(np.mean((quick - layer) ** 2)) < 0.02 * layer.max()
+
+
+def test_force_scales_with_the_modulus_and_the_units():
+    base = solved(ball(0.1), 0.3, 0.1).force
+    stiff = press(jnp.asarray(ball(0.1), jnp.float32), 0.3, Gel(modulus=300.0), 0.1, tolerance=2e-5).force
+    assert stiff == pytest.approx(2 * base, rel=1e-4)
+    assert solved(10 * ball(0.1), 3.0, 1.0).force == pytest.approx(100 * base, rel=1e-4)  # everything ten times larger
+
+
+@pytest.mark.parametrize(
+    ("surface", "rms", "force"), [(ball(0.1), 2e-3, 0.01), (rough(0.1), 0.03, 0.05), (square(0.1), 0.01, 0.02)]
+)
+def test_fast_is_near_exact(surface, rms, force):
+    right, quick = solved(surface, 0.3, 0.1), fast(jnp.asarray(surface, jnp.float32), 0.3, 0.1)
+    error = np.asarray(quick.displacement) - right.displacement
+    assert np.sqrt(np.mean(error**2)) < rms * right.displacement.max()
+    assert float(quick.force) == pytest.approx(right.force, rel=force)
+    assert (np.asarray(quick.displacement) >= surface + 0.3 - 1e-6).all()  # the gel is never inside the object
+    area = (right.pressure > 0).sum()
+    assert abs((np.asarray(quick.pressure) > 0).sum() - area) < 0.6 * area + 1  # unsharpened: every pixel
+    assert np.linalg.norm(quick.pressure - right.pressure) < 0.35 * np.linalg.norm(right.pressure)
+
+
+def test_centroid_and_area():
+    pressure = np.zeros((N, N), np.float32)
+    pressure[10, 40] = 100.0
+    x, y = (40 - 31.5) * 0.1, (10 - 31.5) * 0.1
+    np.testing.assert_allclose(mechanics.centroid(pressure, 0.1), [x, y], rtol=1e-5)
+    assert mechanics.area(pressure, 0.1) == pytest.approx(0.01)
+    assert not np.asarray(mechanics.centroid(np.zeros((N, N), np.float32), 0.1)).any()
+
+
+@pytest.mark.parametrize(
+    ("surface", "depth", "pitch", "options", "word"),
+    [
+        (np.zeros((8, 8)), -0.1, 0.1, {}, "depth"),
+        (np.zeros((8, 8)), float("nan"), 0.1, {}, "depth"),
+        (np.zeros((8, 8)), 0.1, 0.0, {}, "pitch"),
+        (np.full((8, 8), np.nan), 0.1, 0.1, {}, "NaN"),
+        (np.zeros((2, 8, 8)), 0.1, 0.1, {}, "vmap"),
+        (np.zeros((8, 8)), 0.1, 0.1, {"fidelity": "exactly"}, "fidelity"),
+        (np.zeros((8, 8)), float("inf"), 0.1, {}, "depth"),
+        (np.zeros((8, 8)), 0.1, float("inf"), {}, "pitch"),
+        (np.zeros((8, 8)), 0.1, 0.1, {"modulus_object": 0.0}, "modulus_object must be above 0"),
+    ],
+)
+def test_mistakes_are_named(surface, depth, pitch, options, word):
+    with pytest.raises(UserError, match=word):
+        press(surface, depth, Gel(), pitch, **options)
+
+
+@pytest.mark.parametrize(
+    ("gel", "fidelity", "word"),
+    [
+        (Gel(modulus=-1.0), "exact", "modulus must be above 0"),
+        (Gel(modulus=float("nan")), "exact", "modulus must be above 0"),
+        (Gel(thickness=0.0), "exact", "thickness must be above 0"),
+        (Gel(poisson=1.0), "exact", "Poisson ratio is 0 to 0.5"),
+        (Gel(thickness=0.09), "exact", "too thin for this grid: 0.1 mm is the least"),
+        (Gel(thickness=0.25), "fast", "too thin for this grid: 0.3 mm is the least"),
+    ],
+)
+def test_gels_that_cannot_be_are_named(gel, fidelity, word):
+    with pytest.raises(UserError, match=word):
+        press(np.zeros((64, 64)), 0.05, gel, 0.1, fidelity=fidelity)

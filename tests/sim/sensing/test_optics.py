@@ -1,0 +1,290 @@
+"""Pictures of a deformed skin: what must not change, what must move, and how much."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.sensing import markers, optics, units
+from anytouch_jax.sim.sensing.sensors import SENSORS, Markers
+from anytouch_jax.sim.world import splines
+
+SIZE = (48, 64)
+SLIM, DIGIT = SENSORS["gelslim"], SENSORS["digit"]
+PITCH = SLIM.field[0] / 36
+GRID = (36, 48)
+KEY = jax.random.key(0)
+PLAIN = units.identity_unit(SLIM)
+MARKED = PLAIN._replace(marked=np.float32(1))
+
+
+@partial(jax.jit, static_argnames=("shadow",))
+def draw(displacement, tangential, unit, key, shadow=True):
+    return optics.render(displacement, tangential, PITCH, SLIM, unit, key, resolution=SIZE, shadow=shadow)
+
+
+def grid():
+    y, x = (np.arange(n) - (n - 1) / 2 for n in GRID)
+    return jnp.asarray(x * PITCH)[None, :], jnp.asarray(y * PITCH)[:, None]
+
+
+def bump(x=0.0, y=0.0, height=0.8, width=1.5):
+    gx, gy = grid()
+    return (height * jnp.exp(-((gx - x) ** 2 + (gy - y) ** 2) / (2 * width**2))).astype(jnp.float32)
+
+
+STILL = jnp.zeros((*GRID, 2))
+FLAT = jnp.zeros(GRID)
+
+
+def levels(image):
+    return np.asarray(image).astype(int)
+
+
+def test_no_displacement_is_the_background_to_the_bit():
+    drawn = units.draw_unit(SLIM, np.random.default_rng(0))._replace(marked=np.float32(1))
+    for unit in (PLAIN, MARKED, drawn):
+        behind = optics.background(SLIM, unit, KEY, resolution=SIZE)
+        np.testing.assert_array_equal(draw(FLAT, STILL, unit, KEY), behind)
+    assert behind.shape == (*SIZE, 3) and behind.dtype == jnp.uint8
+
+
+def test_a_skin_pushed_in_evenly_looks_untouched():
+    np.testing.assert_allclose(
+        levels(draw(FLAT + 0.7, STILL, PLAIN, KEY)), levels(draw(FLAT, STILL, PLAIN, KEY)), atol=1
+    )
+
+
+def test_a_dent_changes_the_picture_where_it_is():
+    for x, y in ((0.0, 0.0), (5.0, -3.0), (-6.0, 4.0)):
+        change = np.abs(levels(draw(bump(x, y), STILL, PLAIN, KEY)) - levels(draw(FLAT, STILL, PLAIN, KEY))).sum(-1)
+        rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
+        weight = change * (change > 15)
+        pitch = SLIM.field[0] / SIZE[0]
+        seen = [(weight * axis).sum() / weight.sum() for axis in (columns - 31.5, rows - 23.5)]
+        np.testing.assert_allclose(np.array(seen) * pitch, [x, y], atol=1.0)
+        assert change.max() > 60
+        assert change[np.hypot((columns - 31.5) * pitch - x, (rows - 23.5) * pitch - y) > 7].max() <= 12
+
+
+def test_the_gelslims_green_lamp_lights_the_left_flank():
+    change = levels(draw(bump(), STILL, PLAIN, KEY)) - levels(draw(FLAT, STILL, PLAIN, KEY))
+    left, right = change[22:26, 20:29].mean((0, 1)), change[22:26, 35:44].mean((0, 1))
+    assert left[1] > right[1] + 10
+
+
+def test_deeper_is_stronger_and_shadow_can_be_left_out():
+    base = levels(draw(FLAT, STILL, PLAIN, KEY))
+    shallow, deep = (np.abs(levels(draw(bump(height=h), STILL, PLAIN, KEY)) - base).sum() for h in (0.2, 0.8))
+    assert deep > 2 * shallow > 0
+    plain = levels(draw(bump(), STILL, PLAIN, KEY, shadow=False))
+    assert np.abs(plain - levels(draw(bump(), STILL, PLAIN, KEY))).mean() > 0.5
+    np.testing.assert_array_equal(draw(FLAT, STILL, PLAIN, KEY, shadow=False), base)
+
+
+def test_mirror_turns_the_picture_over():
+    for axis, mirror in ((1, [-1, 1]), (0, [1, -1])):
+        unit = PLAIN._replace(mirror=np.array(mirror, np.float32))
+        flipped = np.flip(levels(draw(bump(3.0, 2.0), STILL, PLAIN, KEY)), axis)
+        np.testing.assert_allclose(levels(draw(bump(3.0, 2.0), STILL, unit, KEY)), flipped, atol=1)
+
+
+def test_zoom_and_window_choose_the_part_of_the_field_that_is_shown():
+    unit = PLAIN._replace(zoom=np.float32(0.5), window=np.array([2.5, -1.0], np.float32))
+    seen = optics.view(SLIM, unit, SIZE)
+    np.testing.assert_allclose([seen.x[0], seen.x[-1]], 2.5 + np.array([-5, 5]) * (1 - 1 / 64), rtol=1e-5)
+    np.testing.assert_allclose(np.mean(seen.y), -1, atol=1e-5)
+    np.testing.assert_allclose(seen.u, seen.x / 10, rtol=1e-6)
+    square = optics.view(SLIM, PLAIN, (40, 40))  # another shape: a centred square without stretching
+    np.testing.assert_allclose(np.diff(square.x), np.diff(square.y), rtol=1e-4)
+    assert abs(float(square.y[-1]) - SLIM.field[0] / 2) < 0.5
+
+
+def test_tint_gain_and_light_angle_act():
+    base, dent = levels(draw(FLAT, STILL, PLAIN, KEY)), levels(draw(bump(), STILL, PLAIN, KEY))
+    red = PLAIN._replace(tint=np.array([0.5, 1, 1], np.float32))
+    halved = levels(draw(FLAT, STILL, red, KEY))
+    np.testing.assert_allclose(halved[..., 0], base[..., 0] / 2, atol=1)
+    np.testing.assert_array_equal(halved[..., 1:], base[..., 1:])
+    weak = PLAIN._replace(gain=np.full(3, 0.5, np.float32))
+    inside = (dent > 5) & (dent < 250)
+    np.testing.assert_allclose(
+        (levels(draw(bump(), STILL, weak, KEY)) - base)[inside], ((dent - base) / 2)[inside], atol=1.5
+    )
+    turned = PLAIN._replace(light_angle=np.float32(0.5))
+    assert np.abs(levels(draw(bump(), STILL, turned, KEY)) - dent).max() > 10
+    np.testing.assert_array_equal(draw(FLAT, STILL, turned, KEY), base)
+
+
+def test_turned_lights_shade_and_shadow_a_slope_as_they_would_a_turned_one():
+    x, y = grid()
+    across, down = 0.1 * x + 0 * y, 0.1 * y + 0 * x  # at the middle of the picture neither is deeper than the other
+    turned = PLAIN._replace(light_angle=np.float32(-np.pi / 2))
+    one, other = (levels(draw(*seen, None))[23:25, 31:33].mean((0, 1)) for seen in
+                  ((across, STILL, PLAIN), (down, STILL, turned)))  # fmt: skip
+    np.testing.assert_allclose(other, one, atol=1.5)
+    flat, unturned = (levels(draw(*seen, None))[23:25, 31:33].mean((0, 1)) for seen in
+                      ((FLAT, STILL, PLAIN), (down, STILL, PLAIN)))  # fmt: skip
+    assert np.abs(one - flat).max() > 10 and np.abs(unturned - one).max() > 10
+
+
+def test_markers_follow_the_skin_and_come_back_after_one_step_of_the_lattice():
+    unit = MARKED._replace(marker_phase=np.array([0.3, 0.1], np.float32))
+    rest = optics.render(FLAT, STILL, PITCH, DIGIT, units.identity_unit(DIGIT), resolution=SIZE)
+    assert rest.shape == (*SIZE, 3)  # a sensor without markers draws none
+    ink = Markers(pitch=2.0, radius=0.4)
+    x, y = (jnp.asarray(a) for a in np.meshgrid(np.linspace(-5, 5, 101), np.linspace(-5, 5, 101)))
+    cover = partial(markers.coverage, ink, phase=jnp.zeros(2), size=1.0, soft=0.05, half=10.0)
+    spots = np.asarray(cover(x, y))
+    assert spots[50, 50] == 1 and spots[50, 60] == 0 and spots[50, 70] == 1  # lattice points at 0 and 2 mm
+    assert abs(spots.mean() / (np.pi * 0.4**2 / 4) - 1) < 0.2
+    # Material that has moved by +0.5 mm is seen 5 samples further right.
+    np.testing.assert_allclose(np.asarray(cover(x - 0.5, y))[:, 5:], spots[:, :-5], atol=1e-4)
+    dashes = np.asarray(markers.coverage(Markers(2.0, 0.3, aspect=2.5), x, y, jnp.zeros(2), 1.0, 0.05, 10.0))
+    assert (dashes[50, 40:61] > 0.5).sum() > 2 * (dashes[40:61, 50] > 0.5).sum() - 3
+    moved = STILL.at[..., 0].set(0.6)
+    assert (levels(draw(FLAT, moved, unit, KEY)) != levels(draw(FLAT, STILL, unit, KEY))).mean() > 0.02
+    np.testing.assert_array_equal(draw(FLAT, moved, PLAIN, KEY), draw(FLAT, STILL, PLAIN, KEY))
+
+
+def test_noise_has_the_stated_spread_and_is_a_function_of_the_key():
+    unit = PLAIN._replace(noise=np.float32(4))
+    clean = levels(draw(FLAT, STILL, PLAIN, KEY))
+    noisy = levels(draw(FLAT, STILL, unit, KEY))
+    error = (noisy - clean)[(clean > 20) & (clean < 235)]
+    assert abs(error.mean()) < 0.2 and abs(error.std() - 4) < 0.2
+    np.testing.assert_array_equal(noisy, draw(FLAT, STILL, unit, KEY))
+    other = levels(draw(FLAT, STILL, unit, jax.random.key(1)))
+    assert abs(np.corrcoef((noisy - clean).ravel(), (other - clean).ravel())[0, 1]) < 0.05
+    planes = (noisy - clean).reshape(-1, 3)
+    assert np.abs(np.corrcoef(planes.T) - np.eye(3)).max() < 0.06
+
+
+def test_a_batch_is_its_frames():
+    rng = np.random.default_rng(3)
+    several = [units.draw_unit(SLIM, rng) for _ in range(2)]
+    dents, keys = jnp.stack([bump(2.0), bump(0, -2.0)]), jax.random.split(KEY, 2)
+    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), units.stack(several), keys)
+    for i in range(2):
+        np.testing.assert_allclose(levels(together[i]), levels(draw(dents[i], STILL, several[i], keys[i])), atol=1)
+
+
+def test_a_backdrop_made_beforehand_gives_the_same_picture():
+    unit = units.draw_unit(SLIM, np.random.default_rng(4))
+    behind = optics.backdrop(SLIM, unit, SIZE)
+    given = optics.render(bump(), None, PITCH, SLIM, unit, KEY, resolution=SIZE, behind=behind)
+    made = optics.render(bump(), None, PITCH, SLIM, unit, KEY, resolution=SIZE)
+    np.testing.assert_allclose(levels(given), levels(made), atol=1)
+
+
+def test_the_default_size_has_a_short_side_of_224():
+    assert optics.picture_size(DIGIT) == (299, 224)
+    assert optics.picture_size(SENSORS["gelsight"], 112) == (112, 149)
+    assert optics.picture_size(DIGIT, 0) == DIGIT.resolution == (320, 240)
+
+
+def test_a_field_sensor_has_no_picture():
+    with pytest.raises(UserError, match="tac3d has no pictures"):
+        optics.render(FLAT, None, PITCH, SENSORS["tac3d"], PLAIN, resolution=SIZE)
+
+
+def test_the_field_adds_up_to_the_load():
+    rng = np.random.default_rng(5)
+    pressure, traction = rng.uniform(0, 50, (48, 48)), rng.normal(0, 9, (48, 48, 2))
+    moved, sunk = rng.normal(0, 0.1, (48, 48, 2)), np.full((48, 48), 0.25)
+    pitch = 17.0 / 48
+    measured = np.asarray(optics.field(*map(jnp.asarray, (sunk, moved, pressure, traction)), pitch))
+    assert measured.shape == (20, 20, 6) and measured.dtype == np.float32
+    np.testing.assert_allclose(measured[..., 5].sum(), pressure.sum() * pitch**2 * 1e-3, rtol=1e-4)
+    np.testing.assert_allclose(measured[..., 3:5].sum((0, 1)), traction.sum((0, 1)) * pitch**2 * 1e-3, atol=1e-4)
+    np.testing.assert_allclose(measured[..., 2], 0.25, rtol=1e-5)
+    np.testing.assert_allclose(measured[..., 0].mean(), moved[..., 0].mean(), atol=1e-6)
+    corner = np.zeros((48, 48))
+    corner[1, 40] = 1.0
+    spot = np.asarray(optics.field(*map(jnp.asarray, (sunk, moved, corner, traction)), pitch))[..., 5]
+    assert np.unravel_index(spot.argmax(), spot.shape) == (0, 16)  # rows are y, columns x
+    with pytest.raises(UserError, match="one size"):
+        optics.field(jnp.zeros((4, 4)), jnp.zeros((4, 5, 2)), jnp.zeros((4, 4)), jnp.zeros((4, 4, 2)), pitch)
+
+
+def test_the_noise_of_a_field_is_in_mm_and_in_what_the_gel_makes_of_it():
+    still = [jnp.zeros((48, 48)), jnp.zeros((48, 48, 2)), jnp.zeros((48, 48)), jnp.zeros((48, 48, 2))]
+    noisy = partial(optics.field, *still, 17.0 / 48, noise=0.02, gel=SENSORS["tac3d"].gel)
+    seen = np.asarray(noisy(key=jax.random.key(3)))
+    newton = 0.02 * 200.0 * 17.0 / 20 * 1e-3
+    np.testing.assert_allclose(seen.std((0, 1)), [0.02] * 3 + [newton] * 3, rtol=0.15)
+    assert np.abs(seen.mean((0, 1)) / seen.std((0, 1))).max() < 0.2
+    assert not np.asarray(noisy()).any() and np.array_equal(noisy(key=jax.random.key(3)), seen)
+
+
+def test_the_spline_keeps_lines_differentiates_parabolas_and_repeats_the_edge():
+    at = jnp.array([3.0, 4.25, 7.5, 11.9])
+    value, slope = splines.spline(at, 16)
+    samples = jnp.arange(16.0)
+    np.testing.assert_allclose(value.sum(1), 1, rtol=1e-6)
+    np.testing.assert_allclose(value @ samples, at, rtol=1e-6)
+    np.testing.assert_allclose(slope @ samples**2, 2 * at, rtol=1e-5)
+    np.testing.assert_allclose(slope @ jnp.ones(16), 0, atol=1e-6)
+    outside = splines.spline(jnp.array([-9.0, 40.0]), 16)[0] @ samples
+    np.testing.assert_allclose(outside, [1 / 6, 15 - 1 / 6], rtol=1e-5)
+
+
+def test_blur_and_average_keep_the_mean():
+    np.testing.assert_allclose(splines.blur(12, 2.0).sum(1), 1, rtol=1e-6)
+    peak = splines.blur(41, 3.0)[20]
+    spread = np.sqrt((np.asarray(peak) * (np.arange(41) - 20) ** 2).sum())
+    assert abs(spread - 3) < 0.01
+    matrix = splines.average(10, 4)
+    np.testing.assert_allclose(matrix.sum(1), 1, rtol=1e-6)
+    np.testing.assert_allclose(matrix.sum(0), 0.4, rtol=1e-5)
+    np.testing.assert_allclose(matrix @ np.arange(10), [0.8, 3.2, 5.8, 8.2], rtol=1e-5)
+
+
+def test_steep_and_broken_surfaces_stay_pictures():
+    gx, _ = grid()
+    wall = jnp.where(gx > 0, 5.0, 0.0) + jnp.zeros(GRID)
+    image = levels(draw(wall, STILL, MARKED, KEY))
+    assert image.std() > 1
+    np.testing.assert_array_equal(image[:, :20], levels(draw(wall, STILL, MARKED, KEY))[:, :20])
+    spikes = jnp.asarray(np.random.default_rng(6).choice([0.0, 1e4], GRID).astype(np.float32))
+    assert np.isfinite(levels(draw(spikes, STILL, PLAIN, KEY))).all()
+
+
+def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the_calibration():
+    sensor = SENSORS["gelsight_mini"]
+    unit = units.identity_unit(sensor)
+    draw = jax.jit(lambda d: optics.render(d, None, 0.15, sensor, unit, resolution=(48, 64)))
+    images = [np.asarray(draw(jnp.full((96, 128), depth))).astype(float) for depth in (0.0, 0.1, 3.0, 6.0)]
+    np.testing.assert_allclose(images[2], images[3], atol=1)  # the rounding of slopes that should be zero
+    assert images[3].mean() > 0.4 * images[0].mean() and images[1].mean() != images[0].mean()
+
+
+def test_markers_creep_outwards_in_a_dent(monkeypatch):
+    seen = []
+
+    def remember(ink, x, y, *rest):
+        seen.append((np.asarray(x), np.asarray(y)))
+        return jnp.zeros(x.shape)
+
+    monkeypatch.setattr(optics.markers, "coverage", remember)
+    for dent in (FLAT, bump()):
+        optics.render(dent, STILL, PITCH, SLIM, MARKED, None, resolution=SIZE)
+    (x, y), (came_x, came_y) = seen
+    ring = np.abs(np.hypot(x, y) - 1.5) < 0.4
+    outwards = ((x - came_x) * x + (y - came_y) * y)[ring] / np.hypot(x, y)[ring]
+    assert outwards.min() > 0.01 and np.abs((x - came_x)[np.hypot(x, y) > 6]).max() < 0.01
+
+
+def test_a_bent_lattice_shrinks_outwards():
+    ink = Markers(pitch=1.25, radius=0.1, bend=0.12)
+    x = jnp.linspace(0, 9.9, 4001)[None]
+    spots = np.asarray(markers.coverage(ink, x, jnp.zeros((1, 1)), jnp.zeros(2), 1.0, 0.02, 10.0))[0] > 0.5
+    edges = np.flatnonzero(np.diff(spots.astype(int)))  # the first spot, at 0, ends at the first
+    middles = (edges[1:-1:2] + edges[2::2]) / 2 * 9.9 / 4000
+    gaps = np.diff(np.concatenate([[0.0], middles]))
+    assert (np.diff(gaps) < 0).all() and gaps[0] == pytest.approx(1.25 / 0.88, rel=0.01)

@@ -1,0 +1,132 @@
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.sensing import photo
+from anytouch_jax.sim.sensing.photo import EXTENT, photograph
+from anytouch_jax.sim.world.objects import catalogue, draw
+
+BALL = draw("sphere", "smooth", "plastic", 5)
+BALL = dataclasses.replace(BALL, shape=dataclasses.replace(BALL.shape, size=8.0))
+
+
+def painted(thing, *colour):
+    return dataclasses.replace(thing, colour=colour)
+
+
+def outline(thing, place, seed, size=96):
+    """Where the object is in the picture: what changes with its paint alone."""
+    two = [
+        photograph(painted(thing, *c), place, np.random.default_rng(seed), size)
+        for c in ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8))
+    ]
+    return np.abs(two[0].astype(int) - two[1]).max(-1) > 25
+
+
+def middle(mask):
+    rows, columns = np.nonzero(mask)
+    return np.array([columns.mean(), rows.mean()]) / mask.shape[0] - 0.5
+
+
+@pytest.mark.parametrize("thing", catalogue(2, 27), ids=lambda thing: thing.name)
+def test_a_photograph_is_a_picture_that_is_neither_black_nor_burnt(thing):
+    for place in ((-2.0, 2.0), (2.1, -2.1)):  # touches lie within 3 mm of the middle
+        image = photograph(thing, place, np.random.default_rng(3), 64)
+        assert image.shape == (64, 64, 3) and image.dtype == np.uint8
+        assert 15 < image.mean() < 235 and image.std() > 4
+        assert (image.min(-1) > 252).mean() < 0.15 and (image.max(-1) < 4).mean() < 0.15
+
+
+def test_the_draw_makes_the_view():
+    one, same, other = (photograph(BALL, (0, 0), np.random.default_rng(s), 64) for s in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert np.abs(one.astype(int) - other).mean() > 10
+    rng = np.random.default_rng(1)
+    np.testing.assert_array_equal(photograph(BALL, (0, 0), rng, 64), one)
+    assert not np.array_equal(photograph(BALL, (0, 0), rng, 64), one)
+    assert photograph(BALL, (0, 0), rng).shape == (224, 224, 3)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_place_is_in_the_middle_and_the_scale_is_right(seed):
+    mask = outline(BALL, (0.0, 0.0), seed)
+    # The top of the ball is in the middle; from aside, its body leans away by at most its radius times the tilt.
+    assert np.hypot(*middle(mask)) < 8 * math.sin(math.radians(38)) / EXTENT[0]
+    assert mask[44:52, 44:52].all()
+    share = mask.mean()
+    assert 0.8 * math.pi * 64 / EXTENT[1] ** 2 < share < 1.25 * math.pi * 64 / EXTENT[0] ** 2
+
+
+def test_another_place_moves_the_object_the_other_way():
+    for seed in range(4):
+        here, right, below = (middle(outline(BALL, p, seed)) for p in ((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)))
+        shift = np.array([right - here, below - here])
+        lengths = np.hypot(*shift.T) * np.mean(EXTENT)
+        assert (lengths > 1.0).all() and (lengths < 3.0).all()
+        # x to y is a turn of the same sense as from right to down: the picture is not mirrored.
+        assert np.linalg.det(shift) > 0
+
+
+def fineness(image):
+    grey = image.astype(np.float32).mean(-1)
+    return (grey - cv2.GaussianBlur(grey, (0, 0), 3))[40:-40, 40:-40].std()
+
+
+@pytest.mark.parametrize("texture", ["ridges", "dots", "grid", "weave", "knit", "sand", "bark"])
+def test_textures_can_be_seen(texture):
+    plain, structured = (
+        dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, size=60.0))
+        for thing in (draw("flat", t, "plastic", 4) for t in ("smooth", texture))
+    )
+    for seed in range(3):
+        seen = [fineness(photograph(t, (0.0, 0.0), np.random.default_rng(seed), 160)) for t in (plain, structured)]
+        assert seen[1] > 1.6 * seen[0]
+
+
+@pytest.mark.parametrize("colour", [(0.8, 0.15, 0.1), (0.1, 0.6, 0.15), (0.15, 0.2, 0.8)])
+def test_the_material_gives_its_colour(colour):
+    thing = painted(draw("flat", "weave", "fabric", 4), *colour)
+    for seed in range(4):
+        seen = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 64)[24:40, 24:40].mean((0, 1))
+        assert np.argmax(seen) == np.argmax(colour) and seen.max() > 1.5 * seen.min()
+
+
+def test_gloss_makes_highlights():
+    def brightest(material, seed):
+        thing = painted(draw("sphere", "smooth", material, 5), 0.3, 0.3, 0.3)
+        image = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96)[36:60, 36:60].max(-1)
+        return float(image.max() - np.median(image))
+
+    assert np.mean([brightest("glass", s) - brightest("fabric", s) for s in range(5)]) > 30
+
+
+def test_impossible_photographs_are_named():
+    rng = np.random.default_rng(0)
+    for place, size in (((0.0, math.nan), 64), ((0.0, 0.0, 0.0), 64), ((0.0, 0.0), 4)):
+        with pytest.raises(UserError, match="photograph"):
+            photograph(BALL, place, rng, size)
+
+
+def test_the_border_of_the_picture_is_shaded_like_its_inside():
+    thing = draw("flat", "smooth", "plastic", 4)
+    thing = dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, size=90.0))
+    for seed in range(3):
+        image = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96).astype(np.float32).mean(-1)
+        for turned in (image, image[::-1], image.T, image.T[::-1]):
+            assert abs(turned[0].mean() - turned[3].mean()) < 3
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (4.0, -3.0), (-2.0, 5.0)])
+def test_the_middle_ray_meets_the_place(place):
+    for seed in range(4):
+        view = photo._draw_view(np.random.default_rng(seed))
+        x, y, z, ray = photo._trace(BALL.shape, np.array(place), view, 65)
+        assert (x[32, 32], y[32, 32]) == pytest.approx(place, abs=0.15)
+        assert z[32, 32] == pytest.approx(math.sqrt(64 - place[0] ** 2 - place[1] ** 2) - 8, abs=0.15)
+        np.testing.assert_allclose(np.linalg.norm(ray, axis=0), 1, rtol=1e-5)
+        far = np.hypot(x[0] - x[-1], y[0] - y[-1])  # from the upper to the lower border, on the table
+        assert far.min() > 0.8 * view.extent and far.max() < 2.2 * view.extent

@@ -1,0 +1,166 @@
+"""The sensors' records, their looks, and their units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from anytouch_jax import config
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.sensing import calibration, sensors, shading, units
+from anytouch_jax.sim.sensing.sensors import SENSORS, Light, Lights
+
+LIT = [name for name, sensor in SENSORS.items() if isinstance(sensor.look, Lights)]
+DIGIT = SENSORS["digit"]
+
+
+def test_the_records_are_whole_and_known_to_the_model():
+    assert set(SENSORS) <= {*config.SENSORS, *config.FIELD_SENSORS}
+    for name, sensor in SENSORS.items():
+        assert sensor.name == name and hash(sensor) == hash(replace(sensor))
+        aspect = sensor.field[0] / sensor.field[1] * sensor.resolution[1] / sensor.resolution[0]
+        assert abs(aspect - 1) < 0.02, "square pixels"
+        assert sensor.gel.modulus > 0 and 0 < sensor.gel.thickness < 10 and 0 < sensor.gel.poisson < 0.5
+    assert [s.name for s in SENSORS.values() if s.kind == "field"] == ["tac3d"]
+    for name, indenter in calibration.INDENTERS.items():
+        assert SENSORS[name].halo == indenter.halo, "the renderer blurs as the fit did"
+        assert SENSORS[name].field == (480 * calibration.PITCH, 640 * calibration.PITCH)
+
+
+def test_an_unknown_sensor_and_one_without_pictures_are_named():
+    with pytest.raises(UserError, match=r"'gelsigth'.*gelsight, gelsight_mini, gelslim"):
+        sensors.get("gelsigth")
+    with pytest.raises(UserError, match=r"tac3d has no pictures.*optics\.field"):
+        sensors.look(SENSORS["tac3d"])
+
+
+@pytest.mark.parametrize("name", LIT)
+def test_a_look_made_of_lights_is_neither_black_nor_burnt_and_has_colours(name):
+    seen = sensors.look(SENSORS[name])
+    assert seen.base.dtype == np.float32 and seen.base.shape[2] == 3
+    assert seen.base.min() >= 0.0 and seen.base.max() <= 1.0
+    assert 0.2 < seen.base.mean() < 0.7
+    assert (seen.base == 1).mean() < 0.01
+    assert seen.base.reshape(-1, 3).std(0).min() > 0.02, "every channel varies over the image"
+
+
+def test_no_two_families_look_alike():
+    small = [sensors.look(SENSORS[n]).base[::30, ::30][:4, :3] for n in LIT]
+    for i in range(len(small)):
+        for j in range(i):
+            assert np.abs(small[i] - small[j]).mean() > 0.05, (LIT[i], LIT[j])
+
+
+@pytest.mark.parametrize("name", LIT)
+def test_the_polynomial_follows_the_lights(name):
+    rng = np.random.default_rng(0)
+    angle, size = rng.uniform(0, 2 * np.pi, 400), np.sqrt(rng.uniform(0, 0.9**2, 400))
+    place = rng.uniform(-1, 1, (2, 400))
+    nx, ny = size * np.cos(angle), size * np.sin(angle)
+    look = SENSORS[name].look
+    exact = sensors.shade(look, nx, ny, *place) - sensors.shade(look, 0 * nx, 0 * ny, *place)
+    model = sensors.look(SENSORS[name]).photometry
+    fitted = shading.design(nx, ny, *place) @ model.normal.reshape(-1, 3)
+    assert np.abs(fitted - exact).mean() < 0.25 * np.abs(exact).mean()
+    assert min(np.corrcoef(fitted[:, c], exact[:, c])[0, 1] for c in range(3)) > 0.97
+
+
+def test_a_flank_that_faces_a_light_takes_its_colour():
+    # A lamp at the right; a slope of -1 along x is the right flank of a bump (height falls to the right).
+    lamp = Lights((0.1, 0.1, 0.1), (Light((1.0, 0.0), (1.0, 0.0, 0.0)),))
+    zero = np.zeros(1)
+    right, flat, left = (sensors.shade(lamp, np.array([n]), zero, zero, zero)[0] for n in (-0.5, 0.0, 0.5))
+    assert right[0] > flat[0] > left[0]
+    assert right[1] == flat[1] == left[1] == 0
+
+
+def test_design_and_horner_are_the_same_polynomial():
+    rng = np.random.default_rng(1)
+    normal = rng.normal(size=(20, 6, 3)).astype(np.float32)
+    nx, ny = rng.uniform(-0.6, 0.6, (2, 5, 7)).astype(np.float32)
+    u, v = np.linspace(-1, 1, 7, dtype=np.float32), np.linspace(-1, 1, 5, dtype=np.float32)
+    uu, vv = np.meshgrid(u, v)
+    rows = shading.design(*(a.ravel().astype(np.float64) for a in (nx, ny, uu, vv)))
+    for c in range(3):
+        ours = shading.colour_change(jnp.asarray(normal[..., c]), *map(jnp.asarray, (nx, ny, u, v)))
+        np.testing.assert_allclose(np.asarray(ours).ravel(), rows @ normal[..., c].ravel(), rtol=1e-4, atol=1e-4)
+
+
+def test_ridge_finds_the_coefficients_it_was_made_from():
+    rng = np.random.default_rng(2)
+    rows = shading.design(*rng.uniform(-0.9, 0.9, (4, 4000)))
+    truth = rng.normal(size=(120, 3))
+    np.testing.assert_allclose(shading.ridge(rows, rows @ truth, 1e-12), truth, atol=1e-4)
+    halved = shading.ridge(rows, rows @ truth, 1.0)
+    assert np.linalg.norm(halved) < np.linalg.norm(truth)
+
+
+def test_tilt_is_the_sine_and_is_cut():
+    nx, ny = shading.tilt(jnp.array([0.0, 3.0, 1e6]), jnp.array([0.0, 4.0, 0.0]), 0.99)
+    np.testing.assert_allclose(nx, [0, 3 / np.sqrt(26), 0.99], rtol=1e-6)
+    np.testing.assert_allclose(ny, [0, 4 / np.sqrt(26), 0], rtol=1e-6)
+    np.testing.assert_allclose(shading.tilt(jnp.array([3.0]), jnp.array([4.0]), 0.5), [[0.3], [0.4]], rtol=1e-6)
+    slope = jax.grad(lambda g: shading.tilt(g, jnp.array(0.0), 0.9)[0])(0.0)
+    assert slope == 1.0  # no NaN at rest
+
+
+def test_a_unit_follows_from_the_seed_alone():
+    first, again, other = (units.draw_unit(DIGIT, np.random.default_rng(s)) for s in (3, 3, 4))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    differs = [name for name, a, b in zip(first._fields, first, other, strict=True) if not np.array_equal(a, b)]
+    assert set(differs) >= {"tint", "gain", "uneven", "thickness", "modulus", "zoom", "rotation", "offset", "noise"}
+    streams = [np.random.default_rng(5) for _ in SENSORS]
+    for sensor, stream in zip(SENSORS.values(), streams, strict=True):
+        units.draw_unit(sensor, stream)
+    assert len({stream.uniform() for stream in streams}) == 1, "every sensor takes as many draws"
+
+
+def test_units_stay_inside_the_field_and_carry_markers_by_share():
+    sensor = SENSORS["gelsight_mini"]
+    rng = np.random.default_rng(6)
+    drawn = [units.draw_unit(sensor, rng) for _ in range(300)]
+    for unit in drawn:
+        reach = np.abs(unit.window) + unit.zoom * np.array(sensor.field[::-1]) / 2
+        assert (reach <= np.array(sensor.field[::-1]) / 2 + 1e-4).all()
+        assert set(np.abs(unit.mirror)) == {1}
+        assert unit.tint.min() > 0 and unit.modulus > 0 and unit.thickness > 0 and unit.noise > 0
+    assert abs(np.mean([u.marked for u in drawn]) - 0.5) < 0.1
+    assert not any(units.draw_unit(DIGIT, rng).marked for _ in range(20)), "a DIGIT has no markers"
+    assert all(a.dtype == np.float32 for a in drawn[0])
+
+
+def test_the_mounting_and_its_inverse():
+    unit = units.draw_unit(DIGIT, np.random.default_rng(7))
+    x, y = jnp.array([0.0, 3.0, -2.0]), jnp.array([0.0, 1.0, 5.0])
+    back = units.from_gel(unit, x, y)
+    there = np.stack(units.turned(*back, unit.rotation)) + unit.offset[:, None]
+    np.testing.assert_allclose(there, np.stack([x, y]), atol=1e-5)
+    np.testing.assert_allclose(units.from_gel(unit, *unit.offset), [0, 0], atol=1e-6)
+    quarter = units.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
+    np.testing.assert_allclose(units.from_gel(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
+    np.testing.assert_array_equal(units.from_gel(units.identity_unit(DIGIT), x, y), [x, y])
+
+
+def test_stacked_units_vmap():
+    rng = np.random.default_rng(8)
+    several = [units.draw_unit(DIGIT, rng) for _ in range(3)]
+    stacked = units.stack(several)
+    assert stacked.uneven.shape == (3, 5, 3)
+    moved = jax.vmap(lambda u: jnp.stack(units.from_gel(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
+    np.testing.assert_allclose(moved[2], units.from_gel(several[2], 1.0, 2.0), rtol=1e-6)
+
+
+def test_the_side_of_a_dent_that_turns_away_from_a_light_is_in_its_shadow():
+    lamp = Lights((0.1, 0.1, 0.1), (Light((1.0, 0.0), (1.0, 0.0, 0.0)),), shadow=0.5)
+    seen = sensors.look(replace(DIGIT, name="one lamp", look=lamp))
+    assert not seen.plain.halo.any()
+    rising, zero, middle = jnp.ones((1, 1)), jnp.zeros((1, 1)), jnp.zeros(1)
+    red = shading.halo_change(jnp.asarray(seen.photometry.halo[..., 0]), (rising, zero, zero), middle, middle)
+    np.testing.assert_allclose(red, [[-0.5]])  # it rises to the right, so it faces left: half of the lamp is lost
+    for other in ((zero, rising, zero), (zero, zero, rising)):
+        assert shading.halo_change(jnp.asarray(seen.photometry.halo[..., 0]), other, middle, middle) == 0
+    assert not seen.photometry.halo[..., 1:].any()

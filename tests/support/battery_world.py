@@ -1,0 +1,68 @@
+"""Manifests without pictures for the battery, and features planted in place of an encoder's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+
+MATERIALS = ("foam", "rubber", "wood", "steel")
+TWISTS = ("clockwise", "counterclockwise", "none")
+SLIDES = ("none", "right", "down", "left", "up")
+
+
+def simulated(
+    *,
+    objects: int = 24,
+    each: int = 2,
+    sensors: tuple[str, ...] = ("digit", "duragel"),
+    frames: int = 5,
+    seed: int = 0,
+    shared: bool = False,
+) -> Manifest:
+    """Recordings as the simulator's: deepest in frame 2, slipping most in frame 3; the last quarter of objects is test.
+
+    `shared`: every object is in all splits instead.
+    """
+    rng, rows = np.random.default_rng(seed), []
+    for thing in range(objects):
+        for number in range(each):
+            touch, push = thing * each + number, float(rng.uniform(1, 4))
+            split = ("train", "train", "val", "test")[(number if shared else thing) % 4]
+            for sensor in sensors:
+                for frame in range(frames):
+                    rows.append(
+                        {
+                            "path": f"{touch}-{sensor}-{frame}.png",
+                            "sensor": sensor,
+                            "unit": f"{sensor}_{touch % 2}",
+                            "sequence": f"{touch:04d}-{sensor}",
+                            "frame_index": frame,
+                            "split": split,
+                            "touch": f"{touch:04d}",
+                            "object": f"thing {thing}",
+                            "label.object": f"thing {thing}",
+                            "label.material": MATERIALS[(thing // 4) % len(MATERIALS)],
+                            "label.force": push * (0.01, 0.5, 1.0, 0.9, 0.5)[frame % 5],
+                            "label.slip": (0.0, 0.1, 0.2, 0.9, 0.6)[frame % 5] * (touch % 3 > 0),
+                            "label.twist": TWISTS[touch % 3],
+                            "label.slide": SLIDES[touch % 5],
+                        }
+                    )
+    return table(rows)
+
+
+def table(rows: list[dict[str, Any]]) -> Manifest:
+    """A manifest in memory; a column that a row lacks is null there."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return manifests.from_columns({name: [row.get(name) for row in rows] for name in names}, Path("nowhere.parquet"))
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    """A row that is complete but for what is asked."""
+    plain = {"path": "a.png", "sensor": "digit", "sequence": "a", "frame_index": 0, "split": "train"}
+    return plain | {name.replace("__", "."): value for name, value in changes.items()}

@@ -1,0 +1,8 @@
+"""Where the repository, its experiments and the shared data are."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPERIMENTS = ROOT / "experiments"
+SHARED = ROOT.parent / "shared"  # data beside the checkout; tests that need it are skipped without it
+SUPPORT = ROOT / "tests" / "support"

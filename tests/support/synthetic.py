@@ -1,0 +1,83 @@
+"""JSON files as the runs write them, with numbers that are made up: what the tables and pictures read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.tables import adaptation, plan, real, scores
+from experiments.tables.questions import FORM, FOUR, GRASP, SIX, SPACE, STATIC, VIEWS, dynamic
+from experiments.tables.results import Column
+
+Mean = Callable[[str, str, int, str, str], float]  # (question, name, seed, view, task) -> 0..1
+
+
+def level(question: str, name: str, seed: int, view: str, task: str) -> float:
+    """Every model the same."""
+    return 0.5
+
+
+def write(folder: Path, leaves: Sequence[plan.Leaf], mean: Mean = level) -> list[Path]:
+    """A file for each run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return [write_one(folder, leaf, mean) for leaf in leaves]
+
+
+def write_one(folder: Path, leaf: plan.Leaf, mean: Mean = level) -> Path:
+    rows = [row for view, task, metric in _columns(leaf) for row in _rows(leaf, view, task, metric, mean)]
+    about: dict[str, Any] = {
+        "question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity,
+        "simulator": plan.simulator(), "settings": plan.settings(leaf.size), "scoring": plan.scoring(leaf.question),
+        "size": leaf.size.name, "trained": [{"key": one.key, "seconds": 60.0} for one in leaf.trainings],
+        "data": {"own": "0" * 64}, "version": "0", "source": "s", "machine": "a machine; load 1", "seconds": 30.0,
+        "rows": rows, "points": _points(leaf.seed) if leaf.question == "q2" else [],
+    }  # fmt: skip
+    path = folder / leaf.file
+    path.write_text(json.dumps(about))
+    return path
+
+
+def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
+    columns: tuple[Column, ...] = {
+        "q1": (*FOUR, *FORM), "ablations": (*FOUR, *FORM), "q2": SPACE, "q3": (*SIX, *FORM, *dynamic("clips")),
+        "restricted": SIX, "grasp": GRASP,
+        "dynamics": (*(one for view in VIEWS for one in dynamic(view)), *STATIC),
+    }.get(leaf.question, ())  # fmt: skip
+    found = [(one.view, one.task, one.metric) for one in columns]
+    if leaf.question == "q3" and leaf.name in scores.READ:
+        tasks = (*scores.STATIC, scores.FORM)
+        found += [(f"read: {way}", task, "accuracy") for way in scores.WAYS for task in tasks]
+    if leaf.question == "new_sensor":
+        views = ["seen"] if leaf.name == "seen" else ["universal, 0 unlabelled"]
+        for count in adaptation.FRAMES if leaf.name != "seen" else ():
+            views += [f"fitted, {count} unlabelled", f"universal, {count} labelled", f"fitted, {count} labelled"]
+        found = [(view, task, "accuracy") for view in views for task in adaptation.TASKS]
+    if leaf.question == "real":
+        views = [
+            real.OURS,
+            real.UNTRAINED,
+            real.PIXELS,
+            f"{real.OURS} - {real.PIXELS}",
+            f"{real.OURS} - {real.UNTRAINED}",
+        ]
+        found = [(view, task, "accuracy") for task in ("object", "slip, objects left out") for view in views]
+    return found
+
+
+def _rows(leaf: plan.Leaf, view: str, task: str, metric: str, mean: Mean) -> list[dict[str, Any]]:
+    value = mean(leaf.question, leaf.name, leaf.seed, view, task)
+    shared = {"view": view, "task": task, "metric": metric, "test": 100}
+    both = ("honest",) if leaf.question in ("q2", "real") else ("honest", "published")
+    return [shared | {"protocol": one, "mean": value, "low": value - 0.05, "high": value + 0.05} for one in both]
+
+
+def _points(seed: int) -> list[dict[str, Any]]:
+    rng = np.random.default_rng(seed)
+    return [
+        {"x": float(rng.normal()), "y": float(rng.normal()), "sensor": sensor, "touch": touch}
+        for touch in range(30) for sensor in ("digit", "gelsight", "gelsight_mini")
+    ]  # fmt: skip

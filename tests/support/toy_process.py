@@ -1,0 +1,97 @@
+"""One of several processes that train the toy problem together: a script for the tests, and how they start it."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+from places import ROOT
+from train_toy import ROWS, toy_batch, toy_config, toy_loss, toy_params
+
+from anytouch_jax.errors import UserError
+
+SRC = ROOT / "src"
+WIDE = 8192  # wide enough for the parameters to be cut
+
+
+def config_of(**run):
+    # A small rate: Adam makes a whole step of the sign of a gradient that is only noise.
+    return toy_config(optim={"learning_rate": 1e-4}, **run)
+
+
+def batches_of(index: int, count: int, *, at: int = -1, number: int = 0):
+    """The rows of process `index` of every batch, for which it skips `index` + 1 samples.
+
+    Before step `at` it gets the signal `number`, or fails (-1).
+    """
+    mine = slice(index * ROWS // count, (index + 1) * ROWS // count)
+
+    def batches(start: int, stop: int):
+        for step in range(start, stop):
+            if step == at and number < 0:
+                raise UserError("no such row")
+            if step == at:
+                os.kill(os.getpid(), number)
+            batch = toy_batch(2 * step + 1)  # clips: one program
+            yield step, jax.tree.map(lambda part: part[mine], batch), {"skipped_samples": index + 1}
+
+    return batches
+
+
+def start(run_dir: Path, count: int = 2, *, devices: int = 1, hit: int = -1, at: int = -1, number: int = 0, **run):
+    """Start `count` processes that train in `run_dir`; process `hit` gets the signal `number` before step `at`."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    settings = json.dumps({"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run})
+    common = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(SRC), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
+        "JAX_NUM_CPU_DEVICES": str(devices),
+        "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
+        "JAX_NUM_PROCESSES": str(count),
+    }
+    return [
+        subprocess.Popen(
+            [sys.executable, __file__, settings],
+            env=common | {"JAX_PROCESS_ID": str(index)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(count)
+    ]
+
+
+def finish(processes, timeout: float = 600):
+    """(exit status, error stream) of each, in order."""
+    try:
+        said = [process.communicate(timeout=timeout)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [(process.returncode, text) for process, text in zip(processes, said, strict=True)]
+
+
+def main(run_dir: str, hit: int, at: int, number: int, run: dict) -> None:
+    from anytouch_jax.train.distributed import joined
+    from anytouch_jax.train.loop import fit
+
+    with joined() as place:
+        index = place.index
+        fit(
+            config_of(**run),
+            params=toy_params(WIDE),
+            loss_fn=toy_loss,
+            batches=batches_of(index, jax.process_count(), at=at if index == hit else -1, number=number),
+            run_dir=Path(run_dir),
+        )
+
+
+if __name__ == "__main__":
+    main(**json.loads(sys.argv[1]))

@@ -1,0 +1,81 @@
+"""A file is written whole or not at all."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.files import alone, replacing, write_whole
+
+
+def test_a_file_is_replaced_in_one_move(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.json"
+    write_whole(path, "first ½")
+    assert path.read_text(encoding="utf-8") == "first ½"
+    with replacing(path) as part:
+        part.write_bytes(b"second")
+        assert path.read_text(encoding="utf-8") == "first ½"
+    assert path.read_bytes() == b"second" and [one.name for one in path.parent.iterdir()] == ["a.json"]
+    umask = os.umask(0)
+    os.umask(umask)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
+
+
+@pytest.mark.parametrize("failing", ["pathlib.Path.write_bytes", "os.fsync", "os.replace"])
+def test_a_failed_write_leaves_the_old_file_and_names_it(tmp_path, monkeypatch, failing):
+    path = tmp_path / "config.json"
+    write_whole(path, "old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(failing, full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*config\.json'"):
+        write_whole(path, "new")
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_any_other_error_leaves_the_old_file_too(tmp_path):
+    path = tmp_path / "a"
+    write_whole(path, b"old")
+    with pytest.raises(KeyboardInterrupt), replacing(path) as part:
+        part.write_bytes(b"half")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_left_is_written_over(tmp_path):
+    path, part = tmp_path / "a.bin", tmp_path / "a.bin.tmp"
+    part.write_bytes(b"much longer than what follows")
+    write_whole(path, b"short", part=part)
+    assert path.read_bytes() == b"short" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_is_a_file_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    for place in ("file/a", "file/deep/a"):
+        with pytest.raises(OSError, match="file"):
+            write_whole(tmp_path / place, b"new")
+    assert (tmp_path / "file").read_text() == "" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_is_one_sentence_of_the_command(tmp_path, monkeypatch, capsys):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    picture = tmp_path / "a.csv"
+    picture.write_text("path,sensor,sequence,frame,split\nx.png,digit,0,0,train\n")
+    assert main(["contact", str(picture), "--out", str(tmp_path / "b.csv")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_lock_is_had_once_and_ends_with_its_block(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text("kept")
+    with alone(path) as first, alone(path) as second:
+        assert first and not second
+    with alone(path) as again:
+        assert again and path.read_text() == "kept"

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import io
+import sys
+
+from anytouch_jax.train.progress import progress, silent, summary, to_stderr
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def row(step, **more):
+    return {"step": step, "loss": 0.5, "samples_per_second": 30.4, "skipped_batches": 0} | more
+
+
+def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    screen = sys.stderr
+    with progress(0, 3, to_stderr) as bar:
+        bar.say("saved at step 1")
+        for step in range(3):
+            bar.advance(row(step))
+    shown = screen.getvalue()
+    assert "3/3" in shown and "loss 0.5000" in shown and "saved at step 1" in shown
+
+
+def test_elsewhere_some_twenty_lines_are_said():
+    said = []
+    with progress(100, 1100, said.append) as bar:
+        for step in range(100, 1100):
+            bar.advance(row(step))
+    assert len(said) == 21
+    assert said[0] == "step 101/1100  loss 0.5000  30 samples/s" and said[-1].startswith("step 1100/1100")
+
+
+def test_a_silent_process_shows_no_bar_even_on_a_terminal(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress(0, 1, silent) as bar:
+        bar.advance(row(0))
+    assert sys.stderr.getvalue() == ""
+
+
+def test_the_summary_tells_of_waiting_for_data_when_it_is_much():
+    assert summary(row(3, wait_share=0.049)) == summary(row(3)) == "loss 0.5000  30 samples/s"
+    assert summary(row(3, wait_share=0.31)).endswith("  waits for data 31%")
+
+
+def test_the_summary_tells_of_trouble():
+    told = "  2 samples could not be read and were replaced"
+    assert summary(row(3, skipped_samples=2.0)) == "loss 0.5000  30 samples/s" + told
+    assert summary(row(3, skipped_samples=0.0)) == "loss 0.5000  30 samples/s"
+    assert summary(row(3, loss=None, skipped_batches=2)) == "loss not finite  30 samples/s  skipped 2"

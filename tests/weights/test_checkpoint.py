@@ -1,0 +1,511 @@
+"""Checkpoints: bit-exact, asynchronous, self-describing, whole or not there, and clear about what is wrong."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import textwrap
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.weights import checkpoint
+from anytouch_jax.weights.checkpoint import (
+    CheckpointError,
+    Checkpoints,
+    export_safetensors,
+    load_params,
+    read_metadata,
+    steps,
+)
+from anytouch_jax.weights.echoes import without_echoes
+from anytouch_jax.weights.tensors import read_safetensors
+from anytouch_jax.weights.tree import flatten, nest
+
+METADATA = {"sensors": ["digit", "universal"], "preprocessing": {"mean": [0.5], "size": 112}, "source": "a test"}
+
+
+class State(NamedTuple):
+    step: Any
+    trainable: Any
+    frozen: Any
+    opt_state: Any
+
+
+def params(seed: int = 0, width: int = 6) -> dict[str, Any]:
+    keys = jax.random.split(jax.random.key(seed), 3)
+    return {
+        "touch": {"kernel": jax.random.normal(keys[0], (5, width)), "none": jnp.zeros((0, 3))},
+        "half": jax.random.normal(keys[1], (7,)).astype(jnp.bfloat16),
+        "logit_scale": jax.random.normal(keys[2], ()),
+    }
+
+
+def state_of(seed: int = 0, width: int = 6) -> State:
+    optimiser = optax.chain(optax.identity(), optax.adamw(1e-3, mask=lambda tree: jax.tree.map(lambda _: True, tree)))
+    trainable = params(seed, width)
+    frozen = {"touch": {"table": jnp.arange(4, dtype=jnp.uint32)}, "ids": jnp.array([seed, -1], jnp.int32)}
+    return State(jnp.int32(seed), trainable, frozen, optimiser.init(trainable))
+
+
+def same(first: Any, second: Any) -> None:
+    assert jax.tree.structure(first) == jax.tree.structure(second)
+    for name, leaf in flatten(first).items():
+        other = flatten(second)[name]
+        assert leaf.dtype == other.dtype and leaf.shape == other.shape, name
+        assert np.asarray(leaf).tobytes() == np.asarray(other).tobytes(), name
+
+
+def opened(folder: Path, keep: int = 3) -> Checkpoints:
+    return Checkpoints(folder, keep=keep, config_json='{"stage": 1}', metadata=METADATA)
+
+
+def filled(folder: Path, *losses: float, keep: int = 3) -> Checkpoints:
+    saver = opened(folder, keep)
+    for step, loss in enumerate(losses, 1):
+        saver.save(step, state_of(step), {"loss": loss})
+    saver.wait()
+    return saver
+
+
+def test_a_loss_of_few_steps_is_never_the_best(tmp_path):
+    saver = opened(tmp_path, keep=1)
+    given = ({"loss": 0.1, checkpoint.PARTIAL: 1}, {"loss": 3.0}, {"loss": 2.0}, {"loss": 9.0})
+    for step, metrics in enumerate(given, 1):
+        saver.save(step, state_of(step), metrics)
+    saver.wait()
+    assert checkpoint.steps(tmp_path) == [3, 4] and checkpoint.best_of(tmp_path) == 3
+
+
+def test_every_type_comes_back_bit_equal(tmp_path):
+    with_nan = state_of(3)
+    odd = jnp.array([0x7FC00001, 0x80000000, 1], jnp.uint32).view(jnp.float32)  # a NaN with payload, -0, a denormal
+    with_nan = with_nan._replace(frozen=with_nan.frozen | {"odd": odd, "numpy": np.arange(3, dtype=np.int32)})
+    saver = opened(tmp_path)
+    saver.save(12, with_nan, {"loss": 1.0})
+    saver.close()
+    same(saver.restore(jax.eval_shape(lambda: with_nan)), with_nan)
+    assert opened(tmp_path).latest() == 12
+
+
+def test_one_thread_saves_while_another_loads(tmp_path):
+    """Orbax runs one operation a process: each waits for the other's."""
+    filled(tmp_path / "read", 1).close()
+    saver, done, seen = opened(tmp_path / "written", keep=20), [], []
+
+    def load() -> None:
+        while not done:
+            seen.append(load_params(tmp_path / "read")[0]["logit_scale"])
+
+    with ThreadPoolExecutor(1) as other:
+        loading = other.submit(load)
+        try:
+            for step in range(1, 11):
+                saver.save(step, state_of(step), {"loss": 1.0})
+                if step % 3 == 0:  # the same thread, while its own save may run
+                    same(saver.restore(jax.eval_shape(state_of)), state_of(step))
+                    load_params(tmp_path / "read")
+            saver.close()
+        finally:
+            done.append(True)
+        loading.result()
+    assert steps(tmp_path / "written") == list(range(1, 11)) and len(seen) > 1
+    assert all(one == state_of(1).trainable["logit_scale"] for one in seen)
+
+
+def test_a_save_that_failed_or_was_given_up_keeps_nobody_from_reading(tmp_path, monkeypatch):
+    saver = filled(tmp_path, 1)
+    monkeypatch.setattr(checkpoint.ocp, "save_async", lambda *_: 1 / 0)
+    with pytest.raises(CheckpointError, match="division"):
+        saver.save(2, state_of(2), {})
+    load_params(tmp_path)
+
+    class _Never:
+        def result(self) -> None:
+            never.wait()
+
+    never = threading.Event()
+    monkeypatch.setattr(checkpoint.ocp, "save_async", lambda *_: _Never())
+    saver.save(3, state_of(3), {})
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.jax, "process_count", lambda: 2)
+        patch.setattr(checkpoint, "_PATIENCE", 0.1)
+        saver.leave(ValueError, ValueError("another process"), None)
+    with ThreadPoolExecutor(1) as other:
+        found = other.submit(load_params, tmp_path)
+        try:
+            found.result(timeout=60)
+        finally:
+            never.set()
+            other.shutdown(wait=False)
+
+
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("when", ["checked", "_load"])
+def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatch, when, times):
+    """The one after it is read; where that happens again and again the user is told that, not of damage."""
+    filled(tmp_path, 1).close()
+    real, read = getattr(checkpoint, when), []
+
+    def pruned(folder, *more):
+        read.append(int(folder.name))
+        if len(read) <= times:
+            shutil.copytree(folder, tmp_path / f"{read[-1] + 1:08d}")
+            shutil.rmtree(folder)
+        return real(folder, *more)
+
+    monkeypatch.setattr(checkpoint, when, pruned)
+    if times == 2:
+        np.testing.assert_array_equal(load_params(tmp_path)[0]["half"], state_of(1).trainable["half"])
+    else:
+        with pytest.raises(CheckpointError, match=r"00000003 was removed while it was read; read the latest"):
+            load_params(tmp_path)
+    assert read == [1, 2, 3]
+    read.clear()
+    monkeypatch.setattr(checkpoint, when, lambda folder, *more: (shutil.rmtree(folder), real(folder, *more)))
+    with pytest.raises(CheckpointError, match=r"was removed while it was read"):
+        load_params(tmp_path, steps(tmp_path)[0])
+
+
+def test_state_may_be_donated_or_changed_at_once(tmp_path):
+    start = {"trainable": {"big": jnp.arange(1 << 21, dtype=jnp.float32)}}
+    numbers = np.arange(1 << 16)
+    expected, expected_numbers = np.arange(1 << 21, dtype=np.float32), numbers.copy()
+    step = jax.jit(lambda tree: jax.tree.map(lambda x: x * 0 - 1, tree), donate_argnums=0)
+    saver = opened(tmp_path)
+    saver.save(1, start | {"frozen": {"numbers": numbers}}, {})
+    numbers[:] = -7
+    for _ in range(3):
+        start = step(start)
+    jax.block_until_ready(start)
+    saver.close()
+    stored = load_params(tmp_path)[0]
+    np.testing.assert_array_equal(stored["big"], expected)
+    np.testing.assert_array_equal(stored["numbers"], expected_numbers)
+
+
+@pytest.mark.parametrize(
+    ("losses", "kept"),
+    [
+        ([5, 1, 4, 3, 2], [2, 4, 5]),
+        ([5, 4, 3, 2, 1], [4, 5]),
+        ([1, 1, 1, 1], [3, 4]),  # of equals the latest is the best
+        ([float("nan"), float("inf"), 3, 4, 5], [3, 4, 5]),
+        ([float("nan")] * 4, [3, 4]),
+    ],
+)
+def test_keeps_the_last_and_the_best(tmp_path, losses, kept):
+    saver = filled(tmp_path, *losses, keep=2)
+    assert steps(tmp_path) == kept and saver.latest() == len(losses)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == [f"{step:08d}" for step in kept]
+
+
+def test_the_best_is_remembered_by_the_next_run(tmp_path):
+    filled(tmp_path, 1, 2, 3, keep=1)
+    saver = opened(tmp_path, keep=1)
+    saver.save(4, state_of(4), {"loss": 5})
+    saver.close()
+    assert steps(tmp_path) == [1, 4]
+    same(saver.restore(jax.eval_shape(state_of), 1), state_of(1))
+
+
+def test_describes_itself(tmp_path):
+    filled(tmp_path / "checkpoints", 2.5, float("nan")).close()
+    for folder in (tmp_path, tmp_path / "checkpoints", tmp_path / "checkpoints" / "00000001"):
+        told = read_metadata(folder, 1)
+        assert told == METADATA | {"step": 1, "config": '{"stage": 1}', "metrics": {"loss": 2.5}}
+    assert read_metadata(tmp_path)["metrics"] == {"loss": None}
+    tree, config, told = load_params(tmp_path, 2)
+    assert config == '{"stage": 1}' and told["sensors"] == ["digit", "universal"]
+    expected = state_of(2)
+    assert all(isinstance(leaf, np.ndarray) for leaf in flatten(tree).values())
+    touch = expected.trainable["touch"] | expected.frozen["touch"]
+    same(tree, jax.tree.map(np.asarray, expected.trainable | {"ids": expected.frozen["ids"], "touch": touch}))
+
+
+def test_restores_on_another_number_of_devices(tmp_path):
+    assert len(jax.devices()) == 4
+
+    def sharding(count: int, spec: PartitionSpec) -> NamedSharding:
+        return NamedSharding(Mesh(np.array(jax.devices()[:count]), ("data",)), spec)
+
+    rows, value = PartitionSpec("data"), jnp.arange(32.0).reshape(8, 4)
+    saver = opened(tmp_path)
+    saver.save(1, {"trainable": {"x": jax.device_put(value, sharding(4, rows))}}, {})
+    for count, spec in [(1, rows), (2, rows), (4, PartitionSpec(None, "data")), (4, PartitionSpec())]:
+        wanted = jax.ShapeDtypeStruct(value.shape, value.dtype, sharding=sharding(count, spec))
+        found = saver.restore({"trainable": {"x": wanted}})["trainable"]["x"]
+        assert found.sharding == wanted.sharding
+        np.testing.assert_array_equal(found, value)
+    plain = saver.restore({"trainable": {"x": jax.ShapeDtypeStruct(value.shape, value.dtype)}})
+    assert len(plain["trainable"]["x"].sharding.device_set) == 1
+    assert isinstance(load_params(tmp_path)[0]["x"], np.ndarray)
+
+
+def test_another_configuration_is_named_with_both_shapes(tmp_path):
+    saver = filled(tmp_path, 1)
+    with pytest.raises(CheckpointError, match="use the preset") as caught:
+        saver.restore(jax.eval_shape(lambda: state_of(width=8)))
+    message = str(caught.value)
+    assert "trainable/touch/kernel: (5, 6) float32 stored, (5, 8) float32 wanted" in message
+    assert "opt_state/" in message and "3 entries differ" in message
+    wanted = jax.eval_shape(state_of)
+    many = wanted._replace(trainable={f"n{i}": jax.ShapeDtypeStruct((i + 1,), jnp.float32) for i in range(9)})
+    with pytest.raises(CheckpointError, match=r"nothing stored, .* wanted.*; \.\.\.") as caught:
+        saver.restore(many)
+    assert str(caught.value).count(" wanted") == 5
+    other = wanted._replace(step=jax.ShapeDtypeStruct((), jnp.float32))
+    with pytest.raises(CheckpointError, match=r"step: \(\) int32 stored, \(\) float32 wanted"):
+        saver.restore(other)
+    same(saver.restore(wanted), state_of(1))
+
+
+def test_nothing_there_is_one_sentence(tmp_path):
+    saver = opened(tmp_path / "new")
+    assert saver.latest() is None
+    for attempt in (
+        lambda: saver.restore(jax.eval_shape(state_of)),
+        lambda: load_params(tmp_path / "absent"),
+        lambda: read_metadata(tmp_path / "new"),
+    ):
+        with pytest.raises(CheckpointError, match=r"no complete checkpoint in .*(new|absent)"):
+            attempt()
+    filled(tmp_path / "new", 1, 2)
+    with pytest.raises(CheckpointError, match=r"no checkpoint of step 7 .* it has 1, 2"):
+        load_params(tmp_path / "new", 7)
+    with pytest.raises(CheckpointError, match="step 1, not of step 2"):
+        load_params(tmp_path / "new" / "00000001", 2)
+    foreign = tmp_path / "new" / "00000003"
+    foreign.mkdir()
+    (foreign / "notes.txt").write_text("not ours")
+    with pytest.raises(CheckpointError, match=r"not a checkpoint of this program.*step 2 beside it is intact"):
+        load_params(tmp_path / "new")
+    assert (foreign / "notes.txt").read_text() == "not ours"
+
+
+@pytest.mark.parametrize("damage", ["half", "empty", "gone", "flipped"])
+def test_any_damaged_file_is_named_and_the_older_step_is_intact(tmp_path, damage):
+    saver = filled(tmp_path / "run", 1, 2)
+    target, kept = tmp_path / "run" / "00000002", tmp_path / "kept"
+    shutil.copytree(target, kept)
+    names = [path.relative_to(target) for path in sorted(target.rglob("*")) if path.is_file() and path.stat().st_size]
+    assert len(names) > 5
+    for name in names:
+        shutil.rmtree(target)
+        shutil.copytree(kept, target)
+        path, content = target / name, (target / name).read_bytes()
+        middle = len(content) // 2
+        flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+        path.write_bytes({"half": content[:middle], "empty": b"", "gone": b"", "flipped": flipped}[damage])
+        if damage == "gone":
+            path.unlink()
+        for attempt in (lambda: saver.restore(jax.eval_shape(state_of)), lambda: load_params(tmp_path / "run")):
+            with pytest.raises(CheckpointError, match="step 1 beside it is intact") as caught:
+                attempt()
+            assert str(target) in str(caught.value) and path.name in str(caught.value)
+            assert "\n" not in str(caught.value)
+    same(saver.restore(jax.eval_shape(state_of), 1), state_of(1))
+    (tmp_path / "run" / "00000001" / "checkpoint.json").unlink()
+    with pytest.raises(CheckpointError, match="no intact older checkpoint"):
+        load_params(tmp_path / "run")
+
+
+def test_leftovers_of_a_killed_run_are_swept(tmp_path):
+    filled(tmp_path, 1)
+    for name in ("00000002.writing", "00000002.writing.orbax-checkpoint-tmp", "00000000.deleted"):
+        (tmp_path / name / "state").mkdir(parents=True)
+    users = ["00000001.bak", "00000002.broken", "notes"]
+    for name in users:
+        (tmp_path / name).mkdir()
+    assert steps(tmp_path) == [1]
+    load_params(tmp_path)  # a reader leaves them alone: a run may be writing
+    assert len(list(tmp_path.iterdir())) == 7
+    saver = opened(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000001", *users] and saver.latest() == 1
+
+
+def test_a_step_is_saved_once_and_replaced_by_a_later_run(tmp_path):
+    saver = filled(tmp_path, 1, 2)
+    before = (tmp_path / "00000002" / "checkpoint.json").read_bytes()
+    saver.save(2, state_of(9), {"loss": 0})  # saved already: the last step of a run is often on the interval too
+    saver.close()
+    assert (tmp_path / "00000002" / "checkpoint.json").read_bytes() == before
+    saver = opened(tmp_path)
+    saver.save(2, state_of(9), {"loss": 0})
+    saver.close()
+    same(saver.restore(jax.eval_shape(state_of), 2), state_of(9))
+    assert steps(tmp_path) == [1, 2]
+
+
+def _limited_files(limit: int):
+    """Let no file of this process grow beyond `limit` bytes: a real failing write, without root."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    class _Limit:
+        def __enter__(self) -> None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+
+        def __exit__(self, *_: object) -> None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return _Limit()
+
+
+def test_a_failing_write_spares_the_older_checkpoint(tmp_path, capfd):
+    noise = jax.random.normal(jax.random.key(0), (300, 1000))
+    saver = opened(tmp_path)
+    saver.save(1, {"trainable": {"x": noise}}, {"loss": 1})
+    saver.wait()
+    with _limited_files(100_000):
+        saver.save(2, {"trainable": {"x": noise + 1}}, {"loss": 1})
+        with pytest.raises(CheckpointError, match=r"could not write checkpoint .*00000002.*older ones are untouched"):
+            saver.wait()
+    assert capfd.readouterr().err == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["00000001"]  # the debris would keep the disk full
+    np.testing.assert_array_equal(load_params(tmp_path)[0]["x"], noise)
+    saver.save(2, {"trainable": {"x": noise + 1}}, {"loss": 1})  # and the run may go on
+    saver.close()
+    np.testing.assert_array_equal(load_params(tmp_path)[0]["x"], noise + 1)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_full_disk_says_so(tmp_path, monkeypatch, late):
+    saver = filled(tmp_path, 1)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(*(checkpoint, "write_record") if late else (checkpoint.ocp, "save_async"), full)
+    with pytest.raises(CheckpointError, match=r"00000002: the disk is full"):
+        saver.save(2, state_of(2), {})
+        saver.save(3, state_of(3), {})  # the next save tells of the failure of the last
+    monkeypatch.undo()
+    assert steps(tmp_path) == [1]
+    same(saver.restore(jax.eval_shape(state_of)), state_of(1))
+
+
+CHILD = """
+    import os, pathlib, signal, sys
+    import jax.numpy as jnp
+    from anytouch_jax.io import checkpoint
+
+    folder, where = pathlib.Path(sys.argv[1]), sys.argv[2]
+
+    def die(*args, **kwargs):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def after(function, times):
+        seen = []
+        def wrapped(*args, **kwargs):
+            result = function(*args, **kwargs)
+            seen.append(0)
+            return die() if len(seen) == times else result
+        return wrapped
+
+    saver = checkpoint.Checkpoints(folder, keep=1, config_json="{}", metadata={})
+    for step in range(1, 5):
+        if step == 3:
+            if where == "arrays written":
+                checkpoint.write_record = die
+            elif where == "renamed":
+                checkpoint._loss = die
+            elif where == "removing":
+                half = lambda path, **_: (path / "checkpoint.json").unlink(missing_ok=True)
+                checkpoint.shutil.rmtree = after(half, 2)
+        saver.save(step, {"trainable": {"x": jnp.full((200, 300), float(step))}}, {"loss": -step})
+        if where == "writing" and step == 3:
+            die()
+        saver.wait()
+    print("survived")
+"""
+
+
+@pytest.mark.parametrize(
+    ("where", "last"),
+    [("arrays written", 2), ("renamed", 3), ("removing", 3), ("writing", 2)],
+)
+def test_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, where, last):
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(CHILD), str(tmp_path), where],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == -9, done.stderr
+    found = steps(tmp_path)
+    assert found[-1] == last or (where == "writing" and found[-1] == 3)
+    for step in found:
+        np.testing.assert_array_equal(load_params(tmp_path, step)[0]["x"], np.full((200, 300), step, "f4"))
+    saver = Checkpoints(tmp_path, keep=1, config_json="{}", metadata={})
+    assert all(path.name.isdigit() for path in tmp_path.iterdir())
+    saver.save(9, {"trainable": {"x": jnp.zeros(3)}}, {"loss": -9})
+    saver.close()
+    assert steps(tmp_path) == [9]
+
+
+def test_metadata_must_be_plain(tmp_path):
+    with pytest.raises(CheckpointError, match="plain JSON"):
+        Checkpoints(tmp_path, keep=1, config_json="{}", metadata={"x": np.zeros(2)})
+    with pytest.raises(CheckpointError, match="at least one"):
+        Checkpoints(tmp_path, keep=0, config_json="{}", metadata={})
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CheckpointError, match="could not write"):
+        opened(tmp_path / "file")
+
+
+def test_a_later_format_is_named(tmp_path):
+    filled(tmp_path, 1)
+    path = tmp_path / "00000001" / "checkpoint.json"
+    outer = json.loads(path.read_text())
+    outer["record"]["format"] = "anytouch_jax.checkpoint.2"
+    import zlib
+
+    outer["checksum"] = zlib.crc32(json.dumps(outer["record"], sort_keys=True).encode())
+    path.write_text(json.dumps(outer))
+    with pytest.raises(CheckpointError, match=r"checkpoint\.2"):
+        load_params(tmp_path)
+
+
+def test_safetensors_export_and_back(tmp_path):
+    tree = params() | {"view": np.arange(6.0).reshape(2, 3).T}
+    export_safetensors(tmp_path / "p.safetensors", tree, {"config": "{}"})
+    back, told = read_safetensors(tmp_path / "p.safetensors")
+    assert told == {"config": "{}"}
+    same(nest(back), jax.tree.map(np.asarray, tree))
+
+
+def test_names_and_trees():
+    tree = {"a": {"b": 1, "c": {"d": 2}}, "e": 3}
+    assert flatten(tree) == {"a/b": 1, "a/c/d": 2, "e": 3} and nest(flatten(tree)) == tree
+    assert list(flatten(State(1, [2, (3,)], {}, None))) == ["step", "trainable/0", "trainable/1/0"]
+    with pytest.raises(UserError, match="two arrays"):
+        flatten({"a/b": 1, "a": {"b": 2}})
+    for clash in ({"a": 1, "a/b": 2}, {"a/b": 2, "a": 1}):
+        with pytest.raises(UserError, match="beginning of another"):
+            nest(clash)
+
+
+def test_the_writes_after_the_one_that_failed_are_not_told_of():
+    told: list[str] = []
+    hook = without_echoes(lambda kind, error, trace: told.append(str(error)))
+    for error in (RuntimeError("Event loop is closed"), RuntimeError("no such thing"), OSError("Event loop is closed")):
+        hook(type(error), error, None)
+    assert told == ["no such thing", "Event loop is closed"]
+    words = "import sys; import anytouch_jax.weights.checkpoint; "
+    words += "e = RuntimeError('Event loop is closed'); sys.excepthook(RuntimeError, e, None)"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

@@ -1,0 +1,50 @@
+"""The bicubic resize of position tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anytouch_jax.weights.resize import resize_position
+
+# torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
+UP = [
+    [-0.220484018, 0.204530478, 2.152891397, 4.220484257],
+    [1.355409384, 1.418546438, 2.801180124, 4.506895065],
+    [1.893125772, 1.390535593, 1.888761282, 3.028749228],
+    [1.005151987, 0.140684366, 0.073182821, 0.851293325],
+]
+DOWN = [[0.572738647, 3.497573853], [1.071792603, 1.381332397]]
+
+
+@pytest.mark.parametrize("expected", [UP, DOWN])
+def test_equal_to_torch(expected):
+    table = np.concatenate([[[100.0, -100.0]], np.stack([np.arange(9) ** 2 % 7, -(np.arange(9) ** 2 % 7)], 1)])
+    flat = np.ravel(expected)
+    resized = resize_position(table.astype("f4"), 1 + len(flat))
+    assert resized.dtype == np.float32
+    np.testing.assert_array_equal(resized[0], table[0])  # the class token's row
+    np.testing.assert_allclose(resized[1:], np.stack([flat, -flat], 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("old", "new"), [(4, 8), (16, 7), (1, 3), (5, 5)])
+def test_keeps_constants_and_itself(old, new):
+    constant = np.full((1 + old**2, 3), 2.5, "f4")
+    np.testing.assert_allclose(resize_position(constant, 1 + new**2), 2.5, rtol=1e-6)
+    table = np.random.default_rng(0).normal(size=(1 + old**2, 3)).astype("f4")
+    np.testing.assert_allclose(resize_position(table, 1 + old**2), table, rtol=1e-6)
+
+
+def test_turns_with_the_grid():
+    """Rows and columns are treated alike: the transposed grid gives the transposed result."""
+    grid = np.random.default_rng(0).normal(size=(5, 5, 2)).astype("f4")
+    first = np.zeros((1, 2), "f4")
+    upright = resize_position(np.concatenate([first, grid.reshape(25, 2)]), 65)[1:].reshape(8, 8, 2)
+    turned = resize_position(np.concatenate([first, grid.transpose(1, 0, 2).reshape(25, 2)]), 65)[1:].reshape(8, 8, 2)
+    np.testing.assert_allclose(upright, turned.transpose(1, 0, 2), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "wanted"), [(9, 17), (17, 9), (1, 5), (5, 1)])
+def test_only_square_grids(rows, wanted):
+    with pytest.raises(ValueError, match="square"):
+        resize_position(np.zeros((rows, 2), "f4"), wanted)

@@ -1,0 +1,251 @@
+"""torch files without torch: every view of a storage comes out right, nothing in a file is ever run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.weights.release import read_weights
+from anytouch_jax.weights.torch_file import read_torch
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_reads_every_plain_type(torch_files, legacy):
+    arrays = {
+        "f8": RNG.normal(size=(2, 3)),
+        "f4": RNG.normal(size=(4,)).astype("f4"),
+        "f2": RNG.normal(size=(2, 2)).astype("f2"),
+        "i8": np.arange(-3, 3),
+        "i4": np.arange(3, dtype="i4"),
+        "u1": np.arange(3, dtype="u1"),
+        "bool": np.array([True, False]),
+        "scalar": np.float32(2.5),
+        "empty": np.zeros((0, 4), "f4"),
+    }
+    content = {name: torch_files.tensor(array) for name, array in arrays.items()}
+    read = read_torch(torch_files.write(content, legacy=legacy))
+    assert read.keys() == arrays.keys()
+    for name, array in arrays.items():
+        assert read[name].dtype == array.dtype and read[name].shape == array.shape
+        np.testing.assert_array_equal(read[name], array)
+
+
+def test_views_share_and_stride(torch_files):
+    data = np.arange(12, dtype="f4")
+    content = {
+        "whole": torch_files.Tensor(data, (3, 4), (4, 1)),
+        "transposed": torch_files.Tensor(data, (4, 3), (1, 4)),
+        "column": torch_files.Tensor(data, (3,), (4,), offset=2),
+        "expanded": torch_files.Tensor(data, (2, 3), (0, 1), offset=9),
+    }
+    read = read_torch(torch_files.write(content))
+    grid = data.reshape(3, 4)
+    np.testing.assert_array_equal(read["whole"], grid)
+    np.testing.assert_array_equal(read["transposed"], grid.T)
+    assert read["transposed"].flags.c_contiguous
+    np.testing.assert_array_equal(read["column"], grid[:, 2])
+    np.testing.assert_array_equal(read["expanded"], [[9, 10, 11]] * 2)
+
+
+def test_bfloat16_and_byte_order(torch_files):
+    values = np.array([1.0, -2.5, 3.140625, 0.0], "f4")  # exact in bfloat16
+    half = (values.view(np.uint32) >> 16).astype("u2")
+    path = torch_files.write({"b": torch_files.Tensor(half, (4,), (1,), kind="BFloat16")})
+    np.testing.assert_array_equal(read_torch(path)["b"], values)
+    path = torch_files.write({"x": torch_files.tensor(values)}, order="big")
+    np.testing.assert_array_equal(read_torch(path)["x"], values)
+
+
+@pytest.mark.parametrize("wrapper", ["model", "state_dict", None])
+def test_opens_the_usual_wrappings(torch_files, wrapper):
+    state = {"module.a": torch_files.tensor(np.ones(2, "f4")), "module.b": torch_files.tensor(np.zeros(1, "f4"))}
+    ordered = torch_files.Call(torch_files.Global("collections", "OrderedDict"), (), {"_metadata": {"version": 1}})
+    namespace = torch_files.Call(torch_files.Global("argparse", "Namespace"), (), {"lr": 2e-4, "device": "cuda"})
+    content = (
+        {wrapper: state, "optimizer": {"state": {0: ordered}}, "args": namespace, "epoch": 3} if wrapper else state
+    )
+    assert list(read_torch(torch_files.write(content))) == ["a", "b"]
+
+
+def test_a_parameter_is_its_tensor(torch_files):
+    parameter = torch_files.Call(
+        torch_files.Global("torch._utils", "_rebuild_parameter"), (torch_files.tensor(np.ones(2, "f4")), True, {})
+    )
+    np.testing.assert_array_equal(read_torch(torch_files.write({"p": parameter}))["p"], [1, 1])
+
+
+WICKED = {
+    "os.system": "touch {0}",
+    "posix.system": "touch {0}",
+    "builtins.eval": "open('{0}', 'w')",
+    "builtins.open": "{0}",
+    "__builtin__.getattr": "{0}",
+    "pathlib.Path": "{0}",
+    "numpy.load": "{0}",
+    "torch._utils.os": "{0}",
+    "torch.load": "{0}",
+    "torch.storage._load_from_bytes": "{0}",
+}
+
+
+@pytest.mark.parametrize("which", WICKED)
+@pytest.mark.parametrize("legacy", [False, True])
+def test_code_in_a_pickle_is_refused_by_name(torch_files, tmp_path, which, legacy):
+    marker = tmp_path / "marker"
+    call = torch_files.Call(torch_files.Global(*which.rsplit(".", 1)), (WICKED[which].format(marker),))
+    content = {"model": {"w": torch_files.tensor(np.ones(1, "f4"))}, "extra": call}
+    with pytest.raises(UserError, match=f"'{which}'.*refused"):
+        read_torch(torch_files.write(content, legacy=legacy))
+    assert not marker.exists()
+
+
+class _Benign:
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.marker),)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_a_reduce_of_every_protocol_never_runs(tmp_path, protocol):
+    marker, path = tmp_path / "marker", tmp_path / "weights.pth"
+    wicked = pickle.dumps({"model": _Benign(marker)}, protocol)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", wicked)
+    with pytest.raises(UserError, match=r"mkdir"):
+        read_torch(path)
+    assert not marker.exists()
+    pickle.loads(wicked)
+    assert marker.exists()  # the same bytes do run in an ordinary reader
+
+
+@pytest.mark.parametrize(
+    ("body", "named"),
+    [
+        (b"(S'touch x'\nios\nsystem\n.", "os system"),  # INST
+        (b"\x80\x02\x82\x01.", "EXT1"),  # the extension registry
+        (b"\x80\x02ccollections\nOrderedDict\n(dcos\nsystem\nb.", "os.system"),
+        (b"\x80\x02}(ccollections\nOrderedDict\nK\x01u.", "dictionary"),  # a class as a key
+        (b"\x80\x02}" + b"(" * 5 + b"u.", "state_dict|disorder|not there|no dictionary"),
+        (b"\x80\x02R.", "not there"),
+        (b"\x80\x02h\x05.", "KeyError"),
+        (b"\x80\x04\x96\xff\xff\xff\xff\xff\xff\xff\x7f.", "."),  # a byte array of 2**63 bytes
+        (b"\x80\x02}r\xff\xff\xff\xff.", "no state_dict"),  # a memo of 2**32 places
+    ],
+)
+def test_crafted_pickles_are_errors_not_crashes(tmp_path, body, named):
+    path = tmp_path / "weights.pth"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", body)
+    with pytest.raises(UserError, match=named):
+        read_torch(path)
+
+
+def test_a_deep_tuple_is_no_key(tmp_path):
+    # hashing a tuple nested this deep would end the process
+    body = b"\x80\x02}(" + b")" + b"\x85" * 150_000 + b"K\x01u."
+    path = tmp_path / "weights.pth"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", body)
+    with pytest.raises(UserError, match="tuple as the key"):
+        read_torch(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shape": (5,)},
+        {"offset": 1},
+        {"stride": (2,)},
+        {"stride": (-1,)},
+        {"shape": (-1,)},
+        {"offset": -1},
+        {"stride": (1, 1)},
+        {"shape": (1 << 40,), "stride": (0,)},
+        {"length": 1 << 40},
+        {"length": 3},
+        {"kind": "QUInt8"},
+        {"kind": "Double"},
+    ],
+)
+def test_views_beyond_their_storage_are_errors(torch_files, change):
+    view = {"data": np.arange(4, dtype="f4"), "shape": (4,), "stride": (1,), "kind": "Float"} | change
+    with pytest.raises(UserError, match=r"weights\.pth"):
+        read_torch(torch_files.write({"x": torch_files.Tensor(**view)}))
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_truncated_file_is_one_sentence(torch_files, tmp_path, legacy):
+    content = {"model": {"w": torch_files.tensor(RNG.normal(size=(8, 8)).astype("f4"))}}
+    whole = torch_files.write(content, legacy=legacy).read_bytes()
+    for size in [0, 1, 10, len(whole) // 3, len(whole) // 2, len(whole) - 1]:
+        path = tmp_path / "cut.pth"
+        path.write_bytes(whole[:size])
+        with pytest.raises(UserError, match=r"cut\.pth") as caught:
+            read_torch(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_altered_bytes_never_crash(torch_files, tmp_path, legacy):
+    content = {"model": {"w": torch_files.tensor(np.ones((4, 4), "f4"))}, "args": {"lr": 1.0}}
+    whole = bytearray(torch_files.write(content, legacy=legacy).read_bytes())
+    rng = random.Random(0)
+    for _ in range(200):
+        altered = bytearray(whole)
+        for _ in range(rng.choice([1, 1, 4])):
+            altered[rng.randrange(len(altered))] = rng.randrange(256)
+        path = tmp_path / "altered.pth"
+        path.write_bytes(altered)
+        try:
+            read_torch(path)
+        except UserError as error:
+            assert "altered.pth" in str(error)
+
+
+def test_foreign_files_are_one_sentence(torch_files, tmp_path):
+    bomb = tmp_path / "bomb.pth"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02" + b"N0" * 1_000_000)
+    script = tmp_path / "script.pt"
+    with zipfile.ZipFile(script, "w") as archive:
+        archive.writestr("a/data.pkl", b"\x80\x02N.")
+        archive.writestr("a/constants.pkl", b"")
+    other = tmp_path / "other.bin"
+    with zipfile.ZipFile(other, "w") as archive:
+        archive.writestr("hello.txt", "hello")
+    text = tmp_path / "text.pth"
+    text.write_text("just words")
+    expected = {bomb: "claims", script: "TorchScript", other: "data.pkl", text: "damaged or not a torch file"}
+    expected[torch_files.write([1, 2], "list.pth")] = "state_dict, but list"
+    expected[torch_files.write({"epoch": 3}, "dict.pth")] = "epoch is no tensor"
+    expected[tmp_path / "absent.pth"] = "no weights file"
+    expected[tmp_path / "absent.safetensors"] = "no weights file"
+    for suffix in ("safetensors", "npz"):
+        path = tmp_path / f"words.{suffix}"
+        path.write_text("just words")
+        expected[path] = f"not a whole {suffix} file"
+    unknown = tmp_path / "weights.h5"
+    unknown.write_text("")
+    expected[unknown] = "unknown type"
+    for path, words in expected.items():
+        with pytest.raises(UserError, match=words) as caught:
+            read_weights(path)
+        assert str(path) in str(caught.value)
+
+
+def test_npz_with_objects_is_refused(tmp_path):
+    path = tmp_path / "objects.npz"
+    np.savez(path, a=np.array([{"x": 1}], dtype=object))
+    with pytest.raises(UserError, match=r"objects\.npz"):
+        read_weights(path)

@@ -17,7 +17,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.loading.loader import Loader, SampleError
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
-from anytouch_jax.encoder.encoder import Encoder, Sight, embed_rows, load_encoder
+from anytouch_jax.encoder.encoder import Encoder, Preprocess, embed_rows, load_encoder
 from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy
 
@@ -103,14 +103,14 @@ def test_a_row_without_a_background_is_named_or_skipped(touches):
 
 def test_a_sight_takes_its_first_frame_for_the_background_unless_told(encoder):
     frames = [GEL, np.clip(GEL + 20, 0, 255).astype(np.uint8)]
-    see = Sight(encoder)
+    see = Preprocess(encoder)
     assert [int(np.median(see(one))) for one in frames] == [128, 148]
-    told = Sight(encoder, frames[1])
+    told = Preprocess(encoder, frames[1])
     assert [int(np.median(told(one))) for one in frames] == [108, 128]
-    plain = Sight(replace(encoder, config=replace(encoder.config, data=DataConfig())))
+    plain = Preprocess(replace(encoder, config=replace(encoder.config, data=DataConfig())))
     np.testing.assert_array_equal(plain(GEL), GEL)
-    lying = Sight(encoder, np.rot90(GEL), rotate=90)  # the background lies on its side as the frames do
-    np.testing.assert_array_equal(lying(np.rot90(frames[1])), Sight(encoder, GEL)(frames[1]))
+    lying = Preprocess(encoder, np.rot90(GEL), rotate=90)  # the background lies on its side as the frames do
+    np.testing.assert_array_equal(lying(np.rot90(frames[1])), Preprocess(encoder, GEL)(frames[1]))
 
 
 def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
@@ -128,7 +128,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     assert main([*words, "--out", str(tmp_path / "a.npz"), "--background", str(ground)]) == 0
     assert "first frame" not in capsys.readouterr().err
     said: list[str] = []
-    _, wanted = embed_rows(encoder, table, np.array([row]), say=said.append)
+    _, wanted = embed_rows(encoder, table, np.array([row]), log=said.append)
     assert all("sensor 'gelslim' was not drawn in training" in words for words in said)
     np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
@@ -155,7 +155,7 @@ def test_training_says_at_once_which_rows_have_no_background(touches):
 
 def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
     config = replace(tiny_config(1), data=settings(touches).data)
-    pretrain(replace(config, run=replace(config.run, steps=2, save_every=2, figure_every=0)), tmp_path / "r", say=str)
+    pretrain(replace(config, run=replace(config.run, steps=2, save_every=2, figure_every=0)), tmp_path / "r", log=str)
     assert main(["convert", str(tmp_path / "r"), str(tmp_path / "w.safetensors")]) == 0
     assert main(["convert", str(tmp_path / "w.safetensors"), str(tmp_path / "o.safetensors"), "--names", "own"]) == 0
     run, *files = (load_encoder(tmp_path / name) for name in ("r", "w.safetensors", "o.safetensors"))

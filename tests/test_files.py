@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from anytouch_jax.cli.app import main
-from anytouch_jax.files import alone, replacing, write_whole
+from anytouch_jax.files import atomic_path, atomic_write, lock
 
 
 def test_a_file_is_replaced_in_one_move(tmp_path: Path) -> None:
     path = tmp_path / "new" / "a.json"
-    write_whole(path, "first ½")
+    atomic_write(path, "first ½")
     assert path.read_text(encoding="utf-8") == "first ½"
-    with replacing(path) as part:
+    with atomic_path(path) as part:
         part.write_bytes(b"second")
         assert path.read_text(encoding="utf-8") == "first ½"
     assert path.read_bytes() == b"second" and [one.name for one in path.parent.iterdir()] == ["a.json"]
@@ -26,21 +26,21 @@ def test_a_file_is_replaced_in_one_move(tmp_path: Path) -> None:
 @pytest.mark.parametrize("failing", ["pathlib.Path.write_bytes", "os.fsync", "os.replace"])
 def test_a_failed_write_leaves_the_old_file_and_names_it(tmp_path, monkeypatch, failing):
     path = tmp_path / "config.json"
-    write_whole(path, "old")
+    atomic_write(path, "old")
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(failing, full)
     with pytest.raises(OSError, match=r"No space left on device: '.*config\.json'"):
-        write_whole(path, "new")
+        atomic_write(path, "new")
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_any_other_error_leaves_the_old_file_too(tmp_path):
     path = tmp_path / "a"
-    write_whole(path, b"old")
-    with pytest.raises(KeyboardInterrupt), replacing(path) as part:
+    atomic_write(path, b"old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(path) as part:
         part.write_bytes(b"half")
         raise KeyboardInterrupt
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
@@ -49,7 +49,7 @@ def test_any_other_error_leaves_the_old_file_too(tmp_path):
 def test_what_a_killed_process_left_is_written_over(tmp_path):
     path, part = tmp_path / "a.bin", tmp_path / "a.bin.tmp"
     part.write_bytes(b"much longer than what follows")
-    write_whole(path, b"short", part=part)
+    atomic_write(path, b"short", part=part)
     assert path.read_bytes() == b"short" and list(tmp_path.iterdir()) == [path]
 
 
@@ -57,7 +57,7 @@ def test_a_folder_that_is_a_file_is_told(tmp_path):
     (tmp_path / "file").write_text("")
     for place in ("file/a", "file/deep/a"):
         with pytest.raises(OSError, match="file"):
-            write_whole(tmp_path / place, b"new")
+            atomic_write(tmp_path / place, b"new")
     assert (tmp_path / "file").read_text() == "" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -75,7 +75,7 @@ def test_a_full_disk_is_one_sentence_of_the_command(tmp_path, monkeypatch, capsy
 def test_a_lock_is_had_once_and_ends_with_its_block(tmp_path):
     path = tmp_path / "config.json"
     path.write_text("kept")
-    with alone(path) as first, alone(path) as second:
+    with lock(path) as first, lock(path) as second:
         assert first and not second
-    with alone(path) as again:
+    with lock(path) as again:
         assert again and path.read_text() == "kept"

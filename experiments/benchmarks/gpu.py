@@ -73,13 +73,13 @@ def main() -> None:
             options.out, "gpu", text, numbers | {"rows": [speed_report.as_dict(row) for row in rows]}
         )
 
-    def say(sentence: str) -> None:
+    def log(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
 
     works = [work for what in options.what for work in workloads(what, options.preset, options.batch)]
     for work in works:
         try:
-            found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, say=say)
+            found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, log=log)
         except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
             found = [speed.Row(work.name, "none", work.samples, note=str(error).splitlines()[0])]
         rows += found

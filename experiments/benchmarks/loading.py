@@ -105,7 +105,7 @@ def measure_loading(
     pixels: int = 224,
     rows: int = 2_500_000,
     stages: Sequence[int] = (1, 2),
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> Loading:
     """Measure in `folder`, which gets `pictures` files of every size and, if `rows`, a manifest of so many rows.
 
@@ -116,16 +116,16 @@ def measure_loading(
     root = Path(folder)
     speeds: list[Speed] = []
     for size in sizes:
-        if say:
-            say(f"loading: {size[0]} x {size[1]}, {rounds} rounds of {pictures} pictures")
+        if log:
+            log(f"loading: {size[0]} x {size[1]}, {rounds} rounds of {pictures} pictures")
         manifest = write_pictures(root / f"{size[0]}x{size[1]}", size, pictures)
         speeds += _speeds(manifest, size, rounds, threads, pixels)
     opened = []
     if rows:
         path = write_large(root / "large", rows, sizes[0])
         for stage in stages:
-            if say:
-                say(f"loading: a manifest of {rows:,} rows, stage {stage}")
+            if log:
+                log(f"loading: a manifest of {rows:,} rows, stage {stage}")
             opened.append(open_large(path, stage, threads))
     return Loading(threads, pixels, tuple(speeds), tuple(opened))
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config import PresetName
 from anytouch_jax.config.parsing import COUNT, in_range
 from anytouch_jax.errors import UserError
@@ -67,7 +67,7 @@ def run(options: Bench) -> int:
     if options.quick and page.exists() and not _made_quickly(page):
         raise UserError(f"{page} holds a measurement, which a quick run would replace: choose another --out")
     here = machine.describe()
-    say(here.sentence())
+    log(here.sentence())
     wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)
     sections: list[Section] = []
     for name in wanted:
@@ -75,7 +75,7 @@ def run(options: Bench) -> int:
             sections.append(section)
             path = _write(options, here, sections)  # after each: what was measured is not lost with what fails later
             print(section[1])
-    say(f"{path}, its numbers in {path.stem}.json, and figures/ beside it")
+    log(f"{path}, its numbers in {path.stem}.json, and figures/ beside it")
     return 0
 
 
@@ -132,7 +132,7 @@ def _network(options: Bench, name: str) -> list[Section]:
 
     found: list[Section] = []
     for work in workloads(name, options.preset, _batch(options)):
-        rows = speed.measure(work, rounds=_rounds(options), peak_size=_QUICK_PEAK if options.quick else None, say=say)
+        rows = speed.measure(work, rounds=_rounds(options), peak_size=_QUICK_PEAK if options.quick else None, log=log)
         body = speed_report.to_markdown(rows) + "\n" + _figure(options, rows)
         found.append((f"{work.name}, preset {options.preset}", body, rows))
     return found
@@ -157,7 +157,7 @@ def _figure(options: Bench, rows: list[Row]) -> str:
 def _compile(options: Bench, _: str) -> list[Section]:
     from experiments.benchmarks import startup
 
-    say("compile: fresh processes, without and with the cache")
+    log("compile: fresh processes, without and with the cache")
     steps = startup.STAGE1 if options.quick else startup.STEPS
     found = startup.starts(options.preset, steps, _batch(options))
     title = f"First step of a fresh process, preset {options.preset}"
@@ -169,7 +169,7 @@ def _memory(options: Bench, _: str) -> list[Section]:
 
     found = []
     for devices, fsdp in memory.MESHES[:3] if options.quick else memory.MESHES:
-        say(f"memory: {devices} devices, {fsdp} to a copy of the state")
+        log(f"memory: {devices} devices, {fsdp} to a copy of the state")
         found.append(memory.simulate(options.preset, devices, fsdp, _batch(options) or 4))
     title = f"Memory and communication of a device, stage 1 on clips, preset {options.preset}"
     note = "\n" + " ".join((memory.__doc__ or "").split()) + "\n"
@@ -180,7 +180,7 @@ def _simulator(options: Bench, _: str) -> list[Section]:
     from anytouch_jax.evaluate import plots
     from experiments.benchmarks import fidelity
 
-    say("simulator: contact and shear at every fidelity, against a converged float64 solution")
+    log("simulator: contact and shear at every fidelity, against a converged float64 solution")
     quick = options.quick
     variants = [fidelity.Variant("exact", 28), fidelity.Variant("fast", 28)] if quick else fidelity.VARIANTS
     scenes = {"sphere": fidelity.SCENES["sphere"]} if quick else fidelity.SCENES
@@ -198,7 +198,7 @@ def _simulator(options: Bench, _: str) -> list[Section]:
     plots.pareto(options.out / "figures" / name, points, x="ms a frame", y=y, title="contact and shear")
     body = fidelity.to_markdown(rows) + f"\n![contact and shear](figures/{name})\n"
     small: dict[str, Any] = {"sensors": ("digit",), "batch": 2, "frames": 2, "size": 32} if quick else {}
-    say("simulator: whole recordings, when compiled")
+    log("simulator: whole recordings, when compiled")
     recorded = fidelity.recording_speed(rounds=_rounds(options), **small)
     shape = "two frames at 32" if quick else "ten frames at 224"
     beside = f"Batches of recordings of {shape} pixels, default fidelity:\n\n{fidelity.recorded_markdown(recorded)}"
@@ -208,12 +208,12 @@ def _simulator(options: Bench, _: str) -> list[Section]:
 def _loader(options: Bench, _: str) -> list[Section]:
     from experiments.benchmarks import loading, speed_data
 
-    say("loader: frames a second by threads")
+    log("loader: frames a second by threads")
     rows = speed_data.measure(options.preset, _batch(options) or 64, rounds=_rounds(options))
     toy = {"sizes": ((64, 48),), "pictures": 4, "rounds": 1, "pixels": 28, "rows": 2000}
     small: dict[str, Any] = toy if options.quick else {}
     with tempfile.TemporaryDirectory() as folder:
-        beside = loading.measure_loading(folder, say=say, **small)
+        beside = loading.measure_loading(folder, log=log, **small)
     return [
         (f"Loader, preset {options.preset}", speed_data.to_markdown(rows), list(rows)),
         ("Loader beside plain decoding, and a large manifest", beside.to_markdown(), [*beside.speeds, *beside.opened]),

@@ -23,7 +23,7 @@ from experiments.benchmarks.variants import BASELINE, Program, Variant, cold, co
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of
 
 Tree = Any
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 NAN = float("nan")
 ERROR_SAMPLES = 4  # the float64 reference of a large model takes twice the memory of a step
 _LATENCY_CALLS = 20  # calls a round of what is timed one sample at a time
@@ -141,7 +141,7 @@ def measure(
     rounds: int = 9,
     with_errors: bool = True,
     peak_size: int | None = None,
-    say: Say = lambda _: None,
+    log: Log = lambda _: None,
 ) -> list[Row]:
     """The rows of a workload, the baseline first. A variant that cannot be compiled or run here is a row with a note.
 
@@ -153,14 +153,14 @@ def measure(
     whole = jax.device_get(merge(state.trainable, state.frozen))
     programs, failed = [], []
     for variant in variants:
-        say(f"{work.name}: compiling {variant.name}")
+        log(f"{work.name}: compiling {variant.name}")
         try:
             programs.append(compiled(variant, work, state if work.trains else {"touch": whole["touch"]}))
         except Exception as error:
             if variant == variants[0]:
                 raise UserError(f"{work.name}, {variant.name} cannot be compiled here: {error}") from error
             failed.append((variant, f"{type(error).__name__}: {str(error).splitlines()[0]}"))
-    say(f"{work.name}: {rounds} rounds")
+    log(f"{work.name}: {rounds} rounds")
     peaks = {kind: machine.matmul(kind[0], peak_size, kind[1]) for kind in {_FULL, *map(_kind, programs)}}
     try:
         times = _timed(programs, work, whole, state, peaks, rounds)
@@ -174,11 +174,11 @@ def measure(
     best = {d: peaks[d][1] / float(np.median(t)) for d, t in zip(peaks, times[len(programs) :], strict=True)}
     wrong: list[dict[str, float]] = [{} for _ in programs]
     if with_errors:
-        say(f"{work.name}: errors against float64")
+        log(f"{work.name}: errors against float64")
         try:
             wrong = errors([program.variant for program in programs], work, whole)
         except RuntimeError as error:  # most often out of memory: the times are still worth something
-            say(f"{work.name}: no errors, the float64 reference failed: {str(error).splitlines()[0]}")
+            log(f"{work.name}: no errors, the float64 reference failed: {str(error).splitlines()[0]}")
     rows = [_row(p, times[i], times[0], best, wrong[i]) for i, p in enumerate(programs)]
     return rows + [_empty(work, variant, note) for variant, note in failed]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from anytouch_jax.evaluate.statistics import markdown, plain
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.benchmarks.speed import Row
 
 _HEADS = (
@@ -104,5 +104,5 @@ def write(folder: Path, name: str, text: str, numbers: Mapping[str, Any]) -> Pat
     """Write `name`.md and `name`.json in a folder, each in one move. Raises OSError."""
     for suffix, content in ((".json", json.dumps(numbers, indent=2, allow_nan=False) + "\n"), (".md", text)):
         path = folder / f"{name}{suffix}"
-        write_whole(path, content)
+        atomic_write(path, content)
     return path

@@ -24,7 +24,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder.encoder import load_encoder, text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.pouring.bounds import blind_inputs, imitate_told
 from experiments.pouring.physics import ACTIONS, STAND, Task
 from experiments.pouring.policy import Head, Learning, Touch, forward
@@ -72,7 +72,7 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
         for moment in range(int(steps)):
             name = f"run_{run:04d}/{moment:04d}.png"
             png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[1]
-            write_whole(folder / name, png.tobytes(), sync=False)
+            atomic_write(folder / name, png.tobytes(), sync=False)
             action, choice = (ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices))
             rows.append(
                 {"path": name, "sensor": SENSOR, "sequence": f"run_{run:04d}", "frame_index": moment,
@@ -205,7 +205,7 @@ def save_policy(folder: Path, policy: Touch) -> None:
     data = io.BytesIO()
     arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
     np.savez(data, about=np.asarray(json.dumps(told | {"encoder": encoder.mark})), **arrays)
-    write_whole(folder / POLICY, data.getvalue())
+    atomic_write(folder / POLICY, data.getvalue())
 
 
 def load_policy(folder: Path | str) -> Touch:

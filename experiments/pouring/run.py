@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import SEED, in_range
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.command import main
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _record(options: Pour, folder: Path) -> int:
     if path.exists():
         raise UserError(f"{path} is there already; record into another folder, or remove this one first")
     check_folder(path, "--record")
-    say(f"the expert pours {options.demos} times")
+    log(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=options.size)
     print(recordings.write(folder, shown, task))
     return 0
@@ -117,7 +117,7 @@ def _policy(options: Pour, encoder: Encoder, shown: Trials, sensor: str) -> tupl
     learning = replace(
         learning, steps=options.steps or learning.steps, tune_steps=max(learning.tune_steps, len(shown.steps))
     )
-    say("learning from it")
+    log("learning from it")
     policy = pouring_policy.learn_frozen(encoder, shown, learning, stills=options.stills, sensor=sensor)
     return (tuning.fine_tune(policy, shown, learning) if options.fine_tune else policy), learning
 
@@ -136,7 +136,7 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
     about["data"] = found.data
     _claim(out, about)
     shown, unseen = found.part(False), found.part(True)
-    say(f"{len(shown.steps)} runs of {found.sensor} to learn from, {len(unseen.steps)} of split test")
+    log(f"{len(shown.steps)} runs of {found.sensor} to learn from, {len(unseen.steps)} of split test")
     policy, learning = _policy(options, encoder, shown, found.sensor)
     rate = Task().rate
     rows = {
@@ -152,8 +152,8 @@ def _recorded(options: Pour, path: Path, out: Path) -> int:
     found_text = json.dumps(
         about | {"sensor": policy.sensor} | {name: one._asdict() for name, one in rows.items()}, indent=2
     )
-    write_whole(out / "pour.json", found_text + "\n")
-    say(f"policy and results in {out}")
+    atomic_write(out / "pour.json", found_text + "\n")
+    log(f"policy and results in {out}")
     return 0
 
 
@@ -172,7 +172,7 @@ def _simulated(options: Pour, out: Path) -> int:
     about |= {"stills": options.stills, "fine_tuned": options.fine_tune, "markers": options.markers}
     about |= {"steps": options.steps}
     _claim(out, about)
-    say(f"the expert pours {options.demos} times")
+    log(f"the expert pours {options.demos} times")
     shown = pouring_policy.demonstrate(task, options.seed, options.demos, side=side)
     policy, learning = _policy(options, encoder, shown, pouring.SENSOR)
     rivals: dict[str, pouring.Controller] = {
@@ -180,7 +180,7 @@ def _simulated(options: Pour, out: Path) -> int:
         "count": pouring.best_counter(task, *pouring.draw_runs(task, options.seed, options.demos)),
         "expert": pouring.Expert(task),
     }
-    say(f"the policy pours {options.trials} times")
+    log(f"the policy pours {options.trials} times")
     setups, keys = pouring.draw_runs(task, options.seed + pouring_policy.UNSEEN, options.trials)
     trials = pouring.run(task, setups, keys, policy, side=side, film=1)
     lines = [(str(i + 1), f"{g:.1f}", f"{abs(g - task.target):.1f}") for i, g in enumerate(trials.poured)]
@@ -190,9 +190,9 @@ def _simulated(options: Pour, out: Path) -> int:
         print(f"{name}: mean error {sentence(one, task.target)}")
     recordings.save_policy(out, policy)
     found = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
-    write_whole(out / "pour.json", json.dumps(about | {"poured": found}, indent=2) + "\n")
+    atomic_write(out / "pour.json", json.dumps(about | {"poured": found}, indent=2) + "\n")
     pouring.write_film(out / "pour.gif", trials, task)
-    say(f"film, policy and results in {out}")
+    log(f"film, policy and results in {out}")
     return 0
 
 

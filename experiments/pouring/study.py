@@ -43,7 +43,7 @@ from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.encoder.image_tower import image_tower_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.pouring import bounds as pouring_bounds
 from experiments.pouring import policy as pouring_policy
@@ -151,7 +151,7 @@ def do_seed(seed: int) -> None:
 
     def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float, **about: float) -> None:
         path, about["seconds"] = path_of_row(name, mode, seed), round(time.time() - since, 1)
-        write_whole(path, table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
+        atomic_write(path, table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
         mean = pouring.error(trials.poured, TASK.target).mean
         print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {about['seconds']:.0f} s", flush=True)
 
@@ -244,7 +244,7 @@ flow and the load, {VERSION} now):
 
 Made by `SEEDS={",".join(seeds)} make pouring`, from the JSON in `{FOLDER.name}/`.{other}
 """
-write_whole(PAGE, text)
+atomic_write(PAGE, text)
 print(text)
 for name in (picture, "pouring_frames.png"):
     page.show(figures / name)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.evaluate.statistics import mean_interval
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.sensing.units import stack
 from experiments.pouring import physics, render
 from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
@@ -243,7 +243,7 @@ def write_film(path: Path, trials: Trials, task: Task, *, every: int = 4) -> Non
     pages = [Image.fromarray(_page(trials, task, step)).quantize(64) for step in [*range(0, last - 1, every), last - 1]]
     data = io.BytesIO()
     pages[0].save(data, "gif", save_all=True, append_images=pages[1:], duration=100, loop=0)
-    write_whole(path, data.getvalue())
+    atomic_write(path, data.getvalue())
 
 
 def _page(trials: Trials, task: Task, step: int) -> Array:

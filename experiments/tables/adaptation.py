@@ -20,7 +20,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder, text_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.battery_features import digest
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.tables import cuts, plan
 from experiments.tables.plan import Leaf
 
@@ -75,7 +75,7 @@ def adapted(work: Work, run: Path, data: Path, frames: int, labels: str | None =
         words = ["adapt", "--run", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", frames, "--out", out]
         if main([str(word) for word in (*words, *(("--labels", labels) if labels else ()))]):
             raise UserError(f"anytouch adapt failed with {frames} frames of {plan.UNSEEN}; its message is above")
-        write_whole(note, json.dumps(of) + "\n")
+        atomic_write(note, json.dumps(of) + "\n")
     return out
 
 

@@ -39,7 +39,7 @@ def cut_all(folder: Path) -> None:
     sensors, splits = text_column(table, "sensor"), text_column(table, "split")
     for sensor in np.unique(sensors):
         rows = np.flatnonzero((sensors == sensor) & np.isin(splits, SPLITS))
-        cut(table, rows, folder / f"{sensor}.parquet", alone)
+        cut(table, rows, folder / f"{sensor}.parquet", lock)
     there = [split for split in SPLITS if (splits == split).any()]
     rows = np.concatenate([deepest_rows(table, split=split) for split in there])
     cut(table, rows, folder / STATIC)
@@ -56,7 +56,7 @@ def _content_hash(path: Path, changed: int) -> str:
     return manifests.read(path).content_hash
 
 
-def alone(part: pa.Table) -> pa.Table:
+def lock(part: pa.Table) -> pa.Table:
     """A data set that no other sensor has a share in: its touches are nobody else's."""
     return part.set_column(part.column_names.index("touch"), "touch", pa.nulls(part.num_rows, pa.string()))
 

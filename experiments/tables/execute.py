@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.tables import budget, plan
 from experiments.tables.plan import Leaf, Scenes, Size, Training
 from experiments.tables.results import differences, noted, simulated
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 PAUSE = 5.0  # s until what others work on is looked at again
 
 
@@ -87,7 +87,7 @@ def execute(
     out: Path,
     *,
     minutes: float | None = None,
-    say: Say = print,
+    log: Log = print,
     clock: Callable[[], float] = time.monotonic,
     pause: Callable[[float], None] = time.sleep,
 ) -> Outcome:
@@ -114,12 +114,12 @@ def execute(
                         f"{minutes:g}; give more"
                     )
                 rest = [one.file for one in leaves if one.file not in result.failed and not is_done(one, out)]
-                say(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
+                log(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
                 return result._replace(left=rest)
 
             def begin(leaf: Leaf = leaf, seconds: float = seconds) -> None:
                 if leaf.file not in told:
-                    say(f"{leaf.file}: about {seconds / 60:.1f} min")
+                    log(f"{leaf.file}: about {seconds / 60:.1f} min")
                     told.add(leaf.file)
 
             with work.claim(leaf.file) as mine:
@@ -127,7 +127,7 @@ def execute(
                     done = mine and (is_done(leaf, out) or _one(leaf, work, out, begin))
                 except (UserError, RuntimeError, MemoryError) as error:  # XLA's are RuntimeErrors
                     what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-                    say(f"{leaf.file} failed: {what}")
+                    log(f"{leaf.file} failed: {what}")
                     result.failed[leaf.file] = what
                     done = None
             planned += expected - (0.0 if done else budget.cost(leaf, work.ready(leaf)))
@@ -167,5 +167,5 @@ def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
     about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
     about |= {"identity": leaf.identity, "simulator": plan.simulator(), "scoring": plan.scoring(leaf.question)}
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
+    atomic_write(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
     return True

@@ -12,7 +12,7 @@ from anytouch_jax.encoder.encoder import Encoder, embed_rows
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import deepest_rows
 from anytouch_jax.evaluate.statistics import markdown
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 
 
@@ -22,12 +22,12 @@ def find_again(folder: Path, name: str, seed: int, encoder: Encoder, mark: str, 
     if file.exists() and json.loads(file.read_text())["encoder"] == mark:
         return
     rows = deepest_rows(table, table.rows_of("test"))
-    seen = {name: embed_rows(encoder, table, rows, say=silent)[1]}
+    seen = {name: embed_rows(encoder, table, rows, log=silent)[1]}
     scored = retrieval.cross_sensor_retrieval(table, seen, rows, centre=(True,))
     one = next(one.found for one in scored if one.query_sensor == retrieval.ALL)
     assert one is not None
     shares = {part: float(np.mean(getattr(one, part))) for part in ("top1", "top5")}
-    write_whole(file, json.dumps({"encoder": mark, "queries": len(one.top1)} | shares) + "\n")
+    atomic_write(file, json.dumps({"encoder": mark, "queries": len(one.top1)} | shares) + "\n")
 
 
 def found_table(folder: Path) -> str:

@@ -36,7 +36,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder
 from anytouch_jax.evaluate import plots, probe, tasks
 from anytouch_jax.evaluate.statistics import markdown
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
 from experiments.tables import asked, page
@@ -135,12 +135,12 @@ def make(name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         raise SystemExit(f"there is no {path}: run this page without TABLE=1")
     if found is None:
         found = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": SETTINGS} | measure()
-        write_whole(path, json.dumps(found, indent=1) + "\n")
+        atomic_write(path, json.dumps(found, indent=1) + "\n")
     return found
 
 
 def seen(frames: int, join: Any) -> dict[str, Any]:
-    read, values = embed_rows(encoder, table, rows, frames, "both", join, say=silent)
+    read, values = embed_rows(encoder, table, rows, frames, "both", join, log=silent)
     if len(read) < len(rows):
         raise SystemExit(f"{len(rows) - len(read)} rows cannot be read; `anytouch verify` says what is wrong with them")
     found = scores(values)
@@ -188,7 +188,7 @@ Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
 ![Slip against time](figures/{NAME}.png)
 """
-write_whole(OUT / f"{NAME}.md", text)
+atomic_write(OUT / f"{NAME}.md", text)
 points = {
     f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"]) for one in record
 }

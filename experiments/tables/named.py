@@ -49,7 +49,7 @@ from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, rand
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import baseline
 from anytouch_jax.evaluate.statistics import markdown, seed_interval
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -181,10 +181,10 @@ def taught(
         sensor = np.where(rng.random(BATCH) < 0.5, universal, data["sensor"][rows])
         params, state = step(params, state, images, sensor.astype(np.int32), {k: v[rows] for k, v in numbers.items()})
 
-    say = jax.jit(logits)
+    log = jax.jit(logits)
 
     def right(label: str, rows: np.ndarray) -> float:
-        told = [say(params, *some)[label].argmax(-1) for some in batched(data, rows)]
+        told = [log(params, *some)[label].argmax(-1) for some in batched(data, rows)]
         return float(np.mean(np.concatenate(told) == numbers[label][rows]))
 
     some = np.random.default_rng(seed).choice(train, min(2000, len(train)), replace=False)
@@ -222,7 +222,7 @@ def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Wo
     params, scores = taught(of_encoder(fresh), data, seed, fresh.config.model.universal_row)
     named = (anytouch, Encoder(fresh.config, {"touch": params}, "trained with labels"), fresh)
     rows = contact_rows(table, cuts.SPLITS)
-    found = [embed_rows(one, table, rows, pooling="both", say=silent)[1] for one in named]
+    found = [embed_rows(one, table, rows, pooling="both", log=silent)[1] for one in named]
     pixels = baseline.background_difference(table, rows)
     features = dict(zip(NAMES, found, strict=True))
     features["pixels"] = baseline.reduce(pixels, text_column(table, "split")[rows] == "train")
@@ -270,7 +270,7 @@ def one_seed(seed: int) -> dict[str, Any]:
     same = all(there.get(kind) == found[kind] for kind in ("settings", "data"))
     found[CONVOLUTIONAL] = there[CONVOLUTIONAL] if same and CONVOLUTIONAL in there else by_convolutions(*about)
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(file, json.dumps(found) + "\n")
+    atomic_write(file, json.dumps(found) + "\n")
     return found
 
 
@@ -328,5 +328,5 @@ sensor. AnyTouch is that of Tables 2 to 4{inside}, of the same seeds; captions n
 Made by `{made}` ({runs[0]["machine"]}), from the JSON in `{NAME}/`.
 """
 Path(OUT).mkdir(parents=True, exist_ok=True)
-write_whole(OUT / f"{NAME}.md", text)
+atomic_write(OUT / f"{NAME}.md", text)
 print(text)

@@ -65,7 +65,7 @@ def _slip(leaf: Leaf, encoder: Encoder, options: Probe) -> list[Row]:
 def _features(leaf: Leaf, encoder: Encoder, task: Any) -> dict[str, np.ndarray]:
     encoders = {OURS: encoder, UNTRAINED: random_encoder(encoder.config, leaf.seed)}
     found = {
-        name: embed_rows(one, task.manifest, task.rows, pooling="both", say=_quiet)[1] for name, one in encoders.items()
+        name: embed_rows(one, task.manifest, task.rows, pooling="both", log=_quiet)[1] for name, one in encoders.items()
     }
     return found | {PIXELS: probe_command.raw_features(task)}
 

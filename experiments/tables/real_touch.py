@@ -41,7 +41,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder
 from anytouch_jax.evaluate import probe_command, statistics
 from anytouch_jax.evaluate.reconstruction import pixel_scores
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.train.loop import fit
@@ -213,5 +213,5 @@ head = (
     f"Made by `experiments/real_touch.py` from `{STAGE1}` ({config.run.steps} steps) and `{STAGE2}`; manifest "
     f"{manifest.content_hash[:12]}. Every number is in `real_touch.json`.\n\n"
 )
-write_whole(OUT / "real_touch.md", head + "\n".join(lines) + "\n")
-write_whole(OUT / "real_touch.json", json.dumps(record, indent=1) + "\n")
+atomic_write(OUT / "real_touch.md", head + "\n".join(lines) + "\n")
+atomic_write(OUT / "real_touch.json", json.dumps(record, indent=1) + "\n")

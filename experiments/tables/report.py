@@ -8,7 +8,7 @@ from typing import Any
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.tables import pictures, questions, real_table
 from experiments.tables.plan import LABELS
 from experiments.tables.questions import Part
@@ -143,7 +143,7 @@ def write(folder: Path, out: Path) -> Path:
     runs, page = read(folder), out / "README.md"
     figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(page, whole(runs, figures, out))
+    atomic_write(page, whole(runs, figures, out))
     return page
 
 

@@ -162,7 +162,7 @@ def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
         found = {"class token": contact_vector(table, rows)}
     else:
         encoder = encoder_of(leaf, work)
-        both = embed_rows(encoder, table, rows, pooling="both", say=quiet)[1]
+        both = embed_rows(encoder, table, rows, pooling="both", log=quiet)[1]
         width = encoder.config.model.embed
         found = {"class token": both[:, :width], "patches": both[:, width:]}
     metric: retrieval.Metric = "euclidean" if leaf.name == CONTACT else "cosine"

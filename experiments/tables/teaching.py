@@ -44,7 +44,7 @@ from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, rand
 from anytouch_jax.evaluate import baseline, retrieval
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.statistics import markdown
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
@@ -154,7 +154,7 @@ def features(encoders: dict[str, Encoder], seed: int, table: Any, rows: np.ndarr
     plain = replace(one.config, data=replace(one.config.data, background="keep"))
     fresh = {"untrained": random_encoder(one.config, seed), "untrained, whole picture": random_encoder(plain, seed)}
     every = (encoders | fresh).items()
-    return {name: embed_rows(e, table, rows, pooling=pooling, say=silent)[1] for name, e in every}
+    return {name: embed_rows(e, table, rows, pooling=pooling, log=silent)[1] for name, e in every}
 
 
 # %% [markdown]
@@ -213,7 +213,7 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
     found = about | {"machine": machine.describe().sentence(), "config": asdict(config)}
     found |= {"retrieval": retrieve(encoders, grade, seed), "probes": probes(encoders, grade, seed)}
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(file, json.dumps(found) + "\n")
+    atomic_write(file, json.dumps(found) + "\n")
     return found
 
 
@@ -261,5 +261,5 @@ for grade, found in files.items():
     lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
     lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
 OUT.mkdir(parents=True, exist_ok=True)
-write_whole(OUT / f"{NAME}.md", "\n".join(lines))
+atomic_write(OUT / f"{NAME}.md", "\n".join(lines))
 print("\n".join(lines))

@@ -24,7 +24,7 @@ import jax
 import anytouch_jax
 from anytouch_jax.config import Config, to_json
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import alone, write_whole
+from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
@@ -35,15 +35,15 @@ from experiments.tables.cuts import content_hash
 from experiments.tables.plan import Leaf, Scenes, Size, Training
 from experiments.tables.results import noted
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 DONE, BEGUN = "done.json", "begun.json"
 
 
 class Work:
     """`execute.Work` in the folder `folder`; `real` is the manifest of real touch, or None where there is none."""
 
-    def __init__(self, folder: Path, *, real: Path | None = None, say: Say = print) -> None:
-        self.folder, self.real, self.say = folder, real, say
+    def __init__(self, folder: Path, *, real: Path | None = None, log: Log = print) -> None:
+        self.folder, self.real, self.log = folder, real, log
 
     def ready(self, leaf: Leaf) -> set[str]:
         sets = {one.name for one in plan.scenes(leaf.size) if self.made(one, leaf.size)}
@@ -66,7 +66,7 @@ class Work:
         """A lock on `name` that dies with the process; whether it was free."""
         path = self.folder / "claims" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        return alone(path)
+        return lock(path)
 
     def make(self, one: Scenes, size: Size) -> None:
         check_objects(size)
@@ -94,18 +94,18 @@ class Work:
         start, run, of = time.perf_counter(), self.run_of(one), self._contents(one)
         before = noted(run / BEGUN) or noted(run / DONE)
         if before.get("of", of) != of:
-            self.say(f"  {run.name} was trained on other data: it is begun anew")
+            self.log(f"  {run.name} was trained on other data: it is begun anew")
             shutil.rmtree(run)
             before = {}
         about = {"of": of, "parts": before.get("parts", 0) + 1, "seconds": before.get("seconds", 0.0)}
         run.mkdir(parents=True, exist_ok=True)
-        write_whole(run / BEGUN, json.dumps(about) + "\n")
+        atomic_write(run / BEGUN, json.dumps(about) + "\n")
         init = self.run_of(one.init) if one.init else None
         try:
-            result = pretrain(self.resolved(one.config), run, init=init, say=lambda _: None)
+            result = pretrain(self.resolved(one.config), run, init=init, log=lambda _: None)
         finally:  # the next part adds to this one's time; what a part that was killed took is lost
             about["seconds"] = round(about["seconds"] + time.perf_counter() - start, 1)
-            write_whole(run / BEGUN, json.dumps(about) + "\n")
+            atomic_write(run / BEGUN, json.dumps(about) + "\n")
         if result.interrupted is not None:
             raise KeyboardInterrupt
         self._finish(run, about | {"resumed_at_step": result.resumed})
@@ -157,8 +157,8 @@ class Work:
         } | found
 
     def _finish(self, folder: Path, about: dict[str, Any]) -> None:
-        write_whole(folder / DONE, json.dumps(about) + "\n")
-        self.say(f"  {folder.name}: {about['seconds']:.0f} s")
+        atomic_write(folder / DONE, json.dumps(about) + "\n")
+        self.log(f"  {folder.name}: {about['seconds']:.0f} s")
 
     def _forget(self) -> None:
         """Programs of one training are of no use to the next and hold their memory."""

@@ -13,11 +13,11 @@ import numpy as np
 
 from anytouch_jax.cli.output import check_home
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.config.parsing import SEED, in_range
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from experiments.command import main
 from experiments.translation.generator import GENERATOR
 
@@ -124,16 +124,16 @@ def _fit(options: Translate) -> int:
     encoder = load_encoder(options.run)
     table = manifests.read(options.data)
     split = pairs.find_pairs(table, options.source, options.to)
-    encoder.sensor_row(options.source, say)
-    say(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of objects never seen to test on")
+    encoder.sensor_row(options.source, log)
+    log(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of objects never seen to test on")
     size = encoder.config.model.image_size
     (x, y), val, (test_x, test_y) = (pairs.read_pairs(table, part, size, subtract=encoder.subtracts) for part in split)
-    made, losses = training.fit(encoder, x, y, source=options.source, target=options.to, val=val, options=how, say=say)
+    made, losses = training.fit(encoder, x, y, source=options.source, target=options.to, val=val, options=how, log=log)
     ours, mean = training.errors(made, test_x, test_y), training.mean_errors(made, test_y)
     picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": ours.mean(), "mean target": mean.mean(), "test pairs": len(ours), "losses": losses}
     report["critic"] = made.design.has_critic
-    write_whole(home / "report.json", json.dumps(report, indent=2, allow_nan=False) + "\n")
+    atomic_write(home / "report.json", json.dumps(report, indent=2, allow_nan=False) + "\n")
     generator.save(made, home)  # last: a folder that holds it is whole
     print(f"{home}: error {ours.mean():.4f} on objects never seen (copying the mean target: {mean.mean():.4f})")
     return 0
@@ -191,11 +191,11 @@ def _write(path: Path, result: Any) -> None:
     if result.dtype == np.uint8:
         import cv2
 
-        write_whole(path, cv2.imencode(".png", result[..., ::-1])[1].tobytes())
+        atomic_write(path, cv2.imencode(".png", result[..., ::-1])[1].tobytes())
         return
     data = io.BytesIO()
     np.save(data, result, allow_pickle=False)
-    write_whole(path, data.getvalue())
+    atomic_write(path, data.getvalue())
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.edit import select
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -164,7 +164,7 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
     }
     if about["fit"]["seed"] == SEEDS[0]:
         picture_grid(file.with_suffix(".png"), made, test_x[shown], test_y[shown])
-    write_whole(file, json.dumps(record, indent=2) + "\n")
+    atomic_write(file, json.dumps(record, indent=2) + "\n")
     print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
 
@@ -228,7 +228,7 @@ def all_runs() -> None:
     counts = RUN_FILES / "overlap.json"
     before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
     met = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
-    write_whole(counts, json.dumps(before | {name: " to ".join(found) for name, found in met.items()}) + "\n")
+    atomic_write(counts, json.dumps(before | {name: " to ".join(found) for name, found in met.items()}) + "\n")
     for source, target in TASKS:
         mine = [(*one, file) for file, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
         todo = [one for one in mine if not (one[2].exists() and _settings_of(one[2]) == one[0])]
@@ -250,7 +250,7 @@ if not TABLE:
 
 # %%
 said = translated.page(RUN_FILES)
-write_whole(OUT / f"{NAME}.md", said)
+atomic_write(OUT / f"{NAME}.md", said)
 print(said)
 for picture in sorted(RUN_FILES.glob("*.png")):
     page.show(picture)

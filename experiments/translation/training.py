@@ -35,7 +35,7 @@ from experiments.translation.generator import (
 )
 from experiments.translation.networks import STATES, Translation
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 _SAMPLE = 512  # images that the features' mean and deviation are taken from
 _CHUNK = 64
 _FAINT = 1e-4
@@ -78,7 +78,7 @@ def fit(
     val: tuple[np.ndarray, np.ndarray] | None = None,
     options: Fit | None = None,
     shape: Translation | None = None,
-    say: Say | None = None,
+    log: Log | None = None,
 ) -> tuple[Generator, list[dict[str, float]]]:
     """Train a translation on pairs: source `images` u8 (n, H, W, 3), `targets` images u8 alike or fields f32.
 
@@ -102,8 +102,8 @@ def fit(
             losses.append(_finite(step, metrics, error))
             if error is None or error < best:
                 best, made = error or 0.0, state.made
-            if say is not None:
-                say(", ".join(f"{name} {value:.4g}" for name, value in losses[-1].items()))
+            if log is not None:
+                log(", ".join(f"{name} {value:.4g}" for name, value in losses[-1].items()))
     return Generator(design, jax.tree.map(np.asarray, made | still)), losses
 
 

@@ -13,7 +13,7 @@ from typing import IO
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path, *, sync: bool = True, part: Path | None = None) -> Iterator[Path]:
+def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None) -> Iterator[Path]:
     """The path of a file to write, which takes the place of `path` in one move when the block ends.
 
     On any error, and when the process is killed, `path` stays as it was. Its folder is made. The bytes are on the disk
@@ -39,14 +39,14 @@ def replacing(path: str | Path, *, sync: bool = True, part: Path | None = None) 
             part.unlink()
 
 
-def write_whole(path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None) -> None:
+def atomic_write(path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None) -> None:
     """Write a file whole or not at all, text as UTF-8. Raises OSError, with the file's name (see `replacing`)."""
-    with replacing(path, sync=sync, part=part) as target:
+    with atomic_path(path, sync=sync, part=part) as target:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path) -> Iterator[Path]:
     """A folder to fill, which becomes `path`, that is empty or not there, when the block ends; on an error nothing
     stays."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
@@ -69,7 +69,7 @@ def _opened(path: str | Path) -> IO[bytes]:
 
 
 @contextlib.contextmanager
-def alone(path: str | Path) -> Iterator[bool]:
+def lock(path: str | Path) -> Iterator[bool]:
     """A lock on a file, which is made if need be, that ends with the block or the process; whether it was free.
 
     The lock is of the file, not of its name: one that takes its place is another. Where the system or the disk knows

@@ -31,7 +31,7 @@ from anytouch_jax.weights import checkpoint, fits, release
 from anytouch_jax.weights.record import steps
 
 Params = dict[str, Any]
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 SCRATCH_VOCABULARY, TOKENIZER = 2048, "tokenizer.json"
 _NO_CLIP = "towers=pretrained needs CLIP weights: --clip <folder or file>, with tokenizer.json beside them"
 
@@ -43,7 +43,7 @@ def pretrain(
     init: str | Path | None = None,
     clip: str | Path | None = None,
     stop_after: int | None = None,
-    say: Say = print,
+    log: Log = print,
     mesh: Mesh | None = None,
 ) -> FitResult:
     """Train stage 1 or stage 2 in the folder `run`, or go on with it (Sec. 3.6).
@@ -55,7 +55,7 @@ def pretrain(
     the folder.
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
-    say = say if jax.process_index() == 0 else silent
+    log = log if jax.process_index() == 0 else silent
     _possible(config)
     if config.stage == 1 and init is not None and clip is not None:
         raise UserError(
@@ -67,14 +67,14 @@ def pretrain(
     net = build(config.model)
     params = net.init(jax.random.key(config.run.seed))
     if not steps(run / "checkpoints"):  # else only their shapes matter
-        params = _first_params(params, config, init, clip, say)
+        params = _first_params(params, config, init, clip, log)
     else:
-        _same_start(run, say, init=init, clip=clip)
+        _same_start(run, log, init=init, clip=clip)
     _same_data(run, manifest)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
     for note in loader.notes:
-        say(note)
+        log(note)
     config = _warmed(config, run, loader)
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
     with alone_in(run) if jax.process_index() == 0 else nullcontext():
@@ -89,7 +89,7 @@ def pretrain(
             stop_after=stop_after,
             on_report=partial(_report, run=run, net=net, config=config),
             metadata=_describe(config, run, init, clip, manifest, loader),
-            say=say,
+            log=log,
             mesh=mesh,
         )
 
@@ -142,7 +142,7 @@ def _same_data(run: Path, manifest: manifests.Manifest) -> None:
             )
 
 
-def _same_start(run: Path, say: Say, **given: str | Path | None) -> None:
+def _same_start(run: Path, log: Log, **given: str | Path | None) -> None:
     """Say so where a run that goes on is given another `init` or `clip` than it had: they are not read again."""
     with suppress(checkpoint.CheckpointError):
         source = checkpoint.read_metadata(run).get("source") or {}
@@ -150,7 +150,7 @@ def _same_start(run: Path, say: Say, **given: str | Path | None) -> None:
             before = source.get(name)
             if path is not None and (before is None or Path(before).resolve() != Path(path).resolve()):
                 told = f"from {before}" if before else f"without --{name}"
-                say(f"{run} goes on and was begun {told}: {path} is not read")
+                log(f"{run} goes on and was begun {told}: {path} is not read")
 
 
 def _describe(
@@ -230,15 +230,15 @@ def _weights_file(path: Path) -> Path:
     raise UserError(f"no weights (*.safetensors, *.bin, *.pth) in {path}")
 
 
-def _first_params(params: Params, config: Config, init: Any, clip: Any, say: Say) -> Params:
+def _first_params(params: Params, config: Config, init: Any, clip: Any, log: Log) -> Params:
     """Fresh `params`, with CLIP's and those of `init` in their places (golden K_weight_loading_map)."""
     if config.towers == "pretrained" and clip is None:
         raise UserError(_NO_CLIP)
     fresh = set(params) - ({"image", "text"} if clip else set())
-    first = None if init is None else _load(Path(init), config, say, fresh)
+    first = None if init is None else _load(Path(init), config, log, fresh)
     weights = None if clip is None else _read_clip(_weights_file(Path(clip)), config, touch=init is None)
     if config.stage == 2 and init is None:
-        say("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
+        log("stage 2 starts without a stage-1 run (--init): its touch encoder has seen no touch yet")
     return release.first_params(params, config.model, stage1=first, clip=weights)
 
 
@@ -251,7 +251,7 @@ def _read_clip(file: Path, config: Config, *, touch: bool) -> dict[str, np.ndarr
     return weights
 
 
-def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
+def _load(path: Path, config: Config, log: Log, parts: set[str]) -> Params:
     """Touch encoder and decoder of a run folder or of a weights file, its sensors in the order of the model's.
 
     Tells of other `parts` of the new model that it has too: they start anew.
@@ -282,17 +282,17 @@ def _load(path: Path, config: Config, say: Say, parts: set[str]) -> Params:
     if "touch" not in params or "decoder" not in params:
         raise UserError(f"{path} holds no touch encoder and decoder; give a stage-1 run or the authors' weights")
     if shown != config.data.background:
-        say(
+        log(
             f"{path} was trained with --loader.background {shown}, this run with {config.data.background}: its "
             "encoder has never seen touches like these"
         )
     if lost := [name for name in stored if name in seen and name not in config.model.sensors]:
         kept = " ".join((*config.model.sensors, *lost))
-        say(f"the tokens of {', '.join(lost)} in {path} are left behind; --model.sensors {kept} keeps them")
+        log(f"the tokens of {', '.join(lost)} in {path} are left behind; --model.sensors {kept} keeps them")
     if anew := sorted((parts & set(params)) - {"touch", "decoder"}):
-        say(f"of {path} the touch encoder and the decoder are taken; {', '.join(anew)} start anew")
+        log(f"of {path} the touch encoder and the decoder are taken; {', '.join(anew)} start anew")
     if params["touch"]["position"].shape[0] != config.model.patches + 1:
-        say(f"the positions of {path} are resized for pictures of {config.model.image_size} pixels")
+        log(f"the positions of {path} are resized for pictures of {config.model.image_size} pixels")
         params = release.resized(params, config.model.patches)
     touch, wanted = params["touch"], config.model.sensors
     touch = touch | {"sensor_tokens": release.match_sensors(np.asarray(touch["sensor_tokens"]), stored, wanted)}

@@ -116,10 +116,10 @@ def test_no_clip_of_a_folder_reaches_over_a_missing_number(anytouch, tiny_run, t
         assert [Path(name).stem for name in found["key/path"]] == ["img002", "img007", "img008"]
     assert anytouch("embed", *words, "--input", folder / "img005.png").status == 0
     with np.load(out) as one:
-        alone = one["features"]
+        lock = one["features"]
     assert anytouch("embed", *words, "--input", folder).status == 0
     with np.load(out) as every:
-        np.testing.assert_allclose(alone, every["features"][3:4], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(lock, every["features"][3:4], rtol=1e-5, atol=1e-6)
 
 
 def test_an_option_of_a_section_is_named_in_full(mistake):

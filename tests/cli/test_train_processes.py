@@ -90,15 +90,15 @@ def agree(one: Path, other: Path) -> None:
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["stage 1", "stage 2"])
-def alone(request, tmp_path_factory, world, compiled_once):
+def lock(request, tmp_path_factory, world, compiled_once):
     """(stage, run folder, result) of twenty steps on one device."""
     run = tmp_path_factory.mktemp("alone") / "run"
     return request.param, run, train(config_of(world, request.param), run, mesh=make_mesh(1))
 
 
 @pytest.mark.slow
-def test_one_two_and_four_devices_and_two_processes_give_the_same_losses(alone, world, tmp_path):
-    stage, run, _ = alone
+def test_one_two_and_four_devices_and_two_processes_give_the_same_losses(lock, world, tmp_path):
+    stage, run, _ = lock
     if stage == 2:  # InfoNCE over the global batch: some rows have no photograph or caption
         assert 0 < read_metrics(run)[0]["touch_text_pairs"] < 8
     for devices, fsdp in ((2, 1), (4, 2)):
@@ -111,8 +111,8 @@ def test_one_two_and_four_devices_and_two_processes_give_the_same_losses(alone, 
 
 
 @pytest.mark.slow
-def test_from_four_devices_to_one_and_back_the_parameters_are_the_same(alone, world, tmp_path):
-    stage, run, result = alone
+def test_from_four_devices_to_one_and_back_the_parameters_are_the_same(lock, world, tmp_path):
+    stage, run, result = lock
     for stop, devices, fsdp in ((5, 4, 1), (10, 1, 1), (15, 4, 4), (20, 1, 1)):
         mesh = make_mesh(devices // fsdp, fsdp)
         part = train(config_of(world, stage, fsdp=fsdp), tmp_path / "r", mesh=mesh, stop_after=stop)

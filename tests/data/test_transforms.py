@@ -147,9 +147,9 @@ def test_all_frames_of_a_clip_share_one_draw():
     out = t.touch_transform(same, 16, _rng(5), DataConfig())
     for frame in out[1:]:
         np.testing.assert_array_equal(frame, out[0])
-    alone = t.touch_transform(CLIP[:1], 16, _rng(5), DataConfig())
+    lock = t.touch_transform(CLIP[:1], 16, _rng(5), DataConfig())
     together = t.touch_transform(CLIP, 16, _rng(5), DataConfig())
-    np.testing.assert_array_equal(alone[0], together[0])
+    np.testing.assert_array_equal(lock[0], together[0])
     assert not np.array_equal(out, t.touch_transform(same, 16, _rng(6), DataConfig()))
 
 

@@ -58,7 +58,7 @@ def run(tmp_path_factory, data, compiled_once):
 @pytest.fixture(scope="module")
 def fitted(run, table):
     said = []
-    return adapt(run, table, "gelslim", frames=8, steps=40, say=said.append), said
+    return adapt(run, table, "gelslim", frames=8, steps=40, log=said.append), said
 
 
 def test_only_the_row_of_the_new_sensor_changes(fitted, run):
@@ -225,12 +225,12 @@ def test_a_run_that_does_not_tell_what_it_saw_is_taken_at_its_word(run, table, t
     params, text, _ = checkpoint.load_params(run)
     said = []
     old = stored(tmp_path / "old", from_json(text), params)
-    adapted = adapt(old, table, "gelslim", frames=0, say=said.append)
+    adapted = adapt(old, table, "gelslim", frames=0, log=said.append)
     assert "does not tell on which sensors it was trained" in said[0] and "seen" not in adapted.about
     config = replace(from_json(text), stage=2)
     stored(tmp_path / "two", config, params, seen=["digit"])
     said.clear()
-    adapt(tmp_path / "two", table, "gelslim", frames=2, steps=1, say=said.append)
+    adapt(tmp_path / "two", table, "gelslim", frames=2, steps=1, log=said.append)
     assert "this stage 2 did not train the decoder" in said[0]
 
 

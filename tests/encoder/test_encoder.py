@@ -17,7 +17,7 @@ from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder.encoder import (
     Encoder,
     Features,
-    Sight,
+    Preprocess,
     embed_rows,
     load_encoder,
     plain_column,
@@ -210,7 +210,7 @@ def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):
 
 def test_a_manifest_gives_what_its_pictures_give(encoder, world):
     manifest, said = manifests.read(world), []
-    rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, say=said.append)
+    rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, log=said.append)
     order = np.argsort(rows)
     assert rows[order].tolist() == [0, 5, 9] and said == []
     for row, value in zip(rows, values, strict=True):
@@ -247,7 +247,7 @@ def test_an_unknown_sensor_of_a_manifest_is_said_once(encoder, world):
     params = {"touch": encoder.params["touch"] | {"sensor_tokens": encoder.params["touch"]["sensor_tokens"][[0, 1, 9]]}}
     small, said = Encoder(replace(encoder.config, model=known), params, "small"), []
     manifest = manifests.read(world)
-    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, say=said.append)
+    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, log=said.append)
     assert len(said) == 1 and "'gelsight_mini'" in said[0]
     image = touch_evaluation([decode(world.parent / "b0.png")], 28)[None]
     np.testing.assert_allclose(values[0], encoder.embed(image)[0], atol=1e-5)
@@ -339,7 +339,7 @@ def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
 def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
     """OpenCV writes a resized frame of another type elsewhere, and leaves what was in memory."""
     encoder = load_encoder(tiny_run)
-    see = Sight(encoder)
+    see = Preprocess(encoder)
     rgb = np.random.default_rng(0).integers(0, 256, (40, 52, 3), np.uint8)
     grey = rgb[..., :1]
     alpha = np.concatenate([rgb, grey], -1)
@@ -352,7 +352,9 @@ def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
     for bad in (rgb.astype(np.float32), rgb.astype(np.int32), rgb[None], np.zeros((0, 4, 3), np.uint8)):
         with pytest.raises(UserError, match="the frame has"):
             see(bad)
-    less = Sight(replace(encoder, config=replace(encoder.config, data=DataConfig(background="subtract"))), grey[..., 0])
+    less = Preprocess(
+        replace(encoder, config=replace(encoder.config, data=DataConfig(background="subtract"))), grey[..., 0]
+    )
     assert (less(grey) == 128).all()
     for bad in (grey, alpha, rgb.astype(np.float32)):
         with pytest.raises(UserError, match="a frame must be RGB uint8"):

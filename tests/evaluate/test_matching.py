@@ -84,9 +84,9 @@ def test_triples_are_of_one_place_and_of_two(touched: Any, rows: np.ndarray, neg
 
 
 def test_without_pairs_there_is_nothing_to_match(touched: Any, rows: np.ndarray) -> None:
-    alone = rows[column(touched, rows, "sensor") == "digit"]
+    lock = rows[column(touched, rows, "sensor") == "digit"]
     with pytest.raises(UserError, match="no touch of these rows was felt by two sensors"):
-        draw_triples(touched, alone, "any")
+        draw_triples(touched, lock, "any")
 
 
 # Scores -------------------------------------------------------------------------------------------------------------

@@ -160,10 +160,10 @@ def test_the_table_of_retrieval(touched: Path, tmp_path: Path) -> None:
     assert list(changes["fine"]) == ["random"] and 0.7 < low <= mean <= high <= 1
     assert rows[2] == f"| fine | random | {100 * mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) |"
     assert "nearest in force" in section.text and section.notes == "- a note"
-    alone, _ = retrieval_section(
+    lock, _ = retrieval_section(
         {"fine": {"by chance": scored(manifests.read(touched))["by chance"]}}, "x", [], tmp_path
     )
-    assert "| fine | random | - | - | - |" in alone.table
+    assert "| fine | random | - | - | - |" in lock.table
     empty, none = retrieval_section({}, "stage 2", ["nothing scored"], tmp_path)
     assert empty.figure is None and not none and "nothing scored" in empty.notes
 

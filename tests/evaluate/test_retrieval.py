@@ -196,8 +196,8 @@ def test_the_interval_is_over_objects_not_over_touches() -> None:
     by_object, by_touch = ask(query, gallery), ask(query, gallery, things=[""] * COUNT)
     assert by_object.low < by_object.top1 < by_object.high and by_touch.low < by_touch.top1 < by_touch.high
     assert by_object.high - by_object.low > 2 * (by_touch.high - by_touch.low)
-    alone = ask(query, gallery, things=["one"] * COUNT)
-    assert alone.low is None and alone.groups == 1
+    lock = ask(query, gallery, things=["one"] * COUNT)
+    assert lock.low is None and lock.groups == 1
 
 
 def test_a_paired_difference_is_narrower_than_two_intervals() -> None:
@@ -351,9 +351,9 @@ def test_sensors_that_share_no_touch_are_left_out_aloud(touched: manifests.Manif
         ("digit", "gelsight"), ("gelsight", "digit"), ("gelsight", "gelslim"), ("gelslim", "gelsight"),
     }  # fmt: skip
     assert "digit to gelslim left out: no touch was felt by both" in found[-1].notes
-    alone = rows[np.array(sensor)[rows] != "gelsight"]
+    lock = rows[np.array(sensor)[rows] != "gelsight"]
     with pytest.raises(UserError, match="no touch was felt by two sensors"):
-        cross_sensor_retrieval(touched, {"x": texture_features(touched, alone)}, alone, gallery_size=10)
+        cross_sensor_retrieval(touched, {"x": texture_features(touched, lock)}, lock, gallery_size=10)
 
 
 def test_what_a_manifest_lacks_is_said(touched: manifests.Manifest) -> None:

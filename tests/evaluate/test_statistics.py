@@ -124,8 +124,8 @@ def test_a_difference_is_paired() -> None:
     change, low, high = difference(outcome(better), outcome(worse))
     assert change == pytest.approx(better.mean() - worse.mean())
     assert 0 < low < change < high
-    alone = mean_interval(better, np.arange(300) // 5)
-    assert high - low < (alone[1] - alone[0]) / 2
+    lock = mean_interval(better, np.arange(300) // 5)
+    assert high - low < (lock[1] - lock[0]) / 2
     assert difference(outcome(better), outcome(better)) == (0.0, 0.0, 0.0)
 
 

@@ -44,5 +44,5 @@ def test_a_part_of_the_parameters_serves_the_methods_that_read_it():
     net = build(full_model())
     params = net.init(jax.random.key(0))
     clip = jnp.ones((1, 1, 28, 28, 3))
-    alone = net.apply({"touch": params["touch"]}, "encode", clip, jnp.asarray([0]))
-    np.testing.assert_array_equal(alone, net.apply(params, "encode", clip, jnp.asarray([0])))
+    lock = net.apply({"touch": params["touch"]}, "encode", clip, jnp.asarray([0]))
+    np.testing.assert_array_equal(lock, net.apply(params, "encode", clip, jnp.asarray([0])))

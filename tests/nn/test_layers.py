@@ -85,12 +85,12 @@ def test_what_is_read_alone_is_what_the_whole_stack_gives_there(depth, remat):
     def whole(blocks, x):
         return run_blocks(blocks, x, remat=remat)[:, 0]
 
-    def alone(blocks, x):
+    def lock(blocks, x):
         return read_blocks(blocks, x, remat=remat)
 
-    np.testing.assert_allclose(alone(blocks, x), whole(blocks, x), atol=2e-5)
+    np.testing.assert_allclose(lock(blocks, x), whole(blocks, x), atol=2e-5)
     first, second = (
-        jax.jit(jax.grad(lambda b, x, f=f: jnp.sum(f(b, x) ** 2), (0, 1)))(blocks, x) for f in (whole, alone)
+        jax.jit(jax.grad(lambda b, x, f=f: jnp.sum(f(b, x) ** 2), (0, 1)))(blocks, x) for f in (whole, lock)
     )
     scale = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(first))
     assert scale > 1

@@ -235,9 +235,9 @@ def test_another_batch_gives_the_same_recording(takes, monkeypatch):
     scenes = replace(SCENES, sensors=("digit",))
     things, _ = scene.cast(scenes)
     recording, take = takes["digit"][4]
-    alone = Recorder(scenes, things, batch=6).record([recording])[0]
-    np.testing.assert_array_equal(alone.image, take.image)
-    jax.tree.map(np.testing.assert_array_equal, alone.labels, take.labels)
+    lock = Recorder(scenes, things, batch=6).record([recording])[0]
+    np.testing.assert_array_equal(lock.image, take.image)
+    jax.tree.map(np.testing.assert_array_equal, lock.labels, take.labels)
     monkeypatch.setattr(record, "AT_ONCE", 4 * 2 * scenes.frames * scenes.size**2)
     recordings = [one for one, _ in takes["digit"]]
     assert len(recordings) == 6  # so a program of four runs twice

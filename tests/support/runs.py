@@ -81,7 +81,7 @@ def run_config(
 
 def train(config: Config, run: Path, said: list[str] | None = None, **options: Any) -> FitResult:
     """`pretrain`, quietly: what it says goes to `said`."""
-    return pretrain(config, run, say=(said if said is not None else []).append, **options)
+    return pretrain(config, run, log=(said if said is not None else []).append, **options)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

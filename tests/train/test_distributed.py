@@ -135,7 +135,7 @@ def test_a_ballot_gives_the_largest_vote():
 # Two processes ------------------------------------------------------------------------------------------------------
 
 
-def alone(run_dir, mesh=None, **more):
+def lock(run_dir, mesh=None, **more):
     """The same run in this process."""
     return fit(
         config_of(**{"steps": 12} | more.pop("run", {})),
@@ -144,7 +144,7 @@ def alone(run_dir, mesh=None, **more):
         batches=batches_of(0, 1),
         run_dir=run_dir,
         mesh=mesh or make_mesh(1),
-        say=lambda sentence: None,
+        log=lambda sentence: None,
         **more,
     )
 
@@ -156,7 +156,7 @@ def column(run_dir, name="loss"):
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("undisturbed")
-    return run_dir, alone(run_dir)
+    return run_dir, lock(run_dir)
 
 
 def same(result, run_dir, undisturbed):
@@ -176,7 +176,7 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
     assert second == ""  # one of them speaks
     assert sorted(entry.name for entry in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000006"]
     assert column(tmp_path, "skipped_samples") == [1 + 2] * 6  # by both
-    result = alone(tmp_path, mesh=make_mesh(fsdp=4), run={"fsdp": 4})
+    result = lock(tmp_path, mesh=make_mesh(fsdp=4), run={"fsdp": 4})
     assert result.resumed == 6
     kernel = result.state.trainable["trunk"]["kernel"]
     assert {shard.data.shape for shard in kernel.addressable_shards} == {(12, WIDE // 4)}
@@ -199,7 +199,7 @@ def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(tmp_path, undi
     again = finish(start(tmp_path, steps=12, fsdp=2))
     assert [status for status, _ in again] == [0, 0], again
     assert "going on from the checkpoint of step 3" in again[0][1] or "of step 6" in again[0][1]
-    same(alone(tmp_path, run={"fsdp": 2}), tmp_path, undisturbed)
+    same(lock(tmp_path, run={"fsdp": 2}), tmp_path, undisturbed)
 
 
 @pytest.mark.slow
@@ -207,4 +207,4 @@ def test_two_processes_of_two_devices_each(tmp_path, undisturbed):
     ended = finish(start(tmp_path, devices=2, steps=12, fsdp=4))
     assert [status for status, _ in ended] == [0, 0], ended
     assert column(tmp_path, "skipped_samples") == [1 + 2] * 12
-    same(alone(tmp_path, run={"fsdp": 2}), tmp_path, undisturbed)
+    same(lock(tmp_path, run={"fsdp": 2}), tmp_path, undisturbed)

@@ -31,7 +31,7 @@ SRC = ROOT / "src"
 def run(run_dir, config=None, *, said=None, **more):
     options = {"params": toy_params(), "loss_fn": toy_loss, "batches": toy_batches} | more
     said = [] if said is None else said
-    return fit(config or toy_config(), run_dir=run_dir, say=said.append, **options)
+    return fit(config or toy_config(), run_dir=run_dir, log=said.append, **options)
 
 
 def clips(start, stop):

@@ -21,7 +21,7 @@ def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     screen = sys.stderr
     with progress(0, 3, to_stderr) as bar:
-        bar.say("saved at step 1")
+        bar.log("saved at step 1")
         for step in range(3):
             bar.advance(row(step))
     shown = screen.getvalue()

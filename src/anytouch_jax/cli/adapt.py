@@ -5,7 +5,7 @@ from __future__ import annotations
 from anytouch_jax.cli.options_use import Adapt
 from anytouch_jax.cli.output import check_home
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, SEED, in_range
 
 
@@ -30,7 +30,7 @@ def run(options: Adapt) -> int:
         labels=options.labels,
         steps=options.steps,
         seed=options.seed,
-        say=say,
+        log=log,
     )
     save(found, options.run, options.out)
     if not options.frames:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from anytouch_jax.cli.options_data import Annotate
 from anytouch_jax.cli.output import beside, check_apart, check_folder, check_new, write_new
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.errors import UserError
 
@@ -61,13 +61,13 @@ def run(options: Annotate) -> int:
             confirm=lambda estimate: _consent(options, estimate), price_in=options.price_in,
             price_out=options.price_out, threads=options.threads, side=options.side, split=options.split,
             families=dict(options.family), overwrite=options.overwrite, second_image=options.second_image,
-            limit=options.limit, say=say,
+            limit=options.limit, log=log,
         )  # fmt: skip
     except _OnlyAnEstimate:
         return 0
     _tell(found)
     if options.sheet is not None:
-        say(f"{sample_sheet(manifest, found.captions, options.sheet, count=options.sheet_count)}: captions to check")
+        log(f"{sample_sheet(manifest, found.captions, options.sheet, count=options.sheet_count)}: captions to check")
     print(f"{write_new(found.manifest, target)}: {len(found.captions):,} captions")
     return 1 if found.failures else 0
 
@@ -79,7 +79,7 @@ def _attach(options: Annotate, manifest: Manifest, target: Path) -> int:
     assert options.captions is not None
     named, notes = attach_text(manifest, options.captions, key=options.key, overwrite=options.overwrite)
     for note in notes:
-        say(note)
+        log(note)
     print(f"{write_new(named, target)}: {int(named.present('text').sum()):,} of {len(named):,} rows have a caption")
     return 0
 
@@ -118,6 +118,6 @@ def _tell(found: Annotated) -> None:
     for reason, count in found.left_out.items():
         print(f"left out, {reason}: {count:,} rows")
     for failure in found.failures[:5]:
-        say(f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}")
+        log(f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}")
     if len(found.failures) > 5:
-        say(f"... and {len(found.failures) - 5} more: failures.jsonl has them all")
+        log(f"... and {len(found.failures) - 5} more: failures.jsonl has them all")

@@ -9,7 +9,7 @@ import numpy as np
 from anytouch_jax.cli.options_data import Contact
 from anytouch_jax.cli.output import beside, check_apart, check_folder, check_new, write_new
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import Range, in_range
 from anytouch_jax.errors import UserError
 
@@ -48,7 +48,7 @@ def run(options: Contact) -> int:
         quality = contact_quality(manifest, scores, reference=options.reference, above=options.above, thresholds=limits)
         print("\n".join(quality.lines()))
     if options.picture is not None:
-        say(f"{contact_picture(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
+        log(f"{contact_picture(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
     if target is not None:
         print(f"{write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
     return 0

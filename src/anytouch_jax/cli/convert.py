@@ -11,7 +11,7 @@ import numpy as np
 from anytouch_jax.cli.options import Convert
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config import UNIVERSAL, ModelConfig
 from anytouch_jax.errors import UserError
 
@@ -45,9 +45,9 @@ def run(options: Convert) -> int:
         checkpoint.export_safetensors(options.target, params, about)
     else:
         if "matcher" in params and model.match_head == "mlp":
-            say("the matching MLP of recipe paper is stored as cross_sensor_mlp.*: the authors' code does not read it")
+            log("the matching MLP of recipe paper is stored as cross_sensor_mlp.*: the authors' code does not read it")
         if "force" in params:
-            say("the force heads are left out: the authors' files have none (--names own keeps them)")
+            log("the force heads are left out: the authors' files have none (--names own keeps them)")
             params = {name: tree for name, tree in params.items() if name != "force"}
         arrays = release.to_release(params, model, allow_extra=True)
         release.write_safetensors(options.target, arrays, about | {"format": "pt"})

@@ -14,7 +14,7 @@ import numpy as np
 from anytouch_jax.cli.options import Embed
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.cli.unused import refuse, refuse_join
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
 from anytouch_jax.errors import UserError
 
@@ -104,7 +104,7 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
         source,
         _sight(encoder, options),
         live=live,
-        sensor=encoder.sensor_row(options.sensor or UNIVERSAL, say),
+        sensor=encoder.sensor_row(options.sensor or UNIVERSAL, log),
         frames=options.frames,
         stride=options.stride,
         pooling=options.pooled,
@@ -123,7 +123,7 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
         features.save_npz(options.out, _named(found, head if len(result.numbers) else None), about)
     _say_universal(encoder, options)
     for line in stream.budget(result):
-        say(line)
+        log(line)
     if not lines:
         print(f"{options.out}: {len(result.values)} features of {result.values.shape[1]} values")
     return 0
@@ -151,20 +151,20 @@ def _say_universal(encoder: Encoder, options: Embed) -> None:
     """Tell of a sensor that was not named; once there are features, since a mistake is answered by one sentence."""
     if options.sensor is None:
         names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
-        say(f"no --sensor was given: the universal tokens were used; name it where it is one of {names}")
+        log(f"no --sensor was given: the universal tokens were used; name it where it is one of {names}")
 
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
     from anytouch_jax.data.images import decode
-    from anytouch_jax.encoder.encoder import Sight
+    from anytouch_jax.encoder.encoder import Preprocess
 
     gel = _gel(encoder, options)
     if gel is not None and not encoder.subtracts:
-        say("--background is not used: this encoder sees touches as the camera gives them")
+        log("--background is not used: this encoder sees touches as the camera gives them")
     if options.background is None and encoder.subtracts:
         what = "the first frame" if gel is None else str(gel)
-        say(f"this encoder sees touches less the untouched gel: {what} is taken for that (else --background)")
-    return Sight(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
+        log(f"this encoder sees touches less the untouched gel: {what} is taken for that (else --background)")
+    return Preprocess(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
 
 
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
@@ -175,16 +175,16 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     fields = np.isin(features.text_column(manifest, "sensor")[rows], FIELD_SENSORS)
     if fields.any():
-        say(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
+        log(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
         rows = rows[~fields]
     if options.background is not None:
-        say("--background is not used: a manifest names the backgrounds of its rows")
+        log("--background is not used: a manifest names the backgrounds of its rows")
     usable = rows if options.frames == 1 else np.intersect1d(rows, manifest.clips(options.frames)[:, -1])
     if len(usable) < len(rows):
-        say(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
+        log(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
     rows, values = features.embed_rows(
         encoder, manifest, usable, options.frames, options.pooled, options.join, batch=options.batch,
-        on_bad_sample=options.on_bad_sample, say=say,
+        on_bad_sample=options.on_bad_sample, log=log,
     )  # fmt: skip
     keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
@@ -198,7 +198,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     over a frame that is missing or cannot be read."""
     from anytouch_jax.encoder import encoder as features
 
-    row, see = encoder.sensor_row(options.sensor or UNIVERSAL, say), _sight(encoder, options)
+    row, see = encoder.sensor_row(options.sensor or UNIVERSAL, log), _sight(encoder, options)
     ring: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     values: list[np.ndarray] = []
@@ -241,7 +241,7 @@ def _say_cut(video: Path, count: int) -> None:
 
     told = frames_told(video)
     if 0.98 * told > count + 2:  # some containers only estimate it
-        say(f"{video} tells of {told} frames and {count} could be read; is it whole?")
+        log(f"{video} tells of {told} frames and {count} could be read; is it whole?")
 
 
 def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | None]]:
@@ -265,7 +265,7 @@ def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | No
         return
     files, beside = pictures_in(options.input)
     if beside:
-        say(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
+        log(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
     start = 0  # of the numbers of a finger's frames: no clip reaches from one finger to the next
     for names in by_stem([file.name for file in files]).values():
         numbers = [start + number for number in frame_numbers(names)]

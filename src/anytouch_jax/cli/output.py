@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
@@ -98,7 +98,7 @@ def write_text(text: str, path: Path) -> Path:
     """Write a report to `path`, whole or not at all; its folder is made."""
     target = path.expanduser().resolve()
     try:
-        write_whole(target, text)
+        atomic_write(target, text)
     except OSError as error:
         raise UserError(f"{target} cannot be written: {error.strerror or error}") from None
     return target

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from anytouch_jax.cli.options_data import Pack
 from anytouch_jax.cli.output import beside
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.errors import UserError
 
 
@@ -16,7 +16,7 @@ def run(options: Pack) -> int:
     manifest = manifests.read(options.manifests)
     folder = options.out or beside(options.manifests[0], "packed", "")
     try:
-        target = pack(manifest, folder, shard_bytes=options.shard_mb << 20, threads=options.threads, say=say)
+        target = pack(manifest, folder, shard_bytes=options.shard_mb << 20, threads=options.threads, log=log)
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
     print(f"{target}: {len(manifest):,} rows; train on it as on any manifest. Check a copy: sha256sum -c SHA256SUMS")

@@ -8,10 +8,10 @@ from rich.markdown import Markdown
 from anytouch_jax.cli.options import Probe
 from anytouch_jax.cli.output import check_apart, check_folder, check_home
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 _OF_LABEL = ("label", "group", "leave_out", "where", "sensor", "save")
 _OF_SPLITS = ("group", "seeds", "protocol", "save")  # of a label; --leave-out has folds instead
@@ -40,17 +40,17 @@ def run(options: Probe) -> int:
     if options.tasks or options.benchmark:
         from anytouch_jax.evaluate import battery_command
 
-        battery = battery_command.run_battery(options, say)
+        battery = battery_command.run_battery(options, log)
         table, record = battery_command.to_table(battery), battery_command.to_json(battery)
     else:
         from anytouch_jax.evaluate import statistics
         from anytouch_jax.evaluate.probe_command import run_probes
 
-        found = run_probes(options, say)
+        found = run_probes(options, log)
         table, record = statistics.to_table(found), statistics.to_json(found)
     Console().print(Markdown(table)) if Console().is_terminal else print(table)
     if options.out is not None:
-        write_whole(options.out, record)
+        atomic_write(options.out, record)
     return 0
 
 

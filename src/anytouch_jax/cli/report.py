@@ -6,7 +6,7 @@ import math
 
 from anytouch_jax.cli.options import Report
 from anytouch_jax.cli.output import check_home
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import COUNT, SEED, Range, in_range
 
 
@@ -19,7 +19,7 @@ def run(options: Report) -> int:
     check_home(options.out)
     enable_compilation_cache()
     demo_report(
-        options.data, options.stage1, options.stage2, options.out, say,
+        options.data, options.stage1, options.stage2, options.out, log,
         touches=options.touches, gallery_size=options.gallery, seed=options.seed,
     )  # fmt: skip
     return 0

@@ -13,11 +13,11 @@ from rich.markdown import Markdown
 from anytouch_jax.cli.options import Retrieve
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.config.parsing import COUNT, Range, in_range
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -55,7 +55,7 @@ def run(options: Retrieve) -> int:
     retrieval.cross_sensor_retrieval(table, {}, rows, **asked)  # a gallery that cannot be is told before the work
     found: dict[str, Any] = {}
     for name, encoder in encoders.items():
-        kept, found[name] = features.embed_rows(encoder, table, rows, options.frames, options.pooling, say=say)
+        kept, found[name] = features.embed_rows(encoder, table, rows, options.frames, options.pooling, log=log)
         if len(kept) < len(rows):
             raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows could not be read; repair the manifest first")
     if options.controls:
@@ -63,16 +63,16 @@ def run(options: Retrieve) -> int:
             try:
                 found[name] = make(table, rows)
             except UserError as error:
-                say(f"no control by {name}: {error}")
+                log(f"no control by {name}: {error}")
     scored = retrieval.cross_sensor_retrieval(table, found, rows, metrics={VECTOR: "euclidean"}, **asked)
     head = ("features", "query", "gallery", "centred", "top-1", "95 %", "top-5", "chance", "of", "queries")
     text = markdown(head, [_row(one) for one in scored])
     Console().print(Markdown(text)) if Console().is_terminal else print(text)
     for note in dict.fromkeys(note for one in scored for note in one.notes):
-        say(note)
+        log(note)
     if options.out is not None:
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
-        write_whole(options.out, json.dumps(about | {"results": plain(scored)}, indent=2) + "\n")
+        atomic_write(options.out, json.dumps(about | {"results": plain(scored)}, indent=2) + "\n")
     return 0
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.cli.options import Simulate
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -47,13 +47,13 @@ def run(options: Simulate) -> int:
         first=options.first,
     )
     if missing := _missing(scenes):
-        say(f"no touch is of split {' and '.join(missing)}: more touches or more objects (some 16) give some")
+        log(f"no touch is of split {' and '.join(missing)}: more touches or more objects (some 16) give some")
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar, _ended_by_interrupt(bar):
         told = _teller(bar, scenes.sensors)
         path = simulate(scenes, options.out, threads=options.threads, progress=told)
-    say(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
+    log(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
     return 0
 
 
@@ -68,7 +68,7 @@ def _ended_by_interrupt(bar: Progress) -> Iterator[None]:
 
     def end(*_: Any) -> None:
         bar.stop()
-        say("interrupted: what is finished is kept, the same command goes on")
+        log("interrupted: what is finished is kept, the same command goes on")
         os._exit(130)
 
     signal.signal(signal.SIGINT, end)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 
 from anytouch_jax.cli.options import Train
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.config import Config, baselines, preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.train.progress import Terminated, terminating
@@ -33,7 +33,7 @@ def run(options: Train, config: Config) -> int:
         with terminating():
             return _train(options, config)
     except Terminated:
-        say(f"stopped by SIGTERM before a step of {options.run} was under way; the same command starts it, or goes on")
+        log(f"stopped by SIGTERM before a step of {options.run} was under way; the same command starts it, or goes on")
         return 0
 
 
@@ -62,10 +62,10 @@ def _train(options: Train, config: Config) -> int:
     enable_compilation_cache()
     with joined() as place:
         result = pretrain(
-            config, options.run, init=options.init, clip=options.clip, stop_after=options.stop_after, say=say
+            config, options.run, init=options.init, clip=options.clip, stop_after=options.stop_after, log=log
         )
     if result.interrupted == signal.SIGINT:
         return 130
     if place is None or place.index == 0:
-        say(f"{options.run}: {result.step} of {config.run.steps} steps")
+        log(f"{options.run}: {result.step} of {config.run.steps} steps")
     return 0

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from anytouch_jax.cli.options_data import Verify
 from anytouch_jax.cli.output import check_apart, check_folder, check_new, write_new, write_text
-from anytouch_jax.cli.words import say
+from anytouch_jax.cli.words import log
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -33,10 +33,10 @@ def run(options: Verify) -> int:
         commercial_only(manifest)  # a manifest without such rows is told before the work
     if options.out is not None:
         check_folder(options.out, read=manifest.files)
-    report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, say=say)
+    report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, log=log)
     print(report.to_markdown(), end="")
     if options.out is not None:
-        say(f"{write_text(report.to_json(), options.out)}: the report")
+        log(f"{write_text(report.to_json(), options.out)}: the report")
     errors = [finding.sentence for finding in report.findings if finding.level == "error"]
     if options.repair is not None:
         manifest, errors = _repair(options, manifest, report, errors)

@@ -10,7 +10,7 @@ import tokenizers
 from tokenizers import decoders, models, normalizers, pre_tokenizers, processors, trainers
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 START, END = "<|startoftext|>", "<|endoftext|>"
 
@@ -63,7 +63,7 @@ class Tokenizer:
         """Write a tokenizer.json that `load` reads, whole or not at all; `path` is the file or its folder."""
         path = Path(path)
         target = path / "tokenizer.json" if path.suffix != ".json" else path
-        write_whole(target, self._inner.to_str())
+        atomic_write(target, self._inner.to_str())
 
 
 def load(path: str | Path) -> Tokenizer:

@@ -21,7 +21,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import embed_rows, load_encoder, text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import whole_folder, write_whole
+from anytouch_jax.files import atomic_folder, atomic_write
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses
@@ -29,7 +29,7 @@ from anytouch_jax.train.metrics import Record
 from anytouch_jax.weights import checkpoint, release
 
 Params = dict[str, Any]
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Loss = Callable[[Params, jax.Array, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32, key)
 BATCH = 16  # frames a step; fewer frames come again under other masks
 MEASURED = 64  # frames on which the loss is measured before and after
@@ -59,7 +59,7 @@ def adapt(
     steps: int = 200,
     rate: float = 3e-3,
     seed: int = 0,
-    say: Say = print,
+    log: Log = print,
 ) -> Adapted:
     """Give `sensor` tokens of its own in the model of `run`, from `frames` of its stills in split train.
 
@@ -70,7 +70,7 @@ def adapt(
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
     params, text, about = checkpoint.load_params(run)
-    config, params, row = _with_row(from_json(text), params, about, sensor, run, say)
+    config, params, row = _with_row(from_json(text), params, about, sensor, run, log)
     seen = {"seen": [*about["seen"], sensor]} if "seen" in about else {}
     kept: dict[str, Any] = {name: about[name] for name in ("preprocessing", "data") if name in about}
     source = {"run": str(run), "sensor": sensor, "frames": frames, "labels": labels, "manifest": manifest.content_hash}
@@ -78,11 +78,11 @@ def adapt(
     if not frames:
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", about)
     if config.stage == 2 and not (config.objective.reconstruct or labels):
-        say(
+        log(
             "this stage 2 did not train the decoder, through which the tokens are fitted: they may be worse than the "
             "universal ones; take a stage-1 run, or fit with --labels"
         )
-    classes, prototypes = _classes(run, manifest, sensor, labels, say)
+    classes, prototypes = _classes(run, manifest, sensor, labels, log)
     fitted = choose(manifest, sensor, "train", frames, classes, seed)
     clip, target = _read(manifest, config, fitted), classes[fitted]
     shown, on = _measured(manifest, sensor, classes, seed, fitted)
@@ -111,13 +111,13 @@ def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     size, free = sum(leaf.nbytes for leaf in jax.tree.leaves(adapted.params)), shutil.disk_usage(disk).free
     if size > free:
         raise UserError(f"{out} takes {size / 1e6:.1f} MB and {disk} has {free / 1e6:.1f} MB left; free some space")
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         _save(adapted, Path(run), folder)
 
 
 def _save(adapted: Adapted, run: Path, out: Path) -> None:
     text = to_json(adapted.config)
-    write_whole(out / "config.json", text + "\n")
+    atomic_write(out / "config.json", text + "\n")
     tokenizer = run / "tokenizer.json"
     if tokenizer.exists():
         shutil.copyfile(tokenizer, out / "tokenizer.json")
@@ -168,7 +168,7 @@ def choose(
 
 
 def _with_row(
-    config: Config, params: Params, about: dict[str, Any], sensor: str, run: str | Path, say: Say
+    config: Config, params: Params, about: dict[str, Any], sensor: str, run: str | Path, log: Log
 ) -> tuple[Config, Params, int]:
     """The model with a row for `sensor`, as the universal tokens are."""
     model = config.model
@@ -181,7 +181,7 @@ def _with_row(
     if sensor in about.get("seen", ()):
         raise UserError(f"{run} was trained on {sensor}; adapt is for a sensor that it has not seen")
     if sensor in model.sensors and "seen" not in about:
-        say(
+        log(
             f"{run} does not tell on which sensors it was trained: the tokens of {sensor} start from the universal ones"
         )
     drawn = config.objective.universal_start + config.objective.universal_end > 0
@@ -203,7 +203,7 @@ def _put(params: Params, row: int, tokens: Any) -> Params:
 
 
 def _classes(
-    run: str | Path, manifest: Manifest, sensor: str, labels: str | None, say: Say
+    run: str | Path, manifest: Manifest, sensor: str, labels: str | None, log: Log
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Class i32 (rows of the manifest,) of every row, -1 for none, and unit prototypes f32 (classes, E) of the known
     sensors; without `labels` all rows are of class 0 and there are no prototypes."""
@@ -221,7 +221,7 @@ def _classes(
     rows = np.random.default_rng(0).permutation(np.flatnonzero(usable))[:PROTOTYPE_ROWS]
     if not rows.size:
         raise UserError(f"--labels needs frames of sensors that {run} knows, with a {labels}, in split 'train'")
-    rows, values = embed_rows(encoder, manifest, np.sort(rows), say=say)
+    rows, values = embed_rows(encoder, manifest, np.sort(rows), log=log)
     names, of = np.unique(value[rows], return_inverse=True)
     if len(names) < 2 or len(names) == len(rows):
         raise UserError(f"--labels {labels} must name classes, of two values or more that frames share")

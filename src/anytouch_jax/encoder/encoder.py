@@ -22,7 +22,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation, turned
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import replacing
+from anytouch_jax.files import atomic_path
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
@@ -30,7 +30,7 @@ from anytouch_jax.weights import checkpoint, release
 
 Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 def _warn(sentence: str) -> None:
@@ -55,7 +55,7 @@ class Encoder:
     def net(self) -> Net:
         return build(self.config.model)
 
-    def sensor_row(self, name: str, say: Say = _warn) -> int:
+    def sensor_row(self, name: str, log: Log = _warn) -> int:
         """Row of a sensor's tokens. For one that training has not seen, or that the table does not have, these are the
         universal ones, said aloud. Raises SpellingError for a known name that is spelled otherwise."""
         model, name = self.config.model, str(name)
@@ -67,7 +67,7 @@ class Encoder:
         if known:
             why = f"was not drawn in training (that saw {', '.join(self.seen or ())})"
         instead = "the universal tokens" if drawn else "the mean of the tokens that training saw (no universal ones)"
-        say(f"sensor {name!r} {why}: using {instead}")
+        log(f"sensor {name!r} {why}: using {instead}")
         return model.sensors.index(name) if known else model.universal_row
 
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
@@ -137,7 +137,7 @@ class Encoder:
         return {}
 
 
-class Sight:
+class Preprocess:
     """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
     (a frame), the picture of the untouched gel; the first frame serves where none is given. `rotate` and `flip` turn
     both before (`data.transforms.turned`)."""
@@ -261,7 +261,7 @@ def embed_rows(
     *,
     batch: int = 64,
     on_bad_sample: Literal["error", "skip"] = "error",
-    say: Say = _warn,
+    log: Log = _warn,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(row numbers, features) of manifest rows, each frame encoded once; `frames` is the length of a row's clip.
 
@@ -271,7 +271,7 @@ def embed_rows(
     if not len(rows):
         raise UserError("no rows are left to embed; check the split and the filters")
     for name in sorted(set(text_column(manifest, "sensor")[rows])):
-        encoder.sensor_row(name, say)
+        encoder.sensor_row(name, log)
     if on_bad_sample == "error":
         check_backgrounds(encoder, manifest, rows)
     data = replace(encoder.config.data, batch_size=min(batch, len(rows)), on_bad_sample=on_bad_sample)
@@ -314,5 +314,5 @@ def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> Non
     described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
     keys = {f"key/{k}": v for k, v in features.keys.items()}
     arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **features.said, **keys, **described}
-    with replacing(path) as part, open(part, "wb") as file:
+    with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)

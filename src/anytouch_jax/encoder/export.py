@@ -22,7 +22,7 @@ from jax import export as jax_export
 from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.encoder.names import describes
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder, Join, Pooling
@@ -126,8 +126,8 @@ def export(
         "worst_difference": differs,
         "example": _EXAMPLE.format(name=path.name, frames=frames, size=model.image_size),
     }
-    write_whole(path, data)
-    write_whole(describes(path), json.dumps(about, indent=2) + "\n")
+    atomic_write(path, data)
+    atomic_write(describes(path), json.dumps(about, indent=2) + "\n")
     return about
 
 

@@ -20,7 +20,7 @@ import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.encoder.encoder import Encoder, Join, Pooling, Sight, check_frames, touch_features
+from anytouch_jax.encoder.encoder import Encoder, Join, Pooling, Preprocess, check_frames, touch_features
 from anytouch_jax.errors import UserError
 from anytouch_jax.train.progress import Terminated, terminating
 
@@ -127,7 +127,7 @@ def rate_of(video: str | Path) -> float:
 def stream(
     encoder: Encoder,
     source: Source,
-    see: Sight | None = None,
+    see: Preprocess | None = None,
     *,
     live: bool,
     sensor: int,
@@ -146,7 +146,7 @@ def stream(
     if stride < 1:
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
     embed = compile_for_one(encoder, sensor, frames, pooling, join)
-    return _stream(embed, source, live, see or Sight(encoder), frames, stride)
+    return _stream(embed, source, live, see or Preprocess(encoder), frames, stride)
 
 
 def compile_for_one(
@@ -163,7 +163,7 @@ def compile_for_one(
 
 
 def _stream(
-    embed: Callable[[jax.Array], jax.Array], source: Source, live: bool, see: Sight, frames: int, stride: int
+    embed: Callable[[jax.Array], jax.Array], source: Source, live: bool, see: Preprocess, frames: int, stride: int
 ) -> Generator[Embedded]:
     mailbox = Mailbox(replace=live)
     started, start = time.time(), time.perf_counter()
@@ -185,7 +185,7 @@ def _stream(
             source.release()
 
 
-def _read(source: Source, live: bool, see: Sight, frames: int, stride: int, mailbox: Mailbox) -> None:
+def _read(source: Source, live: bool, see: Preprocess, frames: int, stride: int, mailbox: Mailbox) -> None:
     """The reader's thread: every frame once into the ring, and the newest clip into the mailbox."""
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
     number = 0

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 RAW = "raw pixels"
 
 
-def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
+def run_battery(options: Probe, log: Callable[[str], None]) -> dict[str, Any]:
     """Every run and control on every task: {"manifest": hash, "data", "runs": {name: config}, "left_out": {task:
     why}, "results": [...]}.
 
@@ -47,21 +47,21 @@ def run_battery(options: Probe, say: Callable[[str], None]) -> dict[str, Any]:
         raise UserError("--order does nothing for --features, whose frames are encoded already; leave one of them out")
     names = ("train_sensors", "test_sensors", "train_units", "test_units")
     sides = {name: _names(getattr(options, name)) for name in names}
-    tasks, unprobed = (tasks, {}) if options.benchmark else _possible(options, table, tasks, sides, say)
+    tasks, unprobed = (tasks, {}) if options.benchmark else _possible(options, table, tasks, sides, log)
     shared: dict[str, Any] = {name: getattr(options, name) for name in ("cache", "seeds", "order", "max_rows")} | sides
     plain = {name: settings[name] for name in ("protocols", "frames", "head_names", "recipe") if name in settings}
     mine: list[dict[str, Any]] = []
     for name, store in files.items():  # first: a file that lacks rows is told before the work
         mine += [{"features": name} | one for one in battery.run(store, table, tasks, **shared, **plain)]
-        say(f"probed {name}")
+        log(f"probed {name}")
     found: list[dict[str, Any]] = []
     for name, encoder in encoders.items():
         found += [{"features": name} | one for one in battery.run(encoder, table, tasks, **shared, **settings)]
-        say(f"probed {name}")
+        log(f"probed {name}")
     found += mine
     if options.controls:
         found += [{"features": RAW} | one for one in battery.run(None, table, tasks, **shared, **plain)]
-        say(f"probed {RAW}")
+        log(f"probed {RAW}")
     runs = {name: dataclasses.asdict(encoder.config) for name, encoder in encoders.items()}
     return {"manifest": table.content_hash, "data": [str(path) for path in options.data], "paper": paper,
             "seeds": options.seeds, "sides": sides, "runs": runs, "left_out": unprobed, "results": found}  # fmt: skip
@@ -88,7 +88,7 @@ def _asked(options: Probe, table: Any) -> tuple[Sequence[Any], dict[str, Any], f
 
 
 def _possible(
-    options: Probe, table: Any, tasks: Sequence[str], sides: dict[str, Any], say: Callable[[str], None]
+    options: Probe, table: Any, tasks: Sequence[str], sides: dict[str, Any], log: Callable[[str], None]
 ) -> tuple[list[str], dict[str, str]]:
     """The tasks that can be probed, and why each of the others cannot, said aloud. Raises UserError when none can."""
     why = battery.left_out(table, tasks, options.frames, battery.Sides(**sides), options.max_rows)
@@ -98,7 +98,7 @@ def _possible(
     if options.tasks == "all":
         why |= {name: "the manifest has no such label" for name in TASKS if name not in tasks}
     for name, reason in why.items():
-        say(f"{name}: not probed ({reason})")
+        log(f"{name}: not probed ({reason})")
     return rest, why
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import tokens
@@ -79,4 +79,4 @@ def _to_pixels(normalised: np.ndarray) -> np.ndarray:
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an RGB image u8 (H, W, 3), whole or not at all. Raises OSError."""
-    write_whole(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+    atomic_write(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())

@@ -138,6 +138,6 @@ def table(found: Sequence[MatchScore]) -> tuple[tuple[str, ...], list[tuple[str,
     for one in found:
         between = "" if one.low is None or one.high is None else f" ({100 * one.low:.1f} to {100 * one.high:.1f})"
         share = f"{100 * one.accuracy:.1f} %{between}"
-        alone = f"{100 * one.sensors_alone:.1f} %"
-        rows.append((words[one.negatives], share, f"{one.auc:.3f}", alone, str(one.triples)))
+        lock = f"{100 * one.sensors_alone:.1f} %"
+        rows.append((words[one.negatives], share, f"{one.auc:.3f}", lock, str(one.triples)))
     return ("negatives", "accuracy (chance 50 %)", "AUC", "by the sensors alone", "triples"), rows

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,7 @@ def write_figure(path: Path, figure: Figure) -> None:
     FigureCanvasAgg(figure)  # drawn without pyplot: no global state, no display
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
-    write_whole(path, data.getvalue())
+    atomic_write(path, data.getvalue())
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from anytouch_jax.evaluate.saved_heads import head_of, save_head
 if TYPE_CHECKING:
     from anytouch_jax.cli.options import Probe
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 RAW = "raw pixels"
 GROUPS = ("grasp_group", "object", "touch", "sequence")  # what --group is by default: the first that there is
 
@@ -48,19 +48,19 @@ class Task:
         )  # fmt: skip
 
 
-def run_probes(options: Probe, say: Say) -> list[Any]:
+def run_probes(options: Probe, log: Log) -> list[Any]:
     """All results: for each encoder (and the controls) a linear probe and kNN, or the groups left out."""
-    task = read_task(options, say)
+    task = read_task(options, log)
     _check(options, task)  # mistakes are told before the work
     found: list[Any] = []
-    for name, values, encoder in _features(options, task, say):
+    for name, values, encoder in _features(options, task, log):
         # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.
         results = probe_features(options, task, values, name, "common" if name == RAW else "column")
         if options.save is not None and encoder is not None and name == str(options.run[0]):
             _save(options, results[0], encoder)
-            say(f"{options.save}: the linear head")
+            log(f"{options.save}: the linear head")
         found += results
-        say(f"probed {name}")
+        log(f"probed {name}")
     if not found:
         raise UserError("nothing to probe: give --run or --features, or keep the controls")
     if options.leave_out is None:
@@ -109,7 +109,7 @@ def probe_features(
     ]
 
 
-def read_task(options: Probe, say: Say) -> Task:
+def read_task(options: Probe, log: Log) -> Task:
     """Rows with a label that pass the filters. Raises UserError on a column that is not there."""
     manifest = manifests.read([str(path) for path in options.data])
     table = manifest.table
@@ -129,7 +129,7 @@ def read_task(options: Probe, say: Say) -> Task:
             raise UserError(f"no row is of sensor {options.sensor!r}; the manifest has {', '.join(there)}")
     fields = kept & np.isin(text_column(manifest, "sensor"), FIELD_SENSORS)
     if fields.any():
-        say(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
+        log(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
         kept &= ~fields
     split = text_column(manifest, "split")
     kept &= np.isin(split, ("train", "val", "test"))
@@ -138,7 +138,7 @@ def read_task(options: Probe, say: Say) -> Task:
     rows = np.flatnonzero(kept)
     if not rows.size:
         raise UserError(f"no row has a label in {options.label!r} after the filters")
-    say(f"{len(rows)} of {len(manifest)} rows take part")
+    log(f"{len(rows)} of {len(manifest)} rows take part")
     groups = _groups(manifest, options, rows)
     if options.leave_out is None:
         subsets = _subsets(manifest, label, split, rows, "classes")
@@ -185,7 +185,7 @@ def _subsets(manifest: Any, names: list[Any], split: np.ndarray, rows: np.ndarra
     return {f"{what} with a photograph or caption": mask, f"{what} without": ~mask}
 
 
-def _features(options: Probe, task: Task, say: Say) -> Any:
+def _features(options: Probe, task: Task, log: Log) -> Any:
     """(name, features, encoder or None) of every encoder and file asked for, then of the controls."""
     files = {str(path): given(path, task.manifest) for path in options.features}
     for store in files.values():
@@ -197,7 +197,7 @@ def _features(options: Probe, task: Task, say: Say) -> Any:
     for _, encoder in encoders:
         check_frames(encoder.config.model, options.frames or 1)
     for name, encoder in encoders:
-        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames or 1, options.pooling, say=say)
+        rows, values = embed_rows(encoder, task.manifest, task.rows, options.frames or 1, options.pooling, log=log)
         if not np.array_equal(rows, task.rows):
             raise UserError(f"{len(task.rows) - len(rows)} rows could not be read; repair the manifest first")
         yield name, values, encoder

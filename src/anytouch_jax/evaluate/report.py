@@ -34,11 +34,11 @@ from anytouch_jax.evaluate.sections import (  # fmt: skip
     samples_section,
     space_section,
 )
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 from anytouch_jax.weights import checkpoint
 
 Array = npt.NDArray[Any]
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 RANDOM, PIXELS, VECTOR = "random encoder", "pixels minus background", "area, centroid, force"
 LABELS = ("hardness", "roughness", "material", "indenter")
@@ -67,8 +67,8 @@ def write_report(
             lines.append(f"![{section.title}](figures/{_placed(section.figure, folder / 'figures' / name)})")
         lines += [part.strip() for part in (section.table, section.notes) if part]
     if numbers is not None:
-        write_whole(folder / "report.json", json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n")
-    write_whole(folder / "report.md", "\n\n".join(lines) + "\n")
+        atomic_write(folder / "report.json", json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n")
+    atomic_write(folder / "report.md", "\n\n".join(lines) + "\n")
     return folder / "report.md"
 
 
@@ -77,7 +77,7 @@ def _placed(figure: Path, target: Path) -> str:
     if not figure.is_file():
         raise UserError(f"there is no figure {figure} for the report; draw it first or leave it out")
     if figure.resolve() != target.resolve():
-        write_whole(target, figure.read_bytes())
+        atomic_write(target, figure.read_bytes())
     return target.name
 
 
@@ -102,7 +102,7 @@ def demo_report(
     stage1: str | Path,
     stage2: str | Path,
     out: str | Path,
-    say: Say = print,
+    log: Log = print,
     *,
     touches: int = 200,
     gallery_size: int = retrieval.GALLERY,
@@ -119,10 +119,10 @@ def demo_report(
     table = manifests.read(manifest)
     _check_touches(table, touches, seed)
     with tempfile.TemporaryDirectory(prefix="anytouch-report-") as drawn:
-        sections, numbers = _contents(table, Path(stage1), Path(stage2), Path(drawn), say, touches, gallery_size, seed)
+        sections, numbers = _contents(table, Path(stage1), Path(stage2), Path(drawn), log, touches, gallery_size, seed)
         numbers = {"manifest": str(manifest), **numbers, "seconds": round(time.perf_counter() - clock, 1)}
         path = write_report(out, sections, title="What the demo learned", numbers=numbers)
-    say(f"{path}: written in {numbers['seconds']:.0f} s")
+    log(f"{path}: written in {numbers['seconds']:.0f} s")
     return path
 
 
@@ -139,7 +139,7 @@ def _of_stage(run: Path, stage: int) -> Encoder:
 
 
 def _contents(
-    table: Manifest, stage1: Path, stage2: Path, out: Path, say: Say, touches: int, gallery_size: int, seed: int
+    table: Manifest, stage1: Path, stage2: Path, out: Path, log: Log, touches: int, gallery_size: int, seed: int
 ) -> tuple[list[Section], dict[str, Any]]:
     """The sections of a report, their figures drawn in `out`, and its numbers."""
     first, second = _of_stage(stage1, 1), _of_stage(stage2, 2)
@@ -149,17 +149,17 @@ def _contents(
     sections.append(losses_section({"stage 1": stage1, "stage 2": stage2}, out))
     section, numbers["pixels"] = reconstructions_section(table, stage1, out)
     sections.append(section)
-    say("report: samples, losses and reconstructions are drawn")
-    study = _study(table, encoders, touches, seed, say)
-    say(f"report: {len(study.rows)} touches embedded by {len(encoders)} encoders")
+    log("report: samples, losses and reconstructions are drawn")
+    study = _study(table, encoders, touches, seed, log)
+    log(f"report: {len(study.rows)} touches embedded by {len(encoders)} encoders")
     section, numbers["space"] = _space(study, out, seed)
     sections.append(section)
-    say("report: t-SNE is drawn")
+    log("report: t-SNE is drawn")
     section, numbers["retrieval"] = _retrieval(study, out, gallery_size)
     sections.append(section)
     section, numbers["matching"] = _matching(study, stage2)
     sections.append(section)
-    say("report: retrieval and matching are scored")
+    log("report: retrieval and matching are scored")
     section, numbers["probes"] = _probes(study, out)
     return [*sections, section], numbers
 
@@ -209,13 +209,13 @@ def _check_touches(table: Manifest, touches: int, seed: int) -> None:
         )
 
 
-def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, say: Say) -> _Study:
+def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, log: Log) -> _Study:
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
     chosen = [_chosen(table, name, count, seed) for name, count in most.items()]
     rows = np.concatenate(chosen)
     classes, patches = {}, {}
     for name, encoder in encoders.items():
-        found, values = embed_rows(encoder, table, rows, pooling="both", say=say)
+        found, values = embed_rows(encoder, table, rows, pooling="both", log=log)
         if not np.array_equal(found, rows):
             raise UserError(f"{len(rows) - len(found)} rows could not be read; repair the manifest first")
         classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)

@@ -13,7 +13,7 @@ from scipy.special import expit, softmax
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.probe_models import Linear
-from anytouch_jax.files import replacing
+from anytouch_jax.files import atomic_path
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Pooling
@@ -75,7 +75,7 @@ def head_of(model: Linear, names: Array, *, label: str, pooling: Pooling, frames
 def save_head(path: str | Path, head: Head) -> None:
     """Write a head as `.npz`, whole or not at all. Raises OSError."""
     arrays: dict[str, Any] = {"format": FORMAT} | vars(head)
-    with replacing(path) as part, open(part, "wb") as file:
+    with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
 
 

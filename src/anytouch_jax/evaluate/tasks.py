@@ -110,8 +110,8 @@ def available(table: Manifest) -> tuple[str, ...]:
 
 def _column_of(table: Manifest, task: Task) -> str:
     """The column of a task's label; the object is told by a column of its own where there is no label of it."""
-    alone = task.label == "label.object" and task.label not in table.table.column_names
-    return "object" if alone else task.label
+    lock = task.label == "label.object" and task.label not in table.table.column_names
+    return "object" if lock else task.label
 
 
 def mirrored(label: str, value: str, *, across: bool = False, down: bool = False) -> str:

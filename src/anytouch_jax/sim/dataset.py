@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import alone, replacing, write_whole
+from anytouch_jax.files import atomic_path, atomic_write, lock
 from anytouch_jax.sim import scene
 from anytouch_jax.sim.recorder import Recorder, Take
 from anytouch_jax.sim.scene import Recording, Scenes
@@ -57,7 +57,7 @@ def simulate(
     things, splits = scene.cast(scenes)  # before the folder is taken: what cannot be simulated leaves nothing
     try:
         _claim(scenes, out)
-        with alone(out / SETTINGS) as mine:
+        with lock(out / SETTINGS) as mine:
             if not mine:
                 raise UserError(f"another process simulates into {out}: wait for it, or give another folder")
             return _simulate(scenes, things, splits, out, threads, progress)
@@ -121,7 +121,7 @@ def _claim(scenes: Scenes, out: Path) -> None:
     if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(file, text, part=out / f"{SETTINGS}.tmp")
+    atomic_write(file, text, part=out / f"{SETTINGS}.tmp")
 
 
 def _read_settings(file: Path) -> dict[str, Any]:
@@ -185,8 +185,8 @@ def _write_recording(scenes: Scenes, thing: objects.Object, recording: Recording
         )
     if background is not None:
         _write_image(out / background, take.background)
-        alone = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
-        rows.append(common | alone | {"split": "background", "touch": None, "text": None, "image_path": None})
+        lock = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
+        rows.append(common | lock | {"split": "background", "touch": None, "text": None, "image_path": None})
     return rows
 
 
@@ -217,7 +217,7 @@ def _write_table(rows: list[Row], file: Path) -> None:
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: [row.get(name) for row in rows] for name in names})
     os.sync()  # the files that it vouches for, once a part instead of once a picture
-    with replacing(file, part=file.with_suffix(".tmp")) as part:
+    with atomic_path(file, part=file.with_suffix(".tmp")) as part:
         pq.write_table(table, part)
 
 
@@ -250,4 +250,4 @@ def _write_array(path: Path, array: np.ndarray) -> None:
 
 def _write_bytes(path: Path, data: bytes) -> None:
     """Not waiting for the disk: that is done once a part (`_write_table`)."""
-    write_whole(path, data, sync=False, part=path.with_name(path.name + ".tmp"))
+    atomic_write(path, data, sync=False, part=path.with_name(path.name + ".tmp"))

@@ -30,7 +30,7 @@ from anytouch_jax.train.mesh import (
 )
 from anytouch_jax.train.metrics import Record, alone_in, goes_on, open_run, writing
 from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.progress import Bar, Say, progress, signals, silent, to_stderr
+from anytouch_jax.train.progress import Bar, Log, progress, signals, silent, to_stderr
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
@@ -78,7 +78,7 @@ def fit(
     stop_after: int | None = None,
     on_report: Report | None = None,
     metadata: Mapping[str, Any] | None = None,
-    say: Say | None = None,
+    log: Log | None = None,
     mesh: Mesh | None = None,
 ) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or go on from its latest complete checkpoint.
@@ -90,7 +90,7 @@ def fit(
     disk, a checkpoint that cannot be read, a folder that not all processes see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
-    say = say or to_stderr
+    log = log or to_stderr
     lead = jax.process_index() == 0
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
@@ -99,7 +99,7 @@ def fit(
             open_run(run_dir, config)
         else:
             goes_on(run_dir, config)  # so that each process finds a mistake by itself
-            say = silent
+            log = silent
         check_shared(run_dir / "figures")
         with writing(run_dir / "checkpoints"):
             checkpoints = Checkpoints(
@@ -111,14 +111,14 @@ def fit(
         stack.push(checkpoints.leave)
         state, start = _first_state(config, params, checkpoints, mesh)
         if start:
-            say(f"going on from the checkpoint of step {start}")
+            log(f"going on from the checkpoint of step {start}")
         if start >= stop:
-            say(f"nothing to do: {start} of {config.run.steps} steps are done")
+            log(f"nothing to do: {start} of {config.run.steps} steps are done")
             return FitResult(state, start, resumed=start)
         record = stack.enter_context(
             contextlib.closing(Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead))
         )
-        bar = stack.enter_context(progress(start, stop, say))
+        bar = stack.enter_context(progress(start, stop, log))
         loop = _Loop(config, mesh, checkpoints, record, bar, on_report)
         interrupt = stack.enter_context(signals())
         return loop.run(state, start, stop, batches, loss_fn, interrupt)
@@ -168,7 +168,7 @@ class _Loop:
                 if self.ballot:
                     votes = self.ballot.cast(int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0)))
                     metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), votes, strict=True))
-                self.log()  # of the step before, while this one runs
+                self.log_metrics()  # of the step before, while this one runs
                 self.last.began(metrics)
                 self.pending = (step, metrics, {"samples": _rows(batch)} | dict(info))
                 done = step + 1
@@ -186,7 +186,7 @@ class _Loop:
         if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
         if signalled:
-            self.bar.say(f"stopped by {signalled.name} after step {done}; saved, the same command goes on from here")
+            self.bar.log(f"stopped by {signalled.name} after step {done}; saved, the same command goes on from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
     def awaited(self, feed: Iterator[Item]) -> Iterator[Item]:
@@ -217,7 +217,7 @@ class _Loop:
         places = jax.tree.map(lambda x: x.sharding, state)
         return jax.jit(counted, donate_argnums=donated(), out_shardings=(places, replicated(self.mesh)))
 
-    def log(self) -> None:
+    def log_metrics(self) -> None:
         """Fetch and write the metrics of the pending step; stop the run when too many were skipped in a row."""
         if self.pending is None:
             return
@@ -253,7 +253,7 @@ class _Loop:
 
         Its loss is their mean. That of fewer steps than others' is `partial`: it would be the best by chance.
         """
-        self.log()
+        self.log_metrics()
         self.record.sync()
         metrics = {name: value for name, value in self.row.items() if isinstance(value, int | float)}
         if self.losses:
@@ -268,11 +268,11 @@ class _Loop:
     def report(self, done: int, state: TrainState, batch: Any) -> int:
         """Draw figures; a fault in that must not end the run."""
         if self.on_report is not None:
-            self.log()
+            self.log_metrics()
             try:
                 self.on_report(done, whole(used(state)), whole(batch))
             except Exception as error:
-                self.bar.say(f"no figures at step {done}: {type(error).__name__}: {error}")
+                self.bar.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
 
 

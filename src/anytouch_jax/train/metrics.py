@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from anytouch_jax.config import Config, from_json, to_json
 from anytouch_jax.errors import ConfigError, UserError
-from anytouch_jax.files import alone, write_whole
+from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.weights.record import read_record, steps
 
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
@@ -64,7 +64,7 @@ def alone_in(run_dir: Path) -> Iterator[None]:
         run_dir.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         with writing(run_dir):
-            free = stack.enter_context(alone(run_dir / ".lock"))
+            free = stack.enter_context(lock(run_dir / ".lock"))
         if not free:
             raise UserError(f"another process trains {run_dir}: wait for it, or name another folder with --run")
         _held.add(mine)
@@ -99,7 +99,7 @@ def open_run(run_dir: Path, config: Config) -> None:
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
         if not goes_on(run_dir, config) or not path.exists():
-            write_whole(path, to_json(config) + "\n")
+            atomic_write(path, to_json(config) + "\n")
 
 
 def goes_on(run_dir: Path, config: Config) -> bool:
@@ -208,7 +208,7 @@ def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
                 rows.append(row)
                 kept.append(line)
     if rewrite and len(kept) < len(lines):
-        write_whole(path, "".join(kept))
+        atomic_write(path, "".join(kept))
     return rows
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 _WORTH_TELLING = 0.05  # share of its time that a run may wait for data before the user hears of it
 
 
@@ -18,7 +18,7 @@ _WORTH_TELLING = 0.05  # share of its time that a run may wait for data before t
 class Bar:
     """Where the user sees the run: `say` a sentence, `advance` by one step with its line of metrics."""
 
-    say: Say
+    log: Log
     advance: Callable[[Mapping[str, Any]], None]
 
 
@@ -33,17 +33,17 @@ def silent(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(start: int, stop: int, say: Say) -> Iterator[Bar]:
+def progress(start: int, stop: int, log: Log) -> Iterator[Bar]:
     """A bar from step `start` to `stop` on a terminal, else some twenty lines through `say`."""
-    if say is silent or not sys.stderr.isatty():
+    if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
 
         def line(row: Mapping[str, Any]) -> None:
             done = row["step"] + 1
             if done == start + 1 or done == stop or (done - start) % every == 0:
-                say(f"step {done}/{stop}  {summary(row)}")
+                log(f"step {done}/{stop}  {summary(row)}")
 
-        yield Bar(say, line)
+        yield Bar(log, line)
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -52,7 +52,7 @@ def progress(start: int, stop: int, say: Say) -> Iterator[Bar]:
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("compiling", total=stop, completed=start)
         yield Bar(
-            say,
+            log,
             lambda row: bar.update(task, completed=row["step"] + 1, description=summary(row)),
         )
 

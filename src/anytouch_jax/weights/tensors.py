@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import replacing
+from anytouch_jax.files import atomic_path
 
 
 class WeightsError(UserError):
@@ -26,7 +26,7 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
     if wrong:
         raise WeightsError(f"metadata of {path} must be text; {', '.join(wrong)} is not")
     try:
-        with replacing(path) as part:
+        with atomic_path(path) as part:
             # the library ignores strides: a transposed view would be written in the wrong order
             save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, part, dict(metadata))
             umask = os.umask(0)

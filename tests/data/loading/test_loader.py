@@ -357,7 +357,7 @@ def _check_align(batch, rows, read_back, tokenizer):
 def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, recipe, devices):
     rows = rich
     loader = Loader(make(rows), settings(2, recipe, batch_size=8), devices=devices)
-    alone = Loader(make(rows), settings(2, recipe, batch_size=8))
+    lock = Loader(make(rows), settings(2, recipe, batch_size=8))
     frames = {"still": 1, "clip": 4 if recipe == "release" else 3}
     shapes, steps = {}, 0
     for step, batch, info in loader.stream(0, 24):
@@ -372,7 +372,7 @@ def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, re
         shape = (len(batch.align.image), len(batch.align.text))
         assert shapes.setdefault(loader.kind(step), shape) == shape  # fixed for a run
         assert all(slots % devices == 0 for slots in shape)
-        same = alone.batch(step).align  # the devices add unused slots, and nothing else
+        same = lock.batch(step).align  # the devices add unused slots, and nothing else
         np.testing.assert_array_equal(same.clip, batch.align.clip)
         assert (images, texts) == (len(same.image), len(same.text))  # without them the slots are full
     assert steps >= 5 and set(shapes) == {"still", "clip"}

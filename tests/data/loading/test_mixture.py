@@ -162,8 +162,8 @@ def test_a_negative_of_the_same_sensor_on_random_tables(seed):
         others = [r for r in same if keys.sensor[r] != keys.sensor[a]]
         fit = [r for r in others if len(places[keys.sensor[r]]) > 1]
         units = {keys.unit[r] for r in same} - {-1}
-        alone = not others and len(units) > 1 and keys.unit[a] >= 0 and len(places[keys.sensor[a]]) > 1
-        brute += [a] if fit or alone else []
+        lock = not others and len(units) > 1 and keys.unit[a] >= 0 and len(places[keys.sensor[a]]) > 1
+        brute += [a] if fit or lock else []
     assert matches.anchors.tolist() == brute and len(brute) > 5
     for anchor in brute:
         for key in range(20):
@@ -177,8 +177,8 @@ def test_a_sensor_that_felt_one_place_only_is_no_partner():
     matches = Matches(np.arange(5), keys, same_sensor=True)
     assert matches.anchors.tolist() == [0, 1, 2]
     assert {matches.draw(0, np.random.default_rng(k)) for k in range(50)} == {(1, 4)}  # never 2: sensor 2 felt 0 only
-    alone = _keys(touch=[0, 0, 1], sensor=[0, 1, 2])
-    assert Matches(np.arange(3), alone).anchors.size and not Matches(np.arange(3), alone, same_sensor=True).anchors.size
+    lock = _keys(touch=[0, 0, 1], sensor=[0, 1, 2])
+    assert Matches(np.arange(3), lock).anchors.size and not Matches(np.arange(3), lock, same_sensor=True).anchors.size
 
 
 def test_with_the_option_the_sensor_alone_tells_nothing(make, settings, rich):

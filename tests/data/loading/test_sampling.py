@@ -83,14 +83,14 @@ def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
 
 @pytest.mark.parametrize("multiple", [1, 2, 4, 16])
 def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend_on_them(multiple):
-    alone, strata = (s.Strata((350, 250, 510, 450), 64, m) for m in (1, multiple))
-    assert (alone.images, alone.texts) == (25, 32)  # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
+    lock, strata = (s.Strata((350, 250, 510, 450), 64, m) for m in (1, multiple))
+    assert (lock.images, lock.texts) == (25, 32)  # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
     assert strata.images == -(-25 // multiple) * multiple and strata.texts % multiple == 0
     for k in range(500):
         before, now = strata.at(k)
-        np.testing.assert_array_equal([before, now], alone.at(k))
-        assert now[s.VISION] + now[s.BOTH] == alone.images
-        assert now[s.TEXT] + now[s.BOTH] == alone.texts
+        np.testing.assert_array_equal([before, now], lock.at(k))
+        assert now[s.VISION] + now[s.BOTH] == lock.images
+        assert now[s.TEXT] + now[s.BOTH] == lock.texts
 
 
 def test_a_rare_stratum_is_visited_at_even_distances():

@@ -492,7 +492,7 @@ def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
 
     loose = make(_rows(9))
     with serve(behave) as server:
-        done = _run(loose, server, tmp_path / "answers", threads=1, say=said.append)
+        done = _run(loose, server, tmp_path / "answers", threads=1, log=said.append)
         sample_sheet(done.manifest, done.captions, tmp_path / "sheet.html")
         manifests.write(done.manifest, tmp_path / "new.csv")
     assert done.captions and done.failures and "[key]" in done.captions[0].text
@@ -627,11 +627,11 @@ def test_many_questions_that_are_always_refused_do_not_keep_back_the_answers(mak
 
 
 def test_two_processes_do_not_pay_for_the_same_answers(make, tmp_path):
-    from anytouch_jax.files import alone
+    from anytouch_jax.files import lock
 
     loose, folder = make(_rows(3)), tmp_path / "answers"
     folder.mkdir()
-    with serve() as server, alone(folder / ".lock"), pytest.raises(AnnotateError, match="another process asks for"):
+    with serve() as server, lock(folder / ".lock"), pytest.raises(AnnotateError, match="another process asks for"):
         _run(loose, server, folder)
     assert not server.asked
     with serve() as server:

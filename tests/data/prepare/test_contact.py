@@ -124,9 +124,9 @@ def test_given_backgrounds_and_broken_files(world, tmp_path):
 def test_backgrounds_are_estimated_by_unit_then_by_sequence(world):
     free = [(f"f{k}.png", gel(noise=k + 1), {"unit": "u", "sequence": f"s{k}"}) for k in range(5)]
     presses = [(f"p{k}.png", gel(60, at=(20 + 10 * k, 30)), {"unit": "u", "sequence": f"t{k}"}) for k in range(3)]
-    alone = [("alone.png", gel(60), {"sequence": "x"})]
+    lock = [("alone.png", gel(60), {"sequence": "x"})]
     other = [(f"o{k}.png", gel(noise=k + 9, tint=(60, 0, 0), dots=False), {"sequence": "y"}) for k in range(5)]
-    scores = c.contact_scores(world(free + presses + alone + other))
+    scores = c.contact_scores(world(free + presses + lock + other))
     assert (scores.score[:5] < c.DEFAULT_THRESHOLD).all() and (scores.score[5:8] > c.DEFAULT_THRESHOLD).all()
     assert np.isnan(scores.score[8]) and "fewer than 5 frames" in scores.reasons[8]
     assert (scores.score[9:] < c.DEFAULT_THRESHOLD).all()

@@ -442,12 +442,12 @@ def test_other_pictures_under_the_same_table_are_another_pack(make, tmp_path):
 
 
 def test_two_processes_do_not_pack_into_one_folder(make, tmp_path):
-    from anytouch_jax.files import alone
+    from anytouch_jax.files import lock
 
     source, out = make(_rows()), tmp_path / "packed"
     pack(source, out)
     (out / "README.md").unlink()  # as if it were still under way
-    with alone(out / ".lock"), pytest.raises(PackError, match=r"another process packs into .*: wait for it"):
+    with lock(out / ".lock"), pytest.raises(PackError, match=r"another process packs into .*: wait for it"):
         pack(source, out)
     assert pack(source, out).is_file()
     assert not (out / ".lock").exists()

@@ -62,13 +62,13 @@ def test_the_expert_pours_the_target(told):
 
 
 def test_the_same_seed_is_the_same_run_in_any_company(told):
-    alone = pouring_policy.demonstrate(TASK, 0, 3, side=None, late=0, chunk=3)
-    np.testing.assert_array_equal(alone.poured, told.poured[:3])
-    longest = len(alone.actions)
-    taken = alone.taken
-    np.testing.assert_array_equal(alone.actions[taken], told.actions[:longest, :3][taken])
+    lock = pouring_policy.demonstrate(TASK, 0, 3, side=None, late=0, chunk=3)
+    np.testing.assert_array_equal(lock.poured, told.poured[:3])
+    longest = len(lock.actions)
+    taken = lock.taken
+    np.testing.assert_array_equal(lock.actions[taken], told.actions[:longest, :3][taken])
     other = pouring_policy.demonstrate(TASK, 1, 3, side=None, late=0, chunk=3)
-    assert np.abs(other.tilt[0] - alone.tilt[0]).min() > 1e-3
+    assert np.abs(other.tilt[0] - lock.tilt[0]).min() > 1e-3
 
 
 def test_a_late_hand_changes_what_is_done_and_not_what_is_told(told, late):

@@ -64,7 +64,7 @@ class Notes:
 
 def run(work, out, **options):
     said: list[str] = []
-    result = execute(options.pop("leaves", LEAVES), work, out, say=said.append, clock=work.clock, **options)
+    result = execute(options.pop("leaves", LEAVES), work, out, log=said.append, clock=work.clock, **options)
     return result, said
 
 

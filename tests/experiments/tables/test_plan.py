@@ -107,10 +107,10 @@ def test_the_matrix_fits_in_its_hours():
 def test_cost_counts_what_is_shared_once():
     anytouch, text = BY_NAME["ablations", "anytouch", 0], BY_NAME["ablations", "no_text", 0]
     data = {one.name for one in plan.scenes(plan.FULL)}
-    alone = budget.cost(text, data)
+    lock = budget.cost(text, data)
     after = budget.cost(text, data | {one.key for one in anytouch.trainings})
-    assert alone - after == pytest.approx(budget.of_training(text.trainings[0]))
-    assert budget.cost(text, ()) - alone == pytest.approx(
+    assert lock - after == pytest.approx(budget.of_training(text.trainings[0]))
+    assert budget.cost(text, ()) - lock == pytest.approx(
         sum(budget.of_scenes(one, plan.FULL) for one in plan.scenes(plan.FULL))
     )
     assert budget.costs([anytouch, anytouch])[1] == budget.of_scores(anytouch)

@@ -36,7 +36,7 @@ class Trainer:
         patch.setattr(works, "pretrain", self)
         patch.setattr(works.time, "perf_counter", lambda: self.time)
 
-    def __call__(self, config, run, *, init, say):
+    def __call__(self, config, run, *, init, log):
         self.calls.append((run.name, (run / "weights").exists()))
         (run / "weights").touch()
         self.time += 10
@@ -52,7 +52,7 @@ def trainer(monkeypatch):
 def work(tmp_path):
     write_data(tmp_path, "one")
     said = []
-    found = Work(tmp_path, say=said.append)
+    found = Work(tmp_path, log=said.append)
     found.said = said
     return found
 

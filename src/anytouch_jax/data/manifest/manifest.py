@@ -34,7 +34,7 @@ from anytouch_jax.data.manifest.schema import (
     typed,
 )
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.files import replacing
+from anytouch_jax.files import atomic_path
 
 KEYS = ("sequence", "touch", "grasp_group")  # what two manifests may call alike and is not the same
 __all__ = [
@@ -254,7 +254,7 @@ def write(manifest: Manifest, path: str | Path) -> None:
     target, table = _placed(manifest, path)
     table = with_own_keys(manifest, table)
     try:
-        with replacing(target) as part, part.open("wb") as file:
+        with atomic_path(target) as part, part.open("wb") as file:
             if target.suffix.lower() == ".csv":
                 pa.csv.write_csv(table, file, pa.csv.WriteOptions(quoting_style="needed"))
             else:

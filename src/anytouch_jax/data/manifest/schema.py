@@ -234,7 +234,7 @@ def _first_bad(column: pa.ChunkedArray, parse: Callable[[Any], None]) -> tuple[i
     return 0, column[0].as_py()
 
 
-def _refuse(bad: pa.ChunkedArray, where: str, name: str, say: Callable[[int], str]) -> None:
+def _refuse(bad: pa.ChunkedArray, where: str, name: str, log: Callable[[int], str]) -> None:
     row = pc.index(bad, True).as_py()
     if row >= 0:
-        raise ManifestError(f"{where}, row {row}: column {name!r} {say(row)}")
+        raise ManifestError(f"{where}, row {row}: column {name!r} {log(row)}")

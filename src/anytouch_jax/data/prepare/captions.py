@@ -32,7 +32,7 @@ from anytouch_jax.data.prepare.questions import (
     small_jpeg,
 )
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import alone, write_whole
+from anytouch_jax.files import atomic_write, lock
 
 _NONSENSE_TRIES = 3
 _STREAK = 25  # failures in a row after which the run stops instead of paying on
@@ -105,7 +105,7 @@ def annotate(
     overwrite: bool = False,
     second_image: str = SECOND_IMAGE,
     limit: int | None = None,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> Annotated:
     """Ask `endpoint` for every caption that is lacking, after `confirm(estimate)`, which is also told where nothing is
     lacking; answers and failures in `folder`.
@@ -130,8 +130,8 @@ def annotate(
         if key and key not in store.answers:
             asking.setdefault(key, job)
     lacking = [(job, key) for key, job in asking.items()]
-    if say and exposed:
-        say(f"the key travels unencrypted to {endpoint.url}; use https")
+    if log and exposed:
+        log(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
     estimate = _estimate([job for job, _ in lacking], cached, side, price_in, price_out)
     if not confirm(estimate):
@@ -141,7 +141,7 @@ def annotate(
         with store.alone():
             lacking = [one for one in lacking if one[1] not in store.answers]  # another process may have been faster
             try:
-                run.ask(Client(endpoint), lacking, threads, say)
+                run.ask(Client(endpoint), lacking, threads, log)
             finally:
                 store.write_failures(run.failures, keys)
     elif run.failures or store.failed:
@@ -198,7 +198,7 @@ class _Run:
         return digest.hexdigest()[:32]
 
     def ask(
-        self, client: Client, lacking: list[tuple[Job, str]], threads: int, say: Callable[[str], None] | None
+        self, client: Client, lacking: list[tuple[Job, str]], threads: int, log: Callable[[str], None] | None
     ) -> None:
         """Ask all questions; stops at an endpoint that is of no use. In the end no thread is left.
 
@@ -216,8 +216,8 @@ class _Run:
                         break
                     if streak >= _STREAK:
                         raise AnnotateError(f"{streak} questions in a row failed, the last one: {reason}")
-                    if say and (count % 100 == 0 or count == len(lacking)):
-                        say(f"{count} of {len(lacking)} questions, {len(self.failures)} failed")
+                    if log and (count % 100 == 0 or count == len(lacking)):
+                        log(f"{count} of {len(lacking)} questions, {len(self.failures)} failed")
             finally:
                 client.stop.set()  # before the threads are waited for: none goes on waiting for a server
         for job, key in left:
@@ -279,7 +279,7 @@ class _Store:
     def alone(self) -> Iterator[None]:
         """Keep other processes from asking the same while the block runs. Raises AnnotateError when one does."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        with alone(self.folder / ".lock") as mine:
+        with lock(self.folder / ".lock") as mine:
             if not mine:
                 raise AnnotateError(f"another process asks for {self.folder}: wait for it, or name another --answers")
             self._read_answers()
@@ -321,7 +321,7 @@ class _Store:
         met = {failure.key for failure in failures} | self.answers.keys() | {""}
         lines = [json.dumps(failure._asdict(), ensure_ascii=False) for failure in failures]
         lines += [self.failed[key] for key in dict.fromkeys(keys) if key in self.failed and key not in met]
-        write_whole(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
+        atomic_write(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
 
 
 def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:

@@ -14,7 +14,7 @@ from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import ContactScores, known_contact, limits_of
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 # The columns that tell contact, in the order they are looked for, and the value above which they mean it.
 REFERENCES: Mapping[str, float] = {"label.force": 0.0, "label.contact": 0.5, "label.contact_score": 7.0}
@@ -133,7 +133,7 @@ def contact_picture(manifest: Manifest, scores: ContactScores, path: str | Path,
             else order
         )
         bands.append(_band(f"{title}: {len(side)} frames", manifest, chosen, scores.score, colour))
-    write_whole(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
+    atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
     return Path(path)
 
 

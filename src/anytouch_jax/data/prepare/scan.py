@@ -55,7 +55,7 @@ class _Look(NamedTuple):
 
 
 def scan(
-    manifest: Manifest, *, decode: bool = True, threads: int = 4, say: Callable[[str], None] | None = None
+    manifest: Manifest, *, decode: bool = True, threads: int = 4, log: Callable[[str], None] | None = None
 ) -> Scan:
     """Look at every distinct file; without `decode` only whether it is there and not empty.
 
@@ -85,8 +85,8 @@ def scan(
                 found.colours[file] = one.colours
             if one.reason and len(found.reasons) < _REASONS:
                 found.reasons[file] = one.reason
-            if say and (file + 1) % 100_000 == 0:
-                say(f"{file + 1} of {count} files")
+            if log and (file + 1) % 100_000 == 0:
+                log(f"{file + 1} of {count} files")
     return found
 
 

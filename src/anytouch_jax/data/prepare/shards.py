@@ -30,7 +30,7 @@ from anytouch_jax.data.manifest.packed import INDEX, ShardError, forget, read_fi
 from anytouch_jax.data.manifest.schema import PATHS
 from anytouch_jax.data.prepare.licences import card
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import alone, replacing, write_whole
+from anytouch_jax.files import atomic_path, atomic_write, lock
 
 _PICTURES = tuple(name for name in PATHS if name not in ("path", "field_path"))
 GROUPS = {"touch": ("path",), "shared": _PICTURES, "field": ("field_path",)}
@@ -59,7 +59,7 @@ def pack(
     *,
     shard_bytes: int = SHARD_BYTES,
     threads: int = 4,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> Path:
     """Store all files of a manifest in shards of about `shard_bytes` under the folder `out`; gives back its manifest.
 
@@ -82,22 +82,22 @@ def pack(
         stamp = None
     _is_ours(folder, plan, stamp, finished)  # before a lock is left in a folder of something else
     if finished:
-        if say:
-            say(f"{folder} was finished before: left as it is")
+        if log:
+            log(f"{folder} was finished before: left as it is")
         return target
     folder.mkdir(parents=True, exist_ok=True)
-    with alone(folder / ".lock") as mine:
+    with lock(folder / ".lock") as mine:
         if not mine:
             raise PackError(f"another process packs into {folder}: wait for it, or choose another folder")
         if not _is_ours(folder, plan, stamp, finished):
-            write_whole(folder / "pack.json", json.dumps(plan | {"files": stamp}))
-        _pack(manifest, files, folder, shard_bytes, threads, say)
+            atomic_write(folder / "pack.json", json.dumps(plan | {"files": stamp}))
+        _pack(manifest, files, folder, shard_bytes, threads, log)
         (folder / ".lock").unlink(missing_ok=True)
     return target
 
 
 def _pack(
-    manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, say: Callable[[str], None] | None
+    manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, log: Callable[[str], None] | None
 ) -> None:
     """Write the shards, the manifest and, last, the card."""
     target, orders = folder / "manifest.parquet", _orders(manifest, files)
@@ -112,12 +112,12 @@ def _pack(
             shard_of[here], row_of[here] = len(names), np.arange(rows)
             names.append(name)
             done += rows
-            if say:
-                say(f"{name}: {done} of {len(ids)} files")
+            if log:
+                log(f"{name}: {done} of {len(ids)} files")
     forget()
     packed = _repoint(manifest, target, files, names, shard_of, row_of)
     manifests.write(packed, target)
-    write_whole(folder / "README.md", card(packed, orders))
+    atomic_write(folder / "README.md", card(packed, orders))
 
 
 def _stamp(manifest: Manifest, files: Files) -> str:
@@ -238,13 +238,13 @@ class _Group:
         """One shard and then its index: (rows, the piece that begins the next shard)."""
         path = self.folder / self._name(number)
         left: list[_Piece] = []
-        with replacing(path, part=path.with_suffix(".part")) as part, part.open("w+b") as file:
+        with atomic_path(path, part=path.with_suffix(".part")) as part, part.open("w+b") as file:
             index, digest = self._fill(file, _until(first, pieces, shard_bytes, left))
         self.sums[self._name(number)] = digest
-        write_whole(self.folder / "SHA256SUMS", "".join(f"{d}  {n}\n" for n, d in sorted(self.sums.items())))
+        atomic_write(self.folder / "SHA256SUMS", "".join(f"{d}  {n}\n" for n, d in sorted(self.sums.items())))
         stream = io.BytesIO()
         np.save(stream, index)
-        write_whole(path.with_suffix(".index"), stream.getvalue())
+        atomic_write(path.with_suffix(".index"), stream.getvalue())
         return len(index), left[0] if left else None
 
     def _fill(self, file: BinaryIO, pieces: Iterable[_Piece]) -> tuple[np.ndarray, str]:

@@ -12,7 +12,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.captions import Caption
 from anytouch_jax.data.prepare.questions import picture_bytes, small_jpeg
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 _SIDE = 256
 _STYLE = (
@@ -38,7 +38,7 @@ def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Pa
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
         f"<h1>{title}</h1><p>Tick what is wrong.</p>{''.join(parts)}</html>\n"
     )
-    write_whole(target, page)
+    atomic_write(target, page)
     return target
 
 
@@ -48,7 +48,7 @@ def _article(manifest: Manifest, caption: Caption, number: int, folder: Path) ->
         name = f"{number:04d}_{place}_{column.removesuffix('_path')}.jpg"
         try:
             data = picture_bytes(manifest, row, column)
-            write_whole(folder / name, small_jpeg(data, f"{column} of row {row}", _SIDE))
+            atomic_write(folder / name, small_jpeg(data, f"{column} of row {row}", _SIDE))
         except (UserError, OSError, ValueError) as error:
             figures.append(f"<p>{html.escape(str(error))}</p>")
             continue

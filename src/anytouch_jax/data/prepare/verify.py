@@ -93,7 +93,7 @@ def verify(
     decode: bool = True,
     objects: bool = False,
     threads: int = 4,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> Report:
     """Check a manifest and every file that it names.
 
@@ -101,7 +101,7 @@ def verify(
     `objects`: an object on both sides of a split is an error, not information. Faults in the data are findings of
     the report; nothing of the manifest is changed (see `repair`).
     """
-    found = scan(manifest, decode=decode, threads=threads, say=say)
+    found = scan(manifest, decode=decode, threads=threads, log=log)
     findings = [
         *checks.bad_files(manifest, found),
         *checks.wrong_sizes(manifest, found),

@@ -143,7 +143,7 @@ def index(
             "that contains the data"
         ) from None
     for finding in misspelt_sensors(manifest):
-        notes.say(finding.sentence)
+        notes.log(finding.sentence)
     return _report(one, target, manifest, notes)
 
 

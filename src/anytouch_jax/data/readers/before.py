@@ -54,7 +54,7 @@ def carry(new: Manifest, target: Path, notes: Notes, *, keep: bool, groups: Coll
             "over by path, or remove it"
         )
     if lost:
-        notes.say(f"kept from {target.name} by path: {', '.join(lost)}")
+        notes.log(f"kept from {target.name} by path: {', '.join(lost)}")
     return _with_splits_of_groups(merged, np.asarray(pc.is_valid(at)), groups) if keep else merged
 
 

@@ -42,7 +42,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     table = find_file(["cloth_metadata.json"], options.lists, base.parent, root)
     properties = read_json(table) if table else {}
     if not properties:
-        notes.say("no cloth_metadata.json: no labels of the cloth's properties")
+        notes.log("no cloth_metadata.json: no labels of the cloth's properties")
     listed = contact_list(root, options, ("contact_yuan.csv", "Data_ICRA18/contact_yuan.csv"), "Data")
     rows = Rows("object", "label.contact", *(f"label.{name}" for name in PROPERTIES))
     found = 0

@@ -66,7 +66,7 @@ class Notes:
             before, first = self.skipped.get(reason, (0, example))
             self.skipped[reason] = before + count, first
 
-    def say(self, sentence: str) -> None:
+    def log(self, sentence: str) -> None:
         """Keep a sentence for the report."""
         self.said.append(sentence)
 

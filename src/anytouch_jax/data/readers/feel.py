@@ -46,7 +46,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         if not options.export:
             raise DatasetError(f"{root} has {len(original)} original .h5 files and no feel.csv; add --export to write "
                                "the pictures beside them (needs pip install h5py)")  # fmt: skip
-        notes.say(f"{export(root, original)} grasps written from {len(original)} .h5 files")
+        notes.log(f"{export(root, original)} grasps written from {len(original)} .h5 files")
     splits = _splits(base, options, notes)
     prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
     rows = Rows("object", "unit", "grasp_group", "image_path", "background_path", "label.success", "label.contact")
@@ -103,7 +103,7 @@ def _splits(base: Path, options: Options, notes: Notes) -> dict[str, str] | None
     if path is None and options.fold:
         raise DatasetError(f"there is no split_{options.fold}.npy or .json for --fold {options.fold} under {base}")
     if path is None:
-        notes.say(f"no split_{options.fold}.npy or .json: split by hash of the object")
+        notes.log(f"no split_{options.fold}.npy or .json: split by hash of the object")
         return None
     table = read_json(path) if path.suffix == ".json" else strings_in_pickle(path)
     lists = table.values() if isinstance(table, dict) else ()

@@ -14,7 +14,7 @@ import numpy as np
 
 from anytouch_jax.data.images import natural
 from anytouch_jax.data.readers.common import DatasetError
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 PARTS = ("train", "val", "test")
 PICTURES = {
@@ -82,7 +82,7 @@ def export(root: Path, names: Sequence[str]) -> int:
             raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(lines)
-    write_whole(root / "feel.csv", text.getvalue())
+    atomic_write(root / "feel.csv", text.getvalue())
     return len(lines)
 
 
@@ -119,4 +119,4 @@ def _write_grasp(folder: Path, number: int, grasp: Any) -> None:
         pixels = np.asarray(grasp[key][()])
         path = folder / sub / f"{number}{ending}.png"
         data = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
-        write_whole(path, data, sync=False)
+        atomic_write(path, data, sync=False)

@@ -10,7 +10,7 @@ import numpy as np
 from anytouch_jax.data.images import ImageError, frames_from_video, frames_told
 from anytouch_jax.data.readers.common import Notes, walk
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import whole_folder
+from anytouch_jax.files import atomic_folder
 
 SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 
@@ -37,10 +37,10 @@ def export(root: Path, notes: Notes) -> None:
 
 def _write(film: Path, notes: Notes) -> None:
     count = 0
-    with whole_folder(film.with_suffix("")) as target:
+    with atomic_folder(film.with_suffix("")) as target:
         for frame in frames_from_video(film):
             data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
             (target / f"{count:06d}.png").write_bytes(data)
             count += 1
     if 0.98 * (told := frames_told(film)) > count + 2:  # some containers only estimate it
-        notes.say(f"{film} tells of {told} frames and {count} could be read; is it whole?")
+        notes.log(f"{film} tells of {told} frames and {count} could be read; is it whole?")

@@ -67,7 +67,7 @@ def _own_splits(base: Path, options: Options, notes: Notes) -> dict[str, str]:
     files = {split: find_file([f"{split}_samples.json"], options.lists, base, base.parent) for split in
              ("train", "val", "test")}  # fmt: skip
     if not all(files.values()):
-        notes.say("no train_, val_ and test_samples.json: split by hash of the object")
+        notes.log("no train_, val_ and test_samples.json: split by hash of the object")
         return {}
     own: dict[str, str] = {}
     for split, path in files.items():

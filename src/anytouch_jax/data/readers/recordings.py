@@ -71,7 +71,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         columns = label_table.join(columns, options.labels.expanduser(), notes)
     for split in ("val", "test"):
         if columns["path"] and split not in columns["split"] and getattr(options, split):
-            notes.say(f"there are too few objects or recordings for split {split}")
+            notes.log(f"there are too few objects or recordings for split {split}")
     return columns
 
 
@@ -104,7 +104,7 @@ def _splits(folders: list[str], options: Options, notes: Notes) -> dict[str, str
     if options.split_by == "recording":
         return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
     if len(objects) > 1 and options.val + options.test > 0:
-        notes.say("whole objects are held out; for a classifier of objects: --split-by recording")
+        notes.log("whole objects are held out; for a classifier of objects: --split-by recording")
     split = ranked_split(objects, options)
     return {folder: split[_object(folder)] for folder in folders}
 

@@ -59,7 +59,7 @@ def _tables(base: Path, notes: Notes) -> tuple[set[str], dict[str, str]]:
     for split in ("train", "test"):
         path = base / f"{split}.csv"
         if not path.is_file():
-            notes.say(f"no {split}.csv: no phrases{' and no test pictures' if split == 'test' else ''} of it")
+            notes.log(f"no {split}.csv: no phrases{' and no test pictures' if split == 'test' else ''} of it")
             continue
         for row in read_table(path):
             if "tactile" not in row:

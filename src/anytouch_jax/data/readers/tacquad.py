@@ -44,7 +44,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
                            "'data_indoor'?")  # fmt: skip
     for subset in KEPT:
         if f"data_{subset}" not in subsets:
-            notes.say(f"no data_{subset}: that subset is left out")
+            notes.log(f"no data_{subset}: that subset is left out")
     rows = Rows("object", "touch", "image_path", "background_path", "caption_id", "label.contact", "subset")
     for folder in subsets:
         subset = folder.removeprefix("data_")

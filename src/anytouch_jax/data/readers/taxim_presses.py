@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader, Rows, hash_split
-from anytouch_jax.files import write_whole
+from anytouch_jax.files import atomic_write
 
 FOLDER = "taxim_presses"
 
@@ -71,7 +71,7 @@ def _installed() -> Path:
 def _save(path: Path, image: np.ndarray) -> None:
     """Write a BGR picture as PNG, whole or not at all, unless it is there."""
     if not path.is_file():
-        write_whole(path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
+        atomic_write(path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
 
 
 READER = Reader(

@@ -70,12 +70,12 @@ def _lists(root: Path, options: Options, notes: Notes) -> dict[str, dict[int, _F
                 places = f"{options.lists} and {root}" if options.lists else f"{root} (or say where with --lists)"
                 raise DatasetError(f"expected the list {split}{ending}.txt in {places}; {SOURCE}")
             if path is None:
-                notes.say(f"no {split}{ending}.txt: no labels of that list")
+                notes.log(f"no {split}{ending}.txt: no labels of that list")
             else:
                 _read_list(known, path, task, split)
     every = find_file(["label.txt"], options.lists, root)
     if every is None:
-        notes.say("no label.txt: only the frames of the split lists are taken (the paper has all contact frames)")
+        notes.log("no label.txt: only the frames of the split lists are taken (the paper has all contact frames)")
     else:
         _read_list(known, every, None, "")
     return known

@@ -142,7 +142,7 @@ def _key(path: str) -> str:
 def _contact(folder: Path, notes: Notes) -> tuple[set[str] | None, dict[str, str]]:
     path = folder / "contact.json"
     if not path.is_file():
-        notes.say(f"no {folder.name}/contact.json: which of its frames are contact is not known")
+        notes.log(f"no {folder.name}/contact.json: which of its frames are contact is not known")
         return None, {}
     table = read_json(path)
     lists = [table.get(name, []) for name in ("tactile", "background")] if isinstance(table, dict) else [None]
@@ -163,7 +163,7 @@ def _tables(folder: Path, notes: Notes) -> tuple[set[str], dict[str, str]]:
     for split in ("train", "test"):
         path = folder / f"{split}.csv"
         if not path.is_file():
-            notes.say(f"no {folder.name}/{split}.csv: no captions and no test frames of it")
+            notes.log(f"no {folder.name}/{split}.csv: no captions and no test frames of it")
             continue
         for row in read_table(path):
             if "tactile" not in row:

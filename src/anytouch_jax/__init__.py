@@ -9,7 +9,18 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "config": ["Config", "Model", "UserError", "from_json", "preset", "to_json"],
+    "config": [
+        "Config",
+        "DataConfig",
+        "LossConfig",
+        "ModelConfig",
+        "OptimConfig",
+        "RunConfig",
+        "from_json",
+        "preset",
+        "to_json",
+    ],
+    "errors": ["UserError"],
     "batch": ["AlignBatch", "MatchBatch", "Stage2Batch", "TouchBatch"],
     "nn.functional": ["Net", "build"],
     "ops.tokens": ["patchify", "unpatchify"],
@@ -20,7 +31,7 @@ _HOMES = {
     "train.optim": ["optimizer"],
     "train.loop": ["fit"],
     "pretrain": ["pretrain"],
-    "evaluate.features": ["Encoder", "Sight", "load_encoder", "random_encoder"],
+    "encoder.encoder": ["Encoder", "Preprocess", "load_encoder", "random_encoder"],
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -401,7 +401,7 @@ def test_a_full_disk_says_so(tmp_path, monkeypatch, late):
 CHILD = """
     import os, pathlib, signal, sys
     import jax.numpy as jnp
-    from anytouch_jax.io import checkpoint
+    from anytouch_jax.weights import checkpoint
 
     folder, where = pathlib.Path(sys.argv[1]), sys.argv[2]
 

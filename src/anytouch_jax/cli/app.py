@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass, make_dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -128,9 +129,7 @@ anytouch COMMAND --help explains a command and gives an example."""
 
 
 def _run(name: str, args: list[str]) -> int:
-    from anytouch_jax import cli
-
-    run: Callable[..., int] = getattr(cli, name).run
+    run: Callable[..., int] = import_module(f"anytouch_jax.cli.{name}").run
     if name == "train":
         return run(*_parse_train(args))
     return run(_parse(_COMMANDS[name][0], name, args))

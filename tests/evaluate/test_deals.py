@@ -1,4 +1,4 @@
-"""Whole groups on one side, whatever the manifest's split; and intervals over groups and seeds."""
+"""Whole groups on one side, whatever the manifest's split."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import deals
 from anytouch_jax.evaluate.choices import FOLDS
-from anytouch_jax.evaluate.deals import Rows, Sums, cuts, interval, scheme
+from anytouch_jax.evaluate.deals import Rows, cuts, scheme
 
 N = 240
 
@@ -111,58 +110,3 @@ def test_one_group_is_too_few():
         cuts(rows()._replace(groups=np.where(rows().test, "other", "g")), 0, "honest")
     with pytest.raises(UserError, match="unknown protocol 'lucky'"):
         cuts(rows(), 0, "lucky")
-
-
-def sums_of(right: np.ndarray, groups: np.ndarray) -> Sums:
-    return Sums(groups, np.stack([right.astype(float), np.ones(len(right))], 1))
-
-
-def test_the_interval_covers_a_known_accuracy_in_most_worlds():
-    """Groups differ, rows of a group are alike: an interval over rows would be far too narrow."""
-    rng, covered = np.random.default_rng(0), 0
-    for _ in range(100):
-        group = np.repeat(np.arange(40), 10)
-        right = rng.random(400) < rng.beta(1.4, 0.6, 40)[group]  # 0.7 on average
-        low, high = interval([sums_of(right, group)], deals.accuracy_of)
-        covered += low <= 0.7 <= high
-    assert 86 <= covered <= 100
-
-
-def test_seeds_that_differ_widen_the_interval():
-    group = np.arange(200)
-    same = np.arange(200) % 2 == 0
-    narrow = interval([sums_of(same, group)] * 5, deals.accuracy_of)
-    apart = [sums_of(np.arange(200) % 10 < k, group) for k in (1, 3, 5, 7, 9)]
-    wide = interval(apart, deals.accuracy_of)
-    assert wide[1] - wide[0] > 2 * (narrow[1] - narrow[0])
-
-
-def test_seeds_and_groups_are_drawn_independently():
-    """Seed k is right on group k alone: drawn alike, seeds and groups would meet in every draw, 0.2 at least."""
-    group = np.arange(50) // 10
-    low, high = interval([sums_of(group == k, group) for k in range(5)], deals.accuracy_of)
-    assert low < 0.1 and 0.2 < high < 0.5
-
-
-def test_values_from_sums():
-    truth, said = np.array([1.0, 2.0, 3.0, 6.0]), np.array([1.0, 2.5, 3.0, 5.0])
-    error = said - truth
-    sums = np.stack([error**2, np.abs(error), truth, truth**2, np.ones(4)], 1).sum(0)
-    assert deals.r2_of(sums) == pytest.approx(1 - 1.25 / np.sum((truth - 3) ** 2))
-    assert deals.mae_of(sums) == pytest.approx(1.5 / 4)
-    assert deals.accuracy_of(np.array([3.0, 4.0])) == 0.75
-
-
-def test_a_value_that_no_draw_has_has_no_interval():
-    still = np.stack([np.ones(20), np.ones(20), np.full(20, 3.0), np.full(20, 9.0), np.ones(20)], 1)
-    assert interval([Sums(np.array([f"g{i // 2}" for i in range(20)]), still)], deals.r2_of) == (None, None)
-
-
-def test_one_test_group_has_no_interval():
-    assert interval([sums_of(np.ones(3), np.array(["a"] * 3))], deals.accuracy_of) == (None, None)
-
-
-def test_the_interval_has_the_width_of_a_binomial() -> None:
-    right = np.random.default_rng(0).permutation(400) < 200
-    low, high = interval([sums_of(right, np.arange(400))], deals.accuracy_of)
-    assert high - low == pytest.approx(2 * 1.96 * 0.5 / 20, rel=0.05)

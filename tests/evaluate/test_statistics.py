@@ -11,13 +11,20 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import (
+    GroupSums,
     Outcome,
     Part,
     ProbeResult,
     RegressionResult,
+    bootstrap_interval,
+    classification_sums,
     difference,
+    mae_of,
     mean_interval,
+    mean_of,
     r2_interval,
+    r2_of,
+    regression_sums,
     to_json,
     to_table,
     verdict,
@@ -115,6 +122,36 @@ def test_r2_interval_holds_the_value() -> None:
 def outcome(correct: Any, first: int = 0) -> ProbeResult:
     rows = np.arange(first, first + len(correct))
     return replace(ONE, outcome=Outcome(rows, np.asarray(correct, bool), rows // 5))
+
+
+def test_seeds_that_differ_widen_the_interval() -> None:
+    group = np.arange(200)
+    same = np.arange(200) % 2 == 0
+    narrow = bootstrap_interval([classification_sums(same, group)] * 5, mean_of)
+    apart = [classification_sums(np.arange(200) % 10 < k, group) for k in (1, 3, 5, 7, 9)]
+    wide = bootstrap_interval(apart, mean_of)
+    assert wide[1] - wide[0] > 2 * (narrow[1] - narrow[0])
+
+
+def test_seeds_and_groups_are_drawn_independently() -> None:
+    """Seed k is right on group k alone: drawn alike, seeds and groups would meet in every draw, 0.2 at least."""
+    group = np.arange(50) // 10
+    low, high = bootstrap_interval([classification_sums(group == k, group) for k in range(5)], mean_of)
+    assert low < 0.1 and 0.2 < high < 0.5
+
+
+def test_values_from_sums() -> None:
+    truth, said = np.array([1.0, 2.0, 3.0, 6.0]), np.array([1.0, 2.5, 3.0, 5.0])
+    error = said - truth
+    sums = regression_sums(error, truth, np.arange(4)).sums.sum(0)
+    assert r2_of(sums) == pytest.approx(1 - 1.25 / np.sum((truth - 3) ** 2))
+    assert mae_of(sums) == pytest.approx(1.5 / 4)
+    assert mean_of(np.array([3.0, 4.0])) == 0.75
+
+
+def test_a_value_that_no_draw_has_has_no_interval() -> None:
+    still = np.stack([np.ones(20), np.ones(20), np.full(20, 3.0), np.full(20, 9.0), np.ones(20)], 1)
+    assert bootstrap_interval([GroupSums(np.array([f"g{i // 2}" for i in range(20)]), still)], r2_of) == (None, None)
 
 
 def test_a_difference_is_paired() -> None:

@@ -24,7 +24,7 @@ from anytouch_jax.evaluate import deals, heads, logistic
 from anytouch_jax.evaluate.battery_features import Order, Store, encoded, raw
 from anytouch_jax.evaluate.heads import HeadName, Problem, Recipe
 from anytouch_jax.evaluate.probe_models import Scaling, commonest
-from anytouch_jax.evaluate.statistics import Protocol
+from anytouch_jax.evaluate.statistics import GroupSums, Protocol, bootstrap_interval, mae_of, mean_of, r2_of
 from anytouch_jax.evaluate.tasks import Selection, Task, select, task_of
 
 Array = npt.NDArray[Any]
@@ -243,7 +243,7 @@ def _components(x: Array, rows: deals.Rows) -> Array:
 
 def _result(case: Case, head: HeadName, protocol: Protocol) -> dict[str, Any]:
     rows, chosen, sizes, unfinished = case.rows, list[float](), list[int](), 0
-    tested, chances = list[deals.Sums](), list[deals.Sums]()
+    tested, chances = list[GroupSums](), list[GroupSums]()
     for seed in range(case.setting.seeds):
         cuts = deals.cuts(rows, seed, protocol)
         if seed and protocol == "published" and len(cuts) == 1 and head != "gradient":
@@ -259,27 +259,27 @@ def _result(case: Case, head: HeadName, protocol: Protocol) -> dict[str, Any]:
             sizes.append(len(cut.fit))
         tested.append(_joined(said))
         chances.append(_joined(base))
-    value = deals.r2_of if rows.measured else deals.accuracy_of
+    value = r2_of if rows.measured else mean_of
     values = _values(value, tested)
-    low, high = deals.interval(tested, value)
+    low, high = bootstrap_interval(tested, value)
     result: dict[str, Any] = {"metric": "r2" if rows.measured else "accuracy", "mean": float(np.mean(values))}
     result |= {"low": low, "high": high, "values": values, "train": round(float(np.mean(sizes)))}
     result |= {"test": len(tested[0].groups), "classes": case.names.tolist()}
     result |= {"chance": float(np.mean(_values(value, chances)))}
     if rows.measured:
-        low, high = deals.interval(tested, deals.mae_of)
-        mae, chance = (float(np.mean(_values(deals.mae_of, several))) for several in (tested, chances))
+        low, high = bootstrap_interval(tested, mae_of)
+        mae, chance = (float(np.mean(_values(mae_of, several))) for several in (tested, chances))
         result |= {"mae": mae, "mae_low": low, "mae_high": high, "chance_mae": chance, "unit": case.task.unit}
     notes = [f"{unfinished} of {len(chosen)} fits did not converge"] * bool(unfinished)
     return result | {"groups": len(np.unique(tested[0].groups)), "chosen": chosen, "notes": notes}
 
 
-def _values(value: Callable[[Array], Array], tested: Sequence[deals.Sums]) -> list[float]:
+def _values(value: Callable[[Array], Array], tested: Sequence[GroupSums]) -> list[float]:
     return [float(value(one.sums.sum(0))) for one in tested]
 
 
-def _joined(parts: Sequence[deals.Sums]) -> deals.Sums:
-    return deals.Sums(np.concatenate([one.groups for one in parts]), np.concatenate([one.sums for one in parts]))
+def _joined(parts: Sequence[GroupSums]) -> GroupSums:
+    return GroupSums(np.concatenate([one.groups for one in parts]), np.concatenate([one.sums for one in parts]))
 
 
 def _predicted(case: Case, cut: deals.Cut, head: HeadName, protocol: Protocol, seed: int) -> tuple[float, Array, bool]:
@@ -297,10 +297,10 @@ def _constant(rows: deals.Rows, cut: deals.Cut) -> Array:
     return np.full(len(cut.test), learned.mean() if rows.measured else commonest(learned))
 
 
-def _tested(rows: deals.Rows, cut: deals.Cut, said: Array) -> deals.Sums:
+def _tested(rows: deals.Rows, cut: deals.Cut, said: Array) -> GroupSums:
     truth, ones = rows.y[cut.test], np.ones(len(cut.test))
     if not rows.measured:
-        return deals.Sums(rows.groups[cut.test], np.stack([(said == truth).astype(np.float64), ones], 1))
+        return GroupSums(rows.groups[cut.test], np.stack([(said == truth).astype(np.float64), ones], 1))
     error = said - truth
     truth = truth - rows.y.mean()  # an offset changes no R2, and its square hides the spread
-    return deals.Sums(rows.groups[cut.test], np.stack([error**2, np.abs(error), truth, truth**2, ones], 1))
+    return GroupSums(rows.groups[cut.test], np.stack([error**2, np.abs(error), truth, truth**2, ones], 1))

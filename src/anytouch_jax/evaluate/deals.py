@@ -1,8 +1,7 @@
-"""Who is fitted on, who chooses, who is tested: whole groups on one side, dealt anew by every seed; and intervals."""
+"""Who is fitted on, who chooses, who is tested: whole groups on one side, dealt anew by every seed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.choices import dealt
-from anytouch_jax.evaluate.statistics import Protocol, group_draws
+from anytouch_jax.evaluate.statistics import Protocol
 
 Array = npt.NDArray[Any]
 
@@ -93,51 +92,3 @@ def _parted(rows: Rows, pool: Array, test: Array, rng: np.random.Generator, prot
 
 def _dealt(rows: Rows, numbers: Array, rng: np.random.Generator) -> Array:
     return dealt(rows.groups[numbers], None if rows.measured else rows.y[numbers], rng)
-
-
-class Sums(NamedTuple):
-    """One seed's test rows: `groups` (n,), and what is summed over them, f64 (n, sums)."""
-
-    groups: Array
-    sums: Array
-
-
-def accuracy_of(sums: Array) -> Array:
-    """(..., [right, 1]) -> accuracy."""
-    return np.asarray(sums[..., 0] / sums[..., 1])
-
-
-def r2_of(sums: Array) -> Array:
-    """(..., [squared error, absolute error, truth, truth squared, 1]) -> 1 - squared error / variance."""
-    spread = sums[..., 3] - sums[..., 2] ** 2 / sums[..., 4]
-    return np.asarray(1 - sums[..., 0] / np.where(spread > 1e-12 * sums[..., 3], spread, np.nan))
-
-
-def mae_of(sums: Array) -> Array:
-    """Sums as in `r2_of` -> mean absolute error."""
-    return np.asarray(sums[..., 1] / sums[..., 4])
-
-
-def interval(tested: Sequence[Sums], value: Any) -> tuple[float | None, float | None]:
-    """95 % percentile interval of `value` (sums -> number) of the mean over seeds, drawing groups and seeds anew.
-
-    The seeds share the drawn groups, as they share the test rows. Too narrow with a handful of groups or, where seeds
-    differ more than groups, of seeds (of five it then holds the truth nine times in ten); the tables of several
-    trainings use `results.seed_interval`. (None, None) with fewer than two groups, and where no draw has a value.
-    """
-    names = np.unique(np.concatenate([one.groups for one in tested]))
-    if len(names) < 2:
-        return None, None
-    totals = np.zeros((len(tested), len(names), tested[0].sums.shape[1]))
-    for total, one in zip(totals, tested, strict=True):
-        np.add.at(total, np.searchsorted(names, one.groups), one.sums)
-    chosen = np.concatenate(list(group_draws(len(tested), stream=1))) / len(tested)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.concatenate(
-            [np.stack([value(times @ total) for total in totals], 1) for times in group_draws(len(names))]
-        )
-    drawn = np.where(chosen > 0, chosen * values, 0).sum(1)
-    if not np.isfinite(drawn).any():
-        return None, None
-    low, high = np.percentile(drawn[np.isfinite(drawn)], [2.5, 97.5])
-    return float(low), float(high)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -117,26 +117,73 @@ def group_draws(count: int, stream: int = 0) -> Iterator[Array]:
         yield rng.multinomial(count, np.full(count, 1 / count), size=1000)
 
 
-def _resampled(groups: Array, *columns: Array) -> Array | None:
-    """Sums of `columns` (n,) over the groups of each bootstrap, f64 (columns, DRAWS); None below two groups."""
-    names, ids = np.unique(groups, return_inverse=True)
+class GroupSums(NamedTuple):
+    """Test rows of one run: `groups` (n,), and what is summed over them, f64 (n, sums)."""
+
+    groups: Array
+    sums: Array
+
+
+def classification_sums(correct: Array, groups: Array) -> GroupSums:
+    """Return the sums that `mean_of` divides, of values (n,) or of rows that are right or wrong."""
+    return GroupSums(groups, np.stack([np.asarray(correct, np.float64), np.ones(len(correct))], 1))
+
+
+def regression_sums(error: Array, truth: Array, groups: Array) -> GroupSums:
+    """Return the sums of `r2_of` and `mae_of`; `truth` is best centred, as the square of an offset hides the spread."""
+    return GroupSums(groups, np.stack([error**2, np.abs(error), truth, truth**2, np.ones(len(error))], 1))
+
+
+def mean_of(sums: Array) -> Array:
+    """Return the mean (accuracy) from sums (..., [values, rows])."""
+    return np.asarray(sums[..., 0] / sums[..., 1])
+
+
+def r2_of(sums: Array) -> Array:
+    """Return R2 from sums (..., [squared error, absolute error, truth, squared truth, rows]); NaN for equal labels."""
+    spread = sums[..., 3] - sums[..., 2] ** 2 / sums[..., 4]
+    return np.asarray(1 - sums[..., 0] / np.where(spread > 1e-12 * sums[..., 3], spread, np.nan))
+
+
+def mae_of(sums: Array) -> Array:
+    """Return the mean absolute error from sums as `r2_of` reads them."""
+    return np.asarray(sums[..., 1] / sums[..., 4])
+
+
+def bootstrap_interval(runs: Sequence[GroupSums], value: Callable[[Array], Array]) -> tuple[float | None, float | None]:
+    """Return the 95 % percentile interval of the mean over runs of `value` (sums -> number).
+
+    Groups and runs (seeds) are resampled with replacement; the runs share the drawn groups, as they share the test
+    rows. The interval is too narrow with a handful of groups or of runs. (None, None) with fewer than two groups, and
+    where no draw has a value.
+    """
+    names = np.unique(np.concatenate([run.groups for run in runs]))
     if len(names) < 2:
-        return None
-    sums = np.stack([np.bincount(ids, weights=np.asarray(one, np.float64)) for one in columns], 1)
-    return np.concatenate([times @ sums for times in group_draws(len(names))]).T
+        return None, None
+    totals = np.zeros((len(runs), len(names), runs[0].sums.shape[1]))
+    for total, run in zip(totals, runs, strict=True):
+        np.add.at(total, np.searchsorted(names, run.groups), run.sums)
+    shares = np.concatenate(list(group_draws(len(runs), stream=1))) / len(runs)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.concatenate(
+            [np.stack([value(times @ total) for total in totals], 1) for times in group_draws(len(names))]
+        )
+    drawn = np.where(shares > 0, shares * values, 0).sum(1)
+    drawn = drawn[np.isfinite(drawn)]
+    if not drawn.size:
+        return None, None
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def mean_interval(values: Array, groups: Array) -> tuple[float | None, float | None]:
-    """95 % percentile interval of the mean of `values` (n,) under a bootstrap over `groups` (n,).
+    """Return the 95 % percentile interval of the mean of `values` (n,) under a bootstrap over `groups` (n,)."""
+    return bootstrap_interval([classification_sums(values, groups)], mean_of)
 
-    (None, None) with fewer than two groups. With a handful of groups it is too narrow, as any bootstrap; where all
-    groups agree (accuracy exactly 1) it has no width.
-    """
-    drawn = _resampled(groups, values, np.ones(len(values)))
-    if drawn is None:
-        return None, None
-    low, high = np.percentile(drawn[0] / drawn[1], [2.5, 97.5])
-    return float(low), float(high)
+
+def r2_interval(error: Array, truth: Array, groups: Array) -> tuple[float | None, float | None]:
+    """Return the 95 % percentile interval of R2 under a bootstrap over `groups`; `error`, `truth` (n,)."""
+    return bootstrap_interval([regression_sums(error, truth - truth.mean(), groups)], r2_of)
 
 
 def seed_interval(several: Sequence[float]) -> tuple[float | None, float | None]:
@@ -162,21 +209,6 @@ def verdict(low: float | None, high: float | None, seeds: int, *, wanted: float 
     if low is None or high is None or low <= 0 <= high:
         return "undecided"
     return "agrees" if (low > 0) == (wanted > 0) else "disagrees"
-
-
-def r2_interval(error: Array, truth: Array, groups: Array) -> tuple[float | None, float | None]:
-    """95 % percentile interval of R2 under a bootstrap over `groups`; `error`, `truth` (n,) as `mean_interval`."""
-    truth = truth - truth.mean()  # an offset changes no R2, and its square hides the spread
-    drawn = _resampled(groups, np.ones_like(truth), truth**2, truth, error**2)
-    if drawn is None:
-        return None, None
-    rows, squares, sums, wrong = drawn
-    spread = squares - sums**2 / rows
-    good = spread > 1e-12 * squares  # a draw of equal labels has no R2
-    if not good.any():
-        return None, None
-    low, high = np.percentile(1 - wrong[good] / spread[good], [2.5, 97.5])
-    return float(low), float(high)
 
 
 def difference(first: ProbeResult, second: ProbeResult) -> tuple[float, float | None, float | None]:

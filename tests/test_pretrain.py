@@ -158,7 +158,7 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert not any("without a stage-1 run" in line for line in said)
 
     tokenizer = (tmp_path / "r" / "tokenizer.json").read_bytes()
-    vocabulary = texts.load(tmp_path / "r" / "tokenizer.json").vocab_size
+    vocabulary = texts.load_tokenizer(tmp_path / "r" / "tokenizer.json").vocab_size
     assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == vocabulary < 2048
     assert first.params["text"]["token"].shape == (vocabulary, 16)
 
@@ -214,7 +214,7 @@ def test_stage_two_of_the_release(straight, world, tmp_path):
 
 def clip_folder(folder, config):
     """Weights and tokenizer as CLIP's download has them, of the smallest towers."""
-    tokenizer = texts.train(["a round thing", "an edge", "smooth and hard"], 300)
+    tokenizer = texts.train_tokenizer(["a round thing", "an edge", "smooth and hard"], 300)
     tokenizer.save(folder)
     model = replace(config.model, text=replace(config.model.text, vocab=tokenizer.vocab_size))
     params = build(model).init(jax.random.key(9))
@@ -317,7 +317,7 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     pretrained = run_config(world, 2, towers="pretrained")
     assert "--clip" in refused(pretrained, tmp_path / "c")
     assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")
-    texts.train(["a"], 300).save(tmp_path / "empty")
+    texts.train_tokenizer(["a"], 300).save(tmp_path / "empty")
     assert "no weights" in refused(pretrained, tmp_path / "d", clip=tmp_path / "empty")
     assert not (tmp_path / "a").exists() or not saved_steps_if_any(tmp_path / "a")
 
@@ -461,7 +461,7 @@ def test_a_start_that_failed_leaves_no_tokenizer_behind_that_counts(straight, wo
     run.mkdir()
     (run / "tokenizer.json").write_text("{}")  # of other data
     train(run_config(world, 2), run, init=straight[0], stop_after=0)
-    assert texts.load(run / "tokenizer.json").vocab_size > 2
+    assert texts.load_tokenizer(run / "tokenizer.json").vocab_size > 2
 
 
 # Sensors ------------------------------------------------------------------------------------------------------------

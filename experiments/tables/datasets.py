@@ -34,7 +34,7 @@ from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
 from anytouch_jax.data.prepare.contact_report import contact_picture
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.data.prepare.verify import verify
-from anytouch_jax.data.readers import Options, index
+from anytouch_jax.data.readers import IndexOptions, index
 
 FOLDER = Path(os.environ.get("FOLDER") or tempfile.mkdtemp(prefix="anytouch-"))
 ROOT = FOLDER / "YCB-Slide"
@@ -71,7 +71,7 @@ for thing, grain in (("mug", 0.25), ("sponge", 0.7)):
 # The same as `anytouch index ycb_slide YCB-Slide --val 0 --test 0`. It prints the counts beside the paper's.
 
 # %%
-report = index("ycb_slide", ROOT, options=Options(val=0, test=0))
+report = index("ycb_slide", ROOT, options=IndexOptions(val=0, test=0))
 print("\n".join(report.lines()))
 manifest = manifests.read(report.out)
 manifest.table.select(["path", "sensor", "sequence", "frame_index", "split", "object"]).slice(0, 4).to_pylist()

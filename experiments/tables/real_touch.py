@@ -36,7 +36,7 @@ import optax
 
 from anytouch_jax.cli.options import Probe
 from anytouch_jax.config import Config, from_json
-from anytouch_jax.data.loading.samples import Reader
+from anytouch_jax.data.loading.samples import SampleReader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder
 from anytouch_jax.evaluate import probe_command, statistics
@@ -100,7 +100,7 @@ names = sorted(set(task.labels[task.split == "train"]))
 
 def labelled_batches(start: int, stop: int) -> Iterator[Any]:
     """Random contact frames of train with the number of their object."""
-    reader = Reader(manifest, config)
+    reader = SampleReader(manifest, config)
     rows = np.flatnonzero(task.split == "train")
     for step in range(start, stop):
         chosen = np.random.default_rng([config.run.seed, step]).choice(rows, config.data.batch_size)

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from anytouch_jax.config import FIELD_SENSORS, Config, DataConfig, preset
-from anytouch_jax.data.loading.samples import Reader
-from anytouch_jax.data.manifest.edit import select
-from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.manifest.packed import read_file
+from anytouch_jax.data.loading.samples import SampleReader
+from anytouch_jax.data.manifest.files import read_file
+from anytouch_jax.data.manifest.manifest import Manifest, select_rows
 from anytouch_jax.errors import UserError
 
 FIELD = (20, 20, 6)  # points of a Tac3D; displacement x, y, z mm, force x, y, z N
@@ -110,7 +109,7 @@ def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:
     kept = [row for row, name in enumerate(manifest.column("object").to_pylist()) if name not in taken]
     if not any(manifest.value(row, "split") == "train" for row in kept):
         raise UserError("every object to train on is in the pairs too; simulate pairs of fewer or other objects")
-    return select(manifest, np.array(kept))
+    return select_rows(manifest, np.array(kept))
 
 
 def read_pairs(manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +126,7 @@ def read_pixels(manifest: Manifest, rows: np.ndarray, size: int, *, subtract: bo
     """Images u8 (n, size, size, 3) of manifest rows, or what they are beside their backgrounds. Raises UserError."""
     out = np.empty((len(rows), size, size, 3), np.uint8)
     model = replace(preset("tiny").model, image_size=size)
-    reader = Reader(manifest, Config(model, data=DataConfig(background="subtract" if subtract else "keep")))
+    reader = SampleReader(manifest, Config(model, data=DataConfig(background="subtract" if subtract else "keep")))
 
     def one(k: int) -> None:
         reader.touch(rows[k : k + 1], None, out[k : k + 1])

@@ -46,7 +46,7 @@ import numpy as np
 
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.edit import select
+from anytouch_jax.data.manifest.manifest import select_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
@@ -171,7 +171,7 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
 def of_sensors(table: manifests.Manifest, names: tuple[str, str]) -> str:
     """The hash of the rows of two sensors: what a translation from the one to the other is of."""
     rows = np.flatnonzero(np.isin(table.column("sensor").to_pylist(), names))
-    return select(table, rows).content_hash[:16]
+    return select_rows(table, rows).content_hash[:16]
 
 
 def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:

@@ -17,7 +17,7 @@ from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, from_json
 from anytouch_jax.data import tokenizer as texts
-from anytouch_jax.data.loading import sources
+from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
@@ -157,7 +157,7 @@ def _describe(
     config: Config, run: Path, init: Any, clip: Any, manifest: manifests.Manifest, loader: Loader
 ) -> dict[str, Any]:
     """What a checkpoint says of itself beside its config; `seen`: the sensors that it, or `init`, was trained on."""
-    seen: set[str] = set(loader.sensors_seen)
+    seen: set[str] = set(loader.trained_sensors)
     source = {"init": None if init is None else str(init), "clip": None if clip is None else str(clip)}
     if steps(run / "checkpoints"):  # a run that goes on knows what it began from
         with suppress(checkpoint.CheckpointError):
@@ -195,17 +195,17 @@ def _with_tokenizer(config: Config, run: Path, manifest: Any, clip: Any) -> tupl
         return config, None
     own = run / TOKENIZER
     if own.exists() and steps(run / "checkpoints"):  # else it is left from a start that failed
-        tokenizer = texts.load(own)
+        tokenizer = texts.load_tokenizer(own)
     elif config.data.tokenizer is not None:
-        tokenizer = texts.load(config.data.tokenizer)
+        tokenizer = texts.load_tokenizer(config.data.tokenizer)
     elif config.towers == "pretrained":
-        tokenizer = texts.load(_beside(clip, TOKENIZER))
+        tokenizer = texts.load_tokenizer(_beside(clip, TOKENIZER))
     else:
         rows = manifest.rows_of(config.data.split)
-        captions = sources.captions(manifest, rows, aligned_text=config.data.aligned_text)
+        captions = pools.training_captions(manifest, rows, aligned_text=config.data.aligned_text)
         if not captions:
             return config, None
-        tokenizer = texts.train(captions, min(SCRATCH_VOCABULARY, config.model.text.vocab))
+        tokenizer = texts.train_tokenizer(captions, min(SCRATCH_VOCABULARY, config.model.text.vocab))
     if config.towers == "pretrained":
         return config, tokenizer
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))

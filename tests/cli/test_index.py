@@ -10,7 +10,7 @@ from reader_world import fill
 
 from anytouch_jax.cli.options_data import Index
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.readers import READERS, Options
+from anytouch_jax.data.readers import READERS, IndexOptions
 
 
 @pytest.fixture
@@ -59,4 +59,6 @@ def test_the_help_names_every_reader_and_the_defaults_are_the_readers():
     assert Index.__doc__ is not None
     assert [name for name in READERS if f"{name}," not in Index.__doc__ and f"{name}." not in Index.__doc__] == []
     given = Index("x", Path())
-    assert Options() == Options(given.val, given.test, given.lists, given.task, given.fold, given.export, given.sensor)
+    assert IndexOptions() == IndexOptions(
+        given.val, given.test, given.lists, given.task, given.fold, given.export, given.sensor
+    )

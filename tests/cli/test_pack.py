@@ -9,13 +9,13 @@ import pytest
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.packed import forget
+from anytouch_jax.data.manifest.files import close_shards
 
 
 @pytest.fixture(autouse=True)
 def _closed():
     yield
-    forget()
+    close_shards()
 
 
 def test_a_pack_reads_like_the_files(anytouch, pressed, tmp_path):

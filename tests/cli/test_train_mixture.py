@@ -10,7 +10,7 @@ from gel_pictures import press
 from runs import SIZES
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.packed import forget
+from anytouch_jax.data.manifest.files import close_shards
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def mixture(tmp_path, anytouch):
         manifests.write(manifests.from_columns(columns, files[-1]), files[-1])
     assert anytouch("pack", files[3]).status == 0
     yield [*files[:3], files[3].with_name("touch_packed") / "manifest.parquet"]
-    forget()
+    close_shards()
 
 
 @pytest.mark.slow

@@ -187,24 +187,24 @@ def test_a_folder_comes_in_natural_order(tmp_path):
         image = np.full((4, 4, 3), number, np.uint8)
         cv2.imwrite(str(tmp_path / f"img{number}.png"), image)
     (tmp_path / "notes.txt").write_text("no picture")
-    assert [images.decode(file)[0, 0, 0] for file in images.pictures_in(tmp_path)[0]] == [1, 9, 10]
+    assert [images.decode(file)[0, 0, 0] for file in images.list_images(tmp_path)[0]] == [1, 9, 10]
     for name in ("background.jpg", "Photo.png"):
         assert cv2.imwrite(str(tmp_path / name), np.zeros((4, 4, 3), np.uint8))
     np.save(tmp_path / "000.npy", np.zeros((20, 20, 6), np.float32))
-    frames, beside = images.pictures_in(tmp_path)
+    frames, beside = images.list_images(tmp_path)
     assert len(frames) == 3 and {name: file.name for name, file in beside.items()} == {
         "background": "background.jpg", "photo": "Photo.png"
     }  # fmt: skip
-    order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_order)
+    order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_sort_key)
     assert order == ["1689.9.png", "1690.4666.png", "1690.5.png"]
     stamps = ["0.8.bmp", "0.9.bmp", "1.bmp", "1.1.bmp", "2.bmp", "1690000000000000001.bmp", "1690000000000000002.bmp"]
     turned = stamps[::-1]
-    assert sorted(turned, key=images.frame_order) == stamps  # whole seconds are written without a point
-    assert sorted(["b.png", "img10.png", "img9.png", "3.png"], key=images.frame_order)[:2] == ["3.png", "b.png"]
+    assert sorted(turned, key=images.frame_sort_key) == stamps  # whole seconds are written without a point
+    assert sorted(["b.png", "img10.png", "img9.png", "3.png"], key=images.frame_sort_key)[:2] == ["3.png", "b.png"]
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):
-            images.pictures_in(folder)
+            images.list_images(folder)
 
 
 def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
@@ -222,7 +222,7 @@ def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
     for _ in range(3):
         timed.write(np.zeros((24, 32, 3), np.uint8))
     timed.release()
-    assert len(list(images.frames_from_video("10:30.mp4"))) == images.frames_told("10:30.mp4") == 3  # no protocol
+    assert len(list(images.frames_from_video("10:30.mp4"))) == images.count_frames("10:30.mp4") == 3  # no protocol
     (tmp_path / "bad.avi").write_bytes(b"not a video")
     for name, words in (("bad.avi", "not a video"), ("none.avi", "there is no video")):
         with pytest.raises(images.ImageError, match=words):
@@ -295,4 +295,4 @@ def test_frames_are_numbered_by_what_counts_them():
     ],
 )
 def test_series_that_share_numbers_are_apart(names, series):
-    assert images.by_stem(names) == (series or {"": names})
+    assert images.split_series(names) == (series or {"": names})

@@ -14,7 +14,7 @@ CAPTIONS = ["A soft, springy surface.", "A hard, smooth surface with ridges.", "
 
 @pytest.mark.parametrize("folder", [CLIP] if CLIP.is_dir() else [])
 def test_clips_own_ids_exactly(folder):
-    tokenizer = text.load(folder)
+    tokenizer = text.load_tokenizer(folder)
     assert (tokenizer.vocab_size, tokenizer.start_id, tokenizer.end_id) == (49408, 49406, 49407)
     cases = json.loads((folder / "token_ids.json").read_text())
     ids, mask = tokenizer.encode([case["text"] for case in cases], 77)
@@ -27,7 +27,7 @@ def test_clips_own_ids_exactly(folder):
 
 
 def test_padding_and_the_mask():
-    tokenizer = text.train(CAPTIONS, 300)
+    tokenizer = text.train_tokenizer(CAPTIONS, 300)
     ids, mask = tokenizer.encode(["", "rough"], 16)
     assert ids[0].tolist() == [tokenizer.start_id] + [tokenizer.end_id] * 15
     assert mask[0].tolist() == [True, True] + [False] * 14
@@ -39,7 +39,7 @@ def test_padding_and_the_mask():
 
 @pytest.mark.parametrize("length", [2, 3, 5])
 def test_truncation_keeps_the_end_token_last(length):
-    tokenizer = text.train(CAPTIONS, 300)
+    tokenizer = text.train_tokenizer(CAPTIONS, 300)
     full, _ = tokenizer.encode([CAPTIONS[1]], 64)
     ids, mask = tokenizer.encode([CAPTIONS[1]], length)
     assert ids[0].tolist() == [*full[0, : length - 1].tolist(), tokenizer.end_id]
@@ -47,7 +47,7 @@ def test_truncation_keeps_the_end_token_last(length):
 
 
 def test_a_text_that_just_fits_is_not_cut():
-    tokenizer = text.train(CAPTIONS, 300)
+    tokenizer = text.train_tokenizer(CAPTIONS, 300)
     _, mask = tokenizer.encode([CAPTIONS[0]], 64)
     used = int(mask.sum())
     short, _ = tokenizer.encode([CAPTIONS[0]], used)
@@ -56,8 +56,8 @@ def test_a_text_that_just_fits_is_not_cut():
 
 
 def test_training_is_deterministic_and_covers_any_text(tmp_path):
-    tokenizer = text.train(CAPTIONS, 320)
-    again = text.train([*reversed(CAPTIONS), CAPTIONS[0]], 320)
+    tokenizer = text.train_tokenizer(CAPTIONS, 320)
+    again = text.train_tokenizer([*reversed(CAPTIONS), CAPTIONS[0]], 320)
     texts = [*CAPTIONS, "Ünïcode ½ 触覚 \U0001f91a", "  MANY   spaces\n\tand TABS "]
     np.testing.assert_array_equal(tokenizer.encode(texts, 77)[0], again.encode(texts, 77)[0])
     assert 258 < tokenizer.vocab_size <= 320 and tokenizer.end_id == tokenizer.vocab_size - 1
@@ -66,24 +66,24 @@ def test_training_is_deterministic_and_covers_any_text(tmp_path):
     assert len(different) == len(texts)
     for target in (tmp_path / "new", tmp_path / "new" / "other.json"):
         tokenizer.save(target)
-        loaded = text.load(target)
+        loaded = text.load_tokenizer(target)
         np.testing.assert_array_equal(loaded.encode(texts, 77)[0], tokenizer.encode(texts, 77)[0])
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["other.json", "tokenizer.json"]
 
 
 def test_mistakes_are_told_in_a_sentence(tmp_path):
     with pytest.raises(UserError, match=r"there is no tokenizer .*none.*tokenizer\.json"):
-        text.load(tmp_path / "none")
+        text.load_tokenizer(tmp_path / "none")
     (tmp_path / "tokenizer.json").write_text("{}")
     with pytest.raises(UserError, match="is not a tokenizer"):
-        text.load(tmp_path)
+        text.load_tokenizer(tmp_path)
     plain = tokenizers.Tokenizer(tokenizers.models.WordLevel({"a": 0}, unk_token="a"))
     plain.save(str(tmp_path / "plain.json"))
     with pytest.raises(UserError, match="not of CLIP's kind"):
-        text.load(tmp_path / "plain.json")
+        text.load_tokenizer(tmp_path / "plain.json")
     with pytest.raises(UserError, match="without captions"):
-        text.train([], 300)
+        text.train_tokenizer([], 300)
     with pytest.raises(UserError, match="at least 258"):
-        text.train(CAPTIONS, 257)
+        text.train_tokenizer(CAPTIONS, 257)
     with pytest.raises(UserError, match="length of 1"):
-        text.train(CAPTIONS, 300).encode(["x"], 1)
+        text.train_tokenizer(CAPTIONS, 300).encode(["x"], 1)

@@ -243,4 +243,4 @@ def test_a_frame_is_turned_clockwise_then_mirrored():
         (90, "down"): [[5, 2], [4, 1], [3, 0]],
     }
     for (rotate, flip), pixels in wanted.items():
-        assert t.turned(frame, rotate, flip)[..., 0].tolist() == pixels
+        assert t.orient_frame(frame, rotate, flip)[..., 0].tolist() == pixels

@@ -19,7 +19,7 @@ from anytouch_jax.cli.app import main
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.readers import Options, index
+from anytouch_jax.data.readers import IndexOptions, index
 from anytouch_jax.encoder.encoder import Encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import battery, battery_features, deals, heads
@@ -396,9 +396,9 @@ def objectfolder(root: Path) -> None:
 
 
 MAKERS = {
-    "touch_and_go": (touch_and_go, Options()),
-    "feel": (feel, Options(fold=3)),
-    "objectfolder": (objectfolder, Options()),
+    "touch_and_go": (touch_and_go, IndexOptions()),
+    "feel": (feel, IndexOptions(fold=3)),
+    "objectfolder": (objectfolder, IndexOptions()),
 }
 SIZES = {  # (train, test) of the authors' own split
     "touch_and_go_material": (80, 16),

@@ -74,7 +74,7 @@ def run(options: Annotate) -> int:
 
 def _attach(options: Annotate, manifest: Manifest, target: Path) -> int:
     """Captions that are there already, in a table."""
-    from anytouch_jax.data.manifest.edit import attach_text
+    from anytouch_jax.data.manifest.manifest import attach_text
 
     assert options.captions is not None
     named, notes = attach_text(manifest, options.captions, key=options.key, overwrite=options.overwrite)

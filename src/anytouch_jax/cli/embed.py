@@ -140,10 +140,10 @@ def _print_line(one: Embedded, rate: float, head: Head | None) -> None:
 
 def _gel(encoder: Encoder, options: Embed) -> Path | None:
     """The picture of the untouched gel: that of --background, or that of the folder where the encoder wants one."""
-    from anytouch_jax.data.images import BACKGROUND, pictures_in
+    from anytouch_jax.data.images import BACKGROUND, list_images
 
     if options.background is None and encoder.subtracts and options.input.is_dir():
-        return pictures_in(options.input)[1].get(BACKGROUND)
+        return list_images(options.input)[1].get(BACKGROUND)
     return options.background
 
 
@@ -237,9 +237,9 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
 
 def _say_cut(video: Path, count: int) -> None:
     """Tell of a video of which fewer frames could be read than it tells of."""
-    from anytouch_jax.data.images import frames_told
+    from anytouch_jax.data.images import count_frames
 
-    told = frames_told(video)
+    told = count_frames(video)
     if 0.98 * told > count + 2:  # some containers only estimate it
         log(f"{video} tells of {told} frames and {count} could be read; is it whole?")
 
@@ -250,11 +250,11 @@ def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | No
     from anytouch_jax.data.images import (
         SUFFIXES,
         ImageError,
-        by_stem,
         decode,
         frame_numbers,
         frames_from_video,
-        pictures_in,
+        list_images,
+        split_series,
     )
 
     if options.input.suffix.lower() in SUFFIXES and options.input.is_file():
@@ -263,11 +263,11 @@ def _numbered_frames(options: Embed) -> Iterator[tuple[int, str, np.ndarray | No
     if not options.input.is_dir():
         yield from ((number, "", frame) for number, frame in enumerate(frames_from_video(options.input)))
         return
-    files, beside = pictures_in(options.input)
+    files, beside = list_images(options.input)
     if beside:
         log(f"{', '.join(file.name for file in beside.values())}: not a frame, not embedded")
     start = 0  # of the numbers of a finger's frames: no clip reaches from one finger to the next
-    for names in by_stem([file.name for file in files]).values():
+    for names in split_series([file.name for file in files]).values():
         numbers = [start + number for number in frame_numbers(names)]
         start = numbers[-1] + 2
         for number, name in zip(numbers, names, strict=True):

@@ -9,7 +9,7 @@ def run(options: Index) -> int:
     """Read the dataset, write its manifest, print what was found beside the paper's count."""
     from anytouch_jax.data import readers
 
-    told = readers.Options(
+    told = readers.IndexOptions(
         val=options.val, test=options.test, lists=options.lists, task=options.task, fold=options.fold,
         export=options.export, sensor=options.sensor, split_by=options.split_by, labels=options.labels,
     )  # fmt: skip

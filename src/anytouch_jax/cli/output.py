@@ -22,11 +22,12 @@ def beside(manifest: Path, word: str, suffix: str | None = None) -> Path:
 def check_new(manifest: Manifest, path: Path) -> Path:
     """The absolute path of a manifest that `write_new` can write: to be asked before long work. Raises UserError."""
     from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.data.manifest.schema import is_manifest
 
     target = path.expanduser().resolve()
     if target in manifest.files:
         raise UserError(f"{target} is the manifest that was read; name another file")
-    if target.is_file() and not manifests.is_manifest(target):
+    if target.is_file() and not is_manifest(target):
         raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
     manifests.check_target(manifest, target)
     check_folder(target)

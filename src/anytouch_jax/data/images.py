@@ -14,12 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.data.manifest.packed import HEADER_LOCK, read_file
+from anytouch_jax.data.manifest.files import NPY_HEADER_LOCK, read_file
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
 
 MAX_PIXELS = 1 << 26  # a small PNG can declare a picture that would fill the memory
-MOST_TIMES = (
+MAX_ASPECT = (
     100  # a longer side than so many times the shorter one is a strip, which would fill the memory when resized
 )
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
@@ -95,7 +95,7 @@ def _array(data: bytes) -> np.ndarray:
     stream = io.BytesIO(data)
     try:
         old = np.lib.format.read_magic(stream) == (1, 0)
-        with HEADER_LOCK:
+        with NPY_HEADER_LOCK:
             shape, fortran, kind = (_HEADER_1 if old else _HEADER_2)(stream)
     except Exception:  # the header is Python text: a spoiled one fails in the tokenizer, the parser or in NumPy
         raise ValueError("the file is cut short, or its header is corrupt") from None
@@ -116,7 +116,7 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
         raise ImageError(
             f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels, more than the limit of {MAX_PIXELS}"
         )
-    if max(pixels.shape[:2]) > MOST_TIMES * min(pixels.shape[:2]):
+    if max(pixels.shape[:2]) > MAX_ASPECT * min(pixels.shape[:2]):
         raise ImageError(f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: that is a strip, not a picture")
     pixels = pixels[..., :3].astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.uint16:
@@ -253,7 +253,7 @@ def _opened(path: str | Path) -> cv2.VideoCapture:
     return cv2.VideoCapture(os.path.abspath(path))  # FFmpeg takes what is before a name's colon for a protocol
 
 
-def frames_told(path: str | Path) -> int:
+def count_frames(path: str | Path) -> int:
     """The number of frames that a video's header tells of, 0 where it tells nothing."""
     video = _opened(path)
     try:
@@ -262,9 +262,9 @@ def frames_told(path: str | Path) -> int:
         video.release()
 
 
-def pictures_in(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
-    """The frames of a folder in order (`frame_order`), arrays only where there is nothing else, and the pictures in it
-    that are no frames by name (BACKGROUND, PHOTO). Raises ImageError when there are no frames."""
+def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
+    """The frames of a folder in order (`frame_sort_key`), arrays only where there is nothing else, and the pictures in
+    it that are no frames by name (BACKGROUND, PHOTO). Raises ImageError when there are no frames."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ImageError(f"there is no folder {folder}")
@@ -274,7 +274,7 @@ def pictures_in(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     files = [file for file in files if file.suffix.lower() != ".npy"] or files
     if not files:
         raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)}){_instead(folder)}")
-    return sorted(files, key=lambda file: frame_order(file.name)), beside
+    return sorted(files, key=lambda file: frame_sort_key(file.name)), beside
 
 
 def _instead(folder: Path) -> str:
@@ -301,7 +301,7 @@ def frame_numbers(names: Sequence[str]) -> list[int]:
     return numbers if counts else list(range(len(names)))
 
 
-def by_stem(names: Sequence[str]) -> dict[str, list[str]]:
+def split_series(names: Sequence[str]) -> dict[str, list[str]]:
     """Names of one folder in order by what stands before their numbers, where two series share a number (left_0 and
     right_0 of two fingers); else all of them under "". Series differ by more than numbers: 12-00-05 is a time."""
     series: dict[str, list[str]] = {}
@@ -317,7 +317,7 @@ def by_stem(names: Sequence[str]) -> dict[str, list[str]]:
     return series if shared else {"": list(names)}
 
 
-def frame_order(name: str) -> tuple[int | float, list[tuple[int, str]]]:
+def frame_sort_key(name: str) -> tuple[int | float, list[tuple[int, str]]]:
     """A sort key of frames: numbers and time stamps as the numbers that they are, then the others, 2 before 10."""
     stem = Path(name).stem
     if re.fullmatch(r"\d+", stem):  # a whole second is often written without its point

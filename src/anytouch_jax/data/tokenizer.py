@@ -60,13 +60,13 @@ class Tokenizer:
         return max((len(one.ids) for part in parts for one in part), default=2)
 
     def save(self, path: str | Path) -> None:
-        """Write a tokenizer.json that `load` reads, whole or not at all; `path` is the file or its folder."""
+        """Write a tokenizer.json that `load_tokenizer` reads, whole or not at all; `path` is the file or its folder."""
         path = Path(path)
         target = path / "tokenizer.json" if path.suffix != ".json" else path
         atomic_write(target, self._inner.to_str())
 
 
-def load(path: str | Path) -> Tokenizer:
+def load_tokenizer(path: str | Path) -> Tokenizer:
     """Read a `tokenizer.json`, given as the file or its folder. Raises UserError when it is missing or unfit."""
     path = Path(path).expanduser()
     if not path.exists() and path.name != "tokenizer.json":
@@ -81,7 +81,7 @@ def load(path: str | Path) -> Tokenizer:
     return Tokenizer(inner, str(file))
 
 
-def train(captions: Iterable[str], vocab_size: int) -> Tokenizer:
+def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
     """A byte-level BPE tokenizer of at most `vocab_size` ids trained on `captions`; the same captions, the same ids.
 
     Any text can be encoded (lower case, runs of space as one). Start and end token take the last two ids. Raises

@@ -17,8 +17,16 @@ from anytouch_jax.config import DataConfig
 from anytouch_jax.data.images import ImageError, decode
 
 __all__ = [
-    "ImageError", "augmentation_rng", "colour_jitter", "decode", "subtract_background",
-    "touch_evaluation", "touch_transform", "turned", "vision_evaluation", "vision_transform",
+    "ImageError",
+    "augmentation_rng",
+    "colour_jitter",
+    "decode",
+    "orient_frame",
+    "subtract_background",
+    "touch_evaluation",
+    "touch_transform",
+    "vision_evaluation",
+    "vision_transform",
 ]  # fmt: skip
 
 _GREY = (0.2989, 0.587, 0.114)  # torchvision's weights of red, green, blue
@@ -75,7 +83,7 @@ def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: 
     return out
 
 
-def turned(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
+def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
     """A frame (h, w, c) turned clockwise by 0, 90, 180 or 270 degrees, then mirrored across (left and right exchanged)
     or down (top and bottom)."""
     frame = np.rot90(frame, -rotate // 90) if rotate else frame

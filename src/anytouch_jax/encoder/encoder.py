@@ -20,7 +20,7 @@ from anytouch_jax.config import UNIVERSAL, Config, DataConfig, ModelConfig, chec
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation, turned
+from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path
 from anytouch_jax.nn.attention import usable
@@ -140,12 +140,12 @@ class Encoder:
 class Preprocess:
     """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
     (a frame), the picture of the untouched gel; the first frame serves where none is given. `rotate` and `flip` turn
-    both before (`data.transforms.turned`)."""
+    both before (`data.transforms.orient_frame`)."""
 
     def __init__(
         self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
     ) -> None:
-        self._encoder, self._turned = encoder, partial(turned, rotate=rotate, flip=flip)
+        self._encoder, self._turned = encoder, partial(orient_frame, rotate=rotate, flip=flip)
         self._background = None
         if background is not None:
             self._background = self._turned(to_rgb(np.asarray(background), "the background"))

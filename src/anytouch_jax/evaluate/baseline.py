@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from sklearn.decomposition import PCA
 
-from anytouch_jax.data.loading.samples import read_picture
+from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.errors import UserError
 
@@ -38,13 +38,13 @@ def row_pixels(table: Manifest, row: int, grounds: dict[Path, Array]) -> Array:
 
     Raises SampleError, which names row and file.
     """
-    frame, ground = _same_size(read_picture(table, row)), None
+    frame, ground = _same_size(read_image(table, row)), None
     if table.value(row, "background_path") is not None:
         file = table.file(row, "background_path")
         if file not in grounds:
             if len(grounds) >= 256:  # 230 kB each
                 grounds.clear()
-            grounds[file] = _same_size(read_picture(table, row, "background_path"))
+            grounds[file] = _same_size(read_image(table, row, "background_path"))
         ground = grounds[file]
     return raw_pixels(frame, ground)
 
@@ -61,9 +61,9 @@ def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> A
             raise UserError(f"{table.where(row)} has no background_path; give one, or leave this baseline out")
         file = table.file(row, "background_path")
         if file not in behind:
-            gel = read_picture(table, row, "background_path")
+            gel = read_image(table, row, "background_path")
             behind[file] = _small(gel, size), gel.shape[1] / gel.shape[0]
-        frame, (small, proportion) = read_picture(table, row), behind[file]
+        frame, (small, proportion) = read_image(table, row), behind[file]
         if abs(frame.shape[1] / frame.shape[0] / proportion - 1) > 0.05:
             raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame")
         found[place] = _small(frame, size) - small

@@ -16,9 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.data.loading.evaluation import evaluation
-from anytouch_jax.data.manifest.files import distinct_files
+from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.manifest.packed import read_file, split_packed
 from anytouch_jax.encoder.encoder import Encoder, Features, Join, Pooling, check_backgrounds, save_npz
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import baseline
@@ -188,7 +187,7 @@ def pictures(table: Manifest, count: int = 32) -> str:
             if column == "background_path":
                 found.update(read_file(file))
                 continue
-            packed = split_packed(file)
+            packed = split_shard_path(file)
             about = os.stat(packed[0] if packed else file)
             found.update(f"{about.st_size} {about.st_mtime_ns} ".encode())
     for row in np.unique(np.linspace(0, len(table) - 1, count).astype(int)):

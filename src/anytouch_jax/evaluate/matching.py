@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import from_json
-from anytouch_jax.data.loading.matching import Keys, Matches
+from anytouch_jax.data.loading.matching import Matches, MatchKeys
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import text_column
 from anytouch_jax.errors import UserError
@@ -94,7 +94,7 @@ def draw_triples(
 ) -> tuple[Array, Array, Array]:
     """(anchors, positives, negatives) as places in `rows`, i64 (m,) each: `draws` of every anchor, as in training."""
     names = ("touch", "sensor", "unit", "object", "dataset")
-    keys = Keys(*(manifest.codes(name, own=name == "touch") for name in names))
+    keys = MatchKeys(*(manifest.codes(name, own=name == "touch") for name in names))
     matches = Matches(rows, keys, same_sensor=negatives == "same_sensor", other_object=True)
     if not matches.anchors.size:
         which = "" if negatives == "any" else ", one of which felt another place"

@@ -164,7 +164,7 @@ def _has_values(table: Any, name: str) -> bool:
 
 def _groups(manifest: Any, options: Probe, rows: np.ndarray) -> np.ndarray:
     """The column left out or asked for, else the first of `GROUPS` with a value; the sequence where it is empty."""
-    table = manifests.with_own_keys(manifest, manifest.table)  # recordings of two files are never one
+    table = manifests.with_distinct_keys(manifest, manifest.table)  # recordings of two files are never one
     sequence = table["sequence"].to_pylist()
     usual = (one for one in GROUPS if one != options.label.removeprefix("label.") and _has_values(table, one))
     asked = options.leave_out or options.group

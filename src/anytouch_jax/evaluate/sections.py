@@ -15,8 +15,8 @@ import numpy.typing as npt
 from anytouch_jax.config import FIELD_SENSORS, Config, from_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.manifest.packed import read_file
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.encoder import text_column
 from anytouch_jax.evaluate import matching, plots, retrieval, statistics

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import baselines
-from anytouch_jax.data.loading import sources
+from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.errors import UserError
 
@@ -129,7 +129,7 @@ def test_the_text_of_touches_felt_twice_never_reaches_a_batch(make, settings):
     assert any("the text of 12 of 30 rows is withheld" in note for note in loader.notes)
     assert any(batch.match is not None for batch in batches(loader, 4))  # their touches still match
     manifest = make(world())
-    assert sources.captions(manifest, np.arange(48), aligned_text=False) == [f"caption {i}" for i in (4, 5, 7)]
+    assert pools.training_captions(manifest, np.arange(48), aligned_text=False) == [f"caption {i}" for i in (4, 5, 7)]
 
 
 def test_a_touch_is_aligned_by_another_sensor_or_another_unit(make):
@@ -139,8 +139,8 @@ def test_a_touch_is_aligned_by_another_sensor_or_another_unit(make):
         {"touch": "c", "unit": "1"}, {"touch": "c", "unit": "1"},  # one device twice
         {"touch": None, "sensor": "digit"}, {"touch": None, "sensor": "gelslim"},
     ])  # fmt: skip
-    assert sources.withheld(manifest, aligned_text=False).tolist() == [True] * 4 + [False] * 4
-    assert not sources.withheld(manifest).any()
+    assert pools.withheld_text(manifest, aligned_text=False).tolist() == [True] * 4 + [False] * 4
+    assert not pools.withheld_text(manifest).any()
 
 
 @pytest.mark.parametrize(("name", "images", "texts"), [("no_text", True, False), ("no_vision", False, True)])
@@ -181,14 +181,14 @@ def test_by_default_clips_are_half(make, settings):
 
 def test_the_sensors_seen_are_those_drawn_from(make, settings):
     rows = [*world(), {"sensor": "duragel", "split": "val"}, {"sensor": "gelsight", "image_path": "w.png"}]
-    assert Loader(make(rows), settings(1)).sensors_seen == ["gelsight", "digit", "gelslim"]
-    assert Loader(make(rows), settings(2, require=("text",))).sensors_seen == ["digit", "gelslim"]
+    assert Loader(make(rows), settings(1)).trained_sensors == ["gelsight", "digit", "gelslim"]
+    assert Loader(make(rows), settings(2, require=("text",))).trained_sensors == ["digit", "gelslim"]
 
 
 def test_a_sensor_without_a_clip_is_not_seen_where_clips_alone_are_drawn(make, settings):
     rows = [*world(), {"sensor": "duragel"}]
-    assert "duragel" in Loader(make(rows), settings(1)).sensors_seen
-    assert "duragel" not in Loader(make(rows), settings(1, clip_share=1.0)).sensors_seen
+    assert "duragel" in Loader(make(rows), settings(1)).trained_sensors
+    assert "duragel" not in Loader(make(rows), settings(1, clip_share=1.0)).trained_sensors
 
 
 # Force ---------------------------------------------------------------------------------------------------------------

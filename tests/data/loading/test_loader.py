@@ -89,7 +89,7 @@ def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, 
     rng = augmentation_rng(config.run.seed, 3, 3, TOUCH)
     files = [decode(manifest.file(row)) for row in range(4)] + [decode(manifest.file(3, "background_path"))]
     *seen, gel = touch_transform(files, config.model.image_size, rng, config.data)
-    made = samples.Reader(manifest, config).touch(np.arange(4), 3)
+    made = samples.SampleReader(manifest, config).touch(np.arange(4), 3)
     np.testing.assert_array_equal(made, subtract_background(seen, gel))
 
 
@@ -431,7 +431,7 @@ def test_tokenizers(make, settings, tmp_path):
     manifest, config = make(rows), settings(2)
     loader = Loader(manifest, config)
     assert any("trained on the captions" in note for note in loader.notes)
-    given = text.train([row["text"] for row in rows], 300)
+    given = text.train_tokenizer([row["text"] for row in rows], 300)
     given.save(tmp_path)
     silent = Loader(make([{"image_path": f"v{i}.png"} for i in range(4)], "silent"), config, tokenizer=given)
     assert not len(silent.batch(0).align.text)  # a manifest without captions, as CLIP's tokenizer meets it

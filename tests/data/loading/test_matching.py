@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from anytouch_jax.data.loading.matching import Keys, Matches
+from anytouch_jax.data.loading.matching import Matches, MatchKeys
 
 
 def _keys(**columns):
     size = len(next(iter(columns.values())))
-    return Keys(*(np.array(columns.get(name, [-1] * size), np.int64) for name in Keys._fields))
+    return MatchKeys(*(np.array(columns.get(name, [-1] * size), np.int64) for name in MatchKeys._fields))
 
 
 def _draws(matches, anchor, count=200):
@@ -86,7 +86,7 @@ def test_no_anchor_where_there_is_no_pair_or_no_negative():
 @pytest.mark.parametrize("seed", range(5))
 def test_laws_hold_on_random_tables(seed):
     rng = np.random.default_rng(seed)
-    columns = {name: rng.integers(-1, high, 60) for name, high in zip(Keys._fields, (8, 3, 4, 4, 2), strict=True)}
+    columns = {name: rng.integers(-1, high, 60) for name, high in zip(MatchKeys._fields, (8, 3, 4, 4, 2), strict=True)}
     columns["sensor"] = np.abs(columns["sensor"])
     keys, pool = _keys(**columns), rng.permutation(60)[:40]
     matches, elsewhere = Matches(pool, keys), Matches(pool, keys, other_object=True)

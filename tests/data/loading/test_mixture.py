@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import from_json, to_json
-from anytouch_jax.data.loading import sources
+from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
-from anytouch_jax.data.loading.matching import Keys, Matches
-from anytouch_jax.data.loading.sampling import Stream
+from anytouch_jax.data.loading.matching import Matches, MatchKeys
+from anytouch_jax.data.loading.sampling import EpochSampler
 from anytouch_jax.errors import UserError
 
 
@@ -51,7 +51,7 @@ def test_by_default_the_draws_are_what_they_were(make, settings, stage, recipe, 
 @pytest.mark.parametrize("weights", [[2, 2, 2, 1, 1], [3, 0.5, 0.5, 0.5, 0.5], [1, 2.5, 2.5, 1, 1], [0.2] * 5])
 def test_an_epoch_draws_each_thing_by_its_weight(weights):
     weights = np.array(weights, float)
-    stream = Stream(5, 0, 9, weights)
+    stream = EpochSampler(5, 0, 9, weights)
     epochs = 400
     drawn = stream.take(0, epochs * stream.size)
     for e in range(20):
@@ -65,12 +65,12 @@ def test_an_epoch_draws_each_thing_by_its_weight(weights):
         share = max(1, round(weight * len(ids))) / len(ids)
         assert all(abs(many[t] / epochs - share) < 0.15 for t in ids)
     assert len(set(drawn)) == len(drawn)  # each time with another augmentation
-    assert Stream(5, 0, 9, weights).take(377, 20) == drawn[377:397]  # no need to walk there
+    assert EpochSampler(5, 0, 9, weights).take(377, 20) == drawn[377:397]  # no need to walk there
     assert stream.take(0, stream.size) != stream.take(stream.size, stream.size)
 
 
 def test_weights_of_one_change_nothing():
-    assert Stream(7, 3, 9, np.ones(7)).take(5, 40) == Stream(7, 3, 9).take(5, 40)
+    assert EpochSampler(7, 3, 9, np.ones(7)).take(5, 40) == EpochSampler(7, 3, 9).take(5, 40)
 
 
 def _sets(counts, **extra):
@@ -145,13 +145,13 @@ def test_weights_survive_the_configuration_file(settings):
 
 def _keys(**columns):
     size = len(next(iter(columns.values())))
-    return Keys(*(np.array(columns.get(name, [-1] * size), np.int64) for name in Keys._fields))
+    return MatchKeys(*(np.array(columns.get(name, [-1] * size), np.int64) for name in MatchKeys._fields))
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_negative_of_the_same_sensor_on_random_tables(seed):
     rng = np.random.default_rng(seed)
-    columns = {name: rng.integers(-1, high, 50) for name, high in zip(Keys._fields, (9, 4, 4, 4, 2), strict=True)}
+    columns = {name: rng.integers(-1, high, 50) for name, high in zip(MatchKeys._fields, (9, 4, 4, 4, 2), strict=True)}
     columns["sensor"] = np.abs(columns["sensor"])
     keys = _keys(**columns)
     matches = Matches(np.arange(50), keys, same_sensor=True)
@@ -230,7 +230,7 @@ def test_text_of_downstream_test_frames_is_withheld_and_counted(make, settings):
             used.add(tuple(text.tolist()) if row < 4 else None)
     wanted = {tuple(loader.tokenizer.encode([f"word{i}"], 8)[0][0].tolist()) for i in range(3, 10)}
     assert used - {None} == wanted
-    assert sources.captions(manifest, np.arange(10)) == [f"word{i}" for i in range(3, 10)]
+    assert pools.training_captions(manifest, np.arange(10)) == [f"word{i}" for i in range(3, 10)]
     assert not any("withheld" in note for note in Loader(manifest, settings(1)).notes)
 
 
@@ -241,7 +241,7 @@ def test_text_of_downstream_test_frames_is_withheld_and_counted(make, settings):
 )  # fmt: skip
 def test_what_counts_as_set(make, values, set_):
     manifest = make([{"downstream_test": value} for value in values])
-    assert sources.withheld(manifest).tolist() == [bool(one) for one in set_]
+    assert pools.withheld_text(manifest).tolist() == [bool(one) for one in set_]
 
 
 def test_all_text_withheld_means_no_text_slots(make, settings):

@@ -19,7 +19,7 @@ def test_uniform_is_a_function_of_seed_tag_and_step():
 
 
 def test_turns_count_the_earlier_steps_of_a_kind():
-    turns = s.Turns(lambda steps: (steps * 7 % 5 < 2).astype(np.int64))
+    turns = s.StepSchedule(lambda steps: (steps * 7 % 5 < 2).astype(np.int64))
     seen = {0: 0, 1: 0}
     for step in [*range(50), 3000]:
         if step == 3000:
@@ -27,22 +27,22 @@ def test_turns_count_the_earlier_steps_of_a_kind():
         kind, rank = turns.at(step)
         assert kind == (step * 7 % 5 < 2) and rank == seen[kind]
         seen[kind] += 1
-    assert s.Turns(lambda steps: steps % 3 == 0).at(3000) == (1, 1000)  # no need to walk there
+    assert s.StepSchedule(lambda steps: steps % 3 == 0).at(3000) == (1, 1000)  # no need to walk there
     with pytest.raises(ValueError, match="from 0"):
         turns.at(-1)
 
 
 @pytest.mark.parametrize(("size", "batch"), [(7, 3), (5, 5), (3, 8), (1, 4), (64, 16)])
 def test_every_epoch_of_a_stream_holds_all_once(size, batch):
-    stream = s.Stream(size, 0, 9)
+    stream = s.EpochSampler(size, 0, 9)
     drawn = [pair for k in range(4 * size) for pair in stream.take(k * batch, batch)]
     for epoch in range(4):
         assert sorted(thing for thing, e in drawn if e == epoch) == list(range(size))
     orders = {tuple(thing for thing, e in drawn if e == epoch) for epoch in range(4)}
     assert size < 5 or len(orders) == 4
-    assert s.Stream(size, 0, 9).take(3 * batch, batch) == drawn[3 * batch : 4 * batch]
-    assert size < 5 or s.Stream(size, 1, 9).take(0, size) != drawn[:size]
-    assert s.Stream(0, 0, 9).take(0, 0) == []
+    assert s.EpochSampler(size, 0, 9).take(3 * batch, batch) == drawn[3 * batch : 4 * batch]
+    assert size < 5 or s.EpochSampler(size, 1, 9).take(0, size) != drawn[:size]
+    assert s.EpochSampler(0, 0, 9).take(0, 0) == []
 
 
 CASES = [
@@ -62,7 +62,7 @@ CASES = [
 
 @pytest.mark.parametrize(("sizes", "batch", "multiple"), CASES)
 def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
-    strata = s.Strata(sizes, batch, multiple)
+    strata = s.StratumQuota(sizes, batch, multiple)
     total, steps = np.zeros(4, np.int64), 6 * sum(sizes)
     for k in range(steps):
         before, now = strata.at(k)
@@ -77,13 +77,13 @@ def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
     for slots, share in ((strata.images, shares[:2].sum()), (strata.texts, shares[1:3].sum())):
         assert share - 1e-9 <= slots <= batch
         assert slots == batch or (slots % multiple == 0 and slots < share + multiple)
-    again = s.Strata(sizes, batch, multiple).at(steps - 1)  # straight to one step
+    again = s.StratumQuota(sizes, batch, multiple).at(steps - 1)  # straight to one step
     np.testing.assert_array_equal(again[0] + again[1], total)
 
 
 @pytest.mark.parametrize("multiple", [1, 2, 4, 16])
 def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend_on_them(multiple):
-    lock, strata = (s.Strata((350, 250, 510, 450), 64, m) for m in (1, multiple))
+    lock, strata = (s.StratumQuota((350, 250, 510, 450), 64, m) for m in (1, multiple))
     assert (lock.images, lock.texts) == (25, 32)  # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
     assert strata.images == -(-25 // multiple) * multiple and strata.texts % multiple == 0
     for k in range(500):
@@ -94,16 +94,16 @@ def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend
 
 
 def test_a_rare_stratum_is_visited_at_even_distances():
-    strata = s.Strata((0, 90000, 0, 110), 64)
+    strata = s.StratumQuota((0, 90000, 0, 110), 64)
     visits = np.flatnonzero([strata.at(k)[1][s.NEITHER] for k in range(3000)])
     assert np.diff([-1, *visits, 3000]).max() <= 21
 
 
 def test_shares_that_are_whole_numbers_are_met_exactly():
-    strata = s.Strata((2, 2, 2, 2), 8)
+    strata = s.StratumQuota((2, 2, 2, 2), 8)
     assert (strata.images, strata.texts) == (4, 4)
     assert all(strata.at(k)[1].tolist() == [2, 2, 2, 2] for k in range(20))
-    long = s.Strata((1, 0, 0, 3), 2)  # one image slot; half a row of it is natural, the slot is filled
+    long = s.StratumQuota((1, 0, 0, 3), 2)  # one image slot; half a row of it is natural, the slot is filled
     assert long.images == 1 and all(long.at(k)[1].tolist() == [1, 0, 0, 1] for k in range(20))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from anytouch_jax.data.loading import samples
 from anytouch_jax.data.loading.loader import Loader
-from anytouch_jax.data.loading.shards import Shard
+from anytouch_jax.data.loading.sampling import Shard
 from anytouch_jax.errors import UserError
 
 

@@ -32,9 +32,11 @@ def test_windows_are_what_the_words_say(monkeypatch, start, shuffle, block):
         sequence, frame, stride = sequence[order], frame[order], stride[order]
     for length in (1, 2, 3):
         want = _brute(sequence, frame, stride, length)
-        assert w.windows(sequence, frame, stride, length).tolist() == want and len(want) > 20
+        assert w.clip_windows(sequence, frame, stride, length).tolist() == want and len(want) > 20
         ends = rng.random(540) < 0.5
-        assert w.windows(sequence, frame, stride, length, ends=ends).tolist() == [one for one in want if ends[one[-1]]]
+        assert w.clip_windows(sequence, frame, stride, length, ends=ends).tolist() == [
+            one for one in want if ends[one[-1]]
+        ]
 
 
 def test_what_no_64_bits_hold_is_one_sentence(tmp_path):
@@ -46,10 +48,10 @@ def test_what_no_64_bits_hold_is_one_sentence(tmp_path):
 
 def test_no_rows_no_windows():
     empty = np.arange(0)
-    assert w.windows(empty, empty, empty, 3).shape == (0, 3)
+    assert w.clip_windows(empty, empty, empty, 3).shape == (0, 3)
 
 
 def test_a_clip_longer_than_every_recording_takes_no_memory():
     one = np.arange(4)
-    assert w.windows(0 * one, one, 0 * one + 1, 10**12).shape == (0, 10**12)
-    assert w.windows(0 * one, one, 0 * one + 1, 4).tolist() == [[0, 1, 2, 3]]
+    assert w.clip_windows(0 * one, one, 0 * one + 1, 10**12).shape == (0, 10**12)
+    assert w.clip_windows(0 * one, one, 0 * one + 1, 4).tolist() == [[0, 1, 2, 3]]

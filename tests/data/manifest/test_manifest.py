@@ -177,17 +177,17 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
     (root / "link.png").symlink_to(tmp_path / "secret.png")
     (root / "out").symlink_to(tmp_path / "data2")
     (root / "inside.png").symlink_to(root / "in" / "a.png")
-    assert m.resolve(root, "in/../in/a.png") == root / "in" / "a.png"
-    assert m.resolve(root, "inside.png") == root / "in" / "a.png"
+    assert m.resolve_path(root, "in/../in/a.png") == root / "in" / "a.png"
+    assert m.resolve_path(root, "inside.png") == root / "in" / "a.png"
     for bad in ("../secret.png", "in/../../secret.png", "../data2/x"):
         with pytest.raises(m.ManifestError, match=r"leaves the folder of the manifest, .*/data$"):
-            m.resolve(root, bad)
+            m.resolve_path(root, bad)
     for bad in ("link.png", "out/x.png"):
         with pytest.raises(m.ManifestError, match=r"leaves the folder .*, by a link; put the files there, or"):
-            m.resolve(root, bad)
+            m.resolve_path(root, bad)
     for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name"), (str(root / "a.png"), "absolute")):
         with pytest.raises(m.ManifestError, match=words):
-            m.resolve(root, bad)
+            m.resolve_path(root, bad)
 
 
 def test_sensor_rows(tmp_path):
@@ -249,11 +249,11 @@ def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
 
 
 def test_clips_of_many_rows():
-    from anytouch_jax.data.manifest.clips import windows
+    from anytouch_jax.data.manifest.clips import clip_windows
 
     n = 400_000
     sequence, frame = np.repeat(np.arange(n // 100), 100), np.tile(np.arange(100), n // 100)
-    found = windows(sequence, frame, np.ones(n, np.int64), 4)
+    found = clip_windows(sequence, frame, np.ones(n, np.int64), 4)
     assert found.shape == (n // 100 * 97, 4)
     assert (np.diff(found, axis=1) == 1).all()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.packed import forget
+from anytouch_jax.data.manifest.files import close_shards
 from anytouch_jax.data.prepare.captions import AnnotateError, annotate
 from anytouch_jax.data.prepare.endpoint import AnswerError, Client, Endpoint, EndpointError
 from anytouch_jax.data.prepare.prompts import Nonsense, caption_of, question
@@ -28,7 +28,7 @@ def _environment(monkeypatch):
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
     yield
-    forget()
+    close_shards()
 
 
 def chat(content, **extra):

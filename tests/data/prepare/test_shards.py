@@ -12,11 +12,11 @@ import pyarrow.parquet
 import pytest
 
 from anytouch_jax.data.images import ImageError, decode
-from anytouch_jax.data.loading.bounded import bounded_map
 from anytouch_jax.data.loading.loader import Loader, SampleError
+from anytouch_jax.data.loading.threads import bounded_map
+from anytouch_jax.data.manifest import files as packed
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest import packed
-from anytouch_jax.data.manifest.edit import select
+from anytouch_jax.data.manifest.manifest import select_rows
 from anytouch_jax.data.prepare import shards as packing
 from anytouch_jax.data.prepare.shards import PackError, pack
 from anytouch_jax.errors import UserError
@@ -25,7 +25,7 @@ from anytouch_jax.errors import UserError
 @pytest.fixture(autouse=True)
 def _closed():
     yield
-    packed.forget()
+    packed.close_shards()
 
 
 def _rows(sequences=4, length=6):
@@ -169,7 +169,7 @@ def test_joined_manifests_keep_their_keys_apart(make, settings, tmp_path):
 def test_packed_manifests_go_on_working_when_filtered_moved_or_packed_again(make, tmp_path):
     loose = make(_rows())
     again = manifests.read(pack(loose, tmp_path / "deep" / "out"))
-    manifests.write(select(again, np.array([20, 3])), tmp_path / "part.csv")
+    manifests.write(select_rows(again, np.array([20, 3])), tmp_path / "part.csv")
     part = manifests.read(tmp_path / "part.csv")
     assert part.value(0, "path").startswith("deep/out/touch/00000.parquet/")
     for row, old in enumerate((20, 3)):
@@ -225,7 +225,7 @@ def test_a_pack_that_failed_before_its_first_shard_takes_its_folder_again(make, 
     loose.file(3).unlink()
     with pytest.raises(PackError, match="run anytouch verify with --repair first"):
         pack(loose, tmp_path / "out")
-    mended = select(loose, np.delete(np.arange(len(loose)), 3))  # as --repair leaves it
+    mended = select_rows(loose, np.delete(np.arange(len(loose)), 3))  # as --repair leaves it
     assert pack(mended, tmp_path / "out").is_file()
     loose.file(3).write_bytes(gone)
     with pytest.raises(PackError, match="another manifest or shard size"):
@@ -247,7 +247,7 @@ def test_other_folders_are_not_touched(make, tmp_path):
         pack(loose, tmp_path / "full")
     pack(loose, tmp_path / "out")
     with pytest.raises(PackError, match="another manifest or shard size"):
-        pack(select(loose, np.arange(5)), tmp_path / "out")
+        pack(select_rows(loose, np.arange(5)), tmp_path / "out")
     with pytest.raises(PackError, match="another manifest or shard size"):
         pack(loose, tmp_path / "out", shard_bytes=7)
     for spoiled in ('{"version"', "[1]"):
@@ -377,8 +377,8 @@ def test_few_shards_are_open_at_once_and_threads_do_not_mind(make, tmp_path, mon
 
 def test_what_is_a_row_of_a_shard_and_what_is_a_file(tmp_path):
     for name in ("a.parquet/x.png", "a/7", "a.parquet/7.png", "a.parquet/٣", "a.parquet", "7"):
-        assert packed.split_packed(tmp_path / name) is None, name
-    assert packed.split_packed(tmp_path / "a.parquet" / "7") == (tmp_path / "a.parquet", 7)
+        assert packed.split_shard_path(tmp_path / name) is None, name
+    assert packed.split_shard_path(tmp_path / "a.parquet" / "7") == (tmp_path / "a.parquet", 7)
 
 
 def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monkeypatch):

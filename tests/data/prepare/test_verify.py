@@ -12,7 +12,7 @@ import pytest
 
 from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.edit import attach_text, replace_column, select
+from anytouch_jax.data.manifest.manifest import attach_text, replace_column, select_rows
 from anytouch_jax.data.prepare.licences import NO, UNKNOWN, YES, allows, commercial_only, commercial_use, licences
 from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.shards import pack
@@ -190,7 +190,7 @@ def test_duplicates_leaks_and_repeated_rows_are_told_apart(make):
                               "repeated_frame": [5]}  # fmt: skip
     assert "'f0.png' is in train, test" in next(f for f in report.findings if f.kind == "leak_file").examples[0]
     fixed = repair(loose, report)
-    assert fixed.manifest.table.equals(select(loose, np.array([0, 1, 2, 3, 4, 6, 7, 8])).table)
+    assert fixed.manifest.table.equals(select_rows(loose, np.array([0, 1, 2, 3, 4, 6, 7, 8])).table)
     assert len(fixed.left) == 2 and any("test" in sentence for sentence in fixed.left)  # which side is right is a guess
 
 
@@ -352,7 +352,7 @@ def test_an_exchanged_row_lives_by_its_new_touch_image(make, tmp_path):
 def test_repair_says_when_it_cannot_or_may_not(make, tmp_path):
     loose = make(_clean())
     with pytest.raises(UserError, match="of another manifest"):
-        repair(select(loose, np.arange(3)), verify(loose))
+        repair(select_rows(loose, np.arange(3)), verify(loose))
     manifests.write(loose, tmp_path / "manifest.csv")
     before = (tmp_path / "manifest.csv").read_bytes()
     loose = manifests.read(tmp_path / "manifest.csv")
@@ -377,7 +377,7 @@ def test_a_row_is_dropped_for_one_reason_only(make):
 def test_the_split_hash_sees_splits_and_nothing_else(make):
     loose = make(_clean(unit="u", object="cup"))
     base = split_hash(loose)
-    assert split_hash(select(loose, np.array([3, 0, 5, 1, 4, 2]))) == base
+    assert split_hash(select_rows(loose, np.array([3, 0, 5, 1, 4, 2]))) == base
     assert split_hash(replace_column(loose, "path", [f"x{i}" for i in range(6)])) == base
     assert split_hash(replace_column(loose, "text", ["a"] * 6)) == base
     for name, values in (
@@ -386,7 +386,7 @@ def test_the_split_hash_sees_splits_and_nothing_else(make):
         ("sequence", ["s0"] * 3 + ["s2"] * 3), ("dataset", ["e"] * 6),
     ):  # fmt: skip
         assert split_hash(replace_column(loose, name, values)) != base, name
-    assert split_hash(select(loose, np.arange(5))) != base
+    assert split_hash(select_rows(loose, np.arange(5))) != base
     without, dash = (replace_column(loose, "unit", ["u"] * 5 + [end]) for end in (None, "-"))
     assert split_hash(without) != split_hash(dash)
 
@@ -420,7 +420,7 @@ def test_commercial_rows_are_those_that_certainly_are(make):
     found = licences(loose)
     assert sum(entry.rows for entry in found) == 8 and found[0] == ("MIT", YES, ("d0", "d1"), 2)
     with pytest.raises(UserError, match=r"2 may not, 2 do not say"):
-        commercial_only(select(loose, np.array([2, 3, 5, 7])))
+        commercial_only(select_rows(loose, np.array([2, 3, 5, 7])))
 
 
 # Captions by table ------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from reader_world import Table, check_laws
 
-from anytouch_jax.data.readers import Options, index
+from anytouch_jax.data.readers import IndexOptions, index
 
 
 @pytest.fixture
@@ -16,9 +16,9 @@ def read(tmp_path: Path) -> Callable[..., Table]:
     """read(name, root=tmp_path, out=None, **options): index a dataset, check the laws of every manifest."""
 
     def run(name: str, root: Path = tmp_path, out: Path | None = None, **options: object) -> Table:
-        table = Table(index(name, root, out, options=Options(**options)))  # type: ignore[arg-type]
+        table = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]
         check_laws(table, root)
-        again = Table(index(name, root, out, options=Options(**options)))  # type: ignore[arg-type]
+        again = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]
         assert again.report.content_hash == table.report.content_hash  # one order, always
         return table
 

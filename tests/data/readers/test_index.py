@@ -9,8 +9,8 @@ import pytest
 from reader_world import fill
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.readers import READERS, Notes, Options, index, reader
-from anytouch_jax.data.readers.common import Rows, hash_split, listing, numbered
+from anytouch_jax.data.readers import READERS, IndexOptions, Notes, get_reader, index
+from anytouch_jax.data.readers.common import RowBuilder, hash_split, listing, numbered
 from anytouch_jax.errors import UserError
 
 
@@ -20,7 +20,7 @@ def _ycb(root, objects=("mug",), frames=4):
 
 def test_every_reader_says_what_it_is():
     assert all(one.name == name for name, one in READERS.items())
-    known = set(Options.__dataclass_fields__)
+    known = set(IndexOptions.__dataclass_fields__)
     for one in READERS.values():
         assert one.license and one.about and one.citation and set(one.uses) <= known
     total = sum(one.paper for one in READERS.values() if one.paper)
@@ -29,19 +29,19 @@ def test_every_reader_says_what_it_is():
 
 def test_an_unknown_name_is_answered_with_the_nearest():
     with pytest.raises(UserError, match=r"no reader is called 'Touch-and-go'; did you mean touch_and_go"):
-        reader("Touch-and-go")
+        get_reader("Touch-and-go")
 
 
 @pytest.mark.parametrize("bad", [{"val": -0.1}, {"val": 0.6, "test": 0.5}, {"test": 2}])
 def test_shares_are_checked(bad):
     with pytest.raises(UserError, match="are shares"):
-        Options(**bad)
+        IndexOptions(**bad)
 
 
 def test_an_option_that_is_not_heeded_is_an_error(tmp_path):
     _ycb(tmp_path)
     with pytest.raises(UserError, match="the reader ycb_slide does not use the option fold; it uses val, test"):
-        index("ycb_slide", tmp_path, options=Options(fold=1))
+        index("ycb_slide", tmp_path, options=IndexOptions(fold=1))
 
 
 def test_the_manifest_may_lie_above_the_data_but_not_elsewhere(tmp_path, read):
@@ -61,7 +61,7 @@ def test_a_failed_write_is_told_and_leaves_the_old_file(tmp_path, monkeypatch):
     before = index("ycb_slide", tmp_path).out.read_bytes()
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
     with pytest.raises(UserError, match=r"cannot be written: Permission denied; name another file with --out"):
-        index("ycb_slide", tmp_path, options=Options(val=0.5))
+        index("ycb_slide", tmp_path, options=IndexOptions(val=0.5))
     assert (tmp_path / "ycb_slide.parquet").read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == ["real", "ycb_slide.parquet"]
 
@@ -94,33 +94,33 @@ def test_no_frame_is_opened_or_stated(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "stat", lambda path, *a, **k: (seen.append(os.fspath(path)), real_stat(path, *a, **k))[1])
     scans = []
     monkeypatch.setattr(os, "scandir", lambda path: (scans.append(os.fspath(path)), real_scan(path))[1])
-    READERS["ycb_slide"].read(tmp_path, Options(), Notes())
+    READERS["ycb_slide"].read(tmp_path, IndexOptions(), Notes())
     assert not [path for path in seen if str(path).endswith(".jpg")]
     assert len(scans) == len(set(scans)) == 1 + 2 + 2  # real, the objects, their frames: each once
 
 
 def test_hash_splits_are_stable_disjoint_and_of_the_asked_share():
-    options = Options(val=0.1, test=0.2)
+    options = IndexOptions(val=0.1, test=0.2)
     of = {f"o{k}": hash_split("x", f"o{k}", options) for k in range(4000)}
     shares = {split: sum(one == split for one in of.values()) / len(of) for split in ("train", "val", "test")}
     assert shares == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.03)
-    assert [hash_split("ycb_slide", name, Options(0.5, 0.25)) for name in ("mug", "hammer", "ball")] == [
+    assert [hash_split("ycb_slide", name, IndexOptions(0.5, 0.25)) for name in ("mug", "hammer", "ball")] == [
         "test",
         "val",
         "test",
     ]  # fixed: a change of the rule moves every published split
     wider = replace(options, test=0.4)
     assert all(hash_split("x", name, wider) != "train" for name, split in of.items() if split != "train")
-    assert {hash_split("x", f"o{k}", Options(0, 0)) for k in range(50)} == {"train"}
-    assert {hash_split("x", f"o{k}", Options(0, 1)) for k in range(50)} == {"test"}
+    assert {hash_split("x", f"o{k}", IndexOptions(0, 0)) for k in range(50)} == {"train"}
+    assert {hash_split("x", f"o{k}", IndexOptions(0, 1)) for k in range(50)} == {"test"}
 
 
 def test_rows_refuse_columns_of_another_length_or_name():
-    rows = Rows("object")
+    rows = RowBuilder("object")
     with pytest.raises(ValueError, match="'frame_index' has 1 values for 2 rows"):
         rows.add(["a", "b"], frame_index=[1])
     with pytest.raises(KeyError, match="undeclared"):
-        Rows().add(["a"], object="x")
+        RowBuilder().add(["a"], object="x")
 
 
 def test_numbers_order_frames_and_folders_naturally(tmp_path):

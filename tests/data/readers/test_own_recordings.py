@@ -9,8 +9,8 @@ from reader_world import fill
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.edit import replace_column
-from anytouch_jax.data.readers import Options, index
+from anytouch_jax.data.manifest.manifest import replace_column
+from anytouch_jax.data.readers import IndexOptions, index
 from anytouch_jax.data.readers.recordings import ranked_split
 from anytouch_jax.errors import UserError
 
@@ -82,16 +82,16 @@ def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, 
 
 def test_ranked_splits_have_their_shares_and_hardly_move():
     names = [f"o{n}" for n in range(40)]
-    before = ranked_split(names, Options(0.2, 0.3))
+    before = ranked_split(names, IndexOptions(0.2, 0.3))
     assert [list(before.values()).count(split) for split in ("val", "train", "test")] == [8, 20, 12]
     for new in (f"new {n}" for n in range(20)):
-        after = ranked_split([*names, new], Options(0.2, 0.3))
+        after = ranked_split([*names, new], IndexOptions(0.2, 0.3))
         assert sum(after[name] != before[name] for name in names) <= 2
-    few = {n: sorted(ranked_split(names[:n], Options(0.05, 0.05)).values()) for n in (1, 2, 3)}
+    few = {n: sorted(ranked_split(names[:n], IndexOptions(0.05, 0.05)).values()) for n in (1, 2, 3)}
     assert few == {1: ["train"], 2: ["test", "train"], 3: ["test", "train", "val"]}
-    assert sorted(ranked_split(names[:3], Options(0.05, 0.9)).values()) == ["test", "train", "val"]
-    assert set(ranked_split(names, Options(0, 1)).values()) == {"test"}
-    assert set(ranked_split(names, Options(0, 0)).values()) == {"train"}
+    assert sorted(ranked_split(names[:3], IndexOptions(0.05, 0.9)).values()) == ["test", "train", "val"]
+    assert set(ranked_split(names, IndexOptions(0, 1)).values()) == {"test"}
+    assert set(ranked_split(names, IndexOptions(0, 0)).values()) == {"train"}
 
 
 def test_by_recording_every_object_is_in_every_split(tmp_path, read):
@@ -173,7 +173,7 @@ def test_films_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, mo
     encode, count = cv2.imencode, []
     monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1] if len(count) < 7 else 1 / 0)
     with pytest.raises(ZeroDivisionError):  # in the second film
-        index("recordings", root, options=Options(sensor="digit", export=True))
+        index("recordings", root, options=IndexOptions(sensor="digit", export=True))
     assert sorted(path.name for path in (root / "mug").iterdir()) == ["broken.mp4", "one", "one.avi", "two.avi"]
     monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1])
     table = read("recordings", root, sensor="digit", val=0, test=0, export=True)
@@ -240,7 +240,7 @@ def edited(tmp_path, read):
 def test_an_edited_manifest_is_never_replaced_unasked(tmp_path, read, edited, ending):
     out = edited(ending)
     before = out.read_bytes()
-    options = Options(sensor="digit", val=0, test=0)
+    options = IndexOptions(sensor="digit", val=0, test=0)
     says = rf"hand{ending} has other values of split \(3 rows\), label.material, which index does not write: .*--keep"
     with pytest.raises(UserError, match=says):
         index("recordings", tmp_path, out, options=options)

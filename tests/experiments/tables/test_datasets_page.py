@@ -7,7 +7,7 @@ import runpy
 import cv2
 from places import EXPERIMENTS
 
-from anytouch_jax.data.manifest.packed import forget
+from anytouch_jax.data.manifest.files import close_shards
 
 PAGE = EXPERIMENTS / "datasets.py"
 
@@ -15,7 +15,7 @@ PAGE = EXPERIMENTS / "datasets.py"
 def test_from_a_download_to_a_batch(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FOLDER", str(tmp_path))
     found = runpy.run_path(str(PAGE))
-    forget()
+    close_shards()
     assert len(found["manifest"]) == 96 and 30 < len(found["checked"].scan.files) < 80
     assert found["still"].clip.shape == (6, 1, 112, 112, 3) and found["clip"].clip.shape == (6, 4, 112, 112, 3)
     for name, shape in (("stills.png", (696, 116)), ("clips.png", (696, 464)), ("contact.png", None)):

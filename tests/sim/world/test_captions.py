@@ -98,6 +98,6 @@ def test_captions_are_sentences():
 
 def test_captions_fit_the_tokenizer():
     sentences = [s for t in THINGS for s in drawn(t, 3)]
-    tokenizer = text.train(sentences, 1024)
+    tokenizer = text.train_tokenizer(sentences, 1024)
     _, mask = tokenizer.encode(sentences, 77)
     assert mask.sum(1).max() < 64

@@ -10,7 +10,7 @@ import numpy as np
 
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
-from anytouch_jax.data.loading.samples import Reader, SampleError
+from anytouch_jax.data.loading.samples import SampleError, SampleReader
 from anytouch_jax.data.loading.threads import Work, pump
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
 from anytouch_jax.errors import UserError
@@ -42,11 +42,11 @@ def evaluation(
         raise UserError(
             f"{manifest.where(row)}: sensor {name!r} measures a force field and has no images; leave it out"
         )
-    return _passes(Reader(manifest, config), rows, windows, sensor)
+    return _passes(SampleReader(manifest, config), rows, windows, sensor)
 
 
 def _passes(
-    reader: Reader, rows: np.ndarray, windows: np.ndarray, sensor: np.ndarray
+    reader: SampleReader, rows: np.ndarray, windows: np.ndarray, sensor: np.ndarray
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     data, size = reader.config.data, reader.config.model.image_size
 
@@ -70,7 +70,7 @@ def _passes(
         yield rows[start + kept], batch
 
 
-def _write(reader: Reader, batch: TouchBatch, good: np.ndarray, windows: np.ndarray, slot: int) -> int:
+def _write(reader: SampleReader, batch: TouchBatch, good: np.ndarray, windows: np.ndarray, slot: int) -> int:
     try:
         batch.clip[slot] = reader.touch(windows[slot], None)
     except SampleError:

@@ -16,10 +16,9 @@ from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.loading.labels import UNKNOWN
-from anytouch_jax.data.loading.samples import Reader, SampleError, fill_slot
-from anytouch_jax.data.loading.sampling import BOTH, TEXT, VISION, Turns, uniform
-from anytouch_jax.data.loading.shards import Shard, Slots
-from anytouch_jax.data.loading.sources import CLIP, STILL, Pairs, Pool, find_sources
+from anytouch_jax.data.loading.pools import CLIP, STILL, Pairs, Pool, find_pools
+from anytouch_jax.data.loading.samples import SampleError, SampleReader, fill_slot
+from anytouch_jax.data.loading.sampling import BOTH, TEXT, VISION, Shard, Slots, StepSchedule, uniform
 from anytouch_jax.data.loading.threads import Work, do, pump
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.tokenizer import Tokenizer
@@ -68,12 +67,12 @@ class Loader:
             )
         for name, number in (("devices", devices), ("batch_size", config.data.batch_size)):
             self._shard.check(number, name)
-        self._reader = Reader(manifest, config)
-        found = find_sources(manifest, config, tokenizer, devices)
+        self._reader = SampleReader(manifest, config)
+        found = find_pools(manifest, config, tokenizer, devices)
         self._pools, self._pairs, self._sensor, self.tokenizer, self.notes, self._force = found
         self._length = self._caption_length()
         self._align_share = self._share_of_align()
-        self._align, self._match = Turns(self._align_kinds), Turns(self._match_kinds)
+        self._align, self._match = StepSchedule(self._align_kinds), StepSchedule(self._match_kinds)
 
     # What a step holds ------------------------------------------------------------------------------------------
 
@@ -108,7 +107,7 @@ class Loader:
         return [pairs for pairs in chosen if pairs is not None]
 
     @property
-    def sensors_seen(self) -> list[str]:
+    def trained_sensors(self) -> list[str]:
         """Names of the sensors that batches are drawn from, in the order of the table."""
         drawn = [pool.windows[:, -1] for pool in self._drawn] + [pair.windows[:, -1] for pair in self._drawn_pairs]
         rows = np.unique(self._sensor[np.concatenate(drawn)])

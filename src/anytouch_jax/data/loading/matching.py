@@ -10,7 +10,7 @@ _TABLE = 16  # cells of a table of flags that a row may take before pairs are so
 _TRIES = 32  # uniform draws before the whole pool is searched
 
 
-class Keys(NamedTuple):
+class MatchKeys(NamedTuple):
     """What tells touches apart, i64 codes (rows,), -1 for unknown: place, sensor, unit, object, data set."""
 
     touch: np.ndarray
@@ -30,9 +30,11 @@ class Matches:
     location" (Sec. 3.4).
     """
 
-    def __init__(self, pool: np.ndarray, keys: Keys, *, same_sensor: bool = False, other_object: bool = False) -> None:
+    def __init__(
+        self, pool: np.ndarray, keys: MatchKeys, *, same_sensor: bool = False, other_object: bool = False
+    ) -> None:
         self.pool, self.same_sensor, self.other_object, self._keys = pool, same_sensor, other_object, keys
-        mine = Keys(*(key[pool] for key in keys))  # not held: of millions of rows one copy is enough
+        mine = MatchKeys(*(key[pool] for key in keys))  # not held: of millions of rows one copy is enough
         touch, thing = mine.touch, mine.object
         self._rows: dict[int, np.ndarray] = {}
         self._usable = _many_places(mine) if same_sensor else np.ones(len(pool), bool)
@@ -110,19 +112,19 @@ class Matches:
         return place & ~((keys.object[rows] == keys.object[row]) & (keys.object[row] >= 0))
 
 
-def _has_partner(keys: Keys, usable: np.ndarray) -> np.ndarray:
+def _has_partner(keys: MatchKeys, usable: np.ndarray) -> np.ndarray:
     """Which rows have a usable one of another sensor at their place, or else of another unit: bool (rows,)."""
     sensors, units = _distinct(keys.touch, keys.sensor), _distinct(keys.touch, keys.unit)
     others = _distinct(keys.touch, np.where(usable, keys.sensor, -1)) - usable
     return np.where(sensors > 1, others > 0, (units > 1) & (keys.unit >= 0) & usable)
 
 
-def _many_places(keys: Keys) -> np.ndarray:
+def _many_places(keys: MatchKeys) -> np.ndarray:
     """Which rows are of a sensor that felt two known places or more: bool (rows,)."""
     return _distinct(keys.sensor, keys.touch) > 1
 
 
-def felt_twice(touch: np.ndarray, sensor: np.ndarray, unit: np.ndarray) -> np.ndarray:
+def is_shared_touch(touch: np.ndarray, sensor: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """Rows whose touch, of codes i64 (rows,), was felt by two known sensors or units or more: bool (rows,)."""
     return (_distinct(touch, sensor) > 1) | (_distinct(touch, unit) > 1)
 

@@ -33,7 +33,7 @@ class SampleError(UserError):
 
 
 @dataclass(frozen=True)
-class Reader:
+class SampleReader:
     """Reads samples of `manifest` at the model's size, augmented as `config` says.
 
     Frames are kept in memory as they are after resizing, the first that fit into `data.cache` MB: a small data set is
@@ -55,7 +55,7 @@ class Reader:
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
         # Nothing but the size: frames are resized once, unless the gel is to be taken off frames as they are.
         how = None if epoch is None or (plain and data.background == "subtract") else self._resized
-        frames = [read_picture(self.manifest, row, how=how) for row in rows]
+        frames = [read_image(self.manifest, row, how=how) for row in rows]
         gel = self._background(int(rows[-1]), how or self._gel) if data.background == "subtract" else None
         if epoch is None or plain:
             return touch_evaluation(frames if gel is None else subtract_background(frames, gel), size, out)
@@ -68,7 +68,7 @@ class Reader:
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """The picture of a row's object as u8 (size, size, 3); `epoch` None means no augmentation."""
         size = self.config.model.image_size
-        picture = read_picture(self.manifest, row, "image_path")
+        picture = read_image(self.manifest, row, "image_path")
         if epoch is None:
             return vision_evaluation(picture, size)
         rng = augmentation_rng(self.config.run.seed, epoch, int(row), VISION)
@@ -101,10 +101,10 @@ class Reader:
                 f"{self.manifest.where(row)} has no background_path, which --loader.background subtract takes off; "
                 "name one, or train with --loader.background keep"
             )
-        return read_picture(self.manifest, row, "background_path", how)
+        return read_image(self.manifest, row, "background_path", how)
 
 
-def read_picture(
+def read_image(
     manifest: Manifest, row: int, column: str = "path", how: Callable[[Path], np.ndarray] | None = None
 ) -> np.ndarray:
     """The picture u8 RGB (h, w, 3) that a column of a row names, decoded by `how`. Raises SampleError, which names the

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from math import gcd, lcm
+from typing import NamedTuple
 
 import numpy as np
 
-VISION, BOTH, TEXT, NEITHER = range(4)  # the strata of alignment, in this order along the line (see `Strata`)
+from anytouch_jax.errors import UserError
+
+VISION, BOTH, TEXT, NEITHER = range(4)  # the strata of alignment, in this order along the line (see `StratumQuota`)
 
 
 def uniform(seed: int, tag: int, steps: np.ndarray) -> np.ndarray:
@@ -24,7 +28,7 @@ def _mix(x: np.ndarray) -> np.ndarray:
     return x ^ (x >> np.uint64(31))
 
 
-class Turns:
+class StepSchedule:
     """Which kind of batch each step takes, and how many earlier steps took the same kind.
 
     `choose` maps step numbers i64 (n,) to small codes (n,); it must depend on the step alone.
@@ -49,7 +53,7 @@ class Turns:
         return int(kinds[step]), int(rank[step])
 
 
-class Stream:
+class EpochSampler:
     """An endless stream over `things` things: epoch after epoch, each a seeded permutation of `size` draws.
 
     `weights` f64 (things,) above 0: how often each is drawn in an epoch; without them each once, so `size` is `things`.
@@ -101,7 +105,7 @@ class Stream:
         return things[order], copy[order]
 
 
-class Strata:
+class StratumQuota:
     """How many rows of each stratum (vision, both, text, neither) a batch takes, so that its slots are full.
 
     `sizes` (4,) rows in each stratum; `images`, `texts` are the slots of a batch: the share of each modality, rounded
@@ -160,3 +164,42 @@ def _fill(shares: list[Fraction], images: int, texts: int) -> list[Fraction]:
     move(TEXT, BOTH, no_image)
     move(VISION, BOTH, no_text)
     return shares
+
+
+class Slots(NamedTuple):
+    """Where this shard keeps a sample's touch, picture and caption; None for what it has no part in."""
+
+    touch: int | None
+    image: int | None
+    text: int | None
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part `index` of `count` equal, contiguous parts of every axis of slots."""
+
+    index: int
+    count: int
+
+    def check(self, slots: int, what: str) -> None:
+        """Raises UserError when `slots` cannot be cut into `count` equal parts, or there is no such part."""
+        if not 0 <= self.index < self.count:
+            raise UserError(f"there is no shard {self.index} of {self.count}")
+        if slots % self.count:
+            raise UserError(f"{what} {slots} cannot be shared by {self.count} processes; choose a multiple of them")
+
+    def share(self, slots: int) -> int:
+        """Slots of this part."""
+        return slots // self.count
+
+    def cut(self, array: np.ndarray) -> np.ndarray:
+        """This part of an array, a view."""
+        size = self.share(len(array))
+        return array[self.index * size : (self.index + 1) * size]
+
+    def place(self, slot: int | None, slots: int) -> int | None:
+        """Where slot `slot` of `slots` lies in this part; None where it lies in another (or is None)."""
+        if slot is None:
+            return None
+        here = slot - self.index * self.share(slots)
+        return here if 0 <= here < self.share(slots) else None

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 Batch = TypeVar("Batch")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 _CHUNK = 4  # jobs handed over at once: long enough to hide the hand-over, short enough to stop soon
 
 
@@ -64,3 +66,27 @@ def pump(
 
 def _run(jobs: Sequence[Callable[[], int]]) -> int:
     return sum(job() for job in jobs)
+
+
+def bounded_map(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int, ahead: int | None = None
+) -> Generator[Result, None, None]:
+    """`function` of every item, in order, by `threads` threads that are at most `ahead` (4 a thread) items ahead.
+
+    The first error raises in the caller; when the iterator ends, fails or is closed, its threads have ended too.
+    """
+    if threads < 1:
+        yield from map(function, items)
+        return
+    waiting: deque[Future[Result]] = deque()
+    left = iter(items)
+    executor = ThreadPoolExecutor(threads, thread_name_prefix="anytouch-files")
+    try:
+        for item in left:
+            waiting.append(executor.submit(function, item))
+            if len(waiting) >= (ahead or 4 * threads):
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)

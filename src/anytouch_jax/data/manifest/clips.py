@@ -10,7 +10,7 @@ _MOST = 1 << 61
 _BLOCK = 1 << 18  # rows at a time: what a block needs beside its windows fits into the cache
 
 
-def windows(
+def clip_windows(
     sequence: np.ndarray,
     frame: np.ndarray,
     stride: np.ndarray,

@@ -6,11 +6,12 @@ One row is one tactile frame (the schema is in `table.py`). Row numbers count fr
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,26 +22,19 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, ModelConfig, SpellingError
-from anytouch_jax.data.manifest.clips import windows
-from anytouch_jax.data.manifest.paths import resolve
+from anytouch_jax.data.manifest.clips import clip_windows
 from anytouch_jax.data.manifest.schema import (
     PATHS,
-    REQUIRED,
     SCHEMA,
     SPLITS,
     ManifestError,
-    is_manifest,
     load_table,
     typed,
 )
-from anytouch_jax.errors import ConfigError
+from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_path
 
 KEYS = ("sequence", "touch", "grasp_group")  # what two manifests may call alike and is not the same
-__all__ = [
-    "PATHS", "REQUIRED", "SCHEMA", "SPLITS", "Manifest", "ManifestError",
-    "from_columns", "is_manifest", "read", "resolve", "sensor_rows", "write",
-]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +88,7 @@ class Manifest:
 
     def file(self, row: int, name: str = "path") -> Path:
         """The absolute file in a path column. Raises ManifestError when the path leaves the manifest's folder."""
-        return resolve(self._roots[self.source[row]], self.value(row, name))
+        return resolve_path(self._roots[self.source[row]], self.value(row, name))
 
     def rows_of(self, split: str) -> np.ndarray:
         """Row ids i64 of one split, in order. Raises ManifestError when it is unknown or empty."""
@@ -117,7 +111,7 @@ class Manifest:
             wanted = np.zeros(len(self), bool)
             wanted[self.rows_of(split)] = True
         try:
-            return windows(self._sequence, self._frame, self._stride, length, self._say_repeat, wanted)
+            return clip_windows(self._sequence, self._frame, self._stride, length, self._say_repeat, wanted)
         except OverflowError as error:
             raise ManifestError(f"{self._name}: {error}") from None
 
@@ -252,7 +246,7 @@ def write(manifest: Manifest, path: str | Path) -> None:
     would lie outside the new folder and for a column that the format cannot hold.
     """
     target, table = _placed(manifest, path)
-    table = with_own_keys(manifest, table)
+    table = with_distinct_keys(manifest, table)
     try:
         with atomic_path(target) as part, part.open("wb") as file:
             if target.suffix.lower() == ".csv":
@@ -276,7 +270,7 @@ def _placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
     return target, _rebase(manifest, target.parent)
 
 
-def own_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
+def distinct_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
     """The column `name` with values that two of the manifest's files share made different, for writing as one file.
 
     The keys of a manifest are its own (see manifest.py); in one file equal keys would be one.
@@ -293,11 +287,11 @@ def own_keys(manifest: Manifest, name: str) -> pa.ChunkedArray:
     return pa.chunked_array([pc.binary_join_element_wise(prefix, column.combine_chunks().cast(pa.string()), "")])
 
 
-def with_own_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
+def with_distinct_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
     """`table` with keys of different files made different: in one file equal keys would be one."""
     for name in KEYS if len(manifest.files) > 1 else ():
         if name in table.column_names:
-            table = table.set_column(table.column_names.index(name), name, own_keys(manifest, name))
+            table = table.set_column(table.column_names.index(name), name, distinct_keys(manifest, name))
     return table
 
 
@@ -357,3 +351,126 @@ def sensor_rows(
                 ids[here] = model.universal_row
                 notes.append(f"sensor {name!r} is unknown: its {len(here)} rows use the universal sensor tokens")
     return ids, notes
+
+
+def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
+    """The manifest of `rows` (ids i64) in the order given; errors still name the rows of the files they come from."""
+    rows = np.asarray(rows, np.int64)
+    return Manifest(manifest.table.take(pa.array(rows)), manifest.files, manifest.source[rows], manifest.number[rows])
+
+
+def replace_column(manifest: Manifest, name: str, values: Any) -> Manifest:
+    """The manifest with column `name` set to `values` (rows,), added at the end where it was absent."""
+    column = pa.array(values, SCHEMA.get(name)) if not isinstance(values, pa.Array | pa.ChunkedArray) else values
+    table, names = manifest.table, manifest.table.column_names
+    table = table.set_column(names.index(name), name, column) if name in names else table.append_column(name, column)
+    return Manifest(table, manifest.files, manifest.source, manifest.number)
+
+
+def attach_text(
+    manifest: Manifest, captions: str | Path, *, key: str | None = None, text: str = "text", overwrite: bool = False
+) -> tuple[Manifest, list[str]]:
+    """Captions from a table (.csv or .parquet) with a key column and the column `text`; and notes to say aloud.
+
+    `key` is a column of both (default: the one column of the table beside `text`), for instance `sequence`, `touch`,
+    `object` or `path`. Rows that have a caption keep it unless `overwrite`. Raises UserError for a table that lacks a
+    column, has a key twice with different captions, or matches no row.
+    """
+    path = Path(captions).expanduser()
+    table = _read_captions(path)
+    if text not in table.column_names:
+        raise UserError(f"{path} has no column {text!r}; it has {', '.join(table.column_names)}")
+    others = [name for name in table.column_names if name != text]
+    if key is None and len(others) != 1:
+        raise UserError(f"{path} has the columns {', '.join(table.column_names)}: say which one is the key")
+    key = key or others[0]
+    if key not in others:
+        raise UserError(f"{path} has no column {key!r}; it has {', '.join(table.column_names)}")
+    found = _captions(table, key, text, path)
+    try:
+        keys = manifest.column(key).cast(pa.string())
+    except pa.ArrowException:
+        raise UserError(f"column {key!r} of the manifest is no key: it is {manifest.column(key).type}") from None
+    at = pc.index_in(keys, value_set=pa.array(list(found), pa.string()))
+    new = pa.chunked_array([pa.array(list(found.values()), pa.string())]).take(at.combine_chunks())
+    matched = pc.sum(pc.is_valid(new)).as_py()
+    if not matched:
+        first = next(iter(found), None)
+        raise UserError(f"{path}: no key {key!r} of it is in the manifest; its first one is {first!r}")
+    old = manifest.column("text")
+    merged = pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)
+    kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
+    unused = len(found) - len(pc.unique(at.drop_null()))
+    notes = [f"{matched - kept} rows got a caption by {key!r}"]
+    notes += [f"{kept} rows kept the caption they had"] if kept else []
+    notes += [f"{unused} of {len(found)} keys of {path.name} are not in the manifest"] if unused else []
+    return replace_column(manifest, "text", merged), notes
+
+
+def _read_captions(path: Path) -> pa.Table:
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise UserError(f"{path}: a table of captions ends in .csv or .parquet")
+    if not path.is_file():
+        raise UserError(f"there is no table {path}")
+    try:
+        if kind == ".parquet":
+            return pa.parquet.read_table(path, partitioning=None)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = next(csv.reader(file), [])
+        convert = pa.csv.ConvertOptions(
+            column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=True, null_values=[""]
+        )
+        options = pa.csv.ParseOptions(newlines_in_values=True)
+        return pa.csv.read_csv(path, convert_options=convert, parse_options=options)
+    except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{path} cannot be read as a {kind[1:]} table: {reason}") from None
+
+
+def _captions(table: pa.Table, key: str, text: str, path: Path) -> dict[str, str]:
+    twice = [name for name in (key, text) if table.column_names.count(name) > 1]
+    if twice:
+        raise UserError(f"{path} has the column {twice[0]!r} twice")
+    try:
+        keys, texts = table[key].cast(pa.string()).to_pylist(), table[text].cast(pa.string()).to_pylist()
+    except pa.ArrowException:
+        kinds = f"{table[key].type} and {table[text].type}"
+        raise UserError(f"{path}: {key!r} and {text!r} must be plain columns, are {kinds}") from None
+    found: dict[str, str] = {}
+    for row, (name, caption) in enumerate(zip(keys, texts, strict=True)):
+        if name is None or caption is None or not caption.strip():
+            continue
+        caption = " ".join(caption.split())
+        if found.setdefault(name, caption) != caption:
+            raise UserError(f"{path}, row {row}: {key} {name!r} has another caption in an earlier row")
+    return found
+
+
+def resolve_path(root: str | Path, relative: str | None) -> Path:
+    """The file `relative` inside the folder `root` (absolute, resolved).
+
+    Raises ManifestError when the path is empty, absolute, or leaves the folder by "..", or by a symbolic link.
+    """
+    if not relative:
+        raise ManifestError("the path is empty")
+    if "\0" in relative:
+        raise ManifestError(f"the path {relative!r} is not a file name")
+    root = str(root)
+    head, _, name = relative.rpartition("/")
+    # A folder is looked at once and each file for itself: that is most of the time that a path takes.
+    path = f"{_real_folder(root, head)}/{name}"
+    if name in ("", ".", "..") or os.path.islink(path):
+        path = os.path.realpath(path)
+    if relative[0] == "/":
+        raise ManifestError(f"the path {relative!r} is absolute; write it relative to the manifest's folder, {root}")
+    if not path.startswith(root if root[-1] == "/" else f"{root}/"):
+        link = "" if ".." in relative.split("/") else ", by a link; put the files there, or the manifest beside them"
+        raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}{link}")
+    return Path(path)
+
+
+@lru_cache(4096)
+def _real_folder(root: str, head: str) -> str:
+    folder = os.path.realpath(os.path.join(root, head))
+    return "" if folder == "/" else folder

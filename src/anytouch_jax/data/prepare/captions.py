@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from anytouch_jax.data.loading.bounded import bounded_map
-from anytouch_jax.data.manifest.edit import replace_column
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.loading.threads import bounded_map
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.prepare.endpoint import AnswerError, Client, Endpoint, EndpointError
 from anytouch_jax.data.prepare.prompts import Nonsense, caption_of
 from anytouch_jax.data.prepare.questions import (

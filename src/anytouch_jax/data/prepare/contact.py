@@ -25,8 +25,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.manifest.edit import replace_column, select
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
 from anytouch_jax.errors import UserError
 
 Scored = tuple[int, float, str]  # row, score, reason
@@ -153,7 +152,7 @@ def mark_contact(
     unknown = int(np.isnan(contact).sum())
     report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
                            int(np.isfinite(given).sum()), scores.counts, used)  # fmt: skip
-    return select(marked, np.flatnonzero(stays)), report
+    return select_rows(marked, np.flatnonzero(stays)), report
 
 
 def limits_of(manifest: Manifest, thresholds: Mapping[str, float] | None, share: float) -> np.ndarray:

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow.compute as pc
 
-from anytouch_jax.data.manifest.edit import select
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.manifest import Manifest, select_rows
 from anytouch_jax.errors import UserError
 
 YES, NO, UNKNOWN = 1, 0, -1
@@ -70,7 +69,7 @@ def commercial_only(manifest: Manifest) -> Commercial:
             f"{files}: no row may certainly be used commercially ({non_commercial} may not, {unknown} do not say); "
             "fill in the columns 'license' and 'commercial'"
         )
-    return Commercial(select(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
+    return Commercial(select_rows(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
 
 
 def licences(manifest: Manifest) -> tuple[Licence, ...]:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.images import decode_bytes
-from anytouch_jax.data.manifest.manifest import Manifest, resolve
-from anytouch_jax.data.manifest.packed import read_file
+from anytouch_jax.data.manifest.files import read_file
+from anytouch_jax.data.manifest.manifest import Manifest, resolve_path
 from anytouch_jax.data.manifest.schema import SPLITS
 from anytouch_jax.data.prepare.prompts import FAMILIES, Family, Question, family_of, question
 from anytouch_jax.errors import UserError
@@ -146,7 +146,7 @@ def _job(manifest: Manifest, rows: np.ndarray, family: Family, second_image: str
 
 def picture_bytes(manifest: Manifest, row: int, column: str) -> bytes:
     """The encoded picture in a cell. Raises UserError, OSError or ValueError."""
-    return read_file(resolve(manifest.files[manifest.source[row]].parent, manifest.value(row, column)))
+    return read_file(resolve_path(manifest.files[manifest.source[row]].parent, manifest.value(row, column)))
 
 
 def small_jpeg(data: bytes, name: str, side: int) -> bytes:

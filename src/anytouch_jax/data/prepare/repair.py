@@ -9,8 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.data.manifest.edit import replace_column, select
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
 from anytouch_jax.data.prepare.checks import frame_order, identity, licence_conflicts, repeated_rows, split_leaks
 from anytouch_jax.data.prepare.scan import OK, STATES
 from anytouch_jax.data.prepare.swapped import beside, verdicts
@@ -68,7 +67,7 @@ def repair(manifest: Manifest, report: Report, *, swap: Collection[str] = ()) ->
     if repeats.size:
         keep[repeats] = False
         done.append(f"dropped {repeats.size} rows that repeat another, touch image and all")
-    result = select(result, np.flatnonzero(keep))
+    result = select_rows(result, np.flatnonzero(keep))
     return Repaired(result, tuple(done), _left(report, result, exchanged))
 
 

@@ -14,10 +14,9 @@ import numpy as np
 
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.images import ImageError, decode_bytes
-from anytouch_jax.data.loading.bounded import bounded_map
-from anytouch_jax.data.manifest.files import Files, distinct_files
+from anytouch_jax.data.loading.threads import bounded_map
+from anytouch_jax.data.manifest.files import Files, distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.manifest.packed import read_file, split_packed
 from anytouch_jax.errors import UserError
 
 STATES = ("ok", "missing", "outside", "empty", "truncated", "unreadable")
@@ -75,7 +74,7 @@ def scan(
         except UserError as error:
             return _Look("outside", reason=str(error))
         field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
-        return (_look if decode or split_packed(path) else _glance)(path, decode and not field)
+        return (_look if decode or split_shard_path(path) else _glance)(path, decode and not field)
 
     with closing(bounded_map(look, range(count), threads, 8 * max(threads, 1))) as looks:
         for file, one in enumerate(looks):

@@ -22,11 +22,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet
 
-from anytouch_jax.data.loading.bounded import bounded_map
+from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.files import Files, distinct_files
-from anytouch_jax.data.manifest.manifest import Manifest, with_own_keys
-from anytouch_jax.data.manifest.packed import INDEX, ShardError, forget, read_file, read_index, split_packed
+from anytouch_jax.data.manifest.files import (
+    SHARD_INDEX,
+    Files,
+    ShardError,
+    close_shards,
+    distinct_files,
+    read_file,
+    read_shard_index,
+    split_shard_path,
+)
+from anytouch_jax.data.manifest.manifest import Manifest, with_distinct_keys
 from anytouch_jax.data.manifest.schema import PATHS
 from anytouch_jax.data.prepare.licences import card
 from anytouch_jax.errors import UserError
@@ -114,7 +122,7 @@ def _pack(
             done += rows
             if log:
                 log(f"{name}: {done} of {len(ids)} files")
-    forget()
+    close_shards()
     packed = _repoint(manifest, target, files, names, shard_of, row_of)
     manifests.write(packed, target)
     atomic_write(folder / "README.md", card(packed, orders))
@@ -127,7 +135,7 @@ def _stamp(manifest: Manifest, files: Files) -> str:
     for row, column in zip(files.row, files.column, strict=True):
         try:
             path = manifest.file(row, column)
-            about = os.stat((split_packed(path) or (path,))[0])
+            about = os.stat((split_shard_path(path) or (path,))[0])
         except FileNotFoundError:
             raise _cannot(manifest, int(row), str(column), "the file is missing") from None
         except (OSError, UserError) as error:
@@ -214,7 +222,7 @@ class _Group:
         shard = self.folder / self._name(number)
         index = shard.with_suffix(".index")
         try:
-            return len(read_index(index)) if shard.is_file() else None
+            return len(read_shard_index(index)) if shard.is_file() else None
         except ShardError:
             return None
 
@@ -317,7 +325,7 @@ def _locate(file: BinaryIO, start: int, stop: int, batch: list[_Piece]) -> np.nd
     file.seek(start)
     region = file.read(stop - start)
     file.seek(stop)
-    index, at = np.zeros(len(batch), INDEX), 0
+    index, at = np.zeros(len(batch), SHARD_INDEX), 0
     for entry, piece in zip(index, batch, strict=True):
         at = region.find(len(piece.data).to_bytes(4, "little") + piece.data, at)
         if at < 0:
@@ -338,7 +346,7 @@ def _repoint(
     for name, code in files.code.items():
         place = table.column_names.index(name)
         table = table.set_column(place, name, cell.take(pa.array(code, mask=code < 0)))
-    table = with_own_keys(manifest, table)
+    table = with_distinct_keys(manifest, table)
     return Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest
 from anytouch_jax.data.prepare.checks import misspelt_sensors
 from anytouch_jax.data.readers import (
     before,
@@ -27,12 +28,22 @@ from anytouch_jax.data.readers import (
     visgel,
     ycb_slide,
 )
-from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader
+from anytouch_jax.data.readers.common import Columns, DatasetError, DatasetReader, IndexOptions, Notes
 from anytouch_jax.errors import UserError
 
-__all__ = ["READERS", "Columns", "DatasetError", "IndexReport", "Notes", "Options", "Reader", "index", "reader"]
+__all__ = [
+    "READERS",
+    "Columns",
+    "DatasetError",
+    "DatasetReader",
+    "IndexOptions",
+    "IndexReport",
+    "Notes",
+    "get_reader",
+    "index",
+]
 
-READERS: dict[str, Reader] = {
+READERS: dict[str, DatasetReader] = {
     "touch_and_go": touch_and_go.READER,
     "visgel": visgel.READER,
     "cloth": cloth.READER,
@@ -93,7 +104,7 @@ class IndexReport:
         ]  # fmt: skip
 
 
-def reader(name: str) -> Reader:
+def get_reader(name: str) -> DatasetReader:
     """The reader called `name`. Raises UserError with the nearest names."""
     if name not in READERS:
         near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
@@ -103,7 +114,12 @@ def reader(name: str) -> Reader:
 
 
 def index(
-    name: str, root: str | Path, out: str | Path | None = None, *, options: Options | None = None, keep: bool = False
+    name: str,
+    root: str | Path,
+    out: str | Path | None = None,
+    *,
+    options: IndexOptions | None = None,
+    keep: bool = False,
 ) -> IndexReport:
     """Read the dataset `name` in the folder `root` and write its manifest to `out` (default: ROOT/<name>.parquet).
 
@@ -111,7 +127,7 @@ def index(
     keeps its columns and values (see before.py). Raises UserError for a folder that is not the dataset, an option the
     reader does not heed, a manifest that cannot be written there, and an edited one that would be lost.
     """
-    one, options = reader(name), options or Options()
+    one, options = get_reader(name), options or IndexOptions()
     base = Path(root).expanduser().resolve()
     if not base.is_dir():
         what = f"{base} is a file" if base.exists() else f"there is no folder {base}"
@@ -149,7 +165,7 @@ def index(
 
 def _refuse_links(manifest: manifests.Manifest, base: Path) -> None:
     """Raise UserError for a folder that is a link out of ROOT: no row of it could ever be read."""
-    found = (path for name in manifests.PATHS for path in manifest.column(name).unique().drop_null().to_pylist())
+    found = (path for name in PATHS for path in manifest.column(name).unique().drop_null().to_pylist())
     for folder in dict.fromkeys(path.rpartition("/")[0] for path in found):
         place = manifest.files[0].parent / folder
         if not place.resolve().is_relative_to(manifest.files[0].parent.resolve()):
@@ -158,8 +174,8 @@ def _refuse_links(manifest: manifests.Manifest, base: Path) -> None:
             )
 
 
-def _refuse_unused(one: Reader, options: Options) -> None:
-    for field in fields(Options):
+def _refuse_unused(one: DatasetReader, options: IndexOptions) -> None:
+    for field in fields(IndexOptions):
         if field.name not in one.uses and getattr(options, field.name) != field.default:
             heeds = ", ".join(one.uses) or "no option"
             raise UserError(f"the reader {one.name} does not use the option {field.name}; it uses {heeds}")
@@ -176,7 +192,7 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
         )
     if name == "real_touch" and target == base / "manifest.csv":
         raise UserError(f"{target} is the pack's own manifest; name another file with --out")
-    if target.exists() and not manifests.is_manifest(target):
+    if target.exists() and not is_manifest(target):
         raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
     if not os.access(target.parent, os.W_OK):
         raise UserError(
@@ -191,18 +207,18 @@ def _below(columns: Columns, base: Path, folder: Path) -> Columns:
     prefix = base.relative_to(folder).as_posix()
     if prefix == ".":
         return columns
-    paths = {name: [one and f"{prefix}/{one}" for one in columns[name]] for name in manifests.PATHS if name in columns}
+    paths = {name: [one and f"{prefix}/{one}" for one in columns[name]] for name in PATHS if name in columns}
     return columns | paths
 
 
-def _report(one: Reader, target: Path, manifest: manifests.Manifest, notes: Notes) -> IndexReport:
+def _report(one: DatasetReader, target: Path, manifest: manifests.Manifest, notes: Notes) -> IndexReport:
     splits = Counter(manifest.table["split"].to_pylist())
     return IndexReport(
         name=one.name,
         out=target,
         rows=len(manifest),
         sequences=int(manifest.codes("sequence").max()) + 1,
-        splits={split: splits[split] for split in manifests.SPLITS if splits[split]},
+        splits={split: splits[split] for split in SPLITS if splits[split]},
         sensors=dict(sorted(Counter(manifest.table["sensor"].to_pylist()).items())),
         frames=len(manifest) - splits["background"] - splits["unused"],
         paper=one.paper,

@@ -12,8 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.edit import replace_column
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.readers.common import Notes
 from anytouch_jax.errors import UserError
 

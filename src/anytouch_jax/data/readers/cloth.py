@@ -14,14 +14,14 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     add_recording,
     contact_list,
-    find,
     find_file,
+    find_folder,
     hash_split,
     listing,
     miss_listed,
@@ -35,16 +35,16 @@ PROPERTIES = ("fuzziness", "thickness", "smoothness", "wool", "stretchiness", "e
               "wind_resistance", "season", "wash_method", "textile_type")  # fmt: skip
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every trial of every cloth, with the cloth's properties as labels where they are there."""
-    base = find(root, "Data_ICRA18/Data", "Data")
+    base = find_folder(root, "Data_ICRA18/Data", "Data")
     place = base.relative_to(root).as_posix()
     table = find_file(["cloth_metadata.json"], options.lists, base.parent, root)
     properties = read_json(table) if table else {}
     if not properties:
         notes.log("no cloth_metadata.json: no labels of the cloth's properties")
     listed = contact_list(root, options, ("contact_yuan.csv", "Data_ICRA18/contact_yuan.csv"), "Data")
-    rows = Rows("object", "label.contact", *(f"label.{name}" for name in PROPERTIES))
+    rows = RowBuilder("object", "label.contact", *(f"label.{name}" for name in PROPERTIES))
     found = 0
     for cloth in listing(base, notes)[0]:
         labels = _labels(properties.get(cloth), table, cloth)
@@ -77,7 +77,7 @@ def _labels(values: object, table: Path | None, cloth: str) -> dict[str, int]:
     return {f"label.{name}": int(number) for name, number in zip(PROPERTIES, numbers, strict=True)}
 
 
-READER = Reader(
+READER = DatasetReader(
     name="cloth",
     read=read,
     sensor="gelsight",

@@ -28,7 +28,7 @@ class DatasetError(UserError):
 
 
 @dataclass(frozen=True)
-class Options:
+class IndexOptions:
     """What a reader may be told; each reader says in `uses` which of these it heeds.
 
     `val`, `test`: shares of the groups (objects, else recordings) that go to these splits where a dataset has no
@@ -72,7 +72,7 @@ class Notes:
 
 
 @dataclass(frozen=True)
-class Reader:
+class DatasetReader:
     """One public dataset: how to read it, and what is known of it.
 
     `read(root, options, notes) -> columns` has paths relative to `root` (absolute). `commercial` is False where no
@@ -80,7 +80,7 @@ class Reader:
     """
 
     name: str
-    read: Callable[[Path, Options, Notes], Columns]
+    read: Callable[[Path, IndexOptions, Notes], Columns]
     sensor: str
     license: str
     commercial: bool
@@ -92,7 +92,7 @@ class Reader:
     paper_note: str = ""
 
 
-class Rows:
+class RowBuilder:
     """Columns that grow by whole recordings."""
 
     def __init__(self, *names: str) -> None:
@@ -170,7 +170,7 @@ def numbered(files: Sequence[str], pattern: str, notes: Notes, where: str) -> Fr
     return sorted(frames.items())
 
 
-def find(root: Path, *choices: str, inside: Sequence[str] = ()) -> Path:
+def find_folder(root: Path, *choices: str, inside: Sequence[str] = ()) -> Path:
     """The first of the folders `choices` under `root` that exists ("." is `root` itself).
 
     A choice counts only if it holds one of `inside`, where given. Raises DatasetError that says what was looked for.
@@ -217,7 +217,7 @@ def read_json(path: Path, values: type = object) -> dict[str, Any]:
     return found
 
 
-def hash_split(dataset: str, group: str, options: Options) -> str:
+def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
     """The split of a group: the first 8 bytes of SHA-256(dataset / group) as a share of their range.
 
     Below `val` it is val, below `val + test` test, else train: one group is never in two splits, and adding or
@@ -228,7 +228,7 @@ def hash_split(dataset: str, group: str, options: Options) -> str:
     return "val" if share < options.val else "test" if share < options.val + options.test else "train"
 
 
-def contact_list(root: Path, options: Options, names: Collection[str], marker: str) -> dict[str, list[str]] | None:
+def contact_list(root: Path, options: IndexOptions, names: Collection[str], marker: str) -> dict[str, list[str]] | None:
     """The authors' list of contact frames, where one of the CSV files `names` is there: path -> its cells.
 
     Paths are taken from behind the last folder called `marker` on, where they have one.
@@ -241,7 +241,7 @@ def contact_list(root: Path, options: Options, names: Collection[str], marker: s
 
 
 def add_recording(
-    rows: Rows,
+    rows: RowBuilder,
     frames: Frames,
     folder: str,
     *,

@@ -20,22 +20,22 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     find_file,
     hash_split,
     listing,
     read_csv,
     read_json,
 )
-from anytouch_jax.data.readers.feel_files import export, strings_in_pickle
+from anytouch_jax.data.readers.feel_files import export_grasps, strings_in_pickle
 
 PHASES = ("before", "during", "after")
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every picture of every grasp in feel.csv. Raises DatasetError without it."""
     base = next((root / name for name in ("feel", ".") if (root / name / "feel.csv").is_file()), root)
     if not (base / "feel.csv").is_file():
@@ -46,10 +46,12 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         if not options.export:
             raise DatasetError(f"{root} has {len(original)} original .h5 files and no feel.csv; add --export to write "
                                "the pictures beside them (needs pip install h5py)")  # fmt: skip
-        notes.log(f"{export(root, original)} grasps written from {len(original)} .h5 files")
+        notes.log(f"{export_grasps(root, original)} grasps written from {len(original)} .h5 files")
     splits = _splits(base, options, notes)
     prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
-    rows = Rows("object", "unit", "grasp_group", "image_path", "background_path", "label.success", "label.contact")
+    rows = RowBuilder(
+        "object", "unit", "grasp_group", "image_path", "background_path", "label.success", "label.contact"
+    )
     there: dict[str, set[str]] = {}
     table = base / "feel.csv"
     for line, row in enumerate(read_csv(table), 1):
@@ -71,7 +73,7 @@ def _files(folder: Path, notes: Notes) -> set[str]:
     return {f"{sub}/{file}" for sub in listing(folder, notes)[0] for file in listing(folder / sub, notes)[1]}
 
 
-def _grasp(rows: Rows, notes: Notes, prefix: str, name: str, number: int, success: int, split: str,
+def _grasp(rows: RowBuilder, notes: Notes, prefix: str, name: str, number: int, success: int, split: str,
            there: set[str]) -> None:  # fmt: skip
     grasp = f"{name}/{number}"
     for finger in "AB":
@@ -97,7 +99,7 @@ def _grasp(rows: Rows, notes: Notes, prefix: str, name: str, number: int, succes
             )  # fmt: skip
 
 
-def _splits(base: Path, options: Options, notes: Notes) -> dict[str, str] | None:
+def _splits(base: Path, options: IndexOptions, notes: Notes) -> dict[str, str] | None:
     """object -> split, from split_<fold>.json or .npy; None without a file."""
     path = find_file([f"split_{options.fold}.json", f"split_{options.fold}.npy"], options.lists, base)
     if path is None and options.fold:
@@ -121,7 +123,7 @@ def _is_list(one: object) -> bool:
     return hasattr(one, "__len__") and not isinstance(one, str | bytes | dict)
 
 
-READER = Reader(
+READER = DatasetReader(
     name="feel",
     read=read,
     sensor="gelsight",

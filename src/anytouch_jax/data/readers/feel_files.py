@@ -59,7 +59,7 @@ def strings_in_pickle(path: Path) -> dict[str, list[str]]:
     return lists
 
 
-def export(root: Path, names: Sequence[str]) -> int:
+def export_grasps(root: Path, names: Sequence[str]) -> int:
     """Write the grasps of the HDF5 files `names` in `root` as PNG, and feel.csv last; the number of grasps.
 
     Raises DatasetError when h5py is not installed or a file cannot be read.

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.data.images import ImageError, frames_from_video, frames_told
+from anytouch_jax.data.images import ImageError, count_frames, frames_from_video
 from anytouch_jax.data.readers.common import Notes, walk
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder
@@ -15,7 +15,7 @@ from anytouch_jax.files import atomic_folder
 SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 
 
-def export(root: Path, notes: Notes) -> None:
+def write_video_frames(root: Path, notes: Notes) -> None:
     """Write the frames of every film below `root` as 000000.png, ... into a folder of its name beside it, whole or not
     at all; a film whose folder is there is left alone. A film that cannot be read is counted. Raises UserError where
     nothing can be written.
@@ -42,5 +42,5 @@ def _write(film: Path, notes: Notes) -> None:
             data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
             (target / f"{count:06d}.png").write_bytes(data)
             count += 1
-    if 0.98 * (told := frames_told(film)) > count + 2:  # some containers only estimate it
+    if 0.98 * (told := count_frames(film)) > count + 2:  # some containers only estimate it
         notes.log(f"{film} tells of {told} frames and {count} could be read; is it whole?")

@@ -15,10 +15,10 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     find_file,
     listing,
     numbered,
@@ -29,14 +29,14 @@ LAST_OF_1 = 100
 PLACES = ("obj1.0", "obj2.0/touch", "touch", ".")
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every picture of both parts that are there. Raises DatasetError without pictures, label.json or split.json."""
     places = [place for place in PLACES if _ids(root / place)]
     if not places:
         raise DatasetError(f"expected obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png under {root}; is ROOT the "
                            "folder that holds 'obj1.0' and 'obj2.0'?")  # fmt: skip
     labels, splits = _lists(root, options)
-    rows = Rows("object", "dataset", "label.material")
+    rows = RowBuilder("object", "dataset", "label.material")
     for place in places:
         prefix = "" if place == "." else f"{place}/"
         for name in _ids(root / place):
@@ -64,7 +64,7 @@ def _ids(folder: Path) -> list[str]:
     return [name for name in listing(folder, Notes())[0] if name.isdecimal()] if folder.is_dir() else []
 
 
-def _lists(root: Path, options: Options) -> tuple[dict[int, int], dict[tuple[int, int], str]]:
+def _lists(root: Path, options: IndexOptions) -> tuple[dict[int, int], dict[tuple[int, int], str]]:
     """id -> material number, and (id, n) -> split."""
     found = []
     for name in ("label.json", "split.json"):
@@ -89,7 +89,7 @@ def _lists(root: Path, options: Options) -> tuple[dict[int, int], dict[tuple[int
     return labels, splits
 
 
-READER = Reader(
+READER = DatasetReader(
     name="objectfolder",
     read=read,
     sensor="tacto, taxim",

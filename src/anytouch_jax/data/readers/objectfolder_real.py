@@ -17,10 +17,10 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     add_recording,
     contact_list,
     find_file,
@@ -35,7 +35,7 @@ FRAME = r"(\d+)\.(?:png|jpe?g)"
 LISTS = ("contact_text_obj.csv", "contact_obj.csv")
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every folder `gelsight` under ROOT. Raises DatasetError when there is none."""
     base = next((root / place for place in ("tactile", "real/tactile") if (root / place).is_dir()), root)
     place = "" if base == root else f"{base.relative_to(root).as_posix()}/"
@@ -58,7 +58,9 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         if not any(str(Path(inside).parent) == parent for inside, _ in recordings):
             for inside, files in others:
                 notes.skip("file outside a folder 'gelsight' and not beside one", f"{inside}/{files[0]}", len(files))
-    rows = Rows("object", "image_path", "image2_path", "caption_id", "label.contact", "label.material", "label.object")
+    rows = RowBuilder(
+        "object", "image_path", "image2_path", "caption_id", "label.contact", "label.material", "label.object"
+    )
     found = 0
     for inside, files in recordings:
         frames = numbered(files, FRAME, notes, inside)
@@ -93,7 +95,7 @@ def _views(beside: list[tuple[str, list[str]]], numbers: list[int], place: str) 
     return with_any + [[None] * len(numbers)] * (2 - len(with_any))
 
 
-READER = Reader(
+READER = DatasetReader(
     name="objectfolder_real",
     read=read,
     sensor="gelslim",

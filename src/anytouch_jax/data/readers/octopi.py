@@ -15,10 +15,10 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     add_recording,
     contact_list,
     find_file,
@@ -33,13 +33,13 @@ LISTS = ("contact_text_octopi.csv", "contact_octopi.csv", "contact.csv")
 FRAME = r"(\d+)\.(?:jpe?g|png)"
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every sample folder with frames. Raises DatasetError when there is none."""
     base = root / "processed" if (root / "processed").is_dir() else root
     place = "processed/" if base != root else ""
     listed = contact_list(root, options, LISTS, "processed")
     own = _own_splits(base, options, notes)
-    rows = Rows("object", "caption_id", "label.contact")
+    rows = RowBuilder("object", "caption_id", "label.contact")
     found = samples = 0
     for sample in listing(base, notes)[0]:
         files = listing(base / sample, notes)[1]
@@ -63,7 +63,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     return rows.columns()
 
 
-def _own_splits(base: Path, options: Options, notes: Notes) -> dict[str, str]:
+def _own_splits(base: Path, options: IndexOptions, notes: Notes) -> dict[str, str]:
     files = {split: find_file([f"{split}_samples.json"], options.lists, base, base.parent) for split in
              ("train", "val", "test")}  # fmt: skip
     if not all(files.values()):
@@ -79,7 +79,7 @@ def _own_splits(base: Path, options: Options, notes: Notes) -> dict[str, str]:
     return own
 
 
-READER = Reader(
+READER = DatasetReader(
     name="octopi",
     read=read,
     sensor="gelsight_mini",

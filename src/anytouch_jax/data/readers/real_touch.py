@@ -12,10 +12,10 @@ from pathlib import Path
 import pyarrow.compute as pc
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader, walk
+from anytouch_jax.data.readers.common import Columns, DatasetError, DatasetReader, IndexOptions, Notes, walk
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """The pack's own rows. Raises DatasetError without manifest.csv, ManifestError when it is broken."""
     del options
     if not (root / "manifest.csv").is_file():
@@ -33,7 +33,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     return columns
 
 
-READER = Reader(
+READER = DatasetReader(
     name="real_touch",
     read=read,
     sensor="gelsight_mini, gelslim, digit, 9dtact, allsight",

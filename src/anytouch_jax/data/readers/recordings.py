@@ -20,16 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling
-from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, by_stem, frame_numbers, frame_order
+from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers, frame_sort_key, split_series
 from anytouch_jax.data.readers import films, label_table
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
     Frames,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     add_recording,
     walk,
 )
@@ -39,7 +39,7 @@ CAPTION = "caption.txt"
 MANIFESTS = (".csv", ".parquet")  # such as an earlier index
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every folder of pictures. Raises UserError without a sensor."""
     known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
     if options.sensor is None or options.sensor in (*FIELD_SENSORS, UNIVERSAL):
@@ -48,7 +48,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     found: list[tuple[str, dict[str, Frames]]] = []
     beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
     if options.export:
-        films.export(root, notes)
+        films.write_video_frames(root, notes)
     for folder, folders, files in walk(root, notes):
         beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
@@ -57,7 +57,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
         files = [name for name in files if not _is_cut(name, folders)]
         if fingers := _frames(files, notes, folder):
             found.append((folder, fingers))
-    rows = Rows("object", "unit", "background_path", "image_path", "text", "dataset")
+    rows = RowBuilder("object", "unit", "background_path", "image_path", "text", "dataset")
     splits = _splits([folder for folder, _ in found], options, notes)
     for folder, fingers in found:
         for unit, frames in fingers.items():
@@ -79,7 +79,7 @@ def _object(folder: str) -> str:
     return folder.split("/")[0]
 
 
-def ranked_split(groups: Iterable[str], options: Options) -> dict[str, str]:
+def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]:
     """The split of every group: sorted by SHA-256 of its name, the first round(val n) are val, the last round(test n)
     test, the others train.
 
@@ -96,7 +96,7 @@ def ranked_split(groups: Iterable[str], options: Options) -> dict[str, str]:
     return dict(zip(order, parts, strict=True))
 
 
-def _splits(folders: list[str], options: Options, notes: Notes) -> dict[str, str]:
+def _splits(folders: list[str], options: IndexOptions, notes: Notes) -> dict[str, str]:
     """The split of every recording: that of its object, or, by recording, a part of each object's."""
     objects: dict[str, list[str]] = {}
     for folder in folders:
@@ -133,7 +133,7 @@ def _is_cut(name: str, folders: list[str]) -> bool:
 def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
     """The pictures of a folder in order with their numbers, by finger; arrays count where there is nothing else."""
     names = []
-    for name in sorted(files, key=frame_order):
+    for name in sorted(files, key=frame_sort_key):
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
@@ -148,10 +148,10 @@ def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
         names = pictures
     if not names:
         return {}
-    return {unit: list(zip(frame_numbers(one), one, strict=True)) for unit, one in by_stem(names).items()}
+    return {unit: list(zip(frame_numbers(one), one, strict=True)) for unit, one in split_series(names).items()}
 
 
-READER = Reader(
+READER = DatasetReader(
     name="recordings",
     read=read,
     sensor="",

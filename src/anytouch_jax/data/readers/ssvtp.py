@@ -15,11 +15,11 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
-    find,
+    RowBuilder,
+    find_folder,
     hash_split,
     listing,
     numbered,
@@ -27,9 +27,9 @@ from anytouch_jax.data.readers.common import (
 )
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every tactile picture with its photograph and phrase. Raises DatasetError without `images_tac`."""
-    base = find(root, "tvl_dataset/ssvtp", "ssvtp", "ssvtp_data", ".", inside=("images_tac",))
+    base = find_folder(root, "tvl_dataset/ssvtp", "ssvtp", "ssvtp_data", ".", inside=("images_tac",))
     prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
     frames = numbered(listing(base / "images_tac", notes)[1], r"image_(\d+)_tac\.(?:jpe?g|png)", notes, "images_tac")
     rgb = listing(base / "images_rgb", notes)[1] if (base / "images_rgb").is_dir() else []
@@ -38,7 +38,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     notes.skip("photograph missing (kept without)", "images_rgb", sum(number not in photos for number in ids))
     notes.skip("photograph without touch", "images_rgb", len(photos.keys() - set(ids)))
     tests, captions = _tables(base, notes)
-    rows = Rows("image_path", "text", "caption_id")
+    rows = RowBuilder("image_path", "text", "caption_id")
     rows.add(
         [f"{prefix}images_tac/{name}" for _, name in frames],
         sensor="digit",
@@ -71,7 +71,7 @@ def _tables(base: Path, notes: Notes) -> tuple[set[str], dict[str, str]]:
     return tests, {name: text for name, text in captions.items() if text}
 
 
-READER = Reader(
+READER = DatasetReader(
     name="ssvtp",
     read=read,
     sensor="digit",

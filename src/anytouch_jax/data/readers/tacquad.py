@@ -21,10 +21,10 @@ from typing import Any
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     find_file,
     hash_split,
     listing,
@@ -36,7 +36,7 @@ SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
 KEPT = ("indoor", "outdoor")
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every item of every `data_*` subset. Raises DatasetError without one, or without its contact list."""
     subsets = [name for name in listing(root, notes)[0] if name.startswith("data_")]
     if not subsets:
@@ -45,7 +45,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     for subset in KEPT:
         if f"data_{subset}" not in subsets:
             notes.log(f"no data_{subset}: that subset is left out")
-    rows = Rows("object", "touch", "image_path", "background_path", "caption_id", "label.contact", "subset")
+    rows = RowBuilder("object", "touch", "image_path", "background_path", "caption_id", "label.contact", "subset")
     for folder in subsets:
         subset = folder.removeprefix("data_")
         windows = _windows(root, subset, options)
@@ -63,7 +63,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     return rows.columns()
 
 
-def _windows(root: Path, subset: str, options: Options) -> dict[str, tuple[int, list[tuple[int, int]]]]:
+def _windows(root: Path, subset: str, options: IndexOptions) -> dict[str, tuple[int, list[tuple[int, int]]]]:
     """item -> its line in the list (from 0) and (first, last contact frame) of each sensor."""
     path = find_file([f"contact_{subset}.csv"], options.lists, root)
     if path is None:
@@ -81,7 +81,7 @@ def _windows(root: Path, subset: str, options: Options) -> dict[str, tuple[int, 
     return windows
 
 
-def _item(rows: Rows, notes: Notes, root: Path, place: str, spans: list[tuple[int, int]],
+def _item(rows: RowBuilder, notes: Notes, root: Path, place: str, spans: list[tuple[int, int]],
           cells: dict[str, Any]) -> None:  # fmt: skip
     folders = listing(root / place, notes)[0]
     for folder in folders:
@@ -119,7 +119,7 @@ def _photos(notes: Notes, root: Path, folder: str, numbers: list[int]) -> list[s
     return found
 
 
-READER = Reader(
+READER = DatasetReader(
     name="tacquad",
     read=read,
     sensor="gelsight_mini, digit, duragel",

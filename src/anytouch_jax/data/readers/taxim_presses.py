@@ -17,16 +17,26 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.data.readers.common import Columns, DatasetError, Notes, Options, Reader, Rows, hash_split
+from anytouch_jax.data.readers.common import (
+    Columns,
+    DatasetError,
+    DatasetReader,
+    IndexOptions,
+    Notes,
+    RowBuilder,
+    hash_split,
+)
 from anytouch_jax.files import atomic_write
 
 FOLDER = "taxim_presses"
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Write the presses as pictures and list them. Raises DatasetError when the package is not installed."""
     calib = options.lists or _installed()
-    rows = Rows("object", "unit", "background_path", "label.contact", "label.radius_px", "label.x_px", "label.y_px")
+    rows = RowBuilder(
+        "object", "unit", "background_path", "label.contact", "label.radius_px", "label.x_px", "label.y_px"
+    )
     for sensor in ("gelsight", "gelsight_mini"):
         path = calib / sensor / "dataPack.npz"
         if not path.is_file():
@@ -74,7 +84,7 @@ def _save(path: Path, image: np.ndarray) -> None:
         atomic_write(path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
 
 
-READER = Reader(
+READER = DatasetReader(
     name=FOLDER,
     read=read,
     sensor="gelsight, gelsight_mini",

@@ -23,12 +23,12 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
-    find,
+    RowBuilder,
     find_file,
+    find_folder,
     listing,
     numbered,
     read_csv,
@@ -45,11 +45,11 @@ class _Frame:
     label: dict[str, int]
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """The frames of every list, as columns. Raises DatasetError without `dataset` or the lists of the task."""
-    base = find(root, "dataset")
+    base = find_folder(root, "dataset")
     known = _lists(root, options, notes)
-    rows = Rows("image_path", "background_path", "label.material", "label.hardness", "label.rough",
+    rows = RowBuilder("image_path", "background_path", "label.material", "label.hardness", "label.rough",
                 "label.contact", "downstream_test")  # fmt: skip
     prefix = base.relative_to(root).as_posix()
     for video in listing(base, notes)[0]:
@@ -61,7 +61,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     return rows.columns()
 
 
-def _lists(root: Path, options: Options, notes: Notes) -> dict[str, dict[int, _Frame]]:
+def _lists(root: Path, options: IndexOptions, notes: Notes) -> dict[str, dict[int, _Frame]]:
     known: dict[str, dict[int, _Frame]] = {}
     for task, ending in (("material", ""), ("rough", "_rough")):
         for split in ("train", "test"):
@@ -97,7 +97,7 @@ def _read_list(known: dict[str, dict[int, _Frame]], path: Path, task: str | None
                 frame.label[task] = label
 
 
-def _video(rows: Rows, notes: Notes, folder: Path, prefix: str, known: dict[int, _Frame], task: str) -> int:
+def _video(rows: RowBuilder, notes: Notes, folder: Path, prefix: str, known: dict[int, _Frame], task: str) -> int:
     """Add the touches of one video; the count of its listed frames that are there."""
     folders, files = listing(folder, notes)
     if "gelsight_frame" not in folders:
@@ -119,7 +119,7 @@ def _video(rows: Rows, notes: Notes, folder: Path, prefix: str, known: dict[int,
     return len(there)
 
 
-def _touch(rows: Rows, prefix: str, frames: dict[int, str], photos: set[str], known: list[_Frame], run: list[int],
+def _touch(rows: RowBuilder, prefix: str, frames: dict[int, str], photos: set[str], known: list[_Frame], run: list[int],
            before: str | None, split: str) -> None:  # fmt: skip
     names = [frames[number] for number in run]
     material = [frame.label.get("material") for frame in known]
@@ -152,7 +152,7 @@ def _runs(numbers: list[int], together: Callable[[int, int], bool]) -> list[list
     return runs
 
 
-READER = Reader(
+READER = DatasetReader(
     name="touch_and_go",
     read=read,
     sensor="gelsight",

@@ -27,12 +27,12 @@ from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
     Frames,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
-    find,
+    RowBuilder,
+    find_folder,
     hash_split,
     listing,
     numbered,
@@ -46,12 +46,12 @@ THUMB = 16
 MARGIN = 0.3  # of correlation, by which vision must look more like touch than touch does
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every recording of data1, data2, data3. Raises DatasetError when there is none of them."""
     parts = ("data1", "data2", "data3")
-    base = find(root, "tvl_dataset/hct", "hct", ".", inside=parts)
+    base = find_folder(root, "tvl_dataset/hct", "hct", ".", inside=parts)
     prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
-    rows = Rows("image_path", "background_path", "text", "label.contact")
+    rows = RowBuilder("image_path", "background_path", "text", "label.contact")
     places = [f"{part}/{name}" for part in parts if (base / part).is_dir() for name in listing(base / part, notes)[0]]
     found = {place: _folders(base, place, notes) for place in places}
     pairs = {place: pair for place, pair in found.items() if pair is not None}
@@ -77,8 +77,8 @@ def _folders(base: Path, place: str, notes: Notes) -> dict[str, Frames] | None:
     return {side: numbered(listing(base / place / side, notes)[1], FRAME, notes, f"{place}/{side}") for side in sides}
 
 
-def _part(rows: Rows, notes: Notes, folder: Path, prefix: str, pairs: dict[str, dict[str, Frames]], turned: set[str],
-          options: Options) -> None:  # fmt: skip
+def _part(rows: RowBuilder, notes: Notes, folder: Path, prefix: str, pairs: dict[str, dict[str, Frames]],
+          turned: set[str], options: IndexOptions) -> None:  # fmt: skip
     contact, backgrounds = _contact(folder, notes)
     tests, captions = _tables(folder, notes)
     spare = folder / "digit_background.png"
@@ -215,7 +215,7 @@ def _thumb(picture: np.ndarray) -> np.ndarray:
     return cells + np.linspace(0, 1e-3, cells.size, dtype=np.float32).reshape(cells.shape)
 
 
-READER = Reader(
+READER = DatasetReader(
     name="tvl",
     read=read,
     sensor="digit",

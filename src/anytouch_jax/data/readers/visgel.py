@@ -16,10 +16,10 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     add_recording,
     contact_list,
     hash_split,
@@ -33,7 +33,7 @@ PLACES = ("images/touch", "touch", "data_seen/touch", "data_unseen/touch", "imag
           "images/data_unseen/touch")  # fmt: skip
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every recording under `touch` with its photographs under `vision`. Raises DatasetError when there is none."""
     bases = [root / place for place in PLACES if (root / place).is_dir()]
     if not bases:
@@ -41,7 +41,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
             f"expected images/touch/<recording>/frame0000.jpg under {root}; is ROOT the folder that holds 'images'?"
         )
     listed = contact_list(root, options, ("contact_visgel.csv", "images/contact_visgel.csv"), "touch")
-    rows = Rows("image_path", "background_path", "label.contact")
+    rows = RowBuilder("image_path", "background_path", "label.contact")
     found = 0
     for base in bases:
         place = base.relative_to(root).as_posix()
@@ -54,8 +54,8 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     return rows.columns()
 
 
-def _recording(rows: Rows, notes: Notes, root: Path, place: str, inside: str, files: list[str],
-               listed: dict[str, list[str]] | None, options: Options) -> int:  # fmt: skip
+def _recording(rows: RowBuilder, notes: Notes, root: Path, place: str, inside: str, files: list[str],
+               listed: dict[str, list[str]] | None, options: IndexOptions) -> int:  # fmt: skip
     folder = f"{place}/{inside}"
     frames = numbered(files, r"frame(\d+)\.jpe?g", notes, folder)
     vision = f"{place.removesuffix('touch')}vision/{inside}"
@@ -70,7 +70,7 @@ def _recording(rows: Rows, notes: Notes, root: Path, place: str, inside: str, fi
     )  # fmt: skip
 
 
-READER = Reader(
+READER = DatasetReader(
     name="visgel",
     read=read,
     sensor="gelsight",

@@ -14,10 +14,10 @@ from pathlib import Path
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetReader,
+    IndexOptions,
     Notes,
-    Options,
-    Reader,
-    Rows,
+    RowBuilder,
     add_recording,
     hash_split,
     listing,
@@ -27,11 +27,11 @@ from anytouch_jax.data.readers.common import (
 STRIDE = 3
 
 
-def read(root: Path, options: Options, notes: Notes) -> Columns:
+def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
     """Every recording of every object. Raises DatasetError when there is none."""
     place = next((p for p in ("real", "dataset/real") if (root / p).is_dir()), ".")
     prefix = "" if place == "." else f"{place}/"
-    rows = Rows("object", "stride")
+    rows = RowBuilder("object", "stride")
     recordings = 0
     for obj in listing(root / place, notes)[0]:
         for name in listing(root / place / obj, notes)[0]:
@@ -49,7 +49,7 @@ def read(root: Path, options: Options, notes: Notes) -> Columns:
     return rows.columns()
 
 
-READER = Reader(
+READER = DatasetReader(
     name="ycb_slide",
     read=read,
     sensor="digit",

@@ -11,8 +11,8 @@ import pyarrow.compute as pc
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
 from anytouch_jax.data import tokenizer as texts
 from anytouch_jax.data.loading.labels import Force, find_force
-from anytouch_jax.data.loading.matching import Keys, Matches, felt_twice
-from anytouch_jax.data.loading.sampling import Strata, Stream
+from anytouch_jax.data.loading.matching import Matches, MatchKeys, is_shared_touch
+from anytouch_jax.data.loading.sampling import EpochSampler, StratumQuota
 from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_rows
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.errors import UserError
@@ -28,9 +28,9 @@ class Pool(NamedTuple):
     """Windows of rows i64 (M, T) to draw from; `members[s]` the ids of stratum s in `windows`, `streams[s]` over it."""
 
     windows: np.ndarray
-    strata: Strata
+    strata: StratumQuota
     members: tuple[np.ndarray, ...]
-    streams: tuple[Stream, ...]
+    streams: tuple[EpochSampler, ...]
 
     @property
     def draws(self) -> int:
@@ -43,10 +43,10 @@ class Pairs(NamedTuple):
 
     windows: np.ndarray
     matches: Matches
-    anchors: Stream
+    anchors: EpochSampler
 
 
-class Sources(NamedTuple):
+class Pools(NamedTuple):
     """All there is to draw from, by kind: `pools` (stills, and clips if any), `pairs` (None where there are none).
 
     `sensor` i32 (rows of the manifest,) sensor-table rows; `tokenizer` the one in use; `notes` to tell the user;
@@ -61,7 +61,7 @@ class Sources(NamedTuple):
     force: Force | None
 
 
-def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer | None, devices: int) -> Sources:
+def find_pools(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer | None, devices: int) -> Pools:
     """Look through the split `config.data.split`. Raises UserError: an empty split, nothing to learn, an unknown
     sensor, no tokenizer."""
     rows, sensor, notes = _usable(manifest, config)
@@ -95,7 +95,7 @@ def find_sources(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer 
     if config.stage == 2:
         _something_to_learn(config, pools, pairs)
     force = find_force(manifest, config, rows, pools[CLIP].windows if len(pools) > 1 else None)
-    return Sources(pools, pairs, sensor, tokenizer, notes, force)
+    return Pools(pools, pairs, sensor, tokenizer, notes, force)
 
 
 def _something_to_learn(config: Config, pools: tuple[Pool, ...], pairs: tuple[Pairs | None, ...]) -> None:
@@ -138,7 +138,7 @@ def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.
     wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
     if not wanted:
         return rows, None, []
-    text = manifest.present("text") & ~withheld(manifest, aligned_text=config.data.aligned_text)
+    text = manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
     has = {"image": manifest.present("image_path"), "text": text}
     if config.data.contact_only:
         if "label.contact" not in manifest.table.column_names:
@@ -179,7 +179,7 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
     return weights, [f"an epoch draws {said}, other datasets once"]
 
 
-def withheld(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
+def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
     """Rows in a test split of a downstream task (column `downstream_test`): their text is not trained on, bool (rows,).
 
     So a text that tells the label is never seen with a frame that a probe is tested on (paper, appendix). Without
@@ -190,7 +190,7 @@ def withheld(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
 
 
 def _aligned(manifest: Manifest) -> np.ndarray:
-    return felt_twice(*(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit")))
+    return is_shared_touch(*(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit")))
 
 
 def _say_withheld(manifest: Manifest, config: Config, rows: np.ndarray) -> list[str]:
@@ -215,9 +215,9 @@ def _downstream(manifest: Manifest) -> np.ndarray:
     return ~np.asarray(pc.is_in(pc.fill_null(word, ""), value_set=pa.array(_NOT_SET)))
 
 
-def captions(manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True) -> list[str]:
-    """The different captions of `rows` that may be trained on (see `withheld`), in order."""
-    kept = rows[~withheld(manifest, aligned_text=aligned_text)[rows]]
+def training_captions(manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True) -> list[str]:
+    """The different captions of `rows` that may be trained on (see `withheld_text`), in order."""
+    kept = rows[~withheld_text(manifest, aligned_text=aligned_text)[rows]]
     return sorted(pc.unique(manifest.column("text").take(kept)).drop_null().to_pylist())
 
 
@@ -227,9 +227,9 @@ def _choose_tokenizer(
     tower, notes = config.model.text, []
     assert tower is not None
     if given is None and config.data.tokenizer is not None:
-        given = texts.load(config.data.tokenizer)
+        given = texts.load_tokenizer(config.data.tokenizer)
     if given is None:
-        given = texts.train(captions(manifest, rows), tower.vocab)
+        given = texts.train_tokenizer(training_captions(manifest, rows), tower.vocab)
         notes.append(f"no tokenizer is given: one of {given.vocab_size} tokens was trained on the captions")
     if given.vocab_size > tower.vocab:
         raise UserError(
@@ -256,7 +256,7 @@ class _Finder(NamedTuple):
         image = self.manifest.present("image_path") if model.image else none
         if not model.text:
             return image, none
-        kept = ~withheld(self.manifest, aligned_text=self.config.data.aligned_text)
+        kept = ~withheld_text(self.manifest, aligned_text=self.config.data.aligned_text)
         return image, self.manifest.present("text") & kept
 
     def windows(self, kind: int, length: int) -> np.ndarray:
@@ -276,10 +276,10 @@ class _Finder(NamedTuple):
         seed = self.config.run.seed
         members = tuple(np.flatnonzero(here) for here in (image & ~text, image & text, ~image & text, ~image & ~text))
         streams = tuple(
-            Stream(len(ids), seed, _ALIGN + 4 * kind + s, self._weights_of(windows[ids]))
+            EpochSampler(len(ids), seed, _ALIGN + 4 * kind + s, self._weights_of(windows[ids]))
             for s, ids in enumerate(members)
         )
-        strata = Strata([stream.size for stream in streams], self.config.data.batch_size, devices)
+        strata = StratumQuota([stream.size for stream in streams], self.config.data.batch_size, devices)
         return Pool(windows, strata, members, streams)
 
     def _weights_of(self, windows: np.ndarray) -> np.ndarray | None:
@@ -291,7 +291,7 @@ class _Finder(NamedTuple):
             return found.astype(np.int32) if found.max(initial=0) < 1 << 31 else found
 
         notes = []
-        keys = Keys(codes("touch", own=True), self.sensor, codes("unit"), codes("object"), codes("dataset"))
+        keys = MatchKeys(codes("touch", own=True), self.sensor, codes("unit"), codes("object"), codes("dataset"))
         stills, clips = self._pairs(STILL, keys), self._pairs(CLIP, keys) if self.config.data.clip_share else None
         if stills is None:
             notes.append(
@@ -306,11 +306,11 @@ class _Finder(NamedTuple):
             notes.append("no two clips share a touch: matching uses stills only")
         return (stills, clips), notes
 
-    def _pairs(self, kind: int, keys: Keys) -> Pairs | None:
+    def _pairs(self, kind: int, keys: MatchKeys) -> Pairs | None:
         windows = self.windows(kind, self.config.model.frames)
         wanted = {"same_sensor": self.config.data.negatives == "same_sensor"}
         matches = Matches(windows[:, -1], keys, **wanted, other_object=self.config.recipe == "release")
         if not matches.anchors.size:
             return None
         weights, seed = self._weights_of(windows[matches.anchors]), self.config.run.seed
-        return Pairs(windows, matches, Stream(len(matches.anchors), seed, _ANCHOR + kind, weights))
+        return Pairs(windows, matches, EpochSampler(len(matches.anchors), seed, _ANCHOR + kind, weights))

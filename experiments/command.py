@@ -1,9 +1,9 @@
-"""Run an experiment's script from the shell: options by tyro, a user's mistake as one sentence."""
+"""Command lines of the experiment scripts: options by tyro, a user's mistake as one sentence."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import tyro
@@ -11,16 +11,17 @@ import tyro
 from anytouch_jax.errors import UserError
 
 
-def main(options: type, run: Callable[[Any], int], *, positional: bool = False) -> int:
-    """Parse the command line into `options` and call `run`. Returns the exit status, 1 for a user's mistake."""
-    config: list[Any] = [tyro.conf.AvoidSubcommands]
-    if positional:
-        config.append(tyro.conf.PositionalRequiredArgs)
+def run_script(options: type, run: Callable[[Any], int], args: Sequence[str] | None = None) -> int:
+    """Parse `args`, or the command line, into `options` and call `run`.
+
+    Return the exit status: that of `run`, 2 for a user's mistake and 130 after Ctrl-C.
+    """
+    config: list[Any] = [tyro.conf.AvoidSubcommands, tyro.conf.PositionalRequiredArgs]
     try:
-        return run(tyro.cli(options, config=config))
+        return run(tyro.cli(options, args=args, description=options.__doc__, config=config))
     except UserError as error:
         print(error, file=sys.stderr)
-        return 1
+        return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

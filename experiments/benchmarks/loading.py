@@ -269,7 +269,7 @@ def write_large(folder: Path, rows: int, size: tuple[int, int] = SIZES[0]) -> Pa
 
 def open_large(path: Path, stage: int = 1, threads: int = 2) -> Opened:
     """Open the manifest in a fresh process, up to the first batch of preset tiny. Raises UserError when that fails."""
-    code = f"from anytouch_jax.evaluate import loading; loading.open_here({str(path)!r}, {stage}, {threads})"
+    code = f"from experiments.benchmarks import loading; loading.open_here({str(path)!r}, {stage}, {threads})"
     paths = os.pathsep.join(one for one in sys.path if one)
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -179,18 +179,24 @@ def simulate(preset: str, devices: int, fsdp: int, batch_per_device: int) -> Lay
 def ask(module: str, question: str, devices: int = 1, **environ: str) -> dict[str, Any]:
     """Run `answer(question)` of a module of this folder in a fresh process, its last line the answer in JSON."""
     clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
-    code = f"import sys; from anytouch_jax.evaluate.{module} import answer; answer(sys.stdin.read())"
+    code = f"import sys; from experiments.benchmarks.{module} import answer; answer(sys.stdin.read())"
     done = subprocess.run(
         [sys.executable, "-c", code],
         input=question,
-        env=clean | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)} | environ,
+        env=clean
+        | {
+            "PYTHONPATH": os.pathsep.join(one or os.getcwd() for one in sys.path),
+            "JAX_PLATFORMS": "cpu",
+            "JAX_NUM_CPU_DEVICES": str(devices),
+        }
+        | environ,
         capture_output=True,
         text=True,
         check=False,
     )
     if done.returncode:
         said = done.stderr.strip().splitlines()
-        raise UserError(f"the child process of evaluate.{module} failed: {said[-1] if said else done.returncode}")
+        raise UserError(f"the child process of {module} failed: {said[-1] if said else done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 

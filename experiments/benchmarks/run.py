@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,7 +16,7 @@ from anytouch_jax.cli.words import log
 from anytouch_jax.config import PresetName
 from anytouch_jax.config.parsing import COUNT, in_range
 from anytouch_jax.errors import UserError
-from experiments.command import main
+from experiments.command import run_script
 
 if TYPE_CHECKING:
     from experiments.benchmarks.speed import Row
@@ -229,5 +229,10 @@ _SECTIONS: dict[str, Callable[[Bench, str], list[Section]]] = {
 }
 
 
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line `args`; return the exit status."""
+    return run_script(Bench, run, args)
+
+
 if __name__ == "__main__":
-    sys.exit(main(Bench, run, positional=True))
+    sys.exit(main())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import SEED, in_range
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from experiments.command import main
+from experiments.command import run_script
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -226,5 +226,10 @@ def _check(options: Pour) -> None:
         raise UserError(f"--steps must be at least 1, not {options.steps}")
 
 
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line `args`; return the exit status."""
+    return run_script(Pour, run, args)
+
+
 if __name__ == "__main__":
-    sys.exit(main(Pour, run))
+    sys.exit(main())

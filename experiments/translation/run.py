@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.config.parsing import SEED, in_range
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from experiments.command import main
+from experiments.command import run_script
 from experiments.translation.generator import GENERATOR
 
 _OF_FIT = ("data", "steps", "batch", "learning_rate", "tune", "adversarial", "seed")
@@ -198,5 +199,10 @@ def _write(path: Path, result: Any) -> None:
     atomic_write(path, data.getvalue())
 
 
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line `args`; return the exit status."""
+    return run_script(Translate, run, args)
+
+
 if __name__ == "__main__":
-    sys.exit(main(Translate, run, positional=True))
+    sys.exit(main())

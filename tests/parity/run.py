@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from experiments.command import main
+from experiments.command import run_script
 
 
 @dataclass(frozen=True)
@@ -50,5 +51,10 @@ def run(options: Parity) -> int:
     return 1 if bad else 0
 
 
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line `args`; return the exit status."""
+    return run_script(Parity, run, args)
+
+
 if __name__ == "__main__":
-    sys.exit(main(Parity, run, positional=True))
+    sys.exit(main())

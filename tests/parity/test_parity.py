@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from places import SHARED
+from places import ROOT, SHARED
 
-from anytouch_jax.cli.app import main
 from anytouch_jax.errors import UserError
 from tests.parity import cases, weights
 from tests.parity.golden_files import GRADIENT, OUTPUT, Case, Row, read_cases
+from tests.parity.run import main
 
 HERE = Path(__file__).parent / "golden"
 ALL = SHARED / "golden"  # the whole set, where it lies beside the checkout
@@ -59,8 +59,8 @@ def test_a_case_is_within_tolerance(name):
 def test_the_program_that_users_run_is_within_tolerance():
     """On one device and with all of XLA's optimisations, unlike this process: attention takes its other form there."""
     settings = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
-    command = [sys.executable, "-m", "anytouch_jax", "parity", str(HERE)]
-    done = subprocess.run(command, capture_output=True, text=True, env=settings, timeout=900)
+    command = [sys.executable, "-m", "tests.parity.run", str(HERE)]
+    done = subprocess.run(command, capture_output=True, text=True, env=settings, cwd=ROOT, timeout=900)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert ", 0 out of tolerance" in done.stdout
 
@@ -191,9 +191,9 @@ def test_exit_codes_and_table_of_the_command(tmp_path, capsys):
     good, wrong = tmp_path / "good", tmp_path / "wrong"
     for folder in (good, wrong):
         folder.mkdir()
-    assert main(["parity", str(copied(good, "I_pos_embed"))]) == 0
+    assert main([str(copied(good, "I_pos_embed"))]) == 0
     assert "0 out of tolerance" in capsys.readouterr().out
-    assert main(["parity", str(copied(wrong, "I_pos_embed", pos_embed_32_4_cls=lambda x: x + 1)), "--verbose"]) == 1
+    assert main([str(copied(wrong, "I_pos_embed", pos_embed_32_4_cls=lambda x: x + 1)), "--verbose"]) == 1
     out = capsys.readouterr().out
     assert (
         "1 out of tolerance" in out and "pos_embed_32_4_cls" in out and "OUT" in out and "pos_embed_512_16_cls" in out

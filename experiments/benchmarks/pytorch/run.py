@@ -23,7 +23,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from anytouch_jax import pages
 from anytouch_jax.evaluate import plots, statistics
 from anytouch_jax.train.step import merge
 from anytouch_jax.weights import release
@@ -31,6 +30,7 @@ from experiments.benchmarks import machine, speed, speed_report, variants
 from experiments.benchmarks.pytorch.keys import renamed
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
 
+ROOT = Path(__file__).resolve().parents[3]
 WHAT = ("stage1", "stage2", "embed")
 RIVALS = ("eager float32", "compiled float32", "eager bfloat16", "compiled bfloat16")
 OURS = (variants.BASELINE, variants.Variant("bfloat16", variants.BFLOAT16))
@@ -42,9 +42,9 @@ class Worker:
     """The PyTorch process."""
 
     def __init__(self, python: Path) -> None:
-        script = Path(__file__).with_name("worker.py")
+        command = [str(python), "-m", "experiments.benchmarks.pytorch.worker"]
         self.process = subprocess.Popen(
-            [str(python), str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
         )
 
     def ask(self, **question: Any) -> dict[str, Any]:
@@ -142,7 +142,6 @@ def compare(
     work: Workload, python: Path, rounds: int, peak_size: int | None, rivals: tuple[str, ...]
 ) -> dict[str, Any]:
     """Rows of ours and of PyTorch for a workload. Raises SystemExit where the losses differ."""
-    sys.path.insert(0, str(Path(__file__).parent))
     state = first_state(work.config)
     params = jax.device_get(merge(state.trainable, state.frozen))
     with TemporaryDirectory() as name:
@@ -296,5 +295,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    pages.restart()  # as the command of the package does; PyTorch's process inherits them
     main()

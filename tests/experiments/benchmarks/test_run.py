@@ -1,15 +1,12 @@
 """`anytouch bench`: what it writes, what it prints, its answers to mistakes; our side of the PyTorch comparison."""
 
 import json
-import sys
 from dataclasses import asdict
 
 import numpy as np
 import pytest
-from places import ROOT
 from tiny_models import tiny_config
 
-from anytouch_jax.cli.app import main
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import release
 from experiments.benchmarks import memory, speed, startup, workloads
@@ -25,7 +22,7 @@ def tiny(monkeypatch):
 
 def run(*args):
     try:
-        return main(["bench", *map(str, args)])
+        return bench.main([*map(str, args)])
     except SystemExit as stop:
         return int(stop.code or 0)
 
@@ -36,7 +33,7 @@ def numbers_of(folder, name):
 
 def test_no_page_is_written_over_by_another(tiny, tmp_path, capsys):
     (tmp_path / "speed_embed_tiny.md").write_text("by hand")
-    assert run("embed", "--quick", "--out", tmp_path) == 1
+    assert run("embed", "--quick", "--out", tmp_path) == 2
     assert "was not made by bench" in capsys.readouterr().err
     assert (tmp_path / "speed_embed_tiny.md").read_text() == "by hand" and len(list(tmp_path.iterdir())) == 1
 
@@ -44,7 +41,7 @@ def test_no_page_is_written_over_by_another(tiny, tmp_path, capsys):
 def test_a_quick_run_is_not_put_in_the_place_of_a_measurement(tiny, tmp_path, capsys):
     (tmp_path / "speed_embed_tiny.md").write_text("measured")
     (tmp_path / "speed_embed_tiny.json").write_text('{"quick": false}')
-    assert run("embed", "--quick", "--out", tmp_path) == 1
+    assert run("embed", "--quick", "--out", tmp_path) == 2
     assert "holds a measurement, which a quick run would replace" in capsys.readouterr().err
     assert (tmp_path / "speed_embed_tiny.md").read_text() == "measured"
 
@@ -72,7 +69,7 @@ def test_what_was_measured_outlives_what_fails_later(tiny, tmp_path, capsys, mon
     (rows,) = numbers_of(tmp_path, "embed_tiny")["results"].values()
     assert all(row["ratio"] > 0 and row["error_output"] is None for row in rows)
     monkeypatch.setitem(bench._SECTIONS, "loader", fail)
-    assert main(["bench", "embed", "loader", "--quick", "--out", str(tmp_path / "second")]) == 1
+    assert run("embed", "loader", "--quick", "--out", tmp_path / "second") == 2
     assert "there is not enough memory for this" in capsys.readouterr().err
     assert "embed one still" in (tmp_path / "second" / "speed_embed_loader_tiny.md").read_text()
 
@@ -116,14 +113,14 @@ def test_memory_and_compile_are_asked_of_other_processes(monkeypatch, tmp_path, 
 def test_mistakes(tiny, tmp_path, capsys):
     assert run("speed") == 2
     for words in (("--rounds", 0), ("--batch", 0), ("--batch", -2)):
-        assert run("embed", *words, "--out", tmp_path) == 1
+        assert run("embed", *words, "--out", tmp_path) == 2
         assert f"{words[0]} must be 1 or more, not {words[1]}" in capsys.readouterr().err
     for words, told in (
         (("simulator", "--preset", "large", "--batch", 4), "--preset, --batch do nothing for the simulator alone"),
         (("compile", "memory", "--rounds", 3), "--rounds does nothing for compilation and memory"),
         (("embed", "--quick", "--rounds", 3), "--rounds does nothing with --quick, which takes 2"),
     ):
-        assert run(*words, "--out", tmp_path) == 1 and told in capsys.readouterr().err
+        assert run(*words, "--out", tmp_path) == 2 and told in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
 
 
@@ -131,13 +128,11 @@ def test_mistakes(tiny, tmp_path, capsys):
 
 
 @pytest.fixture
-def rival(monkeypatch):
-    """experiments/torch_rival/run.py, the side that knows no torch."""
-    monkeypatch.syspath_prepend(str(ROOT / "experiments" / "torch_rival"))
-    import run as module
+def rival():
+    """experiments/benchmarks/pytorch/run.py, the side that knows no torch."""
+    from experiments.benchmarks.pytorch import run as module
 
-    yield module
-    del sys.modules["run"], sys.modules["keys"]
+    return module
 
 
 def test_the_rival_gets_the_same_numbers_under_the_authors_names(rival, tmp_path):

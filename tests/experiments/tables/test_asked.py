@@ -7,12 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from places import EXPERIMENTS
+from places import ROOT
 
 from anytouch_jax.errors import UserError
 from experiments.tables import asked
-
-PAGES = EXPERIMENTS
 
 
 @pytest.mark.parametrize(("word", "on"), [(None, False), ("", False), ("0", False), ("1", True)])
@@ -58,11 +56,13 @@ def test_mistakes_are_one_sentence(monkeypatch, name, word, sentence):
 
 def test_a_page_that_is_run_as_a_script_ends_with_the_sentence(monkeypatch):
     monkeypatch.setenv("RUN", "nix")
-    found = subprocess.run([sys.executable, PAGES / "long_clips.py"], capture_output=True, text=True, check=False)
+    found = subprocess.run(
+        [sys.executable, "-m", "experiments.tables.long_clips"], capture_output=True, text=True, check=False, cwd=ROOT
+    )
     assert found.returncode == 1 and found.stderr == "long_clips.py: no run folder or weights file at nix\n"
 
 
 def test_a_page_that_is_interrupted_says_so():
-    words = [sys.executable, "-c", "from study import asked\nraise KeyboardInterrupt"]
-    found = subprocess.run(words, capture_output=True, text=True, check=False, cwd=PAGES)
+    words = [sys.executable, "-c", "from experiments.tables import asked\nraise KeyboardInterrupt"]
+    found = subprocess.run(words, capture_output=True, text=True, check=False, cwd=ROOT)
     assert found.returncode != 0 and found.stderr == "-c: interrupted; the same command goes on\n"

@@ -9,7 +9,7 @@ from places import EXPERIMENTS
 
 from anytouch_jax.data.manifest.files import close_shards
 
-PAGE = EXPERIMENTS / "datasets.py"
+PAGE = EXPERIMENTS / "tables" / "datasets.py"
 
 
 def test_from_a_download_to_a_batch(tmp_path, monkeypatch, capsys):

@@ -12,7 +12,7 @@ from touch_world import make_touches
 
 from anytouch_jax.data.manifest import manifest as manifests
 
-SCRIPT = EXPERIMENTS / "long_clips.py"
+SCRIPT = EXPERIMENTS / "tables" / "long_clips.py"
 
 
 @pytest.mark.slow
@@ -46,11 +46,11 @@ def test_every_length_is_scored_on_the_same_moments(tmp_path, tiny_run, monkeypa
 
 
 def test_the_committed_page_is_what_its_files_give(tmp_path, monkeypatch, capsys):
-    shutil.copytree(SCRIPT.parent / "results" / "long_clips", tmp_path / "long_clips")
+    shutil.copytree(EXPERIMENTS / "results" / "long_clips", tmp_path / "long_clips")
     for name, value in {"TABLE": "1", "OUT": str(tmp_path), "RUN": "nowhere", "DATA": "nowhere"}.items():
         monkeypatch.setenv(name, value)
     runpy.run_path(str(SCRIPT))
-    assert (tmp_path / "long_clips.md").read_text() == (SCRIPT.parent / "results" / "long_clips.md").read_text()
+    assert (tmp_path / "long_clips.md").read_text() == (EXPERIMENTS / "results" / "long_clips.md").read_text()
     (tmp_path / "long_clips" / "7-sum.json").unlink()
     with pytest.raises(SystemExit, match=r"7-sum\.json: run this page without TABLE=1"):
         runpy.run_path(str(SCRIPT))

@@ -146,7 +146,7 @@ def test_processes_side_by_side_have_cores_of_their_own(tmp_path, monkeypatch):
     monkeypatch.setattr(matrix.os, "sched_setaffinity", lambda pid, cores: shares.append((pid, cores)), raising=False)
     words = ["--quick", "--only", "q2", "--work", str(tmp_path), "--real", str(tmp_path / "no.csv")]
     assert matrix.main(words) == 9  # one was killed
-    assert [one[-2:] for one in started] == [["--jobs", "1"]] * 2 and started[0][2 : 2 + len(words)] == words
+    assert [one[-2:] for one in started] == [["--jobs", "1"]] * 2 and started[0][3 : 3 + len(words)] == words
     assert shares == [(1, [3, 5]), (2, [4])]
     assert matrix.main([*words, "--jobs", "4"]) == 0 and len(shares) == 2  # more than cores: they are shared
 
@@ -193,7 +193,7 @@ def test_make_calls_it():
     words = ["make", "-n", "experiments", "QUICK=1", "MINUTES=10", "ONLY=q1 q2"]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
     lines = [line for line in done.stdout.splitlines() if not line.startswith("make")]  # of a make inside a make
-    assert lines[-1].endswith("experiments/matrix.py --quick --minutes 10 --only q1 q2")
+    assert lines[-1].endswith("-m experiments.tables.run --quick --minutes 10 --only q1 q2")
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ PAGES = {
 def visit(name, monkeypatch, results, figures):
     monkeypatch.setenv("RESULTS", str(results))
     monkeypatch.setenv("FIGURES", str(figures))
-    return runpy.run_path(str(ROOT / "experiments" / f"{name}.py"))
+    return runpy.run_path(str(ROOT / "experiments" / "tables" / f"{name}.py"))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_page_without_results_says_what_to_do(tmp_path, monkeypatch, capsys):
 def test_accuracies_alone_are_averaged(tmp_path, monkeypatch, capsys):
     leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "q3"]
     synthetic.write(tmp_path, leaves, lambda question, name, seed, view, task: 0.9 * (task == "force") * (name == "t3"))
-    monkeypatch.setattr("study.pictures.draw_all", lambda runs, folder: [])
+    monkeypatch.setattr("experiments.tables.pictures.draw_all", lambda runs, folder: [])
     visit("q3_perception", monkeypatch, tmp_path, tmp_path)
     found = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("T3-style ")]
     assert found == [["T3-style", "static", "+0.0"], ["T3-style", "dynamic", "+0.0"]]
@@ -73,7 +73,7 @@ def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, 
     monkeypatch.setenv("RUN", str(tiny_run))
     monkeypatch.setenv("DATA", str(tmp_path / "data"))
     synthetic.write(tmp_path / "made", plan.leaves(plan.FULL))
-    monkeypatch.setattr("study.pictures.draw_all", lambda runs, folder: [])
+    monkeypatch.setattr("experiments.tables.pictures.draw_all", lambda runs, folder: [])
     for name, least in (("q2_space", 6), ("q1_sensors", 8), ("dynamics", 19)):
         mine = visit(name, monkeypatch, tmp_path / "made", tmp_path)["mine"]
         out = capsys.readouterr().out
@@ -84,7 +84,7 @@ def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, 
 
 def test_every_page_is_a_percent_script():
     for name in PAGES:
-        text = (ROOT / "experiments" / f"{name}.py").read_text()
+        text = (ROOT / "experiments" / "tables" / f"{name}.py").read_text()
         assert text.startswith("# ---\n# jupyter:") and "# %% [markdown]\n# # " in text
         assert "make experiments ONLY=" in text and "# ## Picture" in text and "# ## Finding" in text
 
@@ -93,14 +93,14 @@ def test_every_page_is_a_percent_script():
 def test_pages_become_notebooks_and_html(made_up, tmp_path, monkeypatch):
     monkeypatch.setenv("RESULTS", str(made_up))
     monkeypatch.setenv("FIGURES", str(tmp_path))
-    source = ROOT / "experiments" / "q2_space.py"
+    source = ROOT / "experiments" / "tables" / "q2_space.py"
     notebook = tmp_path / "q2_space.ipynb"
     subprocess.run(
         [sys.executable, "-m", "jupytext", "--to", "ipynb", "--output", notebook, source],
         check=True,
         capture_output=True,
     )
-    monkeypatch.setenv("PYTHONPATH", str(ROOT / "experiments"))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     words = ["--to", "html", "--execute", "--ExecutePreprocessor.timeout=300", notebook]
     subprocess.run([sys.executable, "-m", "nbconvert", *words], check=True, capture_output=True)
     html = (tmp_path / "q2_space.html").read_text()

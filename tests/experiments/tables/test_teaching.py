@@ -9,8 +9,8 @@ import shutil
 import pytest
 from places import EXPERIMENTS
 
-SCRIPT = EXPERIMENTS / "teaching.py"
-RESULTS = SCRIPT.parent / "results"
+SCRIPT = EXPERIMENTS / "tables" / "teaching.py"
+RESULTS = EXPERIMENTS / "results"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, **settings: object) -> None:

@@ -17,7 +17,7 @@ SCRIPTS = EXPERIMENTS
 def visit(name, monkeypatch, **environment):
     for key, value in environment.items():
         monkeypatch.setenv(key, str(value))
-    return runpy.run_path(str(SCRIPTS / f"{name}.py"))
+    return runpy.run_path(str(SCRIPTS / ("tables/named.py" if name == "named" else f"{name}/study.py")))
 
 
 @pytest.mark.parametrize("name", ["pouring", "translation", "translation_3000", "named"])

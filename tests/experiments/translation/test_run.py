@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pair_world import make_pairs
 
-from anytouch_jax.cli.app import main
+from experiments.translation import run as translate
 from experiments.translation.generator import load
 
 FIT = ("--steps", 2, "--batch", 4)
@@ -33,8 +33,8 @@ def run(tmp_path_factory, tiny_run, world_of_pairs):
     folder = tmp_path_factory.mktemp("run") / "stage1"
     shutil.copytree(tiny_run, folder)
     for source, target in (("gelsight_mini", "duragel"), ("digit", "tac3d")):
-        words = ["translate", "--fit", "--data", world_of_pairs, "--run", folder, "--from", source, "--to", target]
-        assert main([str(word) for word in (*words, *FIT)]) == 0
+        words = ["--fit", "--data", world_of_pairs, "--run", folder, "--source", source, "--to", target]
+        assert translate.main([str(word) for word in (*words, *FIT)]) == 0
     return folder
 
 
@@ -51,9 +51,9 @@ def test_a_translation_is_trained_scored_and_kept(run, world_of_pairs):
     assert (design.source, design.target, design.pairs, design.fit.batch) == ("gelsight_mini", "duragel", 12, 4)
 
 
-def test_an_image_becomes_an_image(run, world_of_pairs, anytouch, tmp_path):
+def test_an_image_becomes_an_image(run, world_of_pairs, script, tmp_path):
     out = tmp_path / "new" / "a.png"
-    said = anytouch("translate", "--run", run, "--from", "gelsight_mini", "--to", "duragel", picture(world_of_pairs),
+    said = script(translate, "--run", run, "--source", "gelsight_mini", "--to", "duragel", picture(world_of_pairs),
                     "--out", out)  # fmt: skip
     assert said.status == 0 and said.out.strip() == str(out)
     made = cv2.imread(str(out))[..., ::-1]
@@ -61,34 +61,34 @@ def test_an_image_becomes_an_image(run, world_of_pairs, anytouch, tmp_path):
     np.testing.assert_array_equal(made, load(run / "generators" / "gelsight_mini-duragel")(given[None])[0])
 
 
-def test_several_images_and_fields(run, world_of_pairs, anytouch, tmp_path):
+def test_several_images_and_fields(run, world_of_pairs, script, tmp_path):
     images = [picture(world_of_pairs, k) for k in range(2)]
-    said = anytouch("translate", *images, "--run", run, "--out", tmp_path)
+    said = script(translate, *images, "--run", run, "--out", tmp_path)
     assert said.status == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == [f"{image.stem}_duragel.png" for image in images]
-    said = anytouch("translate", images[0], "--run", run, "--from", "digit", "--to", "tac3d", "--out", tmp_path)
+    said = script(translate, images[0], "--run", run, "--source", "digit", "--to", "tac3d", "--out", tmp_path)
     assert said.status == 0
     field = np.load(tmp_path / f"{images[0].stem}_tac3d.npy")
     assert field.shape == (20, 20, 6) and field.dtype == np.float32
 
 
-def test_a_generator_of_its_own_place(run, world_of_pairs, anytouch, tmp_path):
-    words = ("--from", "gelsight_mini", "--to", "tac3d")
+def test_a_generator_of_its_own_place(run, world_of_pairs, script, tmp_path):
+    words = ("--source", "gelsight_mini", "--to", "tac3d")
     home = tmp_path / "mine"
-    said = anytouch("translate", "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
+    said = script(translate, "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
     assert said.status == 0 and "objects never seen" in said.out
-    said = anytouch("translate", picture(world_of_pairs), "--generator", home, *words, "--out", tmp_path / "f.npy")
+    said = script(translate, picture(world_of_pairs), "--generator", home, *words, "--out", tmp_path / "f.npy")
     assert said.status == 0 and np.load(tmp_path / "f.npy").shape == (20, 20, 6)
-    said = anytouch("translate", "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
-    assert said.status == 1 and "mine holds a translation already; remove it" in said.err
+    said = script(translate, "--fit", "--data", world_of_pairs, "--run", run, *words, "--out", home, *FIT)
+    assert said.status == 2 and "mine holds a translation already; remove it" in said.err
 
 
-def test_mistakes(run, world_of_pairs, mistake, tmp_path):
+def test_mistakes(run, world_of_pairs, script, tmp_path):
     image, data = picture(world_of_pairs), ("--data", world_of_pairs)
     home = run / "generators" / "gelsight_mini-duragel"
     words = tmp_path / "notes.png"
     words.write_text("no picture")
-    pair = ("--from", "digit", "--to", "duragel")
+    pair = ("--source", "digit", "--to", "duragel")
     cases = [
         ((image,), "give --run"),
         ((image, "--run", tmp_path / "none"), "no run folder"),
@@ -104,7 +104,7 @@ def test_mistakes(run, world_of_pairs, mistake, tmp_path):
         ((image, "--fit", *data, "--run", run), "--fit takes its images"),
         (("--fit", "--run", run), "the pairs of --data"),
         (
-            ("--fit", *data, "--run", run, "--from", "digit", "--to", "tac3d", "--adversarial", 0.5),
+            ("--fit", *data, "--run", run, "--source", "digit", "--to", "tac3d", "--adversarial", 0.5),
             "--adversarial does nothing to tac3d, whose fields have no critic",
         ),
         ((image, "--run", run, "--steps", 9, "--tune", "fine"), "--steps, --tune do nothing without --fit"),
@@ -113,9 +113,9 @@ def test_mistakes(run, world_of_pairs, mistake, tmp_path):
         ((image, "--run", run, "--generator", home), "--run does nothing beside --generator"),
         ((image, "--run", run, "--background", words, "--out", words), "notes.png is an image that is read"),
         (("--fit", *data, "--run", run, "--to", "allsight"), "no rows of sensor 'allsight'"),
-        (("--fit", *data, "--run", run, "--from", "tac3d"), "measures a field"),
+        (("--fit", *data, "--run", run, "--source", "tac3d"), "measures a field"),
         (("--fit", *data, "--run", run, "--steps", 0, "--out", tmp_path / "new"), "at least 1"),
     ]
     for given, says in cases:
-        assert says in mistake("translate", *given), given
+        assert says in script(translate, *given).err, given
     assert not list(tmp_path.glob("*.npy"))

@@ -180,6 +180,7 @@ def ask(module: str, question: str, devices: int = 1, **environ: str) -> dict[st
     """Run `answer(question)` of a module of this folder in a fresh process, its last line the answer in JSON."""
     clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
     code = f"import sys; from experiments.benchmarks.{module} import answer; answer(sys.stdin.read())"
+    paths = os.pathsep.join(one or os.getcwd() for one in sys.path)
     done = subprocess.run(
         [sys.executable, "-c", code],
         input=question,

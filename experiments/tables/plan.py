@@ -197,8 +197,9 @@ def training(
     size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True,
     extra: Sequence[str] = (), data: dict[str, Any] | None = None,
 ) -> Training:  # fmt: skip
-    """The last stage of a recipe (see `anytouch_jax.config.baselines`) on the data of `sensors` and, `aligned`, touches felt
-    by several.
+    """Return the last stage of a recipe (`anytouch_jax.config.baselines`) on the data of `sensors`.
+
+    `aligned` adds the touches that several sensors share.
 
     `extra` more manifests by name; `data` more settings of the data, for both stages.
     """

@@ -251,7 +251,8 @@ def to_markdown(work: Workload, found: dict[str, Any], preset: str) -> str:
     about = found["about"]
     line = f"torch {about['torch']} ({about['threads']} threads), transformers {about['transformers']}"
     title = f"## {work.name}, preset {preset}, batch {work.samples}"
-    return f"{title}\n\n{statistics.markdown(heads, rows)}\n{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
+    table = statistics.markdown(heads, rows)
+    return f"{title}\n\n{table}\n{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
 
 
 def main() -> None:

@@ -184,13 +184,7 @@ def ask(module: str, question: str, devices: int = 1, **environ: str) -> dict[st
     done = subprocess.run(
         [sys.executable, "-c", code],
         input=question,
-        env=clean
-        | {
-            "PYTHONPATH": os.pathsep.join(one or os.getcwd() for one in sys.path),
-            "JAX_PLATFORMS": "cpu",
-            "JAX_NUM_CPU_DEVICES": str(devices),
-        }
-        | environ,
+        env=clean | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)} | environ,
         capture_output=True,
         text=True,
         check=False,

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import io
-import json
-import threading
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
 import pytest
+from chat_server import GOOD, KEY, serve
 from gel_pictures import press
 
 from anytouch_jax.data.manifest import manifest as manifests
-
-KEY = "sk-very-secret-0123456789"
-GOOD = {"object": "wool scarf", "caption": "Soft and fuzzy, it gives way under light pressure."}
 
 
 @pytest.fixture(autouse=True)
@@ -24,37 +18,6 @@ def _environment(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-
-
-class _Handler(BaseHTTPRequestHandler):
-    def do_POST(self):
-        self.rfile.read(int(self.headers["Content-Length"]))
-        self.server.heads.append(dict(self.headers))
-        answer = self.server.answer
-        message = {"role": "assistant", "content": json.dumps(answer) if isinstance(answer, dict) else answer}
-        usage = {"prompt_tokens": 100, "completion_tokens": 20}
-        data = json.dumps({"choices": [{"message": message, "finish_reason": "stop"}], "usage": usage}).encode()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-    def log_message(self, *_):
-        pass
-
-
-@contextmanager
-def serve(answer=GOOD):
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
-    server.heads, server.answer, server.url = [], answer, f"http://127.0.0.1:{server.server_port}/v1"
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 @pytest.fixture
@@ -93,7 +56,7 @@ def test_captions_come_after_an_estimate_and_are_never_paid_twice(anytouch, touc
         assert again.status == 0 and len(server.heads) == 3 and "0 questions asked" in again.out
     assert manifests.read(tmp_path / "touch_captions.parquet").column("text").to_pylist() == [GOOD["caption"]] * 6
     assert "wool scarf" in (tmp_path / "look.html").read_text()
-    assert server.heads[0]["Authorization"] == f"Bearer {KEY}"
+    assert server.heads[0][1]["Authorization"] == f"Bearer {KEY}"
     for file in tmp_path.rglob("*"):
         assert file.is_dir() or KEY.encode() not in file.read_bytes(), file
     assert KEY not in said.out + said.err
@@ -119,7 +82,7 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
             (["--limit", "0"], "limit 0 must be at least 1"), (["--out", "captions.txt"], "ends in .csv or .parquet"),
             (["--url", "http://127.0.0.1:9/\u00e9/v1"], "is not an http or https address"),
             (["--url", "https://api..example.org/v1"], "is not an http or https address"),
-            (["--second-image", "image_2_path"], "there is no column 'image_2_path'"),
+            (["--second-image", "image_2_path"], "no column 'image_2_path'"),
         ):  # fmt: skip
             assert told in mistake(*words, *wrong)
         assert server.heads == [] and not (tmp_path / "touch_captions.parquet").exists()

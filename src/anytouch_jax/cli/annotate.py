@@ -15,8 +15,7 @@ from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
-    from anytouch_jax.data.prepare.captions import Annotated, Estimate
-    from anytouch_jax.data.prepare.endpoint import Endpoint
+    from anytouch_jax.data.prepare.captions import CaptionResult, CostEstimate, Endpoint
 
 
 _ASKING = (
@@ -33,8 +32,7 @@ class _OnlyAnEstimate(Exception):
 def run(options: Annotate) -> int:
     """Estimate, ask for consent, annotate, write the manifest with its captions; 1 when a caption could not be had."""
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.data.prepare.captions import annotate
-    from anytouch_jax.data.prepare.sheet import sample_sheet
+    from anytouch_jax.data.prepare.captions import annotate, sample_sheet
 
     if options.captions is not None:
         refuse(options, _ASKING, "with --captions, which asks nothing")
@@ -85,24 +83,22 @@ def _attach(options: Annotate, manifest: Manifest, target: Path) -> int:
 
 
 def _endpoint(options: Annotate) -> Endpoint:
-    from anytouch_jax.data.prepare import endpoint
+    from anytouch_jax.data.prepare.captions import Endpoint
 
-    return endpoint.Endpoint(
+    return Endpoint(
         options.url, options.model, key_variable=options.key_variable, timeout=options.timeout, tries=options.tries,
         max_tokens=options.max_tokens, temperature=options.temperature, json_mode=options.json_mode,
         token_field=options.token_field,
     )  # fmt: skip
 
 
-def _consent(options: Annotate, estimate: Estimate) -> bool:
-    from anytouch_jax.data.prepare.endpoint import Client
-
+def _consent(options: Annotate, estimate: CostEstimate) -> bool:
     print(f"{options.model} at {options.url}: {estimate}", flush=True)
     if options.estimate:
         raise _OnlyAnEstimate
     if not estimate.questions:
         return True
-    Client(_endpoint(options))  # a key that is not there is told before anybody is asked
+    _endpoint(options).check()  # a missing key is reported before the question
     if options.yes:
         return True
     if not sys.stdin.isatty():
@@ -113,7 +109,7 @@ def _consent(options: Annotate, estimate: Estimate) -> bool:
         return False
 
 
-def _tell(found: Annotated) -> None:
+def _tell(found: CaptionResult) -> None:
     print(f"{found.asked:,} questions asked, {found.tokens_in:,} tokens in, {found.tokens_out:,} tokens out")
     for reason, count in found.left_out.items():
         print(f"left out, {reason}: {count:,} rows")

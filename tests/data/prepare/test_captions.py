@@ -1,25 +1,21 @@
+import asyncio
 import base64
+import builtins
 import json
 import threading
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
 import pytest
+from chat_server import GOOD, KEY, chat, serve
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import close_shards
-from anytouch_jax.data.prepare.captions import AnnotateError, annotate
-from anytouch_jax.data.prepare.endpoint import AnswerError, Client, Endpoint, EndpointError
-from anytouch_jax.data.prepare.prompts import Nonsense, caption_of, question
-from anytouch_jax.data.prepare.questions import find_jobs
+from anytouch_jax.data.prepare import captions
+from anytouch_jax.data.prepare.captions import AnnotateError, Endpoint, EndpointError, annotate, sample_sheet
+from anytouch_jax.data.prepare.prompts import find_caption_jobs, make_prompt
 from anytouch_jax.data.prepare.shards import pack
-from anytouch_jax.data.prepare.sheet import sample_sheet
 from anytouch_jax.errors import UserError
-
-KEY = "sk-very-secret-0123456789"
-GOOD = {"object": "wool scarf", "caption": "Soft and fuzzy, it gives way under light pressure."}
 
 
 @pytest.fixture(autouse=True)
@@ -31,88 +27,18 @@ def _environment(monkeypatch):
     close_shards()
 
 
-def chat(content, **extra):
-    """A chat completion, as the protocol has it."""
-    text = content if isinstance(content, str) or content is None else json.dumps(content)
-    message = {"role": "assistant", "content": text} | extra.pop("message", {})
-    choice = {"index": 0, "message": message, "finish_reason": extra.pop("finish", "stop")}
-    return {"id": "x", "choices": [choice], "usage": {"prompt_tokens": 100, "completion_tokens": 20}} | extra
-
-
-class Server(ThreadingHTTPServer):
-    """Answers by `behave(number, body) -> (status, headers, answer)`; keeps what it was asked and told."""
-
-    daemon_threads = True
-    block_on_close = True
-
-    def __init__(self, behave):
-        super().__init__(("127.0.0.1", 0), _Handler)
-        self.behave, self.asked, self.heads = behave, [], []
-        self.lock, self.release, self.busy, self.most = threading.Lock(), threading.Event(), 0, 0
-
-    @property
-    def url(self):
-        return f"http://127.0.0.1:{self.server_port}/v1"
-
-
-class _Handler(BaseHTTPRequestHandler):
-    def do_POST(self):
-        server = self.server
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        with server.lock:
-            number = len(server.asked)
-            server.asked.append(body)
-            server.heads.append((self.path, dict(self.headers)))
-            server.busy += 1
-            server.most = max(server.most, server.busy)
-        try:
-            status, headers, answer = server.behave(number, body)
-            if status == "stall":
-                server.release.wait(20)
-                return
-            data = answer if isinstance(answer, bytes) else json.dumps(answer).encode()
-            self.send_response(status)
-            for name, value in headers.items():
-                self.send_header(name, value)
-            if "Content-Length" not in headers:
-                self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data)
-        except (BrokenPipeError, ConnectionResetError):
-            pass
-        finally:
-            with server.lock:
-                server.busy -= 1
-
-    def do_GET(self):
-        self.server.heads.append((self.path, dict(self.headers)))
-        self.send_response(200)
-        self.end_headers()
-
-    def log_message(self, *_):
-        pass
-
-
-@contextmanager
-def serve(behave=lambda number, body: (200, {}, chat(GOOD))):
-    server = Server(behave)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.release.set()
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
 def end(server, **options):
-    return Endpoint(server.url, "gpt-4o", **{"timeout": 5.0, "wait": 0.001, "tries": 3} | options)
+    return Endpoint(server.url, "gpt-4o", **{"timeout": 5.0, "tries": 3} | options)
+
+
+async def _ask_at(url, **options):
+    client = captions._Client(Endpoint(url, "gpt-4o", **{"timeout": 5.0, "tries": 3} | options))
+    async with client.connect() as connection:
+        return await client.ask(connection, [{"role": "user", "content": "hello"}])
 
 
 def _ask(server, **options):
-    return Client(end(server, **options)).ask([{"role": "user", "content": "hello"}])
+    return asyncio.run(_ask_at(server.url, **options))
 
 
 def _rows(count=3, dataset="touch_and_go", **extra):
@@ -195,7 +121,7 @@ def test_objectfolder_sends_two_photographs_and_the_touch_and_says_so(make, tmp_
     assert (first.shape, second.shape, touch.shape) == ((40, 40, 3), (20, 20, 3), (12, 16, 3))
     assert abs(second.mean() - 200) < 2
     assert "first two pictures are photographs" in _words(body) and "last picture is the imprint" in _words(body)
-    assert [column for _, column in done.captions[0].job.pictures] == ["image_path", "image2_path", "path"]
+    assert [column for _, column in done.captions[0].job.images] == ["image_path", "image2_path", "path"]
     with serve() as server:
         _run(make(_rows(1, "objectfolder_real")), server, tmp_path / "other")
     assert len(_pictures(server.asked[0])) == 2 and "first picture is a photograph" in _words(server.asked[0])
@@ -216,7 +142,7 @@ def test_phrases_are_expanded_once_and_kept(make, tmp_path):
         assert done.left_out == {"no phrase to expand": 1}
         with pytest.raises(UserError, match=r"nothing to annotate.*5 rows: expanded before"):
             _run(done.manifest, server, tmp_path / "answers")
-        again = find_jobs(done.manifest, overwrite=True).jobs  # of the phrases, not of what became of them
+        again = find_caption_jobs(done.manifest, overwrite=True)[0]  # of the phrases, not of what became of them
         assert sorted(str(job.phrase) for job in again) == ["hard", 'soft, {fuzzy} "wool"']
 
 
@@ -227,19 +153,18 @@ def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
         at = rows.index(row)
         rows[at : at + 3] = [one | change for one in rows[at : at + 3]]
     loose = make(rows)
-    found = find_jobs(loose)
-    assert [job.rows.tolist() for job in found.jobs] == [[12, 13, 14]]
-    assert sorted(found.left_out.values()) == [3, 3, 3, 3]
-    assert any("'mine' has no prompt: give it one, such as --family mine photograph; known" in why
-               for why in found.left_out)  # fmt: skip
+    jobs, left_out = find_caption_jobs(loose)
+    assert [job.rows.tolist() for job in jobs] == [[12, 13, 14]]
+    assert sorted(left_out.values()) == [3, 3, 3, 3]
+    assert any("'mine' has no prompt" in reason and "--family mine" in reason for reason in left_out)
     several = make([row | {"dataset": f"mine {i % 3}"} for i, row in enumerate(_rows(2))])
     with pytest.raises(UserError, match=r"--family 'mine 2' photograph") as told:
-        find_jobs(several)
+        find_caption_jobs(several)
     assert str(told.value).count("touch_and_go") == 1
-    assert len(find_jobs(loose, families={"mine": "photograph"}, overwrite=True).jobs) == 3
-    assert len(find_jobs(loose, split="train").jobs) == 1
-    with pytest.raises(UserError, match="no family of prompts 'photo'"):
-        find_jobs(loose, families={"mine": "photo"})
+    assert len(find_caption_jobs(loose, families={"mine": "photograph"}, overwrite=True)[0]) == 3
+    assert len(find_caption_jobs(loose, split="train")[0]) == 1
+    with pytest.raises(UserError, match="no prompt family 'photo'"):
+        find_caption_jobs(loose, families={"mine": "photo"})
 
 
 def test_a_packed_manifest_is_annotated_like_a_loose_one(make, tmp_path):
@@ -265,7 +190,7 @@ def test_nothing_is_asked_before_it_is_confirmed(make, tmp_path):
         _run(make(_rows()), server, tmp_path / "answers", limit=1)
         _run(make(_rows()), server, tmp_path / "answers", confirm=lambda e: estimates.append(e) or True)
     first, second = estimates
-    words = question("photograph", 1)
+    words = make_prompt("photograph", 1)
     tokens = 3 * (len(words.system + words.text) // 4 + 85 + 170 + 20)
     assert first == (3, 0, tokens, 240, (tokens * 2.5 + 240 * 10) / 1e6)
     assert (second.questions, second.cached, second.cost) == (2, 1, None) and "no prices" in str(second)
@@ -285,7 +210,7 @@ def test_an_answer_is_paid_for_once(make, tmp_path):
         _run(loose, server, tmp_path / "answers", endpoint={"max_tokens": 300})
         assert len(server.asked) == 9
     entry = json.loads((tmp_path / "answers" / "answers.jsonl").read_text().splitlines()[0])
-    assert entry["model"] == "gpt-4o" and entry["prompt"] == question("photograph", 1).hash()
+    assert entry["model"] == "gpt-4o" and entry["prompt"] == make_prompt("photograph", 1).fingerprint()
     assert entry["caption"] == GOOD["caption"] and entry["object"] == GOOD["object"]
 
 
@@ -316,18 +241,18 @@ def test_an_interrupted_run_goes_on(make, tmp_path):
 # Failures ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("status", [408, 409, 425, 429, 500, 502, 503, 504])
-def test_what_may_pass_is_tried_again(status):
+@pytest.mark.parametrize("status", [408, 409, 429, 500, 503])
+def test_a_passing_failure_is_tried_again(status):
     with serve(lambda n, _: (status, {}, b"busy") if n < 2 else (200, {}, chat(GOOD))) as server:
         assert json.loads(_ask(server).text) == GOOD
     assert len(server.asked) == 3
 
 
 @pytest.mark.parametrize("status", [400, 413, 422])
-def test_a_question_that_is_refused_is_not_repeated(status):
+def test_a_refused_question_is_not_repeated(status):
     with (
         serve(lambda *_: (status, {}, {"error": {"message": "bad\nimage " + "x" * 999}})) as server,
-        pytest.raises(AnswerError, match=f"answers {status}: bad image x") as error,
+        pytest.raises(captions._QuestionError, match=f"{status}: bad image x") as error,
     ):
         _ask(server)
     assert len(server.asked) == 1 and len(str(error.value)) < 300 and "\n" not in str(error.value)
@@ -338,64 +263,38 @@ def test_a_question_that_is_refused_is_not_repeated(status):
     [b"", b"<html>busy</html>", b"null", b"[]", b"{}", b'{"choices": []}', b'{"choices": [{"message": null}]}',
      b'{"choices": {"a": 1}}', b"[" * 100_000, b"\xff\xfe\x00"],
 )  # fmt: skip
-def test_what_is_no_chat_completion_is_tried_again_and_named(answer):
+@pytest.mark.parametrize("kind", ["application/json", "text/html"])
+def test_an_answer_that_is_no_chat_completion_is_bad(answer, kind):
     with (
-        serve(lambda *_: (200, {}, answer)) as server,
-        pytest.raises(AnswerError, match=r"form of a chat completion \(after 3 tries\)"),
+        serve(lambda *_: (200, {"Content-Type": kind}, answer)) as server,
+        pytest.raises(captions.BadAnswer, match="not a chat completion"),
     ):
         _ask(server)
-    assert len(server.asked) == 3
 
 
-def test_retry_after_is_obeyed_within_bounds(monkeypatch):
-    heads = iter(["7", "999999", "-4", "Wed, 21 Oct 2015 07:28:00 GMT", "soon", "nan"])
-    waits = []
-    with serve(lambda n, _: (429, {"Retry-After": next(heads)}, b"") if n < 6 else (200, {}, chat(GOOD))) as server:
-        client = Client(end(server, tries=7, longest_wait=60.0))
-        client.stop.wait = waits.append
-        client.ask([])
-    assert waits[:4] == [7, 60, 0, 0] and len(waits) == 6 and all(0 <= wait <= 60 for wait in waits)
-
-
-def test_waits_grow(monkeypatch):
-    waits = []
-    with serve(lambda *_: (500, {}, b"")) as server:
-        client = Client(end(server, tries=6, wait=1.0, longest_wait=9.0))
-        client.stop.wait = waits.append
-        with pytest.raises(AnswerError, match="answers 500"):
-            client.ask([])
-    assert len(waits) == 5 and waits[-1] == 9.0
-    assert all(0.75 * 2**i <= wait <= 1.25 * 2**i for i, wait in enumerate(waits[:3]))
-
-
-def test_a_server_that_stalls_drips_hangs_up_or_floods_does_not_hold_us(monkeypatch):
+def test_waits_for_a_server_are_bounded(monkeypatch):
     with (
         serve(lambda *_: ("stall", {}, b"")) as server,
-        pytest.raises(AnswerError, match=r"no answer within 0\.1 seconds|connection broke"),
+        pytest.raises(captions._QuestionError, match=r"no answer within 0\.1 seconds"),
     ):
         _ask(server, timeout=0.1, tries=2)
-        assert len(server.asked) == 2
-
-    clock = iter(range(0, 10_000, 4))
-    monkeypatch.setattr("anytouch_jax.data.prepare.endpoint.time.monotonic", lambda: float(next(clock)))
-    with (
-        serve(lambda *_: (200, {"Content-Length": "400000"}, bytes(400_000))) as server,
-        pytest.raises(AnswerError, match="no answer within 5 seconds"),
+    assert len(server.asked) == 2
+    with (  # a byte now and then, for ever
+        serve(lambda *_: (200, {"Content-Length": "400000"}, b"{")) as server,
+        pytest.raises(captions._QuestionError, match=r"no answer within 0\.3 seconds"),
     ):
-        _ask(server, tries=1)
-    monkeypatch.undo()
+        _ask(server, tries=1, timeout=0.3)
+    monkeypatch.setattr(captions, "_LONGEST_WAIT", 0.1)
     with (
-        serve(lambda *_: (200, {"Content-Length": "400"}, b"{")) as server,
-        pytest.raises(AnswerError, match=r"connection broke|form of a chat completion"),
+        serve(lambda *_: (429, {"Retry-After-Ms": "60000"}, b"")) as server,
+        pytest.raises(captions._QuestionError, match="no answer"),
     ):
-        _ask(server, tries=1, timeout=0.2)
-    with serve(lambda *_: (200, {}, bytes(5 << 20))) as server, pytest.raises(AnswerError, match="longer than"):
-        _ask(server, tries=1)
-    with pytest.raises(AnswerError, match="cannot be reached"):
-        _ask(server, tries=2)  # nobody listens there any more
+        _ask(server, tries=2, timeout=0.1)
+    with pytest.raises(captions._QuestionError, match="cannot be reached"):
+        _ask(server, tries=1)  # the server has stopped
 
 
-def test_nonsense_is_asked_again_then_counted_and_listed(make, tmp_path):
+def test_bad_answers_are_asked_again_then_counted_and_listed(make, tmp_path):
     answers = ["", "I'm sorry, I can't help with that.", "no JSON", {"caption": "soft"}, {"caption": "word " * 61},
                {"caption": 7}, ["soft and warm"], {"object": "x"}]  # fmt: skip
     loose = make(_rows(3))
@@ -408,35 +307,11 @@ def test_nonsense_is_asked_again_then_counted_and_listed(make, tmp_path):
         done = _run(loose, server, tmp_path / "answers", threads=2)
     assert len(server.asked) == 3 + 2 and len(done.captions) == 2 and done.asked == 5
     (failure,) = done.failures
-    assert failure.rows == 3 and failure.where == loose.where(0) and "nonsense" in failure.reason
+    assert failure.rows == 3 and failure.where == loose.where(0) and "bad answer" in failure.reason
     assert "(3 times)" in failure.reason
     (line,) = (tmp_path / "answers" / "failures.jsonl").read_text().splitlines()
     assert json.loads(line) == failure._asdict()
     assert done.manifest.column("text").to_pylist() == [None] * 3 + [GOOD["caption"]] * 6
-
-
-@pytest.mark.parametrize(
-    ("text", "finish", "words"),
-    [
-        ("", "stop", "empty"), ("  \n", "stop", "empty"), ('{"caption": "soft and', "length", "cut off"),
-        (json.dumps(GOOD), "content_filter", "refused"), (json.dumps(GOOD), "refusal", "refused"),
-        ('{"caption": "I cannot determine what is touched here."}', "stop", "refused"),
-        ("[" * 100_000, "stop", "not JSON"),
-        ('{"caption": "... -- !!"}', "stop", "too short"), ('{"caption": "soft soft"}', "stop", "too short"),
-        (json.dumps({"caption": "soft " * 61}), "stop", "too long"),
-        (json.dumps({"caption": "ab " + "x" * 800 + " b c"}), "stop", "too long"),
-        ('{"caption": "soft \\u0007 and warm"}', "stop", "not text"), ("null", "stop", "without a caption"),
-    ],
-)  # fmt: skip
-def test_nonsense_by_kind(text, finish, words):
-    with pytest.raises(Nonsense, match=words):
-        caption_of(text, finish)
-
-
-def test_a_caption_in_a_code_fence_is_a_caption():
-    fenced = f"```json\n{json.dumps(GOOD | {'caption': ' Soft  and' + chr(10) + 'fuzzy. '})}\n```"
-    assert caption_of(fenced, "stop") == ("Soft and fuzzy.", "wool scarf")
-    assert caption_of('{"caption": "Soft and fuzzy.", "object": null}', "") == ("Soft and fuzzy.", "")
 
 
 def test_a_run_of_failures_stops_the_spending(make, tmp_path):
@@ -497,12 +372,12 @@ def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
         manifests.write(done.manifest, tmp_path / "new.csv")
     assert done.captions and done.failures and "[key]" in done.captions[0].text
     assert KEY.encode() not in _everything_below(tmp_path)
-    shown = "".join([*said, *capfd.readouterr(), repr(done.failures), repr(end(server)), repr(Client(end(server)))])
+    shown = "".join([*said, *capfd.readouterr(), repr(done.failures), repr(end(server))])
     assert KEY not in shown
     for status in (401, 403, 404, 500, 400):
         with (
             serve(lambda *_, status=status: (status, {}, {"error": f"bad key {KEY}"})) as server,
-            pytest.raises((AnswerError, EndpointError)) as error,
+            pytest.raises((captions._QuestionError, EndpointError)) as error,
         ):
             _ask(server, tries=1)
         assert KEY not in str(error.value) and "[key]" in str(error.value)
@@ -526,7 +401,7 @@ def test_the_key_does_not_follow_a_redirect():
         ("https://api.example.org/v1", "two words", "does not hold a key"),
         ("https://api.example.org/v1", "line\nInjected: yes", "does not hold a key"),
         ("https://api.example.org/v1", "schlüssel", "does not hold a key"),
-        (f"https://me:{KEY}@api.example.org/v1", KEY, "not in the address"),
+        (f"https://me:{KEY}@api.example.org/v1", KEY, "Remove it from --url"),
         ("ftp://api.example.org", KEY, "is not an http or https address"),
         ("api.example.org/v1", KEY, "is not an http"),
         ("http://localhost:port/v1", KEY, "is not an http"), ("file:///etc/passwd", KEY, "is not an http"),
@@ -535,7 +410,7 @@ def test_the_key_does_not_follow_a_redirect():
 def test_bad_addresses_and_keys_are_named_without_showing_the_key(monkeypatch, url, key, words):
     monkeypatch.setenv("OPENAI_API_KEY", key)
     with pytest.raises(EndpointError, match=words) as error:
-        Client(Endpoint(url, "m"))
+        Endpoint(url, "m").check()
     assert "Injected" not in str(error.value) and KEY not in str(error.value)
 
 
@@ -547,8 +422,29 @@ def test_a_local_server_needs_no_key_and_a_distant_one_is_warned_about(monkeypat
     assert not Endpoint("http://gpu-box:8000/v1", "m").exposes_key
     with serve() as server:
         _ask(server)
-    assert "Authorization" not in server.heads[0][1]
-    assert Endpoint("http://h/v1/chat/completions/", "m").address == "http://h/v1/chat/completions"
+    assert server.heads[0] == ("/v1/chat/completions", server.heads[0][1] | {"Authorization": "Bearer none"})
+    with serve() as server:
+        asyncio.run(_ask_at(f"{server.url}/chat/completions/"))
+    assert server.heads[0][0] == "/v1/chat/completions"
+
+
+def test_a_missing_client_is_one_sentence(monkeypatch):
+    def missing(name, *args, real=builtins.__import__, **kwargs):
+        if name == "openai":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(EndpointError, match=r"pip install .*annotate"):
+        Endpoint("https://api.example.org/v1", "m").check()
+
+
+def test_a_running_loop_as_in_a_notebook_is_no_obstacle(make, tmp_path):
+    async def cell():
+        with serve() as server:
+            return _run(make(_rows(2)), server, tmp_path / "answers")
+
+    assert len(asyncio.run(cell()).captions) == 2
 
 
 def test_other_servers_can_be_spoken_to():
@@ -622,7 +518,7 @@ def test_many_questions_that_are_always_refused_do_not_keep_back_the_answers(mak
     with serve(never) as server:
         done = _run(loose, server, folder, threads=1)
     assert len(done.captions) == 10 and len(done.failures) == 50
-    assert done.failures[-1].reason == "not asked again: 25 before it failed, all in the last run too"
+    assert done.failures[-1].reason.startswith("not asked again")
     assert done.manifest.present("text").sum() == 30  # three rows a touch
 
 
@@ -641,7 +537,7 @@ def test_two_processes_do_not_pay_for_the_same_answers(make, tmp_path):
 def test_a_key_that_an_error_cuts_in_two_is_not_shown():
     with (
         serve(lambda *_: (400, {}, {"error": "x" * 190 + f" {KEY}"})) as server,
-        pytest.raises(AnswerError) as error,
+        pytest.raises(captions._QuestionError) as error,
     ):
         _ask(server, tries=1)
     assert KEY[:8] not in str(error.value)

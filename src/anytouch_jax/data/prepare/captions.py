@@ -1,46 +1,62 @@
-"""Captions from a vision-language model, as the paper had GPT-4o write them: one for each touch, paid for once.
+"""Captions from a vision-language model, one for each touch (AnyTouch, appendix: annotation by GPT-4o).
 
-Answers are kept in `answers.jsonl`, by a hash of the model, the words of the prompt and the bytes of the pictures, so
-the same call goes on after a kill and asks nothing twice.
+Answers are stored in `answers.jsonl` under a hash of the model, the prompt and the image bytes. The same call
+therefore continues after an interruption, and no question is paid for twice.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
+import html
 import json
-import threading
-from collections.abc import Callable, Iterator, Mapping
+import os
+import urllib.parse
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
-from anytouch_jax.data.prepare.endpoint import AnswerError, Client, Endpoint, EndpointError
-from anytouch_jax.data.prepare.prompts import Nonsense, caption_of
-from anytouch_jax.data.prepare.questions import (
+from anytouch_jax.data.prepare.prompts import (
     PHRASE,
     SECOND_IMAGE,
-    Job,
-    data_url,
-    find_jobs,
-    picture_bytes,
+    BadAnswer,
+    CaptionJob,
+    find_caption_jobs,
+    image_bytes,
+    parse_caption,
     small_jpeg,
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, lock
 
-_NONSENSE_TRIES = 3
-_STREAK = 25  # failures in a row after which the run stops instead of paying on
-_TILE = 512  # the model's price of a picture: a base and so much for each tile of 512 pixels
+if TYPE_CHECKING:
+    import openai
+
+_BAD_ANSWER_TRIES = 3
+_MAX_STREAK = 25  # failures in a row after which the run stops instead of paying for more
+_LONGEST_WAIT = 120.0  # seconds; the client obeys a Retry-After up to this
+_TILE = 512  # an image costs a base price and a price for each tile of 512 pixels
 _BASE_TOKENS, _TILE_TOKENS, _ANSWER_TOKENS = 85, 170, 80
+_LOCAL = ("localhost", "127.0.0.1", "::1")
+_REFUSED = {401: "the key is not accepted", 403: "access is denied", 404: "there is no such address or model"}
+_SHEET_SIDE = 256
+_SHEET_STYLE = (
+    "body{font:15px/1.4 sans-serif;max-width:1000px;margin:2em auto}article{display:flex;gap:1em;margin:1em 0;"
+    "border-top:1px solid #ccc;padding-top:1em}figure{margin:0}img{max-width:200px;display:block}"
+    "figcaption,small{color:#666}"
+)
 
 
-class Estimate(NamedTuple):
-    """What is about to be asked: questions, those answered before, tokens, and their price where prices are given."""
+class CostEstimate(NamedTuple):
+    """The questions to ask, those answered before, their tokens, and their price if prices are known."""
 
     questions: int
     cached: int
@@ -57,15 +73,15 @@ class Estimate(NamedTuple):
 
 
 class Caption(NamedTuple):
-    """A caption, the object that the model saw, and the job that it answers."""
+    """A caption, the object that the model named, and the job that it answers."""
 
-    job: Job
+    job: CaptionJob
     text: str
     object: str
 
 
-class Failure(NamedTuple):
-    """A caption that could not be had: where its first row is, how many rows lack it, why, and the question's key."""
+class CaptionFailure(NamedTuple):
+    """A missing caption: its first row, the number of rows that share it, the reason, and the question's key."""
 
     where: str
     rows: int
@@ -73,12 +89,12 @@ class Failure(NamedTuple):
     key: str = ""
 
 
-class Annotated(NamedTuple):
-    """The manifest with its captions, what could not be had, rows left out by reason, and what was used."""
+class CaptionResult(NamedTuple):
+    """The manifest with its captions, the failures, rows left out by reason, and the questions and tokens used."""
 
     manifest: Manifest
     captions: tuple[Caption, ...]
-    failures: tuple[Failure, ...]
+    failures: tuple[CaptionFailure, ...]
     left_out: dict[str, int]
     asked: int
     tokens_in: int
@@ -86,7 +102,172 @@ class Annotated(NamedTuple):
 
 
 class AnnotateError(UserError):
-    """An annotation that was not begun, or stopped; answers that were given are kept."""
+    """An annotation that did not start, or that stopped. Answers that arrived are stored."""
+
+
+class EndpointError(UserError):
+    """An endpoint that cannot be used, so that no further question makes sense."""
+
+
+class _QuestionError(Exception):
+    """A question that got no answer after all tries. The message gives the reason."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """An OpenAI-compatible chat endpoint.
+
+    `url` is the base address, such as https://api.openai.com/v1. The key is read from the environment variable
+    `key_variable`. `timeout` is the seconds to wait for an answer, `tries` the attempts for each question. `json_mode`
+    asks for a JSON object. `token_field` names the limit field (newer models want max_completion_tokens). A
+    `temperature` of None is not sent. Raises EndpointError for an address or a number that cannot be used.
+    """
+
+    url: str
+    model: str
+    key_variable: str = "OPENAI_API_KEY"
+    timeout: float = 60.0
+    tries: int = 5
+    max_tokens: int = 200
+    temperature: float | None = 0.0
+    json_mode: bool = True
+    token_field: str = "max_tokens"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.timeout <= 86_400:
+            raise EndpointError(f"timeout {self.timeout} must be above 0 seconds and at most 86,400")
+        if self.tries < 1 or self.max_tokens < 1:
+            raise EndpointError(f"tries {self.tries} and max-tokens {self.max_tokens} must be at least 1")
+        try:
+            parts = urllib.parse.urlsplit(self.url)
+            valid = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and self.url.isascii()
+            (parts.hostname or "").encode("idna")  # rejects names that the resolver would reject
+        except ValueError:
+            valid = False
+        if not valid:
+            raise EndpointError(f"{self.url!r} is not an http or https address, such as https://api.openai.com/v1")
+        if parts.username or parts.password:
+            raise EndpointError(f"Set the environment variable {self.key_variable} to the key. Remove it from --url.")
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the endpoint is on this machine, which needs no key."""
+        return urllib.parse.urlsplit(self.url).hostname in _LOCAL
+
+    @property
+    def exposes_key(self) -> bool:
+        """Whether a key is set and would travel unencrypted to another machine."""
+        return self.url.startswith("http:") and not self.is_local and bool(os.environ.get(self.key_variable))
+
+    def read_key(self) -> str:
+        """Return the key, or "" if it is missing and the endpoint is local. Raises EndpointError."""
+        key = os.environ.get(self.key_variable, "").strip()
+        if not key and not self.is_local:
+            raise EndpointError(f"set the environment variable {self.key_variable} to the key of {self.url}")
+        if key and not (key.isascii() and key.isprintable() and " " not in key):
+            raise EndpointError(f"the environment variable {self.key_variable} does not hold a key")
+        return key
+
+    def check(self) -> None:
+        """Raise EndpointError unless a question can be asked: the key is set and the client is installed."""
+        self.read_key()
+        _import_openai()
+
+
+def _import_openai() -> Any:
+    try:
+        import openai
+    except ImportError:
+        raise EndpointError(
+            "captions need the package openai: install it with pip install 'anytouch_jax[annotate]'"
+        ) from None
+    return openai
+
+
+class _Answer(NamedTuple):
+    """The text of an answer, the finish reason, and the tokens that the server counted (0 if it does not say)."""
+
+    text: str
+    finish: str
+    tokens_in: int
+    tokens_out: int
+
+
+class _Client:
+    """The openai client for one endpoint. The key is read once and removed from every message."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint, self._key, self._openai = endpoint, endpoint.read_key(), _import_openai()
+
+    def connect(self) -> openai.AsyncOpenAI:
+        """Return a client. It follows no redirect, which would take the key to another host."""
+        client: openai.AsyncOpenAI = self._openai.AsyncOpenAI(
+            api_key=self._key or "none", base_url=self.endpoint.url.rstrip("/").removesuffix("/chat/completions"),
+            timeout=self.endpoint.timeout, max_retries=self.endpoint.tries - 1,
+            http_client=self._openai.DefaultAsyncHttpxClient(follow_redirects=False),
+        )  # fmt: skip
+        return client
+
+    async def ask(self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]) -> _Answer:
+        """Return the answer to a chat. Raises _QuestionError, BadAnswer, or EndpointError if no try can help."""
+        end = self.endpoint
+        body: dict[str, Any] = {"model": end.model, "messages": messages, end.token_field: end.max_tokens}
+        if end.temperature is not None:
+            body["temperature"] = end.temperature
+        if end.json_mode:
+            body["response_format"] = {"type": "json_object"}
+        try:
+            # The client's timeout is for one read: a server that sends a byte now and then would hold us for ever.
+            async with asyncio.timeout(end.tries * end.timeout + (end.tries - 1) * _LONGEST_WAIT):
+                reply = await connection.post("/chat/completions", body=body, cast_to=object)
+        except (TimeoutError, self._openai.APITimeoutError):
+            reason = f"no answer within {end.timeout:g} seconds"
+        except self._openai.APIConnectionError as error:
+            reason = f"the endpoint cannot be reached: {error.__cause__ or error}"
+        except self._openai.APIStatusError as error:
+            reason = self._judge(error)
+        except (ValueError, RecursionError):  # not JSON
+            return _parse_reply(None)
+        else:
+            return _parse_reply(reply)
+        raise _QuestionError(f"{self.redact(reason)} (at most {end.tries} tries)")
+
+    def redact(self, text: str) -> str:
+        """Return `text` without the key, which a server may quote."""
+        return text.replace(self._key, "[key]") if self._key else text
+
+    def _judge(self, error: openai.APIStatusError) -> str:
+        """Return the reason of an error status. Raises EndpointError for one that concerns every question."""
+        code = error.status_code
+        message = " ".join(self.redact(_error_message(error.response.text)).split())[:200]
+        reason = f"the endpoint answers {code}{f': {message}' if message else ''}"
+        if code in _REFUSED:
+            raise EndpointError(f"{self.endpoint.url}: {_REFUSED[code]}; {reason}")
+        if 300 <= code < 400:
+            raise EndpointError(f"{self.endpoint.url} redirects to another address; give that address")
+        return reason
+
+
+def _parse_reply(reply: Any) -> _Answer:
+    try:
+        choice = reply["choices"][0]
+        message, usage = choice["message"], reply.get("usage") or {}
+        text, refusal = message.get("content"), message.get("refusal")
+        if isinstance(text, list):  # some servers answer in parts
+            text = "".join(str(part.get("text", "")) for part in text)
+        finish = "refusal" if refusal else str(choice.get("finish_reason") or "")
+        tokens = [int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")]
+        return _Answer(str(refusal or text or ""), finish, *tokens)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError):
+        raise BadAnswer("not a chat completion") from None
+
+
+def _error_message(body: str) -> str:
+    try:
+        error = json.loads(body)["error"]
+        return str(error["message"] if isinstance(error, dict) else error)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return body[:10_000]
 
 
 def annotate(
@@ -94,7 +275,7 @@ def annotate(
     endpoint: Endpoint,
     folder: str | Path,
     *,
-    confirm: Callable[[Estimate], bool],
+    confirm: Callable[[CostEstimate], bool],
     price_in: float | None = None,
     price_out: float | None = None,
     threads: int = 4,
@@ -105,228 +286,231 @@ def annotate(
     second_image: str = SECOND_IMAGE,
     limit: int | None = None,
     log: Callable[[str], None] | None = None,
-) -> Annotated:
-    """Ask `endpoint` for every caption that is lacking, after `confirm(estimate)`, which is also told where nothing is
-    lacking; answers and failures in `folder`.
+) -> CaptionResult:
+    """Ask `endpoint` for every missing caption and return the manifest with all captions.
 
-    One question for each touch (else each sequence), `threads` at a time; pictures are sent with no side longer than
-    `side`. Prices are for a million tokens. `limit`: only the first so many captions (to look at a sample first).
-    A phrase that was expanded moves to the column `phrase`. Raises AnnotateError when it is not confirmed or too many
-    questions in a row fail, EndpointError when the endpoint cannot be used, UserError when no caption is lacking.
+    Each touch, or each sequence without a touch, is one question. `threads` questions are open at a time. Images are
+    sent with no side longer than `side` pixels. Answers and failures are stored in `folder`. `confirm` is always
+    called with the estimate, and prices are for a million tokens. `limit` asks only for the first captions. A phrase
+    that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False or too many
+    questions in a row fail, EndpointError if the endpoint cannot be used, and UserError if no caption is missing.
     """
     if threads < 1 or side < 16:
         raise AnnotateError(f"threads {threads} must be at least 1 and side {side} at least 16")
     if limit is not None and limit < 1:
-        raise AnnotateError(f"limit {limit} must be at least 1; leave it away for all captions")
-    exposed = endpoint.exposes_key  # a mistake in the address is told at once; a key is needed only to ask
-    store = _Store(Path(folder).expanduser().resolve())
-    found = find_jobs(manifest, split=split, families=families, overwrite=overwrite, second_image=second_image)
-    run = _Run(manifest, endpoint, store, side)
-    jobs = found.jobs[:limit]
+        raise AnnotateError(f"limit {limit} must be at least 1; omit it for all captions")
+    store = _AnswerStore(Path(folder).expanduser().resolve())
+    jobs, left_out = find_caption_jobs(
+        manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
+    )
+    run = _Run(manifest, endpoint, store, side, log)
+    jobs = jobs[:limit]
     keys = run.keys(jobs, threads)
-    asking: dict[str, Job] = {}  # equal questions about equal pictures are one
+    missing: dict[str, CaptionJob] = {}  # equal questions about equal images are one
     for job, key in zip(jobs, keys, strict=True):
         if key and key not in store.answers:
-            asking.setdefault(key, job)
-    lacking = [(job, key) for key, job in asking.items()]
-    if log and exposed:
+            missing.setdefault(key, job)
+    if log and endpoint.exposes_key:
         log(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
-    estimate = _estimate([job for job, _ in lacking], cached, side, price_in, price_out)
-    if not confirm(estimate):
+    if not confirm(_estimate(list(missing.values()), cached, side, price_in, price_out)):
         raise AnnotateError("not confirmed: nothing was asked")
-    lacking.sort(key=lambda one: one[1] in store.failed)  # what failed the last time bars no other question
-    if lacking:
-        with store.alone():
-            lacking = [one for one in lacking if one[1] not in store.answers]  # another process may have been faster
+    if missing:
+        with store.exclusive():
+            questions = [(job, key) for key, job in missing.items() if key not in store.answers]
+            questions.sort(key=lambda question: question[1] in store.failed)  # earlier failures come last
             try:
-                run.ask(Client(endpoint), lacking, threads, log)
+                _run_async(run.ask(_Client(endpoint), questions, threads))
             finally:
                 store.write_failures(run.failures, keys)
     elif run.failures or store.failed:
         store.write_failures(run.failures, keys)
     captions = tuple(
         Caption(job, store.answers[key]["caption"], store.answers[key]["object"])
-        for job, key in zip(jobs, keys, strict=True) if key in store.answers
-    )  # fmt: skip
-    return Annotated(
-        _attach(manifest, captions), captions, tuple(run.failures), found.left_out,
-        run.asked, run.tokens[0], run.tokens[1],
-    )  # fmt: skip
-
-
-def _estimate(jobs: list[Job], cached: int, side: int, price_in: float | None, price_out: float | None) -> Estimate:
-    picture = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
-    tokens_in = sum(
-        len(job.question.system + job.question.text) // 4 + picture * len(job.pictures) + 20 for job in jobs
+        for job, key in zip(jobs, keys, strict=True)
+        if key in store.answers
     )
+    annotated = _attach(manifest, captions)
+    return CaptionResult(annotated, captions, tuple(run.failures), left_out, run.asked, *run.tokens)
+
+
+def _run_async(coroutine: Any) -> None:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        asyncio.run(coroutine)
+        return
+    with ThreadPoolExecutor(1) as pool:  # a notebook runs a loop in this thread
+        pool.submit(asyncio.run, coroutine).result()
+
+
+def _estimate(
+    jobs: list[CaptionJob], cached: int, side: int, price_in: float | None, price_out: float | None
+) -> CostEstimate:
+    image = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
+    tokens_in = sum(len(job.prompt.system + job.prompt.text) // 4 + image * len(job.images) + 20 for job in jobs)
     tokens_out = _ANSWER_TOKENS * len(jobs)
     cost = None if price_in is None or price_out is None else (tokens_in * price_in + tokens_out * price_out) / 1e6
-    return Estimate(len(jobs), cached, tokens_in, tokens_out, cost)
+    return CostEstimate(len(jobs), cached, tokens_in, tokens_out, cost)
 
 
 class _Run:
-    """One pass over the questions; `failures` and the counts grow as it goes."""
+    """One pass over the questions. `failures` and the counts grow during the pass."""
 
-    def __init__(self, manifest: Manifest, endpoint: Endpoint, store: _Store, side: int) -> None:
-        self.manifest, self.endpoint, self.store, self.side = manifest, endpoint, store, side
-        self.failures: list[Failure] = []
+    def __init__(
+        self, manifest: Manifest, endpoint: Endpoint, store: _AnswerStore, side: int, log: Callable[[str], None] | None
+    ) -> None:
+        self.manifest, self.endpoint, self.store, self.side, self.log = manifest, endpoint, store, side, log
+        self.failures: list[CaptionFailure] = []
         self.asked, self.tokens = 0, [0, 0]
+        self.done = self.streak = 0
 
-    def keys(self, jobs: list[Job], threads: int) -> list[str]:
-        """The name of each job's answer; "" and a failure where a picture cannot be read."""
+    def keys(self, jobs: list[CaptionJob], threads: int) -> list[str]:
+        """Return the key of each job's answer. An unreadable image is a failure with the key ""."""
         keys = []
-        with closing(bounded_map(self._key, jobs, threads)) as found:
-            for job, key in zip(jobs, found, strict=True):
+        with closing(bounded_map(self._key, jobs, threads)) as results:
+            for job, key in zip(jobs, results, strict=True):
                 if isinstance(key, UserError):
                     self._fail(job, "", str(key))
                 keys.append(key if isinstance(key, str) else "")
         return keys
 
-    def _key(self, job: Job) -> str | UserError:
+    def _key(self, job: CaptionJob) -> str | UserError:
         end = self.endpoint
-        digest = hashlib.sha256(json.dumps([end.model, job.question.hash(), self.side, end.max_tokens]).encode())
-        for row, column in job.pictures:
+        parts = [end.model, job.prompt.fingerprint(), self.side, end.max_tokens]
+        digest = hashlib.sha256(json.dumps(parts).encode())
+        for row, column in job.images:
             try:
-                data = picture_bytes(self.manifest, row, column)
+                data = image_bytes(self.manifest, row, column)
                 digest.update(hashlib.sha256(data).digest())
-                small_jpeg(data, f"{column} of row {row}", self.side)  # what cannot be decoded is not to be paid for
+                small_jpeg(data, f"{column} of row {row}", self.side)  # an image that does not decode costs nothing
             except (UserError, OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or error
                 return UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}")
         return digest.hexdigest()[:32]
 
-    def ask(
-        self, client: Client, lacking: list[tuple[Job, str]], threads: int, log: Callable[[str], None] | None
-    ) -> None:
-        """Ask all questions; stops at an endpoint that is of no use. In the end no thread is left.
-
-        A row of questions that had failed in the last run too says nothing of the endpoint: those behind it are left.
-        """
-        streak, left = 0, lacking[:0]
-        with closing(bounded_map(partial(self._ask_one, client), lacking, threads)) as reasons:
-            try:
-                for count, ((job, key), reason) in enumerate(zip(lacking, reasons, strict=True), 1):
-                    streak = streak + 1 if reason else 0
-                    if reason:
-                        self._fail(job, key, client.redact(reason))
-                    if streak >= _STREAK and key in self.store.failed and self.store.answers:
-                        left = lacking[count:]
-                        break
-                    if streak >= _STREAK:
-                        raise AnnotateError(f"{streak} questions in a row failed, the last one: {reason}")
-                    if log and (count % 100 == 0 or count == len(lacking)):
-                        log(f"{count} of {len(lacking)} questions, {len(self.failures)} failed")
-            finally:
-                client.stop.set()  # before the threads are waited for: none goes on waiting for a server
-        for job, key in left:
-            if key not in self.store.answers:
-                self._fail(job, key, f"not asked again: {_STREAK} before it failed, all in the last run too")
-
-    def _ask_one(self, client: Client, item: tuple[Job, str]) -> str:
-        """Get one answer and keep it; why there is none, or ""."""
-        job, key = item
+    async def ask(self, client: _Client, questions: list[tuple[CaptionJob, str]], workers: int) -> None:
+        """Ask all questions. The first error of a worker ends the others."""
+        queue = iter(questions)
         try:
-            pictures = [
-                data_url(small_jpeg(picture_bytes(self.manifest, row, column), f"{column} of row {row}", self.side))
-                for row, column in job.pictures
-            ]
+            async with client.connect() as connection, asyncio.TaskGroup() as group:
+                for _ in range(workers):
+                    group.create_task(self._work(client, connection, queue, len(questions)))
+        except BaseExceptionGroup as errors:
+            raise errors.exceptions[0] from None
+
+    async def _work(
+        self, client: _Client, connection: openai.AsyncOpenAI, queue: Iterator[tuple[CaptionJob, str]], total: int
+    ) -> None:
+        for job, key in queue:
+            reason = await self._ask_one(client, connection, job, key)
+            self.done += 1
+            self.streak = self.streak + 1 if reason else 0
+            if reason:
+                self._fail(job, key, reason)
+            if self.streak >= _MAX_STREAK:
+                # A streak of questions that failed in an earlier run too does not condemn the endpoint.
+                if not (key in self.store.failed and self.store.answers):
+                    raise AnnotateError(f"{self.streak} questions in a row failed, the last one: {reason}")
+                for later_job, later_key in queue:
+                    self._fail(later_job, later_key, f"not asked again: {_MAX_STREAK} before it failed again")
+            if self.log and (self.done % 100 == 0 or self.done == total):
+                self.log(f"{self.done} of {total} questions, {len(self.failures)} failed")
+
+    async def _ask_one(self, client: _Client, connection: openai.AsyncOpenAI, job: CaptionJob, key: str) -> str:
+        """Get and store one answer. Returns the reason if there is none, else ""."""
+        try:
+            jpegs = await asyncio.to_thread(self._jpegs, job)
         except (UserError, OSError, ValueError) as error:
             return str(error)
         reason = ""
-        for _ in range(_NONSENSE_TRIES):
+        for _ in range(_BAD_ANSWER_TRIES):
+            text = ""
             try:
-                answer = client.ask(job.question.messages(pictures))
-            except AnswerError as error:
-                return str(error)
-            except EndpointError:
-                client.stop.set()
-                raise
-            with self.store.lock:
+                answer = await client.ask(connection, job.prompt.messages(jpegs))
+                text = client.redact(answer.text)
                 self.asked += 1
-                self.tokens[0] += answer.tokens_in
-                self.tokens[1] += answer.tokens_out
-            text = client.redact(answer.text)
-            try:
-                caption, seen = caption_of(text, answer.finish)
-            except Nonsense as error:
-                reason = f"nonsense ({error}): {text[:100]!r}"
+                self.tokens = [self.tokens[0] + answer.tokens_in, self.tokens[1] + answer.tokens_out]
+                caption, named = parse_caption(text, answer.finish)
+            except _QuestionError as error:
+                return str(error)
+            except BadAnswer as error:
+                reason = f"bad answer ({error}): {text[:100]!r}"
                 continue
-            self.store.keep(key, {
-                "model": self.endpoint.model, "prompt": job.question.hash(), "family": job.question.family,
-                "caption": caption, "object": seen, "tokens_in": answer.tokens_in, "tokens_out": answer.tokens_out,
+            self.store.add(key, {
+                "model": self.endpoint.model, "prompt": job.prompt.fingerprint(), "family": job.prompt.family,
+                "caption": caption, "object": named, "tokens_in": answer.tokens_in, "tokens_out": answer.tokens_out,
             })  # fmt: skip
             return ""
-        return f"{reason} ({_NONSENSE_TRIES} times)"
+        return f"{reason} ({_BAD_ANSWER_TRIES} times)"
 
-    def _fail(self, job: Job, key: str, reason: str) -> None:
-        self.failures.append(Failure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key))
+    def _jpegs(self, job: CaptionJob) -> list[bytes]:
+        return [
+            small_jpeg(image_bytes(self.manifest, row, column), f"{column} of row {row}", self.side)
+            for row, column in job.images
+        ]
+
+    def _fail(self, job: CaptionJob, key: str, reason: str) -> None:
+        self.failures.append(CaptionFailure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key))
 
 
-class _Store:
-    """The answers of a folder: one JSON line each, added as they come; a line that was cut off is asked again."""
+class _AnswerStore:
+    """The answers of a folder, one JSON line each. A line that was cut off is asked for again."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.lock = folder, threading.Lock()
+        self.folder = folder
         self.answers: dict[str, dict[str, Any]] = {}
-        self._path, self._begin = folder / "answers.jsonl", ""
-        self.failed: dict[str, str] = {}
-        self._read_failures()
+        self.failed: dict[str, str] = {}  # the line of each failed question by its key
+        self._path, self._line_break = folder / "answers.jsonl", ""
+        for line in _lines(folder / "failures.jsonl"):
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
+                self.failed[str(json.loads(line)["key"])] = line.rstrip("\n")
         self._read_answers()
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keep other processes from asking the same while the block runs. Raises AnnotateError when one does."""
+    def exclusive(self) -> Iterator[None]:
+        """Lock the folder while the block runs. Raises AnnotateError if another process holds it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        with lock(self.folder / ".lock") as mine:
-            if not mine:
+        with lock(self.folder / ".lock") as free:
+            if not free:
                 raise AnnotateError(f"another process asks for {self.folder}: wait for it, or name another --answers")
             self._read_answers()
             yield
 
     def _read_answers(self) -> None:
-        if self._path.is_file():
-            with self._path.open(encoding="utf-8", errors="replace") as file:
-                for line in file:
-                    self._begin = "" if line.endswith("\n") else "\n"
-                    self._load(line)
-
-    def _load(self, line: str) -> None:
-        try:
-            entry = json.loads(line)
-            if isinstance(entry["caption"], str) and isinstance(entry["object"], str):
-                self.answers[str(entry["key"])] = entry
-        except (ValueError, KeyError, TypeError, RecursionError):
-            return
-
-    def _read_failures(self) -> None:
-        """The questions that earlier runs could not get an answer to: the line of each by its key."""
-        path = self.folder / "failures.jsonl"
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        for line in _lines(self._path):
+            self._line_break = "" if line.endswith("\n") else "\n"
             with suppress(ValueError, KeyError, TypeError, RecursionError):
-                self.failed[str(json.loads(line)["key"])] = line
+                entry = json.loads(line)
+                if isinstance(entry["caption"], str) and isinstance(entry["object"], str):
+                    self.answers[str(entry["key"])] = entry
 
-    def keep(self, key: str, entry: dict[str, Any]) -> None:
-        """Add an answer, from any thread: what was paid for is on the disk when this returns."""
+    def add(self, key: str, entry: dict[str, Any]) -> None:
+        """Store an answer. It is on the disk when this returns."""
         line = json.dumps({"key": key, **entry}, ensure_ascii=False)
-        with self.lock, self._path.open("a", encoding="utf-8") as file:
-            file.write(f"{self._begin}{line}\n")
-            self._begin = ""
-            self.answers[key] = entry
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(f"{self._line_break}{line}\n")
+        self._line_break = ""
+        self.answers[key] = entry
 
-    def write_failures(self, failures: list[Failure], keys: list[str]) -> None:
-        """failures.jsonl: what this run could not get, and of its `keys` what an earlier one could not and it did not
-        come to."""
-        met = {failure.key for failure in failures} | self.answers.keys() | {""}
+    def write_failures(self, failures: list[CaptionFailure], keys: list[str]) -> None:
+        """Write failures.jsonl: the new failures, and earlier ones among `keys` that are still open."""
+        closed = {failure.key for failure in failures} | self.answers.keys() | {""}
         lines = [json.dumps(failure._asdict(), ensure_ascii=False) for failure in failures]
-        lines += [self.failed[key] for key in dict.fromkeys(keys) if key in self.failed and key not in met]
+        lines += [self.failed[key] for key in dict.fromkeys(keys) if key in self.failed and key not in closed]
         atomic_write(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
 
 
+def _lines(path: Path) -> Iterator[str]:
+    if path.is_file():
+        with path.open(encoding="utf-8", errors="replace") as file:
+            yield from file
+
+
 def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
+    has_phrase = PHRASE in manifest.table.column_names
     text = manifest.column("text").to_pylist()
-    kept = manifest.column(PHRASE) if PHRASE in manifest.table.column_names else [None] * len(manifest)
-    phrase = kept if isinstance(kept, list) else kept.to_pylist()
+    phrase = manifest.column(PHRASE).to_pylist() if has_phrase else [None] * len(manifest)
     for caption in captions:
         for row in caption.job.rows:
             text[row] = caption.text
@@ -335,3 +519,48 @@ def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
     if any(caption.job.phrase is not None for caption in captions):
         result = replace_column(result, PHRASE, pa.array(phrase, pa.string()))
     return result
+
+
+def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40) -> Path:
+    """Write an HTML page with a random sample of `count` captions and their images, to be checked by hand.
+
+    Images are in the folder `<name>_images` next to the page. Raises UserError if there are no captions.
+    """
+    if not captions:
+        raise UserError("there are no captions to look at")
+    target = Path(path).expanduser().resolve()
+    folder = target.with_name(f"{target.stem}_images")
+    chosen = np.random.default_rng(0).permutation(len(captions))[:count]
+    parts = [_article(manifest, captions[i], number, folder) for number, i in enumerate(np.sort(chosen))]
+    title = f"{len(parts)} of {len(captions)} captions"
+    page = (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_SHEET_STYLE}</style>'
+        f"<h1>{title}</h1><p>Tick what is wrong.</p>{''.join(parts)}</html>\n"
+    )
+    atomic_write(target, page)
+    return target
+
+
+def _article(manifest: Manifest, caption: Caption, number: int, folder: Path) -> str:
+    job, row = caption.job, int(caption.job.rows[0])
+    images = list(job.images)
+    if not any(column == "path" for _, column in images):  # the model did not see the touch
+        images.append((images[0][0] if images else row, "path"))
+    figures = []
+    for i, (image_row, column) in enumerate(images):
+        name = f"{number:04d}_{i}_{column.removesuffix('_path')}.jpg"
+        try:
+            data = image_bytes(manifest, image_row, column)
+            atomic_write(folder / name, small_jpeg(data, f"{column} of row {image_row}", _SHEET_SIDE))
+        except (UserError, OSError, ValueError) as error:
+            figures.append(f"<p>{html.escape(str(error))}</p>")
+            continue
+        word = "touch" if column == "path" else "photograph"
+        figures.append(f'<figure><img src="{folder.name}/{name}" alt="{word}"><figcaption>{word}</figcaption></figure>')
+    phrase = f"<p><small>phrase: {html.escape(job.phrase)}</small></p>" if job.phrase else ""
+    source = f"{manifest.value(row, 'dataset')}, row {manifest.number[row]}, {len(job.rows)} rows share it"
+    return (
+        f"<article>{''.join(figures)}<div><p><label><input type=checkbox> {number + 1}. "
+        f"<b>{html.escape(caption.object)}</b></label></p><p>{html.escape(caption.text)}</p>{phrase}"
+        f"<p><small>{html.escape(source)}</small></p></div></article>"
+    )

@@ -1,24 +1,36 @@
-"""What is asked of a vision-language model, one prompt a family of datasets (AnyTouch, appendix: GPT-4o annotation).
+"""Caption prompts: one for each family of datasets, and the rows of a manifest that need a caption.
 
-The wording is our own; the inputs are the paper's: one photograph for Touch and Go and TacQuad; two photographs and
-the tactile image for ObjectFolder Real, where the touched place can be hidden; photograph and phrase for TVL, SSVTP
-and Octopi.
+The paper lets GPT-4o write the captions (AnyTouch, appendix). The wording of the prompts is ours, the inputs are the
+paper's. Touch and Go and TacQuad send one photograph. ObjectFolder Real sends two photographs and the tactile image,
+because the photographs can hide the touched place. TVL, SSVTP and Octopi send a photograph and a phrase.
 """
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import re
+import shlex
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
+import cv2
+import numpy as np
+
+from anytouch_jax.data.images import decode_bytes
+from anytouch_jax.data.manifest.files import read_file
+from anytouch_jax.data.manifest.manifest import Manifest, resolve_path
+from anytouch_jax.data.manifest.schema import SPLITS
 from anytouch_jax.errors import UserError
 
 Family = Literal["photograph", "object", "phrase"]
-MOST_WORDS = 60  # CLIP reads 77 tokens
-_FEWEST_WORDS = 3
+PHRASE = "phrase"  # the column that stores the words that were expanded
+SECOND_IMAGE = "image2_path"  # a manifest need not have this column
+_MIN_WORDS, _MAX_WORDS = 3, 60  # CLIP reads 77 tokens
 
+# Answers are stored under a hash of the prompt: another wording asks, and pays for, every question again.
 FAMILIES: dict[str, Family] = {
     "touch_and_go": "photograph",
     "tacquad": "photograph",
@@ -62,72 +74,203 @@ _REFUSAL = re.compile(
 )
 
 
-class Question(NamedTuple):
-    """A prompt of a family: the system's and the user's words; pictures go along in the order photographs, touch."""
+class Prompt(NamedTuple):
+    """The words sent to the model. Images follow in the order photographs, tactile image."""
 
     family: Family
     system: str
     text: str
 
-    def hash(self) -> str:
-        """The first 16 hex digits of the SHA-256 of the words."""
+    def fingerprint(self) -> str:
+        """Return the first 16 hex digits of the SHA-256 of the words."""
         return hashlib.sha256(f"{self.system}\0{self.text}".encode()).hexdigest()[:16]
 
-    def messages(self, pictures: list[str]) -> list[dict[str, Any]]:
-        """The chat; `pictures` are data URLs."""
+    def messages(self, jpegs: list[bytes]) -> list[dict[str, Any]]:
+        """Return the chat messages with JPEG images as data URLs."""
+        urls = [f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}" for jpeg in jpegs]
         parts: list[dict[str, Any]] = [{"type": "text", "text": self.text}]
-        parts += [{"type": "image_url", "image_url": {"url": url}} for url in pictures]
+        parts += [{"type": "image_url", "image_url": {"url": url}} for url in urls]
         return [{"role": "system", "content": self.system}, {"role": "user", "content": parts}]
 
 
 def family_of(dataset: str | None, families: Mapping[str, str] | None = None) -> Family | None:
-    """The family of a dataset: of `families` (dataset -> family), else of FAMILIES; None for one that is unknown.
+    """Return the family of a dataset from `families` (dataset -> family), else from FAMILIES, else None.
 
     Raises UserError for a family that does not exist.
     """
-    chosen = (families or {}).get(dataset or "") or FAMILIES.get(dataset or "")
-    if chosen is not None and chosen not in _TEXTS:
-        raise UserError(f"there is no family of prompts {chosen!r}; use one of {', '.join(_TEXTS)}")
-    return chosen
+    family = (families or {}).get(dataset or "") or FAMILIES.get(dataset or "")
+    if family is not None and family not in _TEXTS:
+        raise UserError(f"There is no prompt family {family!r}. Use one of {', '.join(_TEXTS)}.")
+    return family
 
 
-def question(family: Family, photographs: int, phrase: str | None = None) -> Question:
-    """The prompt of a family for so many photographs and, for family phrase, the words to expand."""
+def make_prompt(family: Family, photographs: int, phrase: str | None = None) -> Prompt:
+    """Return the prompt of a family for a number of photographs and, in family phrase, the words to expand."""
     views = "The first two pictures are photographs of the same object from two sides."
     if photographs == 1:
         views = "The first picture is a photograph of the object."
     view = "The photograph shows the place that is touched. " if photographs else ""
     quoted = json.dumps(" ".join((phrase or "").split()), ensure_ascii=False)
     text = _TEXTS[family].format(views=views, phrase=quoted, view=view)
-    return Question(family, _SYSTEM, f"{text}\n\n{_FORM}")
+    return Prompt(family, _SYSTEM, f"{text}\n\n{_FORM}")
 
 
-class Nonsense(ValueError):
-    """An answer that is no caption; the message says why."""
+class BadAnswer(ValueError):
+    """An answer without a usable caption. The message gives the reason."""
 
 
-def caption_of(text: str, finish: str) -> tuple[str, str]:
-    """(caption, object) of a model's answer. Raises Nonsense: empty, cut off, refused, no JSON, too short or long."""
+def parse_caption(text: str, finish: str) -> tuple[str, str]:
+    """Return (caption, object) from a model's answer and its finish reason.
+
+    Raises BadAnswer if the answer is empty, cut off, refused, not JSON, too short or too long.
+    """
     if finish in ("refusal", "content_filter") or _REFUSAL.search(text):
-        raise Nonsense("refused")
+        raise BadAnswer("refused")
     if not text.strip():
-        raise Nonsense("empty")
+        raise BadAnswer("empty")
     if finish == "length":
-        raise Nonsense("cut off")
+        raise BadAnswer("cut off")
     bare = re.sub(r"\A\s*```(?:json)?\s*|\s*```\s*\Z", "", text)
     try:
         answer = json.loads(bare)
     except (ValueError, RecursionError):
-        raise Nonsense("not JSON") from None
+        raise BadAnswer("not JSON") from None
     caption = answer.get("caption") if isinstance(answer, dict) else None
     if not isinstance(caption, str):
-        raise Nonsense("JSON without a caption")
+        raise BadAnswer("JSON without a caption")
     caption = " ".join(caption.split())
     words = len(caption.split())
-    if words < _FEWEST_WORDS or not re.search(r"[^\W\d_]{2}", caption):
-        raise Nonsense("too short")
-    if words > MOST_WORDS or len(caption) > 12 * MOST_WORDS:
-        raise Nonsense(f"too long ({words} words)")
+    if words < _MIN_WORDS or not re.search(r"[^\W\d_]{2}", caption):
+        raise BadAnswer("too short")
+    if words > _MAX_WORDS or len(caption) > 12 * _MAX_WORDS:
+        raise BadAnswer(f"too long ({words} words)")
     if "\ufffd" in caption or any(ord(letter) < 32 for letter in caption):
-        raise Nonsense("not text")
+        raise BadAnswer("not text")
     return caption, " ".join(str(answer.get("object") or "").split())[:100]
+
+
+class CaptionJob(NamedTuple):
+    """One caption to get: the rows i64 that share it, the prompt, and its images as (row, column)."""
+
+    rows: np.ndarray
+    prompt: Prompt
+    images: tuple[tuple[int, str], ...]
+    phrase: str | None
+
+
+def find_caption_jobs(
+    manifest: Manifest,
+    *,
+    split: str | None = None,
+    families: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+    second_image: str = SECOND_IMAGE,
+) -> tuple[list[CaptionJob], dict[str, int]]:
+    """Return the captions to get, and the number of rows left out for each reason.
+
+    Rows of one touch share a caption. Rows without a touch share it by sequence. The photograph of a group is that of
+    its middle frame. Backgrounds and datasets without a prompt family are left out. Raises UserError if no caption is
+    missing.
+    """
+    names = manifest.table.column_names
+    if second_image not in (SECOND_IMAGE, *names):
+        raise UserError(f"The manifest has no column {second_image!r}. It has {', '.join(names)}.")
+    rows_to_ask, family, left_out = _rows_to_ask(manifest, split, families, overwrite)
+    jobs: list[CaptionJob] = []
+    for rows in _group_rows(manifest, rows_to_ask, family):
+        job = _make_job(manifest, rows, family[rows[0]], second_image)
+        if job is None:
+            left_out["no photograph"] += len(rows)
+        else:
+            jobs.append(job)
+    if not jobs:
+        reasons = "; ".join(f"{count} rows: {reason}" for reason, count in left_out.items())
+        raise UserError(f"{manifest.files[0]}: there is nothing to annotate ({reasons or 'no rows'})")
+    return jobs, dict(left_out)
+
+
+def _rows_to_ask(
+    manifest: Manifest, split: str | None, families: Mapping[str, str] | None, overwrite: bool
+) -> tuple[np.ndarray, np.ndarray, Counter[str]]:
+    """Return the row ids i64 to ask for, the family of every row, and the number of other rows by reason."""
+    left_out: Counter[str] = Counter()
+    splits = np.asarray(manifest.table["split"].to_pylist())
+    asked = np.isin(splits, [name for name in SPLITS if name != "background"])
+    if split is not None:
+        asked = np.zeros(len(manifest), bool)
+        asked[manifest.rows_of(split)] = True
+    left_out["background frame, or another split"] = int((~asked).sum())
+    family = np.full(len(manifest), None, object)
+    dataset = manifest.codes("dataset")
+    for code in np.unique(dataset):
+        rows = np.flatnonzero(dataset == code)
+        name = manifest.value(rows[0], "dataset")
+        family[rows] = chosen = family_of(name, families)
+        if chosen is None and asked[rows].any():
+            known, remedy = "", "the manifest has no column dataset that names it"
+            if name is not None:
+                remedy = f"give it one, such as --family {shlex.quote(name)} photograph"
+            if not any("has no prompt" in reason for reason in left_out):
+                known = f"; known: {', '.join(FAMILIES)}"
+            left_out[f"dataset {name!r} has no prompt: {remedy}{known}"] = int(asked[rows].sum())
+    asked &= family != None  # noqa: E711 - elementwise
+    has_text, expanded = manifest.present("text"), np.zeros(len(manifest), bool)
+    if PHRASE in manifest.table.column_names:
+        expanded = manifest.present(PHRASE)
+    is_phrase = family == "phrase"
+    for reason, excluded in (
+        ("no phrase to expand", is_phrase & ~has_text),
+        ("expanded before", is_phrase & expanded & (not overwrite)),
+        ("has a caption", ~is_phrase & has_text & (not overwrite)),
+    ):
+        left_out[reason] += int((asked & excluded).sum())
+        asked &= ~excluded
+    return np.flatnonzero(asked), family, +left_out
+
+
+def _group_rows(manifest: Manifest, rows: np.ndarray, family: np.ndarray) -> list[np.ndarray]:
+    """Return the rows of every group in frame order. Groups are in the order of their first row."""
+    if not rows.size:
+        return []
+    touch, sequence = manifest.codes("touch", own=True)[rows], manifest.codes("sequence", own=True)[rows]
+    text = np.where(family[rows] == "phrase", manifest.codes("text")[rows], -1)
+    key = np.stack([touch, np.where(touch < 0, sequence, -1), text, manifest.codes("dataset")[rows]], 1)
+    _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    order = np.lexsort((rows, np.asarray(manifest.table["frame_index"])[rows], first[group.ravel()]))
+    cuts = np.flatnonzero(np.diff(group.ravel()[order])) + 1
+    return np.split(rows[order], cuts)
+
+
+def _make_job(manifest: Manifest, rows: np.ndarray, family: Family, second_image: str) -> CaptionJob | None:
+    with_photograph = [int(row) for row in rows if manifest.value(row, "image_path") is not None]
+    if not with_photograph and family != "phrase":
+        return None
+    phrase = None
+    if family == "phrase":  # an expanded phrase is in its own column
+        before = manifest.value(rows[0], PHRASE) if PHRASE in manifest.table.column_names else None
+        phrase = str(before or manifest.value(rows[0], "text"))
+    images: list[tuple[int, str]] = []
+    if with_photograph:
+        row = with_photograph[len(with_photograph) // 2]
+        images.append((row, "image_path"))
+        if family == "object" and manifest.value(row, second_image) is not None:
+            images.append((row, second_image))
+    prompt = make_prompt(family, len(images), phrase)
+    if family == "object":
+        images.append((images[0][0], "path"))
+    return CaptionJob(rows, prompt, tuple(images), phrase)
+
+
+def image_bytes(manifest: Manifest, row: int, column: str) -> bytes:
+    """Return the encoded image that a cell names. Raises UserError, OSError or ValueError."""
+    return read_file(resolve_path(manifest.files[manifest.source[row]].parent, manifest.value(row, column)))
+
+
+def small_jpeg(data: bytes, name: str, side: int) -> bytes:
+    """Return an encoded image as JPEG with no side longer than `side`. Raises ImageError (a UserError)."""
+    pixels = decode_bytes(data, name)
+    scale = side / max(pixels.shape[:2])
+    if scale < 1:
+        size = [max(1, round(length * scale)) for length in pixels.shape[1::-1]]
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()

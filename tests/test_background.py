@@ -14,7 +14,8 @@ from anytouch_jax.cli.app import main
 from anytouch_jax.config import DataConfig, preset
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.evaluation import evaluation
-from anytouch_jax.data.loading.loader import Loader, SampleError
+from anytouch_jax.data.loading.loader import Loader
+from anytouch_jax.data.loading.samples import SampleError
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.encoder import Encoder, Preprocess, embed_rows, load_encoder
@@ -94,7 +95,7 @@ def test_a_row_without_a_background_is_named_or_skipped(touches):
     columns["background_path"][table.rows_of("test")[1]] = None
     holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
     rows = holed.rows_of("test")[:3]
-    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*train with --loader.background keep"):
+    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*--data.background keep"):
         list(evaluation(holed, rows, settings(touches)))
     ((ids, _),) = evaluation(holed, rows, settings(touches, on_bad_sample="skip"))
     assert ids.tolist() == [rows[0], rows[2]]

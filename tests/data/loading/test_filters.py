@@ -1,4 +1,4 @@
-"""Which samples a baseline draws: complete ones, stills alone, without certain text; and the force labels."""
+"""Which samples a baseline draws: complete ones, stills alone, without certain text."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def changed(config, name):
 # Complete samples ----------------------------------------------------------------------------------------------------
 
 
-def test_tlv_link_is_given_only_samples_with_all_three(make, settings, read_back):
+def test_tlv_link_draws_only_samples_with_all_three(make, settings, read_back):
     loader = Loader(make(world()), changed(settings(2), "tlv_link"))
     seen = set()
     for batch in batches(loader):
@@ -52,7 +52,7 @@ def test_tlv_link_is_given_only_samples_with_all_three(make, settings, read_back
     assert any("24 of 48 rows have image and text" in note for note in loader.notes)
 
 
-def test_unitouch_is_given_photographs_and_no_text(make, settings, read_back):
+def test_unitouch_draws_photographs_and_no_text(make, settings, read_back):
     loader = Loader(make(world()), changed(settings(2), "unitouch"))
     seen = set()
     for batch in batches(loader):
@@ -62,7 +62,7 @@ def test_unitouch_is_given_photographs_and_no_text(make, settings, read_back):
     assert seen == {0, 2, 4, 5, 7} and loader.tokenizer is None
 
 
-def test_clips_too_end_at_rows_that_have_what_is_required(make, settings, read_back):
+def test_clips_end_at_rows_with_the_required_modalities(make, settings, read_back):
     rows = world()
     for row in rows:
         if row["frame_index"] != 4:  # one photograph in a recording: a clip may reach back over frames without one
@@ -77,7 +77,7 @@ def test_clips_too_end_at_rows_that_have_what_is_required(make, settings, read_b
             assert set((read_back(clip)[:, -1] % 6).tolist()) == {4}
 
 
-def test_nothing_that_has_what_is_required_is_one_sentence(make, settings):
+def test_no_row_with_the_required_modalities_is_an_error(make, settings):
     rows = [{**row, "image_path": None} for row in world()]
     with pytest.raises(UserError, match=r"data\.require: no row of split 'train' has image and text"):
         Loader(make(rows), settings(2, require=("image", "text")))
@@ -97,8 +97,8 @@ def test_only_frames_in_contact_are_drawn_in_alignment_and_in_matching(make, set
     assert any("25 of 48 rows have text and contact" in note for note in both.notes)
 
 
-def test_contact_that_nobody_marked_is_one_sentence(make, settings):
-    with pytest.raises(UserError, match=r"'label\.contact', which `anytouch contact` writes"):
+def test_contact_only_needs_the_contact_column(make, settings):
+    with pytest.raises(UserError, match=r"--data\.contact-only needs the column 'label\.contact'"):
         Loader(make(world()), settings(1, contact_only=True))
     free = [row | {"label.contact": "0"} for row in world()]
     with pytest.raises(UserError, match=r"data\.contact_only: no row of split 'train' has contact"):
@@ -121,7 +121,7 @@ def code(loader, name):
     return tuple(loader.tokenizer.encode([name], 8)[0][0].tolist())
 
 
-def test_the_text_of_touches_felt_twice_never_reaches_a_batch(make, settings):
+def test_the_text_of_shared_touches_never_reaches_a_batch(make, settings):
     everything = Loader(make(world()), settings(2))
     assert captions_drawn(everything) == {f"caption {i}" for i in (1, 2, 4, 5, 7)}
     loader = Loader(make(world()), changed(settings(2), "no_text_aligned"))
@@ -179,74 +179,13 @@ def test_by_default_clips_are_half(make, settings):
     assert [loader.kind(step) for step in range(4)] == ["still", "clip", "still", "clip"]
 
 
-def test_the_sensors_seen_are_those_drawn_from(make, settings):
+def test_the_trained_sensors_are_those_drawn_from(make, settings):
     rows = [*world(), {"sensor": "duragel", "split": "val"}, {"sensor": "gelsight", "image_path": "w.png"}]
     assert Loader(make(rows), settings(1)).trained_sensors == ["gelsight", "digit", "gelslim"]
     assert Loader(make(rows), settings(2, require=("text",))).trained_sensors == ["digit", "gelslim"]
 
 
-def test_a_sensor_without_a_clip_is_not_seen_where_clips_alone_are_drawn(make, settings):
+def test_a_sensor_without_a_clip_is_not_trained_where_only_clips_are_drawn(make, settings):
     rows = [*world(), {"sensor": "duragel"}]
     assert "duragel" in Loader(make(rows), settings(1)).trained_sensors
     assert "duragel" not in Loader(make(rows), settings(1, clip_share=1.0)).trained_sensors
-
-
-# Force ---------------------------------------------------------------------------------------------------------------
-
-
-def pressed():
-    return [{**row, "label.force": float(10 * i + row["frame_index"] ** 2)} for i, row in enumerate(world())]
-
-
-def test_force_labels_are_those_of_the_frames_that_are_seen(make, settings, read_back):
-    manifest = make(pressed())
-    newton = np.asarray(manifest.column("label.force"))
-    loader = Loader(manifest, changed(settings(1), "force_heads"))
-    spread = newton.std()
-    clips = manifest.clips(4)
-    change = np.std(newton[clips[:, 2]] - newton[clips[:, 0]])
-    kinds = set()
-    for batch in batches(loader, 12):
-        rows = read_back(batch.clip)
-        kinds.add(rows.shape[1])
-        last = rows[:, min(2, rows.shape[1] - 1)]  # the next frame is not seen, so its force is not asked for
-        np.testing.assert_allclose(batch.force[:, 0], (newton[last] - newton.mean()) / spread, rtol=1e-4, atol=1e-5)
-        if rows.shape[1] == 1:
-            assert np.isnan(batch.force[:, 1]).all()
-        else:
-            np.testing.assert_allclose(batch.force[:, 1], (newton[last] - newton[rows[:, 0]]) / change, rtol=1e-4)
-    assert kinds == {1, 4}
-    assert batch.force.dtype == np.float32
-
-
-def test_without_a_force_head_there_are_no_labels(make, settings):
-    assert Loader(make(pressed()), settings(1)).batch(0).force is None
-
-
-def test_rows_without_a_force_are_not_known(make, settings, read_back):
-    rows = [{**row, "label.force": None if i % 2 else row["label.force"]} for i, row in enumerate(pressed())]
-    for batch in batches(Loader(make(rows), changed(settings(1), "force_heads")), 6):
-        seen = read_back(batch.clip)[:, : min(3, batch.clip.shape[1])]
-        assert np.array_equal(np.isnan(batch.force[:, 0]), seen[:, -1] % 2 == 1)
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (lambda row: {**row, "label.force": 3.0}, "has 1 value"),
-        (lambda row: {**row, "label.force": None}, "lacks|has 0 value|needs numbers"),
-        (lambda row: {**row, "label.force": "hard"}, "needs numbers"),
-        (lambda row: {k: v for k, v in row.items() if k != "label.force"}, "needs the column 'label.force'"),
-    ],
-)
-def test_forces_that_cannot_be_learned_are_one_sentence(make, settings, change, told):
-    with pytest.raises(UserError, match=told):
-        Loader(make([change(row) for row in pressed()]), changed(settings(1), "force_heads"))
-
-
-def test_a_weight_without_a_head_is_one_sentence(make, settings):
-    from dataclasses import replace
-
-    config = settings(1)
-    with pytest.raises(UserError, match=r"set --model\.force-head"):
-        Loader(make(pressed()), replace(config, objective=replace(config.objective, force=1.0)))

@@ -124,13 +124,13 @@ def test_strata_follow_the_weights(make, settings):
     ("weights", "told"),
     [
         ((("c", 2.0),), r"names the dataset 'c', but split 'train' has a, b"),
-        ((("a", -1.0),), "how often it is drawn"),
-        ((("a", float("nan")),), "how often it is drawn"),
+        ((("a", -1.0),), r"--data\.weights of 'a'"),
+        ((("a", float("nan")),), r"--data\.weights of 'a'"),
         ((("a", 1.0), ("a", 2.0)), "a dataset twice"),
         ((("a", 0.0), ("b", 0.0)), "leaves out every row"),
     ],
 )
-def test_weights_that_make_no_sense_are_told(make, settings, weights, told):
+def test_weights_that_make_no_sense_are_errors(make, settings, weights, told):
     with pytest.raises(UserError, match=told):
         Loader(make(_sets({"a": 4, "b": 4})), settings(weights=weights))
 
@@ -205,7 +205,7 @@ def test_where_the_batch_is_the_negatives_they_are_of_one_sensor(make, settings,
     assert all(np.array_equal(a, b) for a, b in zip(batches[3], Loader(manifest, config).batch(3).match, strict=True))
 
 
-def test_without_such_negatives_there_is_no_matching_and_it_is_said(make, settings):
+def test_without_negatives_of_the_same_sensor_there_is_no_matching_and_a_note(make, settings):
     seen = {"text": "words"}
     rows = [{"touch": "p", "sensor": name, "object": "o", **seen} for name in ("digit", "gelslim")]
     loader = Loader(make([*rows, {"touch": "q", "object": "r", "sensor": "duragel"}] * 2), settings(2))

@@ -8,14 +8,14 @@ from anytouch_jax.data.loading import sampling as s
 
 def test_uniform_is_a_function_of_seed_tag_and_step():
     steps = np.arange(20_000)
-    draw = s.uniform(3, 1, steps)
+    draw = s.uniform_per_step(3, 1, steps)
     assert draw.min() >= 0 and draw.max() < 1
     counts, _ = np.histogram(draw, 20, (0, 1))
     assert np.abs(counts - 1000).max() < 5 * np.sqrt(1000)
     assert abs(np.corrcoef(draw[1:], draw[:-1])[0, 1]) < 0.03
-    np.testing.assert_array_equal(s.uniform(3, 1, steps[500:600]), draw[500:600])
+    np.testing.assert_array_equal(s.uniform_per_step(3, 1, steps[500:600]), draw[500:600])
     for seed, tag in ((4, 1), (3, 2), (-3, 1)):
-        assert abs(np.corrcoef(s.uniform(seed, tag, steps), draw)[0, 1]) < 0.03
+        assert abs(np.corrcoef(s.uniform_per_step(seed, tag, steps), draw)[0, 1]) < 0.03
 
 
 def test_turns_count_the_earlier_steps_of_a_kind():

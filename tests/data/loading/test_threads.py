@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from anytouch_jax.data.loading.threads import Work, do, pump
+from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches, run_jobs
 
 
 def _ours():
@@ -18,24 +18,24 @@ def _plan(step, log=None):
 
     if log is not None:
         log.append(step)
-    return Work(batch, [lambda slot=slot: job(slot) for slot in range(10)], {"n": step})
+    return BatchJobs(batch, [lambda slot=slot: job(slot) for slot in range(10)], {"n": step})
 
 
 @pytest.mark.parametrize("threads", [0, 1, 2, 4])
 @pytest.mark.parametrize("prefetch", [0, 1, 3])
 def test_batches_come_whole_and_in_order(threads, prefetch):
-    got = list(pump(_plan, range(3, 9), threads, prefetch))
+    got = list(prefetch_batches(_plan, range(3, 9), threads, prefetch))
     assert [step for step, _, _ in got] == list(range(3, 9))
     for step, batch, info in got:
         assert batch == [(step, slot) for slot in range(10)] and info == {"skipped_samples": 5, "n": step}
     assert not _ours()
-    assert do(_plan(4)) == (got[1][1], got[1][2])
-    assert list(pump(_plan, range(0), threads, prefetch)) == []
+    assert run_jobs(_plan(4)) == (got[1][1], got[1][2])
+    assert list(prefetch_batches(_plan, range(0), threads, prefetch)) == []
 
 
 def test_no_more_is_planned_than_the_prefetch():
     log = []
-    stream = pump(lambda step: _plan(step, log), range(100), 2, 3)
+    stream = prefetch_batches(lambda step: _plan(step, log), range(100), 2, 3)
     assert log == []  # nothing before the first batch is asked for
     for taken in range(1, 6):
         next(stream)
@@ -54,9 +54,9 @@ def test_closing_early_ends_the_threads_and_drops_what_waits():
                 done.append(step)
             return 0
 
-        return Work(step, [job] * 4)
+        return BatchJobs(step, [job] * 4)
 
-    stream = pump(plan, range(50), 2, 20)
+    stream = prefetch_batches(plan, range(50), 2, 20)
     assert next(stream)[0] == 0
     assert len(_ours()) == 2
     threading.Timer(0.05, gate.set).start()
@@ -73,18 +73,18 @@ def test_the_first_error_of_a_step_reaches_the_caller(threads):
                 raise ValueError(f"slot {slot}")
             return 0
 
-        return Work(step, [lambda slot=slot: job(slot) for slot in range(9)])
+        return BatchJobs(step, [lambda slot=slot: job(slot) for slot in range(9)])
 
     seen = []
     with pytest.raises(ValueError, match="slot 5"):
-        for step, _, _ in pump(plan, range(9), threads, 4):
+        for step, _, _ in prefetch_batches(plan, range(9), threads, 4):
             seen.append(step)
     assert seen == [0, 1] and not _ours()
 
 
 def test_an_error_in_the_caller_ends_the_threads():
     with pytest.raises(RuntimeError, match="mine"):
-        for _ in pump(_plan, range(9), 2, 2):
+        for _ in prefetch_batches(_plan, range(9), 2, 2):
             raise RuntimeError("mine")
     assert not _ours()
 
@@ -96,5 +96,5 @@ def test_an_error_in_the_plan_ends_the_threads():
         return _plan(step)
 
     with pytest.raises(ValueError, match="no plan"):
-        list(pump(plan, range(9), 2, 2))
+        list(prefetch_batches(plan, range(9), 2, 2))
     assert not _ours()

@@ -12,7 +12,8 @@ import pyarrow.parquet
 import pytest
 
 from anytouch_jax.data.images import ImageError, decode
-from anytouch_jax.data.loading.loader import Loader, SampleError
+from anytouch_jax.data.loading.loader import Loader
+from anytouch_jax.data.loading.samples import SampleError
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import files as packed
 from anytouch_jax.data.manifest import manifest as manifests

@@ -11,7 +11,7 @@ import numpy as np
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.samples import SampleError, SampleReader
-from anytouch_jax.data.loading.threads import Work, pump
+from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
 from anytouch_jax.errors import UserError
 
@@ -50,17 +50,17 @@ def _passes(
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     data, size = reader.config.data, reader.config.model.image_size
 
-    def plan(start: int) -> Work[tuple[TouchBatch, np.ndarray]]:
+    def plan(start: int) -> BatchJobs[tuple[TouchBatch, np.ndarray]]:
         here = windows[start : start + data.batch_size]
         batch = TouchBatch(
             np.zeros((data.batch_size, here.shape[1], size, size, 3), np.uint8), np.zeros(data.batch_size, np.int32)
         )
         good = np.ones(len(here), bool)
         batch.sensor[: len(here)] = sensor[here[:, -1]]
-        return Work((batch, good), [partial(_write, reader, batch, good, here, slot) for slot in range(len(here))])
+        return BatchJobs((batch, good), [partial(_write, reader, batch, good, here, slot) for slot in range(len(here))])
 
     starts = range(0, len(rows), data.batch_size)
-    for start, (batch, good), _ in pump(plan, starts, data.threads, data.prefetch):
+    for start, (batch, good), _ in prefetch_batches(plan, starts, data.threads, data.prefetch):
         kept = np.flatnonzero(good)
         if not kept.size:
             continue

@@ -1,7 +1,12 @@
-"""What a run can draw from: stills, clips and touches felt twice, cut into strata, each with its stream of epochs."""
+"""Pools to draw from: the stills, clips and matching pairs of a split, cut into strata by modality.
+
+`find_pools` runs once before the first step. It selects the rows of the split, finds the clips among them, and gives
+each stratum a sampler. The loader then draws from the pools by step number.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -9,37 +14,36 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
-from anytouch_jax.data import tokenizer as texts
-from anytouch_jax.data.loading.labels import Force, find_force
 from anytouch_jax.data.loading.matching import Matches, MatchKeys, is_shared_touch
 from anytouch_jax.data.loading.sampling import EpochSampler, StratumQuota
 from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_rows
 from anytouch_jax.data.prepare.contact import known_contact
+from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
 from anytouch_jax.errors import UserError
 
 STILL, CLIP = 0, 1
-_BARE = 3  # stratum of windows without picture and caption, the last (`_Finder.pool`)
+_NEITHER = 3  # the last stratum: windows without photograph and caption
 _ALIGN, _ANCHOR = 100, 200  # tags that keep the random streams of one seed apart
-_WITHHELD = "downstream_test"  # column of frames in a test split of a downstream task (paper, appendix: fairness)
-_NOT_SET = ("", "0", "0.0", "false", "no", "none")
+_DOWNSTREAM = "downstream_test"  # column of frames in a test split of a downstream task (paper, appendix: fairness)
+_FALSE_WORDS = ("", "0", "0.0", "false", "no", "none")
 
 
 class Pool(NamedTuple):
-    """Windows of rows i64 (M, T) to draw from; `members[s]` the ids of stratum s in `windows`, `streams[s]` over it."""
+    """Windows of rows i64 (M, T); for each stratum its ids in `windows` (`members`) and a sampler over these."""
 
     windows: np.ndarray
-    strata: StratumQuota
+    quota: StratumQuota
     members: tuple[np.ndarray, ...]
-    streams: tuple[EpochSampler, ...]
+    samplers: tuple[EpochSampler, ...]
 
     @property
     def draws(self) -> int:
-        """Windows that an epoch draws: each once, or as the weights say."""
-        return sum(stream.size for stream in self.streams)
+        """Windows that an epoch draws."""
+        return sum(sampler.size for sampler in self.samplers)
 
 
-class Pairs(NamedTuple):
-    """Matching: windows of rows i64 (M, T), the matches between them, and the stream over their anchors."""
+class MatchPool(NamedTuple):
+    """Windows of rows i64 (M, T) for matching, the matches among them, and a sampler over the anchors."""
 
     windows: np.ndarray
     matches: Matches
@@ -47,94 +51,181 @@ class Pairs(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """All there is to draw from, by kind: `pools` (stills, and clips if any), `pairs` (None where there are none).
+    """All pools of a run: `touch` (stills, then clips if there are any) and `match` (stills, clips; None if empty).
 
-    `sensor` i32 (rows of the manifest,) sensor-table rows; `tokenizer` the one in use; `notes` to tell the user;
-    `force` the labels of a run with a force head.
+    `sensor` i32 (rows of the manifest,) holds sensor-table rows, -1 for rows left out; `notes` are for the user.
     """
 
-    pools: tuple[Pool, ...]
-    pairs: tuple[Pairs | None, Pairs | None]
+    touch: tuple[Pool, ...]
+    match: tuple[MatchPool | None, MatchPool | None]
     sensor: np.ndarray
-    tokenizer: texts.Tokenizer | None
+    tokenizer: Tokenizer | None
     notes: list[str]
-    force: Force | None
 
 
-def find_pools(manifest: Manifest, config: Config, tokenizer: texts.Tokenizer | None, devices: int) -> Pools:
-    """Look through the split `config.data.split`. Raises UserError: an empty split, nothing to learn, an unknown
-    sensor, no tokenizer."""
-    rows, sensor, notes = _usable(manifest, config)
+class _Usable(NamedTuple):
+    """The rows that a run may use: `sensor` as in `Pools`, `rows` i64 ids that may be drawn.
+
+    For every row of the manifest: `weights` f64 draws per epoch (None: 1), `ends` bool whether a clip may end there
+    (None: yes), `has_image` and `has_text` bool whether it has a modality that the model has a tower for.
+    """
+
+    sensor: np.ndarray
+    rows: np.ndarray
+    weights: np.ndarray | None
+    ends: np.ndarray | None
+    has_image: np.ndarray
+    has_text: np.ndarray
+
+    def weights_of(self, windows: np.ndarray) -> np.ndarray | None:
+        return None if self.weights is None else self.weights[windows[:, -1]]
+
+
+def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, devices: int) -> Pools:
+    """Return the pools of the split `config.data.split`; `devices` sets the multiple of the slots.
+
+    Raises UserError for an empty split, an unknown sensor, an unfit tokenizer, and for data without a training signal.
+    """
+    usable, notes = _usable_rows(manifest, config)
+    captioned = usable.rows[usable.has_text[usable.rows]]
+    if captioned.size and tokenizer is None:
+        tokenizer, note = choose_tokenizer(manifest, captioned, config)
+        notes += note
+    if captioned.size and tokenizer and config.model.text and tokenizer.vocab_size > config.model.text.vocab:
+        raise UserError(
+            f"the tokenizer has {tokenizer.vocab_size} tokens but the text tower only {config.model.text.vocab}: "
+            f"set --model.text.vocab {tokenizer.vocab_size} or give another tokenizer"
+        )
+    if config.stage == 2 and config.model.text:
+        notes += _withheld_notes(manifest, config, usable.rows)
+    data, frames = config.data, config.model.frames
+    length = frames + (config.stage == 1 or config.objective.reconstruct)
+    stills, clips = usable.rows[:, None], _clips(manifest, config, usable, length)
+    touch = tuple(
+        _pool(config, usable, kind, windows, devices)
+        for kind, windows in ((STILL, stills), (CLIP, clips))
+        if len(windows)
+    )
+    if len(touch) == 1 and data.clip_share:
+        notes.append(f"split {data.split!r} has no clip of {length} frames, so all batches are stills")
+    match: tuple[MatchPool | None, MatchPool | None] = (None, None)
+    if config.stage == 2 and config.model.match_head != "none":
+        clips = clips if length == frames else _clips(manifest, config, usable, frames)
+        match, note = _match_pools(manifest, config, usable, stills, clips)
+        notes += note
+        if match[STILL] and match[CLIP] is None and len(touch) > 1:
+            notes.append("no two clips share a touch: matching uses stills only")
+    if config.stage == 2:
+        _check_signal(config, touch, match)
+    return Pools(touch, match, usable.sensor, tokenizer, notes)
+
+
+def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> np.ndarray:
+    """Return the clips of usable rows, i64 (clips, length); none for a run of stills."""
+    if not config.data.clip_share:
+        return np.empty((0, length), np.int64)
+    clips = manifest.clips(length, config.data.split)
+    good = np.ones(len(clips), bool)
+    for frame in clips.T:
+        good &= usable.sensor[frame] >= 0
+    if usable.ends is not None:
+        good &= usable.ends[clips[:, -1]]
+    return clips if good.all() else clips[good]
+
+
+def _pool(config: Config, usable: _Usable, kind: int, windows: np.ndarray, devices: int) -> Pool:
+    has_image, has_text = usable.has_image[windows[:, -1]], usable.has_text[windows[:, -1]]
+    strata = (has_image & ~has_text, has_image & has_text, ~has_image & has_text, ~has_image & ~has_text)
+    members = tuple(np.flatnonzero(stratum) for stratum in strata)
+    samplers = tuple(
+        EpochSampler(len(ids), config.run.seed, _ALIGN + 4 * kind + s, usable.weights_of(windows[ids]))
+        for s, ids in enumerate(members)
+    )
+    quota = StratumQuota([sampler.size for sampler in samplers], config.data.batch_size, devices)
+    return Pool(windows, quota, members, samplers)
+
+
+def _match_pools(
+    manifest: Manifest, config: Config, usable: _Usable, stills: np.ndarray, clips: np.ndarray
+) -> tuple[tuple[MatchPool | None, MatchPool | None], list[str]]:
+    """Return the matching pools of stills and clips, and notes."""
+
+    def codes(name: str, own: bool = False) -> np.ndarray:
+        codes = manifest.codes(name, own=own)
+        return codes.astype(np.int32) if codes.max(initial=0) < 1 << 31 else codes
+
+    keys = MatchKeys(codes("touch", own=True), usable.sensor, codes("unit"), codes("object"), codes("dataset"))
+    same_sensor, seed = config.data.negatives == "same_sensor", config.run.seed
+
+    def pool(kind: int, windows: np.ndarray) -> MatchPool | None:
+        other_object = config.recipe == "release"
+        matches = Matches(windows[:, -1], keys, same_sensor=same_sensor, other_object=other_object)
+        if not matches.anchors.size:
+            return None
+        weights = usable.weights_of(windows[matches.anchors])
+        return MatchPool(windows, matches, EpochSampler(len(matches.anchors), seed, _ANCHOR + kind, weights))
+
+    still, clip = pool(STILL, stills), pool(CLIP, clips) if config.data.clip_share else None
+    notes = []
+    if still is None:
+        reason = "no place (column 'touch') was touched by two sensors or units"
+        if same_sensor:
+            reason = "no place was touched by two sensors, one of which also touched another place"
+        option = " with data.negatives=same_sensor" if same_sensor else ""
+        notes.append(f"{reason}: there is no cross-sensor matching{option}")
+    elif still.matches.one_object:
+        notes.append("all touches are of one object: the negatives of matching are other places on it")
+    return (still, clip), notes
+
+
+def _check_signal(config: Config, touch: tuple[Pool, ...], match: tuple[MatchPool | None, ...]) -> None:
+    """Raise UserError if the loss of stage 2 would be 0 at every step."""
+    has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
+    if not has_modality and not any(match) and not config.objective.reconstruct:
+        raise UserError(
+            f"stage 2 has nothing to learn from split {config.data.split!r}: it needs photographs (image_path), "
+            "captions (text), or places touched by two sensors (touch), with the tower or head for them; add one, or "
+            "train stage 1"
+        )
+
+
+def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]]:
+    rows, sensor, notes = _known_rows(manifest, config)
     weights, note = _weights(manifest, config, rows)
     notes += note
     if weights is not None:
         rows = rows[weights[rows] > 0]
         sensor = np.where(weights > 0, sensor, -1)
-    rows, drawn, note = _required(manifest, config, rows)
-    notes += note
-    finder = _Finder(manifest, config, rows, sensor, weights, drawn, {})
-    has_image, has_text = finder.modalities()
-    captioned = rows[has_text[rows]]
-    if captioned.size:
-        tokenizer, note = _choose_tokenizer(tokenizer, manifest, captioned, config)
-        notes += note
-    if config.stage == 2 and config.model.text:
-        notes += _say_withheld(manifest, config, rows)
-    length = config.model.frames + (config.stage == 1 or config.objective.reconstruct)
-    pools = tuple(
-        finder.pool(kind, windows, has_image[windows[:, -1]], has_text[windows[:, -1]], devices)
-        for kind in ((STILL, CLIP) if config.data.clip_share else (STILL,))
-        if len(windows := finder.windows(kind, length))
-    )
-    if len(pools) == 1 and config.data.clip_share:
-        notes.append(f"split {config.data.split!r} has no clip of {length} frames: all batches are stills")
-    pairs: tuple[Pairs | None, Pairs | None] = (None, None)
-    if config.stage == 2 and config.model.match_head != "none":
-        pairs, note = finder.both_pairs(len(pools) > 1)
-        notes += note
-    if config.stage == 2:
-        _something_to_learn(config, pools, pairs)
-    force = find_force(manifest, config, rows, pools[CLIP].windows if len(pools) > 1 else None)
-    return Pools(pools, pairs, sensor, tokenizer, notes, force)
+    rows, ends, note = _required(manifest, config, rows)
+    return _Usable(sensor, rows, weights, ends, *_modalities(manifest, config)), notes + note
 
 
-def _something_to_learn(config: Config, pools: tuple[Pool, ...], pairs: tuple[Pairs | None, ...]) -> None:
-    """Raise UserError where stage 2 would have a loss of 0 at every step."""
-    shown = any(len(ids) for pool in pools for ids in pool.members[:_BARE])
-    if not shown and not any(pairs) and not config.objective.reconstruct:
-        raise UserError(
-            f"stage 2 has nothing to learn from split {config.data.split!r}: no photograph (image_path), no caption "
-            "(text) that this run has a tower for, and no touch felt twice (touch) that this run matches; add one, or "
-            "train stage 1"
-        )
-
-
-def _usable(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Rows of the split that have images of a known sensor, the sensor-table row of every row, notes."""
-    split, unknown = config.data.split, config.data.on_bad_sample
+def _known_rows(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the rows of the split with images of a known sensor, the sensor-table row of every row, and notes."""
+    split, on_bad = config.data.split, config.data.on_bad_sample
     rows = manifest.rows_of(split)
-    sensor, notes = sensor_rows(manifest, config.model, rows, unknown=unknown)
+    sensor, notes = sensor_rows(manifest, config.model, rows, unknown=on_bad)
     rows = rows[sensor[rows] >= 0]
-    files = ", ".join(map(str, manifest.files))
     if not rows.size:
+        files = ", ".join(map(str, manifest.files))
         raise ManifestError(f"{files}: split {split!r} has no row of a known sensor with images")
     if config.data.background == "subtract":
-        bare = rows[~manifest.present("background_path")[rows]]
-        if len(bare) == len(rows) or (len(bare) and unknown == "error"):
+        missing = rows[~manifest.present("background_path")[rows]]
+        if len(missing) == len(rows) or (len(missing) and on_bad == "error"):
             raise ManifestError(
-                f"{manifest.where(int(bare[0]))} and {len(bare) - 1} other rows have no background_path, which "
-                "--loader.background subtract takes off; --on-bad-sample skip leaves such rows out"
+                f"{manifest.where(int(missing[0]))} and {len(missing) - 1} other rows have no background_path, which "
+                "--data.background subtract requires; add backgrounds, or pass --data.on-bad-sample skip"
             )
-        if len(bare):
-            notes.append(f"left out {len(bare)} rows without background_path, which data.background subtract takes off")
+        if len(missing):
+            notes.append(f"left out {len(missing)} rows without background_path, which data.background needs")
             sensor = sensor.copy()
-            sensor[bare] = -1
+            sensor[missing] = -1
             rows = rows[sensor[rows] >= 0]
     return rows, sensor, notes
 
 
 def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """`rows` that have what `data.require` and `contact_only` ask; which rows of the manifest (None: any); notes."""
+    """Return the `rows` that `data.require` and `data.contact_only` allow, a mask over the manifest, and notes."""
     wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
     if not wanted:
         return rows, None, []
@@ -142,175 +233,110 @@ def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.
     has = {"image": manifest.present("image_path"), "text": text}
     if config.data.contact_only:
         if "label.contact" not in manifest.table.column_names:
-            raise UserError("--loader.contact-only reads the column 'label.contact', which `anytouch contact` writes")
-        has["contact"] = known_contact(manifest) != 0  # or nothing is known
-    drawn = np.logical_and.reduce([has[name] for name in wanted])
-    kept, what = rows[drawn[rows]], " and ".join(wanted)
-    named = "data.contact_only" if wanted == ["contact"] else "data.require"
-    if not kept.size:
-        raise UserError(f"{named}: no row of split {config.data.split!r} has {what}")
-    return kept, drawn, [f"{len(kept)} of {len(rows)} rows have {what}; only they are drawn ({named})"]
+            raise UserError(
+                "--data.contact-only needs the column 'label.contact', which `anytouch data contact` writes"
+            )
+        has["contact"] = known_contact(manifest) != 0  # rows of unknown contact stay
+    allowed = np.logical_and.reduce([has[name] for name in wanted])
+    remaining, words = rows[allowed[rows]], " and ".join(wanted)
+    option = "data.contact_only" if wanted == ["contact"] else "data.require"
+    if not remaining.size:
+        raise UserError(f"{option}: no row of split {config.data.split!r} has {words}")
+    return remaining, allowed, [f"{len(remaining)} of {len(rows)} rows have {words}; only they are drawn ({option})"]
 
 
 def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
-    """How often an epoch draws each row of the manifest, f64 (rows,), None where all are drawn once; and notes."""
-    column = manifest.column("dataset")
-    there = pc.unique(column.take(rows)).drop_null().to_pylist()
+    """Return how often an epoch draws each row of the manifest, f64 (rows,), None if each comes once; and notes."""
+    column, split = manifest.column("dataset"), config.data.split
+    datasets = pc.unique(column.take(rows)).drop_null().to_pylist()
     wanted = config.data.weights
     if wanted is None:
-        own = config.recipe == "release" and config.stage == 2  # its stage 1 draws every row once
-        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in there) if own else ()
+        released = config.recipe == "release" and config.stage == 2  # its stage 1 draws every row once
+        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in datasets) if released else ()
     for name, weight in wanted:
-        if name not in there:
-            known = ", ".join(sorted(there)) or "none: its column 'dataset' is empty"
-            raise UserError(f"--loader.weights names the dataset {name!r}, but split {config.data.split!r} has {known}")
+        if name not in datasets:
+            known = ", ".join(sorted(datasets)) or "none: its column 'dataset' is empty"
+            raise UserError(f"--data.weights names the dataset {name!r}, but split {split!r} has {known}")
         if not 0 <= weight < 1e6:
-            raise UserError(f"--loader.weights of {name!r} is how often it is drawn in an epoch, not {weight}")
+            raise UserError(f"--data.weights of {name!r} is the number of draws per epoch, not {weight}")
     if len(set(dict(wanted))) < len(wanted):
-        raise UserError("--loader.weights names a dataset twice")
+        raise UserError("--data.weights names a dataset twice")
     if not wanted:
         return None, []
     weights = np.ones(len(manifest))
     for name, weight in wanted:
         weights[np.asarray(pc.fill_null(pc.equal(column, name), False))] = weight
     if not weights[rows].any():
-        raise UserError(f"--loader.weights leaves out every row of split {config.data.split!r}")
-    said = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
-    return weights, [f"an epoch draws {said}, other datasets once"]
+        raise UserError(f"--data.weights leaves out every row of split {split!r}")
+    counts = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
+    return weights, [f"an epoch draws {counts}, other datasets once"]
+
+
+def _modalities(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """Return which rows of the manifest have a photograph and a caption that the model has a tower for."""
+    model, none = config.model, np.zeros(len(manifest), bool)
+    if config.stage == 1:
+        return none, none
+    image = manifest.present("image_path") if model.image else none
+    if not model.text:
+        return image, none
+    return image, manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
 
 
 def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
-    """Rows in a test split of a downstream task (column `downstream_test`): their text is not trained on, bool (rows,).
+    """Return the rows whose text is not trained on, bool (rows,).
 
-    So a text that tells the label is never seen with a frame that a probe is tested on (paper, appendix). Without
-    `aligned_text` also the rows whose touch several sensors or units felt (Table 6, "w/o Text in TacQuad").
+    These are frames in a test split of a downstream task (column `downstream_test`), whose text may name the label
+    (paper, appendix). Without `aligned_text` they include touches shared by sensors or units (Table 6, "w/o Text in
+    TacQuad").
     """
-    tested = _downstream(manifest)
-    return tested if aligned_text else tested | _aligned(manifest)
+    tested = _in_downstream_test(manifest)
+    return tested if aligned_text else tested | _is_aligned(manifest)
 
 
-def _aligned(manifest: Manifest) -> np.ndarray:
+def _is_aligned(manifest: Manifest) -> np.ndarray:
     return is_shared_touch(*(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit")))
 
 
-def _say_withheld(manifest: Manifest, config: Config, rows: np.ndarray) -> list[str]:
-    text, tested = manifest.present("text")[rows], _downstream(manifest)[rows]
-    notes = []
-    if (text & tested).any():
-        count = int((text & tested).sum())
+def _in_downstream_test(manifest: Manifest) -> np.ndarray:
+    if _DOWNSTREAM not in manifest.table.column_names:
+        return np.zeros(len(manifest), bool)
+    word = pc.utf8_lower(manifest.table[_DOWNSTREAM].cast(pa.string()))
+    return ~np.asarray(pc.is_in(pc.fill_null(word, ""), value_set=pa.array(_FALSE_WORDS)))
+
+
+def _withheld_notes(manifest: Manifest, config: Config, rows: np.ndarray) -> list[str]:
+    text, notes = manifest.present("text")[rows], []
+    if count := int((text & _in_downstream_test(manifest)[rows]).sum()):
         notes.append(f"the text of {count} rows is withheld: they are in a test split of a downstream task")
     if not config.data.aligned_text:
-        count = int((text & _aligned(manifest)[rows]).sum())
+        count = int((text & _is_aligned(manifest)[rows]).sum())
         notes.append(
-            f"the text of {count} of {int(text.sum())} rows is withheld: other sensors or units felt the same touch "
+            f"the text of {count} of {int(text.sum())} rows is withheld: other sensors or units share the touch "
             "(data.aligned_text)"
         )
     return notes
 
 
-def _downstream(manifest: Manifest) -> np.ndarray:
-    if _WITHHELD not in manifest.table.column_names:
-        return np.zeros(len(manifest), bool)
-    word = pc.utf8_lower(manifest.table[_WITHHELD].cast(pa.string()))
-    return ~np.asarray(pc.is_in(pc.fill_null(word, ""), value_set=pa.array(_NOT_SET)))
-
-
 def training_captions(manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True) -> list[str]:
-    """The different captions of `rows` that may be trained on (see `withheld_text`), in order."""
-    kept = rows[~withheld_text(manifest, aligned_text=aligned_text)[rows]]
-    return sorted(pc.unique(manifest.column("text").take(kept)).drop_null().to_pylist())
+    """Return the distinct captions of `rows` that may be trained on (see `withheld_text`), sorted."""
+    allowed = rows[~withheld_text(manifest, aligned_text=aligned_text)[rows]]
+    return sorted(pc.unique(manifest.column("text").take(allowed)).drop_null().to_pylist())
 
 
-def _choose_tokenizer(
-    given: texts.Tokenizer | None, manifest: Manifest, rows: np.ndarray, config: Config
-) -> tuple[texts.Tokenizer, list[str]]:
-    tower, notes = config.model.text, []
-    assert tower is not None
-    if given is None and config.data.tokenizer is not None:
-        given = texts.load_tokenizer(config.data.tokenizer)
-    if given is None:
-        given = texts.train_tokenizer(training_captions(manifest, rows), tower.vocab)
-        notes.append(f"no tokenizer is given: one of {given.vocab_size} tokens was trained on the captions")
-    if given.vocab_size > tower.vocab:
-        raise UserError(
-            f"the tokenizer has {given.vocab_size} tokens but the text tower only {tower.vocab}: "
-            f"set --model.text.vocab {given.vocab_size} or give another tokenizer"
-        )
-    return given, notes
+def choose_tokenizer(
+    manifest: Manifest, rows: np.ndarray, config: Config, *, file: Path | None = None, vocabulary: int | None = None
+) -> tuple[Tokenizer | None, list[str]]:
+    """Return the tokenizer of a run, and notes: from `file`, else `data.tokenizer`, else trained on the captions.
 
-
-class _Finder(NamedTuple):
-    manifest: Manifest
-    config: Config
-    rows: np.ndarray
-    sensor: np.ndarray
-    weights: np.ndarray | None
-    drawn: np.ndarray | None  # rows of the manifest that may end a window, None: any
-    found: dict[int, np.ndarray]  # clips by their length
-
-    def modalities(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which rows of the manifest have a picture and a caption that the model has a tower for."""
-        model, none = self.config.model, np.zeros(len(self.manifest), bool)
-        if self.config.stage == 1:
-            return none, none
-        image = self.manifest.present("image_path") if model.image else none
-        if not model.text:
-            return image, none
-        kept = ~withheld_text(self.manifest, aligned_text=self.config.data.aligned_text)
-        return image, self.manifest.present("text") & kept
-
-    def windows(self, kind: int, length: int) -> np.ndarray:
-        if kind == STILL:
-            return self.rows[:, None]
-        if length not in self.found:
-            clips = self.manifest.clips(length, self.config.data.split)
-            good = np.ones(len(clips), bool)
-            for frame in clips.T:
-                good &= self.sensor[frame] >= 0
-            if self.drawn is not None:
-                good &= self.drawn[clips[:, -1]]
-            self.found[length] = clips if good.all() else clips[good]
-        return self.found[length]
-
-    def pool(self, kind: int, windows: np.ndarray, image: np.ndarray, text: np.ndarray, devices: int) -> Pool:
-        seed = self.config.run.seed
-        members = tuple(np.flatnonzero(here) for here in (image & ~text, image & text, ~image & text, ~image & ~text))
-        streams = tuple(
-            EpochSampler(len(ids), seed, _ALIGN + 4 * kind + s, self._weights_of(windows[ids]))
-            for s, ids in enumerate(members)
-        )
-        strata = StratumQuota([stream.size for stream in streams], self.config.data.batch_size, devices)
-        return Pool(windows, strata, members, streams)
-
-    def _weights_of(self, windows: np.ndarray) -> np.ndarray | None:
-        return None if self.weights is None else self.weights[windows[:, -1]]
-
-    def both_pairs(self, has_clips: bool) -> tuple[tuple[Pairs | None, Pairs | None], list[str]]:
-        def codes(name: str, own: bool = False) -> np.ndarray:
-            found = self.manifest.codes(name, own=own)
-            return found.astype(np.int32) if found.max(initial=0) < 1 << 31 else found
-
-        notes = []
-        keys = MatchKeys(codes("touch", own=True), self.sensor, codes("unit"), codes("object"), codes("dataset"))
-        stills, clips = self._pairs(STILL, keys), self._pairs(CLIP, keys) if self.config.data.clip_share else None
-        if stills is None:
-            notes.append(
-                "no touch was felt by two sensors or units (column 'touch'): there is no cross-sensor matching"
-                if self.config.data.negatives == "any"
-                else "no touch was felt by two sensors, one of which felt another place: there is no cross-sensor "
-                "matching with data.negatives=same_sensor"
-            )
-        elif stills.matches.one_object:
-            notes.append("all touches are of one object: negatives of matching are other places of it")
-        if stills and has_clips and clips is None:
-            notes.append("no two clips share a touch: matching uses stills only")
-        return (stills, clips), notes
-
-    def _pairs(self, kind: int, keys: MatchKeys) -> Pairs | None:
-        windows = self.windows(kind, self.config.model.frames)
-        wanted = {"same_sensor": self.config.data.negatives == "same_sensor"}
-        matches = Matches(windows[:, -1], keys, **wanted, other_object=self.config.recipe == "release")
-        if not matches.anchors.size:
-            return None
-        weights, seed = self._weights_of(windows[matches.anchors]), self.config.run.seed
-        return Pairs(windows, matches, EpochSampler(len(matches.anchors), seed, _ANCHOR + kind, weights))
+    Captions are those of `rows` that may be trained on; without any the tokenizer is None. A trained tokenizer has at
+    most `vocabulary` tokens (default: as many as the text tower). Raises UserError for a file that cannot be used.
+    """
+    path = file or config.data.tokenizer
+    if path is not None:
+        return load_tokenizer(path), []
+    captions = training_captions(manifest, rows, aligned_text=config.data.aligned_text)
+    if not captions or config.model.text is None:
+        return None, []
+    tokenizer = train_tokenizer(captions, vocabulary or config.model.text.vocab)
+    return tokenizer, [f"no tokenizer was given: one of {tokenizer.vocab_size} tokens was trained on the captions"]

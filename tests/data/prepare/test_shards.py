@@ -2,12 +2,13 @@ import hashlib
 import json
 import os
 import threading
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
+import pyarrow.compute
 import pyarrow.parquet
 import pytest
 
@@ -82,61 +83,46 @@ def test_every_file_is_stored_once_and_unchanged(make, tmp_path):
         for column in ("path", "image_path", "image2_path", "background_path"):
             if loose.value(row, column) is not None:
                 assert packed.read_file(again.file(row, column)) == loose.file(row, column).read_bytes()
-    touch = pyarrow.parquet.read_table(tmp_path / "out" / "touch" / "00000.parquet")
-    shared = pyarrow.parquet.read_table(tmp_path / "out" / "shared" / "00000.parquet")
     # A background that is also a row's touch image is not stored a second time.
-    assert (touch.num_rows, shared.num_rows) == (24, 4)
+    assert [len(_entries(tmp_path / "out" / group)) for group in ("touch", "shared")] == [24, 4]
     assert again.value(3, "background_path") == again.value(0, "path")
-    stored = touch["image"].to_pylist() + shared["image"].to_pylist()
-    assert len({entry["path"] for entry in stored}) == 28
-    for entry in stored:
-        assert entry["bytes"] == (tmp_path / entry["path"]).read_bytes()
     same = [name for name in loose.table.column_names if not name.endswith("path")]
     assert again.table.select(same).equals(loose.table.select(same))
 
 
-def test_a_shard_is_what_the_hub_reads(make, tmp_path):
+def _entries(folder):
+    return [entry for path in sorted(folder.glob("*.zip")) for entry in zipfile.ZipFile(path).infolist()]
+
+
+def test_a_shard_is_a_zip_that_any_tool_reads(make, tmp_path):
     loose = make(_shuffled([row | {"license": "MIT"} for row in _rows()]))
-    score = pyarrow.array(np.arange(len(loose)), pyarrow.float32())  # as `anytouch contact` writes it
-    pack(replace(loose, table=loose.table.append_column("label.contact_score", score)), tmp_path / "out")
-    shard = pyarrow.parquet.ParquetFile(tmp_path / "out" / "touch" / "00000.parquet")
-    schema = shard.schema_arrow
-    assert schema.field("image").type == pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
-    features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
-    assert features["image"] == {"_type": "Image"} and set(features) == set(schema.names)
-    assert features["frame_index"] == {"dtype": "int64", "_type": "Value"}
-    assert features["label.contact_score"] == {"dtype": "float32", "_type": "Value"}
-    table = shard.read()
-    order = list(zip(table["sequence"].to_pylist(), table["frame_index"].to_pylist(), strict=True))
-    assert [frame for _, frame in order] == list(range(6)) * 4  # contiguous by sequence, in time
-    assert [name for name, _ in order] == [name for name in dict.fromkeys(n for n, _ in order) for _ in range(6)]
-    card = (tmp_path / "out" / "README.md").read_text()
-    assert "data_files: touch/*.parquet" in card and "data_files: shared/*.parquet" in card
-    assert "| MIT | 24 | " in card
+    again = manifests.read(pack(loose, tmp_path / "out"))
+    with zipfile.ZipFile(tmp_path / "out" / "touch" / "00000.zip") as archive:
+        assert archive.testzip() is None and {name[6:] for name in archive.namelist()} == {".png"}
+        for row in range(len(again)):
+            entry = archive.infolist()[int(again.file(row).name)]
+            assert entry.compress_type == zipfile.ZIP_STORED
+            assert archive.read(entry) == loose.file(row).read_bytes()
+    order = sorted(range(24), key=lambda row: int(again.file(row).name))
+    frames = [loose.value(row, "frame_index") for row in order]
+    assert frames == list(range(6)) * 4  # contiguous by sequence, in time
+    assert "| MIT | 24 | " in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_the_sums_are_those_of_the_files(make, tmp_path):
     pack(make(_rows()), tmp_path / "out", shard_bytes=600)
     lines = (tmp_path / "out" / "SHA256SUMS").read_text().splitlines()
-    there = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*/*.parquet")}
+    there = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.zip")}
     assert {line[66:] for line in lines} == there and len(there) > 3
     for line in lines:
         assert hashlib.sha256((tmp_path / "out" / line[66:]).read_bytes()).hexdigest() == line[:64]
-
-
-def test_row_groups_stay_small(make, tmp_path, monkeypatch):
-    monkeypatch.setattr(packing, "_GROUP_ROWS", 5)
-    again = manifests.read(pack(make(_rows()), tmp_path / "out"))
-    about = pyarrow.parquet.ParquetFile(tmp_path / "out" / "touch" / "00000.parquet").metadata
-    assert [about.row_group(i).num_rows for i in range(about.num_row_groups)] == [5, 5, 5, 5, 4]
-    assert decode(again.file(23)).shape == (12, 16, 3)
 
 
 def test_shards_are_cut_by_size(make, tmp_path):
     loose = make(_rows())
     sizes = [loose.file(row).stat().st_size for row in range(24)]
     pack(loose, tmp_path / "out", shard_bytes=4 * max(sizes))
-    counts = [len(np.load(path)) for path in sorted((tmp_path / "out" / "touch").glob("*.index"))]
+    counts = [len(packed.read_shard_index(path)) for path in sorted((tmp_path / "out" / "touch").glob("*.zip"))]
     assert sum(counts) == 24 and max(counts) >= 4
     for number, start in enumerate(np.cumsum([0, *counts[:-1]])):
         assert sum(sizes[start : start + counts[number]]) <= 4 * max(sizes)
@@ -172,7 +158,7 @@ def test_packed_manifests_go_on_working_when_filtered_moved_or_packed_again(make
     again = manifests.read(pack(loose, tmp_path / "deep" / "out"))
     manifests.write(select_rows(again, np.array([20, 3])), tmp_path / "part.csv")
     part = manifests.read(tmp_path / "part.csv")
-    assert part.value(0, "path").startswith("deep/out/touch/00000.parquet/")
+    assert part.value(0, "path").startswith("deep/out/touch/00000.zip/")
     for row, old in enumerate((20, 3)):
         assert packed.read_file(part.file(row)) == loose.file(old).read_bytes()
     twice = manifests.read(pack(part, tmp_path / "twice"))
@@ -186,7 +172,7 @@ def _bytes_of(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("stop_at", range(1, 7))
+@pytest.mark.parametrize("stop_at", range(1, 4))
 def test_a_killed_pack_goes_on_behind_the_last_whole_shard(make, tmp_path, monkeypatch, stop_at):
     loose = make(_rows())
     size = 9 * loose.file(0).stat().st_size
@@ -198,7 +184,7 @@ def test_a_killed_pack_goes_on_behind_the_last_whole_shard(make, tmp_path, monke
     moves, real = [], os.replace
 
     def killing(source, target):
-        # After pack.json, every shard is three moves: the shard, the sums, the index.
+        # pack.json is the first move, then every shard is one.
         moves.append(target)
         if len(moves) == 1 + stop_at:
             raise Killed
@@ -211,20 +197,20 @@ def test_a_killed_pack_goes_on_behind_the_last_whole_shard(make, tmp_path, monke
     assert not (tmp_path / "out" / "manifest.parquet").exists()
     # What a kill -9 leaves behind: half of the shard that was being written.
     (tmp_path / "out" / "touch").mkdir(exist_ok=True)
-    (tmp_path / "out" / "touch" / f"{(stop_at - 1) // 3:05d}.part").write_bytes(b"half of it")
+    (tmp_path / "out" / "touch" / f"{stop_at - 1:05d}.part").write_bytes(b"half of it")
     read, fetch = [], packing.read_file
     monkeypatch.setattr(packing, "read_file", lambda path: read.append(path) or fetch(path))
     pack(loose, tmp_path / "out", shard_bytes=size)
     assert _bytes_of(tmp_path / "out") == _bytes_of(tmp_path / "whole")
-    first = len(np.load(tmp_path / "whole" / "touch" / "00000.index"))
-    assert len(read) == 28 - (first if stop_at > 3 else 0)
+    shards = sorted((tmp_path / "whole" / "touch").glob("*.zip"))
+    assert len(read) == 28 - sum(len(packed.read_shard_index(path)) for path in shards[: stop_at - 1])
 
 
 def test_a_pack_that_failed_before_its_first_shard_takes_its_folder_again(make, tmp_path):
     loose = make(_rows())
     gone = loose.file(3).read_bytes()
     loose.file(3).unlink()
-    with pytest.raises(PackError, match="run anytouch verify with --repair first"):
+    with pytest.raises(PackError, match="--repair"):
         pack(loose, tmp_path / "out")
     mended = select_rows(loose, np.delete(np.arange(len(loose)), 3))  # as --repair leaves it
     assert pack(mended, tmp_path / "out").is_file()
@@ -275,7 +261,7 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
     with pytest.raises(PackError, match=words) as error:
         pack(loose, tmp_path / "out")
     assert "\n" not in str(error.value)
-    assert not list((tmp_path / "out").rglob("*.parquet")) or harm in ("empty", "folder")  # told before the packing
+    assert not list((tmp_path / "out").rglob("*.zip")) or harm in ("empty", "folder")  # told before the packing
     assert {file.name for file in (tmp_path / "out").rglob("*.part")} | {
         f.name for f in (tmp_path / "out").rglob(".*")
     } <= {".lock"}
@@ -284,49 +270,47 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
 # Damage -----------------------------------------------------------------------------------------------------------
 
 
-def _harm(shard, how, row):
-    index = np.load(shard.with_suffix(".index"))
-    if how == "flip":
+def _harm(shard, harm, row):
+    entry = packed.read_shard_index(shard)[row]
+    if harm == "flip":
         with shard.open("r+b") as file:
-            file.seek(int(index["offset"][row]) + 30)
+            file.seek(int(entry["offset"]) + 30)
             byte = file.read(1)
             file.seek(-1, 1)
             file.write(bytes([byte[0] ^ 1]))
-    elif how == "cut":
-        os.truncate(shard, int(index["offset"][row]) + 10)
-    elif how == "gone":
+    elif harm == "cut":
+        os.truncate(shard, int(entry["offset"]) + 10)
+    elif harm == "gone":
         shard.unlink()
-    elif how == "no index":
-        shard.with_suffix(".index").unlink()
-    elif how == "bad index":
-        shard.with_suffix(".index").write_bytes(b"\x93NUMPY garbage")
-    elif how == "short index":
-        np.save(shard.with_suffix(".npy"), index[:row])
-        shard.with_suffix(".npy").rename(shard.with_suffix(".index"))
-    elif how == "other index":
-        with shard.with_suffix(".index").open("wb") as file:
-            np.save(file, np.arange(9))
+    elif harm == "short":
+        with zipfile.ZipFile(shard, "w") as archive:
+            for number in range(row):
+                archive.writestr(f"{number:06d}.png", b"x")
+    elif harm == "compressed":
+        with zipfile.ZipFile(shard, "w", zipfile.ZIP_DEFLATED) as archive:
+            for number in range(30):
+                archive.writestr(f"{number:06d}.png", bytes(999))
+    elif harm == "garbage":
+        shard.write_bytes(b"PK garbage")
 
 
 @pytest.mark.parametrize(
-    ("how", "words"),
+    ("harm", "words"),
     [
-        ("flip", "row 7 of the shard is damaged"), ("cut", "row 7 of the shard is cut short"),
-        ("gone", "there is no shard"),
-        ("no index", "the shard's index"), ("bad index", "is damaged"), ("short index", "7 rows, no row 7"),
-        ("other index", "is not the index of a shard"),
+        ("flip", "row 7 of the shard is damaged"), ("cut", "is damaged"), ("gone", "there is no shard"),
+        ("short", "7 rows, no row 7"), ("compressed", "is not a shard"), ("garbage", "is damaged"),
     ],
 )  # fmt: skip
-def test_damage_is_one_sentence_with_shard_and_row(make, settings, tmp_path, how, words):
+def test_damage_is_one_sentence_with_shard_and_row(make, settings, tmp_path, harm, words):
     again = manifests.read(pack(make(_rows()), tmp_path / "out"))
-    _harm(tmp_path / "out" / "touch" / "00000.parquet", how, 7)
+    _harm(tmp_path / "out" / "touch" / "00000.zip", harm, 7)
     with pytest.raises(ImageError, match=words) as error:
         decode(again.file(7))
-    assert "touch/00000.parquet/7" in str(error.value) and "\n" not in str(error.value)
-    if how in ("flip", "cut"):
+    assert "touch/00000.zip/7" in str(error.value) and "\n" not in str(error.value)
+    if harm == "flip":
         assert decode(again.file(6)).shape == (12, 16, 3)
         loader = Loader(again, settings(1, threads=2, batch_size=24, clip_share=0.0))
-        with pytest.raises(SampleError, match=r"row \d+ of .*manifest\.parquet, column 'path': .*00000\.parquet/"):
+        with pytest.raises(SampleError, match=r"row \d+ of .*manifest\.parquet, column 'path': .*00000\.zip/"):
             list(loader.stream(0, 1))
         loader = Loader(again, settings(1, threads=2, batch_size=24, clip_share=0.0, on_bad_sample="skip"))
         ((_, _, info),) = loader.stream(0, 1)
@@ -335,9 +319,9 @@ def test_damage_is_one_sentence_with_shard_and_row(make, settings, tmp_path, how
 
 def test_a_shard_that_leads_out_of_the_folder_is_refused(make, tmp_path):
     again = manifests.read(pack(make(_rows()), tmp_path / "out"))
-    shard = tmp_path / "out" / "touch" / "00000.parquet"
-    shard.rename(tmp_path / "moved.parquet")
-    shard.symlink_to(tmp_path / "moved.parquet")
+    shard = tmp_path / "out" / "touch" / "00000.zip"
+    shard.rename(tmp_path / "moved.zip")
+    shard.symlink_to(tmp_path / "moved.zip")
     with pytest.raises(manifests.ManifestError, match="leaves the folder"):
         again.file(0)
 
@@ -377,9 +361,10 @@ def test_few_shards_are_open_at_once_and_threads_do_not_mind(make, tmp_path, mon
 
 
 def test_what_is_a_row_of_a_shard_and_what_is_a_file(tmp_path):
-    for name in ("a.parquet/x.png", "a/7", "a.parquet/7.png", "a.parquet/٣", "a.parquet", "7"):
+    for name in ("a.zip/x.png", "a/7", "a.zip/7.png", "a.zip/٣", "a.zip", "7"):
         assert packed.split_shard_path(tmp_path / name) is None, name
-    assert packed.split_shard_path(tmp_path / "a.parquet" / "7") == (tmp_path / "a.parquet", 7)
+    for shard in (tmp_path / "a.zip", tmp_path / "a.parquet"):
+        assert packed.split_shard_path(shard / "7") == (shard, 7)
 
 
 def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monkeypatch):
@@ -435,7 +420,7 @@ def test_other_pictures_under_the_same_table_are_another_pack(make, tmp_path):
     target = pack(loose, tmp_path / "out")
     picture = loose.file(0)
     picture.write_bytes(picture.read_bytes() + b"more")
-    with pytest.raises(PackError, match="are others than when"):
+    with pytest.raises(PackError, match="have changed since"):
         pack(loose, tmp_path / "out")
     for row in range(len(loose)):
         loose.file(row).unlink(missing_ok=True)  # packed and done with
@@ -474,13 +459,69 @@ def test_a_pack_under_way_is_not_taken_over_before_its_first_shard(make, tmp_pat
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
 
 
-@pytest.mark.parametrize("left", [b"", b"\x93NUMPY\x01"])
-def test_a_shard_whose_index_was_cut_is_packed_again(make, tmp_path, left):
+def test_a_damaged_shard_of_an_unfinished_pack_is_written_again(make, tmp_path):
     source, out = make(_rows()), tmp_path / "packed"
     pack(source, out)
     (out / "README.md").unlink()
-    index = out / "touch/00000.index"
-    whole = index.read_bytes()
-    index.write_bytes(left)
+    shard = out / "touch/00000.zip"
+    whole = shard.read_bytes()
+    shard.write_bytes(whole[:-9])
     pack(source, out)
-    assert index.read_bytes() == whole
+    assert shard.read_bytes() == whole
+
+
+# Shards of version 1 ----------------------------------------------------------------------------------------------
+
+
+def _version_1(loose, out):
+    """A pack as the first version wrote it: Parquet shards with plain bytes, and an index of where each file lies."""
+    pack(loose, out)
+    for shard in sorted(out.rglob("*.zip")):
+        with zipfile.ZipFile(shard) as archive:
+            data = [archive.read(entry) for entry in archive.infolist()]
+        image = pyarrow.StructArray.from_arrays(
+            [pyarrow.array(data, pyarrow.binary()), pyarrow.array([""] * len(data))], ["bytes", "path"]
+        )
+        table = shard.with_suffix(".parquet")
+        pyarrow.parquet.write_table(
+            pyarrow.table({"image": image}), table, compression="NONE", use_dictionary=False, write_statistics=False
+        )
+        index, start, raw = np.zeros(len(data), packed._PARQUET_INDEX), 0, table.read_bytes()
+        for entry, one in zip(index, data, strict=True):
+            start = raw.index(len(one).to_bytes(4, "little") + one, start) + 4
+            entry["offset"], entry["size"] = start, len(one)
+            entry["sha256"] = np.frombuffer(hashlib.sha256(one).digest(), np.uint8)
+        with table.with_suffix(".index").open("wb") as file:
+            np.save(file, index)
+        shard.unlink()
+    record = json.loads((out / "pack.json").read_text()) | {"version": 1}
+    (out / "pack.json").write_text(json.dumps(record))
+    target, again = out / "manifest.parquet", manifests.read(out / "manifest.parquet")
+    for name in ("path", "image_path", "image2_path", "background_path"):
+        cells = pyarrow.compute.replace_substring(again.column(name), ".zip/", ".parquet/")
+        again = manifests.replace_column(again, name, cells)
+    manifests.write(again, target)
+    packed.close_shards()
+    return target
+
+
+def test_a_pack_of_version_1_is_still_read(make, settings, tmp_path):
+    loose = make(_rows())
+    target = _version_1(loose, tmp_path / "out")
+    again = manifests.read(target)
+    assert again.file(0).parent.suffix == ".parquet"
+    for row in range(len(loose)):
+        assert packed.read_file(again.file(row)) == loose.file(row).read_bytes()
+    _assert_same_batches(loose, again, settings(2))
+    assert pack(loose, tmp_path / "out") == target and not list((tmp_path / "out").rglob("*.zip"))
+    index = tmp_path / "out" / "touch" / "00000.index"
+    whole = index.read_bytes()
+    for damage in (b"\x93NUMPY garbage", whole[:-1], b""):
+        packed.close_shards()
+        index.write_bytes(damage)
+        with pytest.raises(packed.ShardError):
+            packed.read_file(again.file(0))
+    packed.close_shards()
+    index.unlink()
+    with pytest.raises(packed.ShardError, match="index"):
+        packed.read_file(again.file(0))

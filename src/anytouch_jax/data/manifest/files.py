@@ -6,6 +6,8 @@ import hashlib
 import os
 import stat
 import threading
+import zipfile
+import zlib
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +21,8 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.manifest.schema import PATHS
 
 MAX_BYTES = 1 << 29  # of one file: a picture of images.MAX_PIXELS with four channels of 16 bits
-SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
+SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
+_PARQUET_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
 _OPEN = 64  # shards held open at once
 NPY_HEADER_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 fails at times in two threads
 
@@ -40,7 +43,7 @@ def read_file(path: Path) -> bytes:
 
 def split_shard_path(path: Path) -> tuple[Path, int] | None:
     """(shard, row) of a path into a shard; None for the path of a loose file."""
-    if path.name.isascii() and path.name.isdecimal() and path.parent.suffix == ".parquet":
+    if path.name.isascii() and path.name.isdecimal() and path.parent.suffix in (".zip", ".parquet"):
         return path.parent, int(path.name)
     return None
 
@@ -48,6 +51,7 @@ def split_shard_path(path: Path) -> tuple[Path, int] | None:
 def close_shards() -> None:
     """Close all shards that are held open (after they were written anew)."""
     _shard.cache_clear()
+    _cached_index.cache_clear()
 
 
 def _read_loose(path: Path) -> bytes:
@@ -71,11 +75,11 @@ def _read_loose(path: Path) -> bytes:
 
 
 class _Shard:
-    """An open shard and its index; reading is safe from many threads."""
+    """An open shard and its index. Reading is safe from many threads."""
 
     def __init__(self, path: Path) -> None:
         self._file = -1
-        self._index = read_shard_index(path.with_suffix(".index"))
+        self._index = _cached_index(path)
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError:
@@ -90,19 +94,43 @@ class _Shard:
             raise ShardError(f"the shard has {len(self._index)} rows, no row {row}; pack the data again")
         entry = self._index[row]
         size, offset = int(entry["size"]), int(entry["offset"])
-        parts, got = [], 0
-        while got < size and (part := os.pread(self._file, size - got, offset + got)):
+        parts, length = [], 0
+        while length < size and (part := os.pread(self._file, size - length, offset + length)):
             parts.append(part)
-            got += len(part)
+            length += len(part)
         data = parts[0] if len(parts) == 1 else b"".join(parts)
-        if hashlib.sha256(data).digest() != entry["sha256"].tobytes():
-            how = "cut short" if got < size else "damaged (its SHA-256 is another)"
-            raise ShardError(f"row {row} of the shard is {how}; copy the shard again from where the data were packed")
+        if "crc" in entry.dtype.names:
+            valid = zlib.crc32(data) == entry["crc"]
+        else:
+            valid = hashlib.sha256(data).digest() == entry["sha256"].tobytes()
+        if not valid:
+            reason = "cut short" if length < size else "damaged (its checksum does not match)"
+            raise ShardError(
+                f"row {row} of the shard is {reason}; copy the shard again from where the data were packed"
+            )
         return data
 
 
 def read_shard_index(path: Path) -> np.ndarray:
-    """Where the files of a shard lie in it, SHARD_INDEX (n,). Raises ShardError where none can be read."""
+    """Return where the files of a shard lie in it, SHARD_INDEX (n,). Raises ShardError if it cannot be read."""
+    if path.suffix == ".parquet":
+        return _parquet_index(path.with_suffix(".index"))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except FileNotFoundError:
+        raise ShardError(f"there is no shard {path}; copy it from where the data were packed") from None
+    except (zipfile.BadZipFile, ValueError, NotImplementedError, OSError) as error:
+        raise ShardError(f"{path} is damaged: {error}; copy it again from where the data were packed") from None
+    if any(entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_BYTES for entry in entries):
+        raise ShardError(f"{path} is not a shard made by anytouch data pack")
+    # `pack` writes ASCII names and no extra fields, so a local header is 30 bytes and the name.
+    places = [(entry.header_offset + 30 + len(entry.filename), entry.file_size, entry.CRC) for entry in entries]
+    return np.array(places, SHARD_INDEX)
+
+
+def _parquet_index(path: Path) -> np.ndarray:
+    """Return the index of a shard of version 1, a Parquet file with its index next to it."""
     try:
         with NPY_HEADER_LOCK:
             index = np.load(path, allow_pickle=False)
@@ -110,16 +138,14 @@ def read_shard_index(path: Path) -> np.ndarray:
         raise ShardError(f"there is no {path}, the shard's index; copy it from where the data were packed") from None
     except (ValueError, EOFError, SyntaxError) as error:
         raise ShardError(f"{path}, the index of the shard, is damaged: {str(error).splitlines()[0]}") from None
-    if (
-        index.dtype != SHARD_INDEX
-        or index.ndim != 1
-        or (index["size"] > MAX_BYTES).any()
-        or (index["offset"] < 0).any()
-    ):
+    if index.dtype != _PARQUET_INDEX or index.ndim != 1:
+        raise ShardError(f"{path} is not the index of a shard")
+    if (index["size"] > MAX_BYTES).any() or (index["offset"] < 0).any():
         raise ShardError(f"{path} is not the index of a shard")
     return index
 
 
+_cached_index = lru_cache(None)(read_shard_index)  # 20 bytes a file; parsing takes some 5 us a file
 _shard = lru_cache(_OPEN)(_Shard)  # the least recently used one is closed when its last reader is done with it
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -82,17 +81,3 @@ def licences(manifest: Manifest) -> tuple[Licence, ...]:
         sets = sorted({str(value) for row in rows[first] if (value := manifest.value(row, "dataset")) is not None})
         found.append(Licence(manifest.value(rows[0], "license"), int(verdict), tuple(sets), len(rows)))
     return tuple(sorted(found, key=lambda licence: -licence.rows))
-
-
-def card(packed: Manifest, groups: Iterable[str]) -> str:
-    """README.md of a pack: which files make which table, for the Hub and for `datasets`, and whose terms they have."""
-    configs = "".join(f"- config_name: {group}\n  data_files: {group}/*.parquet\n" for group in groups)
-    terms = "".join(
-        f"| {one.name or 'none given'} | {one.rows} | {', '.join(one.datasets)} |\n" for one in licences(packed)
-    )
-    return (
-        f"---\nconfigs:\n{configs}---\n{len(packed)} tactile frames, content {packed.content_hash}.\n\n"
-        "`manifest.parquet` is the manifest for `anytouch`; its paths name a shard and a row.\n"
-        "The other tables are the stored files, for viewing and for other tools.\n\n"
-        f"| licence | rows | datasets |\n|---|---|---|\n{terms}"
-    )

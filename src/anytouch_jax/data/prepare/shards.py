@@ -1,31 +1,30 @@
-"""Millions of small files as a few Parquet shards with the encoded bytes inside, and a manifest that points into them.
+"""Shards: millions of small files as a few uncompressed ZIP files, and a manifest that points into them.
 
-OUT/manifest.parquet     the manifest, rows in their old order; its paths are `touch/00000.parquet/17`
-OUT/touch/00000.parquet  image {bytes, path} and the columns of the manifest, by sequence and frame
-OUT/shared/, OUT/field/  image {bytes, path}: photographs and backgrounds, field files; each stored once
-OUT/SHA256SUMS           for `sha256sum -c`; README.md: a data card that the Hub and `datasets` understand
+OUT/manifest.parquet   the manifest, rows in their old order; its paths are `touch/00000.zip/17` (entry 17)
+OUT/touch/00000.zip    touch images by sequence and frame
+OUT/shared/, field/    photographs and backgrounds, field files; each stored once
+OUT/SHA256SUMS         for `sha256sum -c`; README.md lists the licences
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+import re
+import zipfile
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet
 
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import (
-    SHARD_INDEX,
     Files,
     ShardError,
     close_shards,
@@ -36,28 +35,24 @@ from anytouch_jax.data.manifest.files import (
 )
 from anytouch_jax.data.manifest.manifest import Manifest, with_distinct_keys
 from anytouch_jax.data.manifest.schema import PATHS
-from anytouch_jax.data.prepare.licences import card
+from anytouch_jax.data.prepare.licences import licences
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, atomic_write, lock
 
-_PICTURES = tuple(name for name in PATHS if name not in ("path", "field_path"))
-GROUPS = {"touch": ("path",), "shared": _PICTURES, "field": ("field_path",)}
+_SHARED = tuple(name for name in PATHS if name not in ("path", "field_path"))
+_GROUPS = {"touch": ("path",), "shared": _SHARED, "field": ("field_path",)}
 SHARD_BYTES = 256 << 20
-_GROUP_ROWS, _GROUP_BYTES = 64, 8 << 20  # of a row group: what a viewer reads at once
-_VERSION = 1
-_FEATURES = {pa.string(): "string", pa.bool_(): "bool"}
-_FEATURES |= {kind: str(kind) for kind in (pa.int8(), pa.int16(), pa.int32(), pa.int64())}
-_FEATURES |= {pa.float32(): "float32", pa.float64(): "float64"}
+_VERSION = 2  # version 1 stored the files in Parquet; read_file still reads it
 
 
 class PackError(UserError):
-    """A manifest that cannot be packed as asked."""
+    """A manifest that cannot be packed as requested."""
 
 
 class _Piece(NamedTuple):
     """A file on its way into a shard."""
 
-    file: int
+    suffix: str
     data: bytes
 
 
@@ -69,11 +64,11 @@ def pack(
     threads: int = 4,
     log: Callable[[str], None] | None = None,
 ) -> Path:
-    """Store all files of a manifest in shards of about `shard_bytes` under the folder `out`; gives back its manifest.
+    """Store all files of a manifest in shards of about `shard_bytes` in the folder `out`, and return its manifest.
 
-    The encoded bytes are stored as they are and each file once, so a loader reads the same batches. After a kill the
-    same call goes on behind the last whole shard; a finished pack is left alone. Memory holds a few files a thread.
-    Raises PackError, which names the row, for a file that is missing or empty, and when `out` holds something else.
+    Files are stored unchanged and once each, so a loader reads the same batches. After an interruption the same call
+    continues behind the last whole shard. A finished pack is not changed. Memory holds a few files for each thread.
+    Raises PackError for a missing or empty file, and for a folder `out` with other contents.
     """
     folder = Path(out).expanduser().resolve()
     if shard_bytes < 1:
@@ -83,22 +78,22 @@ def pack(
     finished = target.is_file() and (folder / "README.md").is_file()
     plan = {"version": _VERSION, "manifest": manifest.content_hash, "shard_bytes": shard_bytes}
     try:
-        stamp = _stamp(manifest, files)
+        fingerprint = _fingerprint(manifest, files)
     except PackError:
         if not finished:
-            raise  # before hours of packing the others
-        stamp = None
-    _is_ours(folder, plan, stamp, finished)  # before a lock is left in a folder of something else
+            raise  # now, rather than after hours of packing the others
+        fingerprint = None
+    _is_same_pack(folder, plan, fingerprint, finished)  # before a lock is made in a foreign folder
     if finished:
         if log:
-            log(f"{folder} was finished before: left as it is")
+            log(f"{folder} is already packed; it was not changed")
         return target
     folder.mkdir(parents=True, exist_ok=True)
-    with lock(folder / ".lock") as mine:
-        if not mine:
+    with lock(folder / ".lock") as free:
+        if not free:
             raise PackError(f"another process packs into {folder}: wait for it, or choose another folder")
-        if not _is_ours(folder, plan, stamp, finished):
-            atomic_write(folder / "pack.json", json.dumps(plan | {"files": stamp}))
+        if not _is_same_pack(folder, plan, fingerprint, finished):
+            atomic_write(folder / "pack.json", json.dumps(plan | {"files": fingerprint}))
         _pack(manifest, files, folder, shard_bytes, threads, log)
         (folder / ".lock").unlink(missing_ok=True)
     return target
@@ -107,239 +102,138 @@ def pack(
 def _pack(
     manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, log: Callable[[str], None] | None
 ) -> None:
-    """Write the shards, the manifest and, last, the card."""
-    target, orders = folder / "manifest.parquet", _orders(manifest, files)
-    sums: dict[str, str] = _read_sums(folder)
+    """Write the shards, the manifest and, last, the README."""
     shard_of, row_of = np.empty(len(files), np.int64), np.empty(len(files), np.int64)
     names: list[str] = []
-    for group, ids in orders.items():
-        writer = _Group(manifest, files, group, folder, sums)
+    sums: dict[str, str] = {}
+    for group, ids in _group_files(manifest, files).items():
         done = 0
-        for name, rows in writer.shards(ids, shard_bytes, threads):
-            here = ids[done : done + rows]
-            shard_of[here], row_of[here] = len(names), np.arange(rows)
+        for number, rows in enumerate(_write_shards(manifest, files, ids, folder / group, shard_bytes, threads)):
+            name = f"{group}/{number:05d}.zip"
+            shard_of[ids[done : done + rows]], row_of[ids[done : done + rows]] = len(names), np.arange(rows)
+            with (folder / name).open("rb") as file:
+                sums[name] = hashlib.file_digest(file, "sha256").hexdigest()
             names.append(name)
             done += rows
             if log:
                 log(f"{name}: {done} of {len(ids)} files")
     close_shards()
-    packed = _repoint(manifest, target, files, names, shard_of, row_of)
+    atomic_write(folder / "SHA256SUMS", "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
+    target = folder / "manifest.parquet"
+    packed = _point_into_shards(manifest, target, files, names, shard_of, row_of)
     manifests.write(packed, target)
-    atomic_write(folder / "README.md", card(packed, orders))
+    atomic_write(folder / "README.md", _readme(packed))
 
 
-def _stamp(manifest: Manifest, files: Files) -> str:
-    """A digest of where the files are, their sizes and times: equal manifests may show other pictures. Raises PackError
-    for the first that is not there."""
+def _fingerprint(manifest: Manifest, files: Files) -> str:
+    """Return a digest of the paths, sizes and times of all files. Raises PackError for the first missing one.
+
+    Equal manifests may name other images.
+    """
     digest = hashlib.sha256()
     for row, column in zip(files.row, files.column, strict=True):
         try:
             path = manifest.file(row, column)
-            about = os.stat((split_shard_path(path) or (path,))[0])
+            status = os.stat((split_shard_path(path) or (path,))[0])
         except FileNotFoundError:
-            raise _cannot(manifest, int(row), str(column), "the file is missing") from None
+            raise _cannot_pack(manifest, int(row), str(column), "the file is missing") from None
         except (OSError, UserError) as error:
-            raise _cannot(manifest, int(row), str(column), str(error)) from None
-        digest.update(f"{path}\0{about.st_size}\0{about.st_mtime_ns}\n".encode(errors="surrogateescape"))
+            raise _cannot_pack(manifest, int(row), str(column), str(error)) from None
+        digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
 
-def _cannot(manifest: Manifest, row: int, column: str, reason: str) -> PackError:
+def _cannot_pack(manifest: Manifest, row: int, column: str, reason: str) -> PackError:
     return PackError(
         f"{manifest.where(row)}, column {column!r}: {manifest.value(row, column)!r} cannot be packed: {reason}; "
-        "run anytouch verify with --repair first"
+        "run anytouch data verify with --repair first"
     )
 
 
-def _is_ours(folder: Path, plan: dict[str, object], stamp: str | None, finished: bool) -> bool:
-    """Whether the folder is this plan's from an earlier run; False where it may be taken, as after another plan that
-    failed before its first shard. Raises PackError otherwise."""
-    mark = folder / "pack.json"
-    if mark.is_file():
+def _is_same_pack(folder: Path, plan: dict[str, object], fingerprint: str | None, finished: bool) -> bool:
+    """Return whether the folder holds this pack, finished or not. False means that the folder can be taken.
+
+    Raises PackError if it holds anything else. A pack that failed before its first shard is not protected.
+    """
+    record = folder / "pack.json"
+    if record.is_file():
         try:
-            old = dict(json.loads(mark.read_text(encoding="utf-8")))
+            old = dict(json.loads(record.read_text(encoding="utf-8")))
         except (ValueError, TypeError):
-            raise PackError(f"{mark} is not of a pack; choose another folder") from None
+            raise PackError(f"{record} is not of a pack; choose another folder") from None
         files = old.pop("files", None)
-        if old == plan and (files in (stamp, None) or (finished and stamp is None)):
+        if finished:
+            old["version"] = plan["version"]  # a finished pack of version 1 stays in use
+        if old == plan and (files in (fingerprint, None) or (finished and fingerprint is None)):
             return True
-        if any(folder.rglob("*.parquet")):
+        if any([*folder.rglob("*.zip"), *folder.rglob("*.parquet")]):
             if old != plan:
                 raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")
-            raise PackError(f"the files of the manifest are others than when {folder} was begun; choose another folder")
+            raise PackError(f"the files of the manifest have changed since {folder} was begun; choose another folder")
     elif folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
         raise PackError(f"{folder} is not an empty folder; choose another one")
     return False
 
 
-def _orders(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
-    """For every group that has files, their ids in the order of storing: by sequence and frame."""
+def _group_files(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
+    """Return the file ids of every group that has files, ordered by sequence and frame."""
     frame, sequence = np.asarray(manifest.table["frame_index"]), manifest.codes("sequence")
     rank = np.empty(len(manifest), np.int64)
     rank[np.lexsort((frame, sequence, manifest.source))] = np.arange(len(manifest))
-    orders = {}
-    for group, members in GROUPS.items():
+    groups = {}
+    for group, members in _GROUPS.items():
         ids = np.flatnonzero(np.isin(files.column, members))
         if ids.size:
-            orders[group] = ids[np.argsort(rank[files.row[ids]], kind="stable")]
-    return orders
+            groups[group] = ids[np.argsort(rank[files.row[ids]], kind="stable")]
+    return groups
 
 
-class _Group:
-    """Writes the shards of one group of files."""
-
-    def __init__(self, manifest: Manifest, files: Files, group: str, folder: Path, sums: dict[str, str]) -> None:
-        self.manifest, self.files, self.group, self.folder, self.sums = manifest, files, group, folder, sums
-        table = manifest.table
-        schema = table.schema if group == "touch" else ()
-        self.extra = kept = [c.name for c in schema if c.type in _FEATURES and c.name not in (*PATHS, "image")]
-        features = {"image": {"_type": "Image"}} if group != "field" else {}
-        features |= {name: {"dtype": _FEATURES[table.schema.field(name).type], "_type": "Value"} for name in kept}
-        about = {"huggingface": json.dumps({"info": {"features": features}})} if group != "field" else None
-        first = "field" if group == "field" else "image"
-        image = pa.field(first, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
-        self.schema = pa.schema([image, *(table.schema.field(name) for name in kept)], about)
-
-    def shards(self, ids: np.ndarray, shard_bytes: int, threads: int) -> Iterator[tuple[str, int]]:
-        """(name, rows) of every shard in order: those that are there, then the new ones as they are finished."""
-        (self.folder / self.group).mkdir(exist_ok=True)
-        number = done = 0
-        while (rows := self._finished(number)) is not None:
-            yield self._name(number), rows
-            number, done = number + 1, done + rows
-        with closing(bounded_map(self._fetch, ids[done:].tolist(), threads)) as pieces:
-            ahead = next(pieces, None)
-            while ahead is not None:
-                rows, ahead = self._write(number, ahead, pieces, shard_bytes)
-                yield self._name(number), rows
-                number += 1
-
-    def _name(self, number: int) -> str:
-        return f"{self.group}/{number:05d}.parquet"
-
-    def _finished(self, number: int) -> int | None:
-        """Rows of a shard that is whole: its index is written last."""
-        shard = self.folder / self._name(number)
-        index = shard.with_suffix(".index")
+def _write_shards(
+    manifest: Manifest, files: Files, ids: np.ndarray, folder: Path, shard_bytes: int, threads: int
+) -> Iterator[int]:
+    """Yield the number of files of each shard in order: first the existing ones, then each new one when it is whole."""
+    number = done = 0
+    while (path := folder / f"{number:05d}.zip").is_file():
         try:
-            return len(read_shard_index(index)) if shard.is_file() else None
+            rows = len(read_shard_index(path))
         except ShardError:
-            return None
+            break  # damaged: it is written again
+        yield rows
+        number, done = number + 1, done + rows
 
-    def _fetch(self, file: int) -> _Piece:
-        row, name = int(self.files.row[file]), str(self.files.column[file])
+    def fetch(file: int) -> _Piece:
+        row, column = int(files.row[file]), str(files.column[file])
         try:
-            data = read_file(self.manifest.file(row, name))
+            data = read_file(manifest.file(row, column))
         except FileNotFoundError:
             reason = "the file is missing"
         except (UserError, OSError, ValueError) as error:
             reason = str(error)
         else:
             if data:
-                return _Piece(file, data)
+                suffix = re.search(r"\.[a-zA-Z0-9]{1,8}$", manifest.value(row, column))
+                return _Piece(suffix.group() if suffix else "", data)
             reason = "the file is empty"
-        raise _cannot(self.manifest, row, name, reason)
+        raise _cannot_pack(manifest, row, column, reason)
 
-    def _write(
-        self, number: int, first: _Piece, pieces: Iterator[_Piece], shard_bytes: int
-    ) -> tuple[int, _Piece | None]:
-        """One shard and then its index: (rows, the piece that begins the next shard)."""
-        path = self.folder / self._name(number)
-        left: list[_Piece] = []
-        with atomic_path(path, part=path.with_suffix(".part")) as part, part.open("w+b") as file:
-            index, digest = self._fill(file, _until(first, pieces, shard_bytes, left))
-        self.sums[self._name(number)] = digest
-        atomic_write(self.folder / "SHA256SUMS", "".join(f"{d}  {n}\n" for n, d in sorted(self.sums.items())))
-        stream = io.BytesIO()
-        np.save(stream, index)
-        atomic_write(path.with_suffix(".index"), stream.getvalue())
-        return len(index), left[0] if left else None
-
-    def _fill(self, file: BinaryIO, pieces: Iterable[_Piece]) -> tuple[np.ndarray, str]:
-        """Write pieces as row groups: (index, SHA-256 of the file)."""
-        sink, entries = _Sink(file), []
-        options = {"compression": "NONE", "use_dictionary": self.extra, "write_statistics": self.extra}
-        with pa.parquet.ParquetWriter(pa.PythonFile(sink, "w"), self.schema, **options) as writer:
-            for batch in _batches(pieces):
-                start = sink.tell()
-                writer.write_table(self._table(batch))
-                entries.append(_locate(file, start, sink.tell(), batch))
-        return np.concatenate(entries), sink.digest.hexdigest()
-
-    def _table(self, batch: list[_Piece]) -> pa.Table:
-        rows = self.files.row[[piece.file for piece in batch]]
-        cells = [self.manifest.value(row, str(self.files.column[p.file])) for row, p in zip(rows, batch, strict=True)]
-        data = pa.array([piece.data for piece in batch], pa.binary())
-        image = pa.StructArray.from_arrays([data, pa.array(cells, pa.string())], ["bytes", "path"])
-        extra = [c.combine_chunks() for c in self.manifest.table.select(self.extra).take(pa.array(rows)).columns]
-        return pa.table([image, *extra], schema=self.schema)
+    with closing(bounded_map(fetch, ids[done:].tolist(), threads)) as pieces:
+        piece = next(pieces, None)
+        while piece is not None:
+            path, rows, size = folder / f"{number:05d}.zip", 0, 0
+            with atomic_path(path, part=path.with_suffix(".part")) as part, zipfile.ZipFile(part, "w") as archive:
+                while piece is not None and (not rows or size + len(piece.data) <= shard_bytes):
+                    # A fixed date makes equal packs equal to the byte.
+                    archive.writestr(zipfile.ZipInfo(f"{rows:06d}{piece.suffix}"), piece.data)
+                    rows, size = rows + 1, size + len(piece.data)
+                    piece = next(pieces, None)
+            yield rows
+            number += 1
 
 
-class _Sink:
-    """A file that hashes what is written to it."""
-
-    closed = False
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.digest = file, hashlib.sha256()
-
-    def write(self, data: bytes) -> int:
-        self.digest.update(data)
-        return self._file.write(data)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def flush(self) -> None:
-        self._file.flush()
-
-    def close(self) -> None:
-        self.closed = True
-
-
-def _until(first: _Piece, pieces: Iterator[_Piece], most: int, left: list[_Piece]) -> Iterator[_Piece]:
-    """`first` and more pieces while they fit into `most` bytes; the one that does not goes to `left`."""
-    total = len(first.data)
-    yield first
-    for piece in pieces:
-        total += len(piece.data)
-        if total > most:
-            left.append(piece)
-            return
-        yield piece
-
-
-def _batches(pieces: Iterable[_Piece]) -> Iterator[list[_Piece]]:
-    batch: list[_Piece] = []
-    for piece in pieces:
-        batch.append(piece)
-        if len(batch) >= _GROUP_ROWS or sum(len(p.data) for p in batch) >= _GROUP_BYTES:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
-
-
-def _locate(file: BinaryIO, start: int, stop: int, batch: list[_Piece]) -> np.ndarray:
-    """Where the bytes of a row group lie in the file: plain Parquet stores each value whole, after its length."""
-    file.seek(start)
-    region = file.read(stop - start)
-    file.seek(stop)
-    index, at = np.zeros(len(batch), SHARD_INDEX), 0
-    for entry, piece in zip(index, batch, strict=True):
-        at = region.find(len(piece.data).to_bytes(4, "little") + piece.data, at)
-        if at < 0:
-            raise RuntimeError("this version of pyarrow does not store plain values; packing needs another one")
-        entry["offset"], entry["size"] = start + at + 4, len(piece.data)
-        entry["sha256"] = np.frombuffer(hashlib.sha256(piece.data).digest(), np.uint8)
-        at += 4 + len(piece.data)
-    return index
-
-
-def _repoint(
+def _point_into_shards(
     manifest: Manifest, target: Path, files: Files, names: list[str], shard_of: np.ndarray, row_of: np.ndarray
 ) -> Manifest:
-    """The manifest at `target` with cells that point into the shards."""
+    """Return the manifest at `target` with cells that point into the shards."""
     shard = pa.array(names).take(pa.array(shard_of))
     cell = pc.binary_join_element_wise(shard, pa.array(row_of).cast(pa.string()), "/")
     table = manifest.table
@@ -350,7 +244,14 @@ def _repoint(
     return Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
 
 
-def _read_sums(folder: Path) -> dict[str, str]:
-    path = folder / "SHA256SUMS"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+def _readme(packed: Manifest) -> str:
+    terms = "".join(
+        f"| {licence.name or 'none given'} | {licence.rows} | {', '.join(licence.datasets)} |\n"
+        for licence in licences(packed)
+    )
+    return (
+        f"{len(packed)} tactile frames, content {packed.content_hash}.\n\n"
+        "`manifest.parquet` is the manifest for `anytouch`. Its paths name a ZIP file and the number of an entry.\n"
+        "The ZIP files are not compressed. Any tool can read them.\n\n"
+        f"| licence | rows | datasets |\n|---|---|---|\n{terms}"
+    )

@@ -30,8 +30,7 @@ import numpy as np
 from anytouch_jax.config import preset
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
-from anytouch_jax.data.prepare.contact_report import contact_picture
+from anytouch_jax.data.prepare.contact import contact_scores, contact_sheet, mark_contact
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.data.readers import IndexOptions, index
@@ -86,7 +85,7 @@ manifest.table.select(["path", "sensor", "sequence", "frame_index", "split", "ob
 scores = contact_scores(manifest)
 touched, contact = mark_contact(manifest, scores, drop=True)
 print("\n".join(contact.lines()))
-print(contact_picture(manifest, scores, FOLDER / "contact.png"))
+print(contact_sheet(manifest, scores, FOLDER / "contact.png"))
 manifests.write(touched, ROOT / "touched.parquet")
 
 # %% [markdown]

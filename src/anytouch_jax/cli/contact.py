@@ -18,7 +18,6 @@ def run(options: Contact) -> int:
     """Score every frame; write the marked manifest, the picture of both sides, or compare with what is known."""
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.prepare import contact
-    from anytouch_jax.data.prepare.contact_report import contact_picture, contact_quality, known_contact_by
 
     if not options.check:
         refuse(options, ("reference", "above"), "without --check, which compares with a column")
@@ -36,19 +35,21 @@ def run(options: Contact) -> int:
         frames = map(manifest.file, range(len(manifest))) if options.picture.exists() else ()
         check_folder(options.picture, "--picture", read=(*manifest.files, *frames))
     limits = dict(options.threshold)
-    contact.limits_of(manifest, limits, options.share)  # mistakes are told before the work
+    contact.threshold_of_rows(manifest, limits, options.share)  # mistakes are told before the work
     if options.check:
-        known_contact_by(manifest, options.reference)
+        contact.reference_contact(manifest, options.reference)
     if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
         refuse(options, ("threshold", "share"), "where every row has a label.contact, which is kept")
     scores = contact.contact_scores(manifest, workers=options.threads)
     marked, report = contact.mark_contact(manifest, scores, thresholds=limits, share=options.share, drop=options.drop)
     print("\n".join(report.lines()))
     if options.check:
-        quality = contact_quality(manifest, scores, reference=options.reference, above=options.above, thresholds=limits)
+        quality = contact.contact_quality(
+            manifest, scores, reference=options.reference, above=options.above, thresholds=limits
+        )
         print("\n".join(quality.lines()))
     if options.picture is not None:
-        log(f"{contact_picture(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
+        log(f"{contact.contact_sheet(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
     if target is not None:
         print(f"{write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
     return 0

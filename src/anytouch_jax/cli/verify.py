@@ -11,7 +11,7 @@ from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
-    from anytouch_jax.data.prepare.verify import Report
+    from anytouch_jax.data.prepare.verify import VerifyReport
 
 
 def run(options: Verify) -> int:
@@ -45,7 +45,7 @@ def run(options: Verify) -> int:
     return 1 if errors else 0
 
 
-def _repair(options: Verify, manifest: Manifest, report: Report, errors: list[str]) -> tuple[Manifest, list[str]]:
+def _repair(options: Verify, manifest: Manifest, report: VerifyReport, errors: list[str]) -> tuple[Manifest, list[str]]:
     """Write the repaired copy: (the manifest, the errors that are left)."""
     from anytouch_jax.data.prepare.repair import repair
 

@@ -154,9 +154,9 @@ def test_a_packed_manifest_is_verified_like_a_loose_one(make, tmp_path):
     one, two = verify(loose), verify(again)
     assert two.findings == () and two.split_hash == one.split_hash
     np.testing.assert_array_equal(np.sort(one.scan.digest), np.sort(two.scan.digest))
-    data = bytearray((tmp_path / "out" / "touch" / "00000.parquet").read_bytes())
+    data = bytearray((tmp_path / "out" / "touch" / "00000.zip").read_bytes())
     data[data.index(loose.file(3).read_bytes()) + 20] ^= 1
-    (tmp_path / "out" / "touch" / "00000.parquet").write_bytes(bytes(data))
+    (tmp_path / "out" / "touch" / "00000.zip").write_bytes(bytes(data))
     for decoded in (True, False):
         report = verify(again, decode=decoded)
         assert _kinds(report) == {"unreadable": [3]}

@@ -7,9 +7,10 @@ One row is one tactile frame (the schema is in `table.py`). Row numbers count fr
 from __future__ import annotations
 
 import csv
+import difflib
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -21,7 +22,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from anytouch_jax.config import FIELD_SENSORS, ModelConfig, SpellingError
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, ModelConfig, SpellingError, check_spelling
 from anytouch_jax.data.manifest.clips import clip_windows
 from anytouch_jax.data.manifest.schema import (
     PATHS,
@@ -474,3 +475,19 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
 def _real_folder(root: str, head: str) -> str:
     folder = os.path.realpath(os.path.join(root, head))
     return "" if folder == "/" else folder
+
+
+def misspelt_sensors(manifest: Manifest) -> Iterator[tuple[Literal["error", "warning"], str, np.ndarray]]:
+    """Yield (level, sentence, row ids i64) for sensor names that are nearly known names. New names are no fault."""
+    names = np.array(manifest.column("sensor").to_pylist(), str)
+    known = (*(name for name in SENSORS if name != UNIVERSAL), *FIELD_SENSORS)
+    for name in sorted(set(names.tolist()) - set(known)):
+        rows = np.flatnonzero(names == name)
+        try:
+            check_spelling(name)
+        except SpellingError as error:
+            yield "error", f"{rows.size} rows are of {error}", rows
+            continue
+        if near := difflib.get_close_matches(name.lower(), known, 1, 0.8):
+            sentence = f"{rows.size} rows are of sensor {name!r}, which is not known: did you mean {near[0]}?"
+            yield "warning", sentence, rows

@@ -1,13 +1,13 @@
-"""Which frames are touched: the difference from the recording's background frame (the paper, appendix A.1).
+"""Contact filter: which frames are touched, by difference from the background image (AnyTouch, appendix A.1).
 
-The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel, after what is no
-contact has been taken away: dark marker dots, which shear moves, are closed in both pictures; a change of exposure or
-tint over the whole picture is subtracted as the median of each colour; noise is blurred. Lengths are in pixels of a
-picture scaled to 160 on its long side, so thresholds do not depend on the camera's resolution.
+The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel. Other changes
+are removed first. Dark marker dots, which shear moves, are closed in both images. A change of exposure or tint is
+subtracted as the median of each colour. Noise is blurred. Lengths are in pixels of an image scaled to 160 on its long
+side, so thresholds do not depend on the camera's resolution.
 
-The background is the file in `background_path`, else it is estimated from the frames of the same unit (else of the
-same sequence): the median of the quarter of them that lies nearest to the median of all. That holds where the gel is
-free, at each place, in most of these frames; a recording that never lets go has no background to be found in it.
+Without a `background_path`, the background is estimated from the frames of the same unit, or else the same sequence.
+It is the median of the quarter of the frames that is nearest to the median of all. This needs a gel that is free, at
+each place, in most of these frames. A recording that never releases the gel shows no background.
 """
 
 from __future__ import annotations
@@ -21,26 +21,31 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.data.images import decode
+from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write
 
-Scored = tuple[int, float, str]  # row, score, reason
-LONG_SIDE, DOT, BLUR, EDGE, PERCENTILE = 160, 13, 1.5, 4, 98
-FEWEST, MOST = 5, 64  # frames from which a background is estimated
+_LONG_SIDE, _DOT, _BLUR, _EDGE, _PERCENTILE = 160, 13, 1.5, 4, 98
+_MIN_FRAMES, _MAX_FRAMES = 5, 64  # frames from which a background is estimated
+_Scored = tuple[int, float, str]  # row, score, reason
 
 # Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without dots), gelslim and
-# gelsight; 9dtact's is set below its one light press; the other sensors have the default, which nothing has tested.
+# gelsight. The one of 9dtact is below its one light press. The default of the other sensors is untested.
 DEFAULT_THRESHOLD = 6.5
 THRESHOLDS: Mapping[str, float] = {"gelsight_mini": 6.5, "gelslim": 6.5, "gelsight": 6.5, "9dtact": 4.0}
+# Columns that report contact, in order of preference, and the value above which they do.
+REFERENCES: Mapping[str, float] = {"label.force": 0.0, "label.contact": 0.5, "label.contact_score": 7.0}
+TILE, PER_ROW = 120, 10  # of contact_sheet
 
 
 @dataclass(frozen=True, eq=False)
 class ContactScores:
-    """Scores f32 (rows,), NaN where there is none; `reasons` (rows,) says where the background is from, or why not."""
+    """Scores f32 (rows,), NaN if unknown. `reasons` (rows,) names the source of the background, or why it failed."""
 
     score: np.ndarray
     reasons: np.ndarray
@@ -53,195 +58,159 @@ class ContactScores:
 
 @dataclass(frozen=True)
 class ContactReport:
-    """Rows with contact, without, unknown; how many were dropped; how many kept the mark that the manifest gives; rows
-    by where their background is from."""
+    """Numbers of rows by result, of rows dropped, of rows labelled before, and of rows by source of the background."""
 
     rows: int
     contact: int
     free: int
     unknown: int
     dropped: int
-    kept: int
+    labelled: int
     backgrounds: dict[str, int]
     thresholds: dict[str, float]
 
     def lines(self) -> list[str]:
-        """The report as lines of text."""
+        """Return the report as lines of text."""
         limits = ", ".join(f"{sensor} {limit:g}" for sensor, limit in self.thresholds.items())
-        kept = f"; {self.kept:,} rows keep the label.contact that they had" if self.kept else ""
+        labelled = f"; {self.labelled:,} rows keep the label.contact that they had" if self.labelled else ""
         return [
             f"{self.rows:,} rows: contact {self.contact:,}, no contact {self.free:,}, unknown {self.unknown:,}; "
             f"dropped {self.dropped:,}",
             "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.backgrounds.items()),
-            f"contact is a score above: {limits}{kept}",
+            f"contact is a score above: {limits}{labelled}",
         ]
 
 
+@dataclass(frozen=True)
+class ContactQuality:
+    """The filter compared with a reference column: precision and recall of contact, NaN without any contact.
+
+    `rows` were compared. `positives` have contact by the reference, `predicted` by the filter, `hits` by both.
+    `correlation` is Pearson's, of score and reference. `parts` holds (rows, precision, recall) by sensor and by source
+    of the background.
+    """
+
+    reference: str
+    above: float
+    rows: int
+    skipped: int
+    positives: int
+    predicted: int
+    hits: int
+    correlation: float
+    parts: dict[str, tuple[int, float, float]]
+
+    @property
+    def precision(self) -> float:
+        return self.hits / self.predicted if self.predicted else float("nan")
+
+    @property
+    def recall(self) -> float:
+        return self.hits / self.positives if self.positives else float("nan")
+
+    def lines(self) -> list[str]:
+        """Return the figures as lines of text."""
+        return [
+            f"contact by {self.reference} > {self.above:g} on {self.positives:,} of {self.rows:,} rows "
+            f"({self.skipped:,} without reference or score): precision {self.precision:.3f}, recall {self.recall:.3f}, "
+            f"correlation {self.correlation:.3f}",
+            *(f"  {name}: {rows:,} rows, precision {precision:.3f}, recall {recall:.3f}"
+              for name, (rows, precision, recall) in self.parts.items()),
+        ]  # fmt: skip
+
+
+# Images -----------------------------------------------------------------------------------------------------------
+
+
+def scale_and_close(image: np.ndarray) -> np.ndarray:
+    """Return an image RGB u8 (h, w, 3) scaled to 160 on its long side, with dark dots and thin dark lines closed."""
+    height, width = image.shape[:2]
+    shrink = _LONG_SIDE / max(height, width)
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    scaled = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
+    return cv2.morphologyEx(scaled, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_DOT, _DOT)))
+
+
 def difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Colour difference f32 (h, w) of two pictures RGB u8 (h, w, 3) from `prepare`, without dots, tint and noise."""
+    """Return the colour difference f32 (h, w) of two images from `scale_and_close`, without tint and noise."""
     change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
     change -= np.median(change[::2, ::2], axis=(0, 1))  # every other pixel is enough for a median
-    red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), BLUR)))
+    red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), _BLUR)))
     return cv2.max(cv2.max(red, green), blue)
 
 
-def prepare(picture: np.ndarray) -> np.ndarray:
-    """A picture RGB u8 (h, w, 3) scaled to LONG_SIDE, its dark dots and thin dark lines closed."""
-    return _close(_scale(picture))
-
-
-def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, workers: int = 2) -> ContactScores:
-    """The score of every row, or of `rows` (the others are NaN, "not asked for"); frames are read by `workers` threads.
-
-    A frame or background that cannot be read gives NaN and its reason; nothing is raised for one file.
-    """
-    if workers < 1:
-        raise UserError(f"--threads (workers) must be at least 1, not {workers}")
-    asked = np.arange(len(manifest)) if rows is None else np.asarray(rows)
-    score = np.full(len(manifest), np.nan, np.float32)
-    reasons = np.full(len(manifest), "not asked for", dtype=object)
-    given = manifest.present("background_path")
-    given_rows = asked[given[asked]]
-    with ThreadPoolExecutor(workers) as pool:
-        background = lru_cache(256)(_prepared_file)
-        for row, value, reason in _map(pool, partial(_from_file, manifest, background), given_rows):
-            score[row], reasons[row] = value, reason
-        for group in _groups(manifest, asked[~given[asked]]):
-            estimate = _estimate(manifest, group, pool)
-            if estimate is None:
-                reasons[group] = f"none: no background and fewer than {FEWEST} frames to estimate it from"
-                continue
-            for row, value, reason in _map(pool, partial(_from_estimate, manifest, estimate), group):
-                score[row], reasons[row] = value, reason
-    return ContactScores(score, reasons)
-
-
-def mark_contact(
-    manifest: Manifest,
-    scores: ContactScores,
-    *,
-    thresholds: Mapping[str, float] | None = None,
-    share: float = 0.0,
-    drop: bool = False,
-) -> tuple[Manifest, ContactReport]:
-    """`manifest` with `label.contact_score` and `label.contact` (1, 0 or null where unknown), and what was found.
-
-    A `label.contact` that the dataset gives is kept; a score column that is there is kept as `<name>_given`.
-    `thresholds` replaces entries of THRESHOLDS. `share`: contact has at least this share of the highest score in its
-    sequence too; what is less is the making and the breaking of contact. `drop` leaves out the frames without contact,
-    but never the split `background` nor a frame of which nothing is known.
-    """
-    limits, given, score = limits_of(manifest, thresholds, share), known_contact(manifest), scores.score
-    contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * _highest(manifest, score)))
-    background = np.asarray(manifest.table["split"].to_pylist(), object) == "background"
-    contact[background] = 0  # what the split says
-    contact = np.where(np.isnan(given), contact, given > 0)
-    free = contact == 0
-    table, name, kept = manifest.table, "label.contact_score", "label.contact_score_given"
-    if name in table.column_names:
-        table = table.select([one for one in table.column_names if one != kept]).append_column(kept, table[name])
-    marked = replace_column(replace(manifest, table=table), name, pa.array(score, pa.float32(), mask=np.isnan(score)))
-    column = pa.array(np.nan_to_num(contact).astype(np.int64), pa.int64(), mask=np.isnan(contact))
-    marked = replace_column(marked, "label.contact", column)
-    stays = np.ones(len(manifest), bool)
-    if drop:
-        stays = ~free | background
-    if not stays.any():
-        raise UserError("every frame is without contact by these thresholds; nothing would be left")
-    used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
-    unknown = int(np.isnan(contact).sum())
-    report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
-                           int(np.isfinite(given).sum()), scores.counts, used)  # fmt: skip
-    return select_rows(marked, np.flatnonzero(stays)), report
-
-
-def limits_of(manifest: Manifest, thresholds: Mapping[str, float] | None, share: float) -> np.ndarray:
-    """The threshold of every row, f64. Raises UserError for what `mark_contact` cannot use, `share` included."""
-    if not 0 <= share <= 1:
-        raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")
-    table = {**THRESHOLDS, **(thresholds or {})}
-    wrong = [name for name in thresholds or {} if name not in manifest.table["sensor"].to_pylist()]
-    if wrong:
-        raise UserError(f"a threshold is given for the sensor {wrong[0]!r}, which the manifest does not have")
-    if strange := [name for name, least in table.items() if not np.isfinite(least)]:
-        raise UserError(f"the threshold of {strange[0]} must be a number, not {table[strange[0]]}")
-    return np.array([table.get(name, DEFAULT_THRESHOLD) for name in manifest.table["sensor"].to_pylist()])
-
-
-def _highest(manifest: Manifest, score: np.ndarray) -> np.ndarray:
-    """The highest score in the sequence of every row, f64 (rows,)."""
-    codes = manifest.codes("sequence", own=True)
-    best = np.zeros(codes.max() + 1)
-    np.fmax.at(best, codes, score)
-    return np.asarray(best[codes])
-
-
-def _scale(picture: np.ndarray) -> np.ndarray:
-    height, width = picture.shape[:2]
-    shrink = LONG_SIDE / max(height, width)
-    size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
-
-
-def _close(picture: np.ndarray) -> np.ndarray:
-    return cv2.morphologyEx(picture, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT)))
-
-
-def known_contact(manifest: Manifest) -> np.ndarray:
-    """`label.contact` of every row as f64 (rows,), NaN where it is not known. Raises UserError for another word."""
-    words = {"true": 1.0, "false": 0.0}
-    found = np.full(len(manifest), np.nan)
-    if "label.contact" not in manifest.table.column_names:
-        return found
-    for row, value in enumerate(manifest.table["label.contact"].to_pylist()):
-        word = "" if value is None else str(value).strip().lower()
-        if not word:  # an empty cell of a CSV
-            continue
-        try:
-            found[row] = words[word] if word in words else float(word)
-        except ValueError:
-            what = f"column 'label.contact' must be a number, true or false, is {value!r}"
-            raise UserError(f"{manifest.where(row)}: {what}") from None
-    return found
-
-
 def _score(frame: np.ndarray, background: np.ndarray) -> float:
-    """How far a frame is from the untouched gel, 0 to 255; both from `prepare`."""
+    """Return the distance, 0 to 255, of two images from `scale_and_close`. Raises ValueError."""
     if max(abs(a - b) for a, b in zip(frame.shape, background.shape, strict=True)) > 2:
         raise ValueError("its background has other proportions")
     if frame.shape != background.shape:
         background = cv2.resize(background, frame.shape[1::-1])
-    inner = difference(frame, background)[EDGE:-EDGE, EDGE:-EDGE]
+    inner = difference(frame, background)[_EDGE:-_EDGE, _EDGE:-_EDGE]
     if not inner.size:
         raise ValueError("it is too thin a strip")
-    return float(np.percentile(inner, PERCENTILE))
+    return float(np.percentile(inner, _PERCENTILE))
 
 
-def _prepared_file(path: Path) -> np.ndarray:
-    return prepare(decode(path))
+def estimate_background(images: np.ndarray) -> np.ndarray:
+    """Return the untouched gel u8 (h, w, 3): the median of the quarter of `images` u8 (n, h, w, 3) nearest to the
+    median of all."""
+    middle = np.median(images, axis=0).astype(np.uint8)
+    distances = [_score(image, middle) for image in images]  # a mean would sort by noise: a press is small
+    nearest = np.argsort(distances, kind="stable")[: max(3, len(images) // 4)]
+    return np.median(images[nearest], axis=0).astype(np.uint8)
 
 
-def _from_file(manifest: Manifest, background: Callable[[Path], np.ndarray], row: int) -> Scored:
+# Scores -----------------------------------------------------------------------------------------------------------
+
+
+def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, workers: int = 2) -> ContactScores:
+    """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
+
+    A frame or background that cannot be read has the score NaN and a reason. It raises nothing.
+    """
+    if workers < 1:
+        raise UserError(f"--threads (workers) must be at least 1, not {workers}")
+    rows = np.arange(len(manifest)) if rows is None else np.asarray(rows)
+    score = np.full(len(manifest), np.nan, np.float32)
+    reasons = np.full(len(manifest), "not asked for", dtype=object)
+    has_background = manifest.present("background_path")[rows]
+    with ThreadPoolExecutor(workers) as pool:
+
+        def assign(score_row: Callable[[int], _Scored], some: np.ndarray) -> None:
+            for start in range(0, len(some), 1024):  # millions of rows must not wait in memory
+                for row, value, reason in pool.map(score_row, some[start : start + 1024].tolist()):
+                    score[row], reasons[row] = value, reason
+
+        cached = lru_cache(256)(_load)
+        assign(partial(_score_row, manifest, lambda row: cached(manifest.file(row, "background_path")), "given"),
+               rows[has_background])  # fmt: skip
+        for group in _groups(manifest, rows[~has_background]):
+            estimate = _estimate(manifest, group, pool)
+            if estimate is None:
+                reasons[group] = f"none: no background and fewer than {_MIN_FRAMES} frames to estimate it from"
+                continue
+            assign(partial(_score_row, manifest, estimate, "estimated"), group)
+    return ContactScores(score, reasons)
+
+
+def _load(path: Path) -> np.ndarray:
+    return scale_and_close(decode(path))
+
+
+def _score_row(
+    manifest: Manifest, background: np.ndarray | Callable[[int], np.ndarray], source: str, row: int
+) -> _Scored:
     try:
-        frame = _prepared_file(manifest.file(row))
-        return row, _score(frame, background(manifest.file(row, "background_path"))), "given"
-    except (UserError, ValueError) as error:
-        return row, np.nan, _why(error)
-
-
-def _from_estimate(manifest: Manifest, background: np.ndarray, row: int) -> Scored:
-    try:
-        return row, _score(_prepared_file(manifest.file(row)), background), "estimated"
-    except (UserError, ValueError) as error:
-        return row, np.nan, _why(error)
-
-
-def _why(error: Exception) -> str:
-    return "none: the frame or its background cannot be read" if isinstance(error, UserError) else f"none: {error}"
+        frame = _load(manifest.file(row))
+        return row, _score(frame, background(row) if callable(background) else background), source
+    except UserError:
+        return row, np.nan, "none: the frame or its background cannot be read"
+    except ValueError as error:
+        return row, np.nan, f"none: {error}"
 
 
 def _groups(manifest: Manifest, rows: np.ndarray) -> Iterator[np.ndarray]:
-    """`rows` by unit of one dataset and sensor where a unit is named, else by sequence; each in row order."""
+    """Yield `rows` by unit of one dataset and sensor if a unit is named, else by sequence, each in row order."""
     unit, sequence = manifest.codes("unit", own=True), manifest.codes("sequence", own=True)
     dataset, sensor = manifest.codes("dataset"), manifest.codes("sensor")
     no_unit = unit < 0
@@ -253,39 +222,214 @@ def _groups(manifest: Manifest, rows: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _estimate(manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor) -> np.ndarray | None:
-    """The untouched gel of a group, prepared; None when too few of its frames can be read.
+    """Return the background of a group from `scale_and_close`, or None if too few frames can be read.
 
-    Rows of the split `background` are the untouched gel, so where the group has some no others are needed.
+    Rows of the split `background` show the untouched gel, so a group with such rows uses only them.
     """
     free = group[np.asarray(pc.equal(manifest.table["split"].take(group), "background"))]
     if len(free):
         group = free
-    chosen = group[np.unique(np.linspace(0, len(group) - 1, MOST).astype(int))]
-    pictures = [one for one in pool.map(partial(_readable, manifest), chosen) if one is not None]
-    pictures = [one for one in pictures if min(one.shape[:2]) > 2 * EDGE]
-    shapes = Counter(one.shape for one in pictures)
+    chosen = group[np.unique(np.linspace(0, len(group) - 1, _MAX_FRAMES).astype(int))]
+    loaded = pool.map(partial(_load_or_none, manifest), chosen)
+    images = [image for image in loaded if image is not None and min(image.shape[:2]) > 2 * _EDGE]
+    shapes = Counter(image.shape for image in images)
     if not shapes:
         return None
-    pictures = [one for one in pictures if one.shape == shapes.most_common(1)[0][0]]
-    return estimate_background(np.stack(pictures)) if len(pictures) >= (1 if len(free) else FEWEST) else None
+    images = [image for image in images if image.shape == shapes.most_common(1)[0][0]]
+    return estimate_background(np.stack(images)) if len(images) >= (1 if len(free) else _MIN_FRAMES) else None
 
 
-def _readable(manifest: Manifest, row: int) -> np.ndarray | None:
+def _load_or_none(manifest: Manifest, row: int) -> np.ndarray | None:
     try:
-        return _prepared_file(manifest.file(row))
+        return _load(manifest.file(row))
     except UserError:
         return None
 
 
-def estimate_background(pictures: np.ndarray) -> np.ndarray:
-    """The untouched gel u8 (h, w, 3) in pictures u8 (n, h, w, 3): the median of the quarter nearest to their median."""
-    middle = np.median(pictures, axis=0).astype(np.uint8)
-    far = [_score(one, middle) for one in pictures]  # a mean would sort by noise: a press is small
-    near = np.argsort(far, kind="stable")[: max(3, len(pictures) // 4)]
-    return np.median(pictures[near], axis=0).astype(np.uint8)
+# Labels -----------------------------------------------------------------------------------------------------------
 
 
-def _map(pool: ThreadPoolExecutor, work: Callable[[int], Scored], rows: np.ndarray) -> Iterator[Scored]:
-    """`work` over `rows` in blocks, so that millions of rows never wait in memory."""
-    for at in range(0, len(rows), 1024):
-        yield from pool.map(work, rows[at : at + 1024].tolist())
+def mark_contact(
+    manifest: Manifest,
+    scores: ContactScores,
+    *,
+    thresholds: Mapping[str, float] | None = None,
+    share: float = 0.0,
+    drop: bool = False,
+) -> tuple[Manifest, ContactReport]:
+    """Return the manifest with `label.contact_score` and `label.contact` (1, 0 or null if unknown), and a report.
+
+    An existing `label.contact` is kept. An existing score column is renamed to `<name>_given`. `thresholds` replaces
+    entries of THRESHOLDS. With `share`, contact also needs this share of the highest score of its sequence, which
+    excludes the start and the end of contact. `drop` removes frames without contact, but never the split `background`
+    nor frames of unknown contact. Raises UserError if nothing would be left.
+    """
+    limits, known = threshold_of_rows(manifest, thresholds, share), known_contact(manifest)
+    score = scores.score
+    contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * _highest(manifest, score)))
+    background = np.asarray(manifest.table["split"].to_pylist(), object) == "background"
+    contact[background] = 0
+    contact = np.where(np.isnan(known), contact, known > 0)
+    free = contact == 0
+    table, name, renamed = manifest.table, "label.contact_score", "label.contact_score_given"
+    if name in table.column_names:
+        table = table.select([column for column in table.column_names if column != renamed])
+        table = table.append_column(renamed, table[name])
+    marked = replace_column(replace(manifest, table=table), name, pa.array(score, pa.float32(), mask=np.isnan(score)))
+    column = pa.array(np.nan_to_num(contact).astype(np.int64), pa.int64(), mask=np.isnan(contact))
+    marked = replace_column(marked, "label.contact", column)
+    stays = ~free | background if drop else np.ones(len(manifest), bool)
+    if not stays.any():
+        raise UserError("every frame is without contact by these thresholds; nothing would be left")
+    used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
+    unknown = int(np.isnan(contact).sum())
+    report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
+                           int(np.isfinite(known).sum()), scores.counts, used)  # fmt: skip
+    return select_rows(marked, np.flatnonzero(stays)), report
+
+
+def threshold_of_rows(manifest: Manifest, thresholds: Mapping[str, float] | None, share: float) -> np.ndarray:
+    """Return the threshold of every row, f64. Raises UserError for thresholds or a `share` that cannot be used."""
+    if not 0 <= share <= 1:
+        raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")
+    table = {**THRESHOLDS, **(thresholds or {})}
+    sensors = manifest.table["sensor"].to_pylist()
+    for name in thresholds or {}:
+        if name not in sensors:
+            raise UserError(f"a threshold is given for the sensor {name!r}, which the manifest does not have")
+        if not np.isfinite(table[name]):
+            raise UserError(f"the threshold of {name} must be a number, not {table[name]}")
+    return np.array([table.get(name, DEFAULT_THRESHOLD) for name in sensors])
+
+
+def _highest(manifest: Manifest, score: np.ndarray) -> np.ndarray:
+    """Return the highest score in the sequence of every row, f64 (rows,)."""
+    codes = manifest.codes("sequence", own=True)
+    best = np.zeros(codes.max() + 1)
+    np.fmax.at(best, codes, score)
+    return np.asarray(best[codes])
+
+
+def known_contact(manifest: Manifest) -> np.ndarray:
+    """Return `label.contact` of every row, f64 (rows,), NaN if unknown. Raises UserError for another word."""
+    words = {"true": 1.0, "false": 0.0}
+    contact = np.full(len(manifest), np.nan)
+    if "label.contact" not in manifest.table.column_names:
+        return contact
+    for row, value in enumerate(manifest.table["label.contact"].to_pylist()):
+        word = "" if value is None else str(value).strip().lower()
+        if not word:  # an empty cell of a CSV
+            continue
+        try:
+            contact[row] = words[word] if word in words else float(word)
+        except ValueError:
+            message = f"column 'label.contact' must be a number, true or false, is {value!r}"
+            raise UserError(f"{manifest.where(row)}: {message}") from None
+    return contact
+
+
+# Quality ----------------------------------------------------------------------------------------------------------
+
+
+def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple[str, npt.NDArray[np.float64]]:
+    """Return the column that reports contact (default: the first existing one of REFERENCES) and its numbers.
+
+    Raises UserError if there is no such column, or if it holds no numbers.
+    """
+    columns = manifest.table.column_names
+    name = reference or next((column for column in REFERENCES if column in columns), None)
+    if name is None or name not in columns:
+        raise UserError(
+            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with"
+        )
+    if name == "label.contact":
+        return name, known_contact(manifest)
+    try:
+        values = manifest.table[name].to_pylist()
+        return name, np.array([np.nan if value is None else float(value) for value in values])
+    except (TypeError, ValueError):
+        raise UserError(f"column {name} holds something that is no number; contact must be a number") from None
+
+
+def contact_quality(
+    manifest: Manifest,
+    scores: ContactScores,
+    *,
+    reference: str | None = None,
+    above: float | None = None,
+    thresholds: Mapping[str, float] | None = None,
+) -> ContactQuality:
+    """Compare the filter with column `reference` > `above` (default: the first existing one of REFERENCES).
+
+    Rows with a value and a score are compared, except the split `background`. `thresholds` replaces entries of
+    THRESHOLDS. Raises UserError if there is no such column or row.
+    """
+    name, truth = reference_contact(manifest, reference)
+    limit = REFERENCES.get(name, 0.0) if above is None else above
+    relevant = np.asarray(manifest.table["split"].to_pylist(), object) != "background"
+    used = np.flatnonzero(relevant & ~np.isnan(truth) & ~np.isnan(scores.score))
+    if not used.size:
+        raise UserError(f"no row has both a value in {name} and a score")
+    score, sources = scores.score[used], scores.reasons[used]
+    sensors = np.asarray(manifest.table["sensor"].to_pylist(), object)[used]
+    predicted, positive = score > threshold_of_rows(manifest, thresholds, 0.0)[used], truth[used] > limit
+    hit = positive & predicted
+    groups = {f"sensor {sensor}": sensors == sensor for sensor in sorted(set(sensors))}
+    groups |= {f"background {source}": sources == source for source in sorted(set(sources))}
+    parts = {
+        group: (int(members.sum()), _share(hit[members], predicted[members]), _share(hit[members], positive[members]))
+        for group, members in groups.items()
+    }
+    counts = (len(used), int(relevant.sum()) - len(used), int(positive.sum()), int(predicted.sum()), int(hit.sum()))
+    constant = len(used) < 2 or np.ptp(score) == 0 or np.ptp(truth[used]) == 0
+    correlation = float("nan") if constant else float(np.corrcoef(score, truth[used])[0, 1])
+    return ContactQuality(name, limit, *counts, correlation, parts)
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    return int(part.sum()) / int(whole.sum()) if whole.any() else float("nan")
+
+
+def contact_sheet(manifest: Manifest, scores: ContactScores, path: str | Path, *,
+                  thresholds: Mapping[str, float] | None = None, rows: int = 4) -> Path:  # fmt: skip
+    """Write a PNG with `rows` rows of frames without contact (red) and as many with contact (green), by rising score.
+
+    Frames are spread evenly over the scores of each side, so the doubtful ones are next to each other. Raises
+    UserError if no row has a score.
+    """
+    limits = threshold_of_rows(manifest, thresholds, 0.0)
+    splits = np.asarray(manifest.table["split"].to_pylist(), object)
+    scored = np.flatnonzero(~np.isnan(scores.score) & (splits != "background"))
+    if not scored.size:
+        raise UserError("no frame has a contact score, so there is nothing to show")
+    contact = scores.score[scored] > limits[scored]
+    bands = []
+    for title, side, colour in (
+        ("no contact", scored[~contact], (60, 60, 230)), ("contact", scored[contact], (80, 180, 60)),
+    ):  # fmt: skip
+        order = side[np.argsort(scores.score[side], kind="stable")]
+        chosen = order[np.unique(np.linspace(0, len(order) - 1, rows * PER_ROW).astype(int))] if len(order) else order
+        tiles = [_tile(manifest, row, float(scores.score[row]), colour) for row in chosen]
+        tiles += [np.full((TILE, TILE, 3), 255, np.uint8)] * (-len(tiles) % PER_ROW)
+        head = np.full((28, TILE * PER_ROW, 3), 255, np.uint8)
+        cv2.putText(head, f"{title}: {len(side)} frames", (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1,
+                    cv2.LINE_AA)  # fmt: skip
+        bands += [head, *(np.hstack(tiles[start : start + PER_ROW]) for start in range(0, len(tiles), PER_ROW))]
+    atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
+    return Path(path)
+
+
+def _tile(manifest: Manifest, row: int, score: float, colour: tuple[int, int, int]) -> np.ndarray:
+    """Return a square BGR tile with the frame, its score and a coloured border."""
+    tile = np.full((TILE, TILE, 3), 255, np.uint8)
+    try:
+        image = decode(manifest.file(row))[..., ::-1]
+    except ImageError:
+        return tile
+    shrink = (TILE - 20) / max(image.shape[:2])
+    size = max(1, round(image.shape[1] * shrink)), max(1, round(image.shape[0] * shrink))
+    left = (TILE - size[0]) // 2
+    tile[2 : 2 + size[1], left : left + size[0]] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    cv2.rectangle(tile, (left - 1, 1), (left + size[0], 2 + size[1]), colour, 1)
+    cv2.putText(tile, f"{score:.1f}", (left, size[1] + 16), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+    return tile

@@ -1,4 +1,4 @@
-"""What may be used commercially, row by row; and the rows that certainly may."""
+"""Licences: which rows may be used commercially."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _YES = re.compile(
 
 
 class Licence(NamedTuple):
-    """Rows under one licence: its name (None where none is given), YES, NO or UNKNOWN, the datasets, the rows."""
+    """Rows under one licence: its name or None, YES, NO or UNKNOWN, the datasets, the number of rows."""
 
     name: str | None
     commercial: int
@@ -30,7 +30,7 @@ class Licence(NamedTuple):
 
 
 class Commercial(NamedTuple):
-    """The rows that may be used commercially, and how many were left out."""
+    """The rows that may be used commercially, and the numbers of rows left out."""
 
     manifest: Manifest
     non_commercial: int
@@ -38,7 +38,7 @@ class Commercial(NamedTuple):
 
 
 def allows(licence: str | None) -> int:
-    """Whether a licence by its name allows commercial use: YES, NO or UNKNOWN (a name that is not known)."""
+    """Return whether a licence with this name allows commercial use: YES, NO or UNKNOWN."""
     if licence is None or not licence.strip():
         return UNKNOWN
     if _NO.search(licence):
@@ -47,9 +47,9 @@ def allows(licence: str | None) -> int:
 
 
 def commercial_use(manifest: Manifest) -> np.ndarray:
-    """YES, NO or UNKNOWN for every row, i8 (rows,).
+    """Return YES, NO or UNKNOWN for every row, i8 (rows,).
 
-    NO where the flag `commercial` or the licence's name says so; else the flag decides, else the licence's name.
+    A NO by the flag `commercial` or by the licence's name decides. Otherwise the flag comes before the name.
     """
     codes = manifest.codes("license")
     names = pc.unique(manifest.column("license")).drop_null().to_pylist()
@@ -59,25 +59,25 @@ def commercial_use(manifest: Manifest) -> np.ndarray:
 
 
 def commercial_only(manifest: Manifest) -> Commercial:
-    """The rows that may certainly be used commercially. Raises UserError when none is left."""
+    """Return the rows that may certainly be used commercially. Raises UserError if there is none."""
     use = commercial_use(manifest)
     non_commercial, unknown = int((use == NO).sum()), int((use == UNKNOWN).sum())
     if not (use == YES).any():
         files = ", ".join(map(str, manifest.files))
         raise UserError(
-            f"{files}: no row may certainly be used commercially ({non_commercial} may not, {unknown} do not say); "
-            "fill in the columns 'license' and 'commercial'"
+            f"{files}: no row may certainly be used commercially ({non_commercial} may not, {unknown} do not say). "
+            "Fill in the columns 'license' and 'commercial'."
         )
     return Commercial(select_rows(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
 
 
 def licences(manifest: Manifest) -> tuple[Licence, ...]:
-    """Rows under each licence, most rows first."""
+    """Return the rows under each licence, most rows first."""
     use, name, dataset = commercial_use(manifest), manifest.codes("license"), manifest.codes("dataset")
-    found = []
+    result = []
     for code, verdict in np.unique(np.stack([name, use.astype(np.int64)], 1), axis=0):
         rows = np.flatnonzero((name == code) & (use == verdict))
         _, first = np.unique(dataset[rows], return_index=True)
         sets = sorted({str(value) for row in rows[first] if (value := manifest.value(row, "dataset")) is not None})
-        found.append(Licence(manifest.value(rows[0], "license"), int(verdict), tuple(sets), len(rows)))
-    return tuple(sorted(found, key=lambda licence: -licence.rows))
+        result.append(Licence(manifest.value(rows[0], "license"), int(verdict), tuple(sets), len(rows)))
+    return tuple(sorted(result, key=lambda licence: -licence.rows))

@@ -1,4 +1,4 @@
-"""Every file of a manifest looked at once: is it there, does it decode whole, its size, its hash, its colours."""
+"""File scan: existence, decoding, size, hash and colours of every file of a manifest, each read once."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from anytouch_jax.errors import UserError
 
 STATES = ("ok", "missing", "outside", "empty", "truncated", "unreadable")
 OK = STATES.index("ok")
-SIDE = 4  # the colours of a picture: means of 4 x 4 fields
-_REASONS = 1000  # sentences kept, so that a million broken files do not fill the memory
+_SIDE = 4  # colours are the means of 4 x 4 fields
+_MAX_REASONS = 1000  # a million broken files must not fill the memory
 
 
 class Scan(NamedTuple):
-    """What is known of every distinct file i (n in all).
+    """The state of every distinct file i of n.
 
-    `state` u8 (n,) a number in STATES; `size` i32 (n, 2) width and height, 0 where not decoded; `digest` S32 (n,) the
-    first half of its SHA-256 in hex; `colours` u8 (n, 48); `reasons` why the first thousand bad ones are bad.
+    `state` u8 (n,) indexes STATES. `size` i32 (n, 2) is width and height, 0 if not decoded. `digest` S32 (n,) is the
+    first half of the SHA-256 in hex. `colours` is u8 (n, 48). `reasons` explains the first thousand bad files.
     """
 
     files: Files
@@ -40,12 +40,12 @@ class Scan(NamedTuple):
     reasons: dict[int, str]
 
     def states(self, column: str) -> np.ndarray:
-        """The state of the file in every cell of a column, u8 (rows,); OK where the cell is null."""
+        """Return the state of the file in every cell of a column, u8 (rows,). A null cell is OK."""
         code = self.files.code[column]
         return np.where(code < 0, OK, self.state[code])
 
 
-class _Look(NamedTuple):
+class _FileState(NamedTuple):
     state: str
     size: tuple[int, int] = (0, 0)
     digest: bytes = b""
@@ -53,69 +53,75 @@ class _Look(NamedTuple):
     reason: str = ""
 
 
+_MISSING = _FileState("missing", reason="there is no such file")
+_EMPTY = _FileState("empty", reason="the file has no bytes")
+
+
 def scan(
     manifest: Manifest, *, decode: bool = True, threads: int = 4, log: Callable[[str], None] | None = None
 ) -> Scan:
-    """Look at every distinct file; without `decode` only whether it is there and not empty.
+    """Read every distinct file. Without `decode`, check only that it exists and is not empty.
 
-    Memory: some 100 bytes a file and the pictures that are under way.
+    Memory holds some 100 bytes for each file and the images being decoded.
     """
     files = distinct_files(manifest)
     count = len(files)
-    found = Scan(
+    result = Scan(
         files, np.zeros(count, np.uint8), np.zeros((count, 2), np.int32), np.zeros(count, "S32"),
-        np.zeros((count, 3 * SIDE * SIDE), np.uint8), {},
+        np.zeros((count, 3 * _SIDE * _SIDE), np.uint8), {},
     )  # fmt: skip
 
-    def look(file: int) -> _Look:
+    def inspect(file: int) -> _FileState:
         row, column = int(files.row[file]), str(files.column[file])
         try:
             path = manifest.file(row, column)
         except UserError as error:
-            return _Look("outside", reason=str(error))
-        field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
-        return (_look if decode or split_shard_path(path) else _glance)(path, decode and not field)
+            return _FileState("outside", reason=str(error))
+        is_field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
+        if decode or split_shard_path(path):
+            return _read(path, decode and not is_field)
+        return _stat(path)
 
-    with closing(bounded_map(look, range(count), threads, 8 * max(threads, 1))) as looks:
-        for file, one in enumerate(looks):
-            found.state[file] = STATES.index(one.state)
-            found.size[file], found.digest[file] = one.size, one.digest
-            if one.colours is not None:
-                found.colours[file] = one.colours
-            if one.reason and len(found.reasons) < _REASONS:
-                found.reasons[file] = one.reason
+    with closing(bounded_map(inspect, range(count), threads, 8 * max(threads, 1))) as states:
+        for file, state in enumerate(states):
+            result.state[file] = STATES.index(state.state)
+            result.size[file], result.digest[file] = state.size, state.digest
+            if state.colours is not None:
+                result.colours[file] = state.colours
+            if state.reason and len(result.reasons) < _MAX_REASONS:
+                result.reasons[file] = state.reason
             if log and (file + 1) % 100_000 == 0:
                 log(f"{file + 1} of {count} files")
-    return found
+    return result
 
 
-def _glance(path: Path, _: bool) -> _Look:
+def _stat(path: Path) -> _FileState:
     try:
         size = os.stat(path).st_size
     except FileNotFoundError:
-        return _Look("missing", reason="there is no such file")
+        return _MISSING
     except OSError as error:
-        return _Look("unreadable", reason=str(error.strerror))
-    return _Look("ok") if size else _Look("empty", reason="the file has no bytes")
+        return _FileState("unreadable", reason=str(error.strerror))
+    return _FileState("ok") if size else _EMPTY
 
 
-def _look(path: Path, is_picture: bool) -> _Look:
+def _read(path: Path, is_image: bool) -> _FileState:
     try:
         data = read_file(path)
     except FileNotFoundError:
-        return _Look("missing", reason="there is no such file")
+        return _MISSING
     except (OSError, ValueError, MemoryError) as error:
-        return _Look("unreadable", reason=str(getattr(error, "strerror", None) or error))
+        return _FileState("unreadable", reason=str(getattr(error, "strerror", None) or error))
     if not data:
-        return _Look("empty", reason="the file has no bytes")
+        return _EMPTY
     digest = hashlib.sha256(data).hexdigest()[:32].encode()
-    if not is_picture:
-        return _Look("ok", digest=digest)
+    if not is_image:
+        return _FileState("ok", digest=digest)
     try:
         pixels = decode_bytes(data, path)
     except ImageError as error:
         reason = str(error).removeprefix(f"{path} ").removeprefix("cannot be read: ")
-        return _Look("truncated" if "cut short" in reason else "unreadable", digest=digest, reason=reason)
+        return _FileState("truncated" if "cut short" in reason else "unreadable", digest=digest, reason=reason)
     height, width = pixels.shape[:2]
-    colours = cv2.resize(pixels, (SIDE, SIDE), interpolation=cv2.INTER_AREA).reshape(-1)
-    return _Look("ok", (width, height), digest, colours)
+    colours = cv2.resize(pixels, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).reshape(-1)
+    return _FileState("ok", (width, height), digest, colours)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest
-from anytouch_jax.data.prepare.checks import misspelt_sensors
 from anytouch_jax.data.readers import (
     before,
     cloth,
@@ -158,8 +157,8 @@ def index(
             f"the manifest {target} cannot be written: {error.strerror}; name another file with --out, in a folder "
             "that contains the data"
         ) from None
-    for finding in misspelt_sensors(manifest):
-        notes.log(finding.sentence)
+    for _, sentence, _ in manifests.misspelt_sensors(manifest):
+        notes.log(sentence)
     return _report(one, target, manifest, notes)
 
 

@@ -227,11 +227,6 @@ def test_vision_flip_is_an_exact_mirror_and_rotation_turns():
     assert 15 < max(angles) < 20.5 and -20.5 < min(angles) < -15
 
 
-def test_decode_is_to_be_had_here(tmp_path):
-    cv2.imwrite(str(tmp_path / "x.png"), CLIP[0][..., ::-1])
-    np.testing.assert_array_equal(t.decode(tmp_path / "x.png"), CLIP[0])
-
-
 def test_a_frame_is_turned_clockwise_then_mirrored():
     frame = np.arange(6, dtype=np.uint8).reshape(2, 3, 1)  # 0 1 2 / 3 4 5
     wanted = {

@@ -1,4 +1,4 @@
-"""Captions to token ids: CLIP's tokenizer where its file is at hand, else a small one trained on our own captions."""
+"""Tokenizers of captions: CLIP's, read from its file, or a small one trained on the captions of a data set."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ START, END = "<|startoftext|>", "<|endoftext|>"
 
 
 class Tokenizer:
-    """A tokenizer with CLIP's conventions: a start token first, an end token last, the end token as padding.
+    """A tokenizer with CLIP's conventions: a start token first, an end token last, padding with the end token.
 
-    `vocab_size` ids in all, `end_id` the end token. The end token has the largest id, so pooling at the largest id
-    (golden Q10) finds it.
+    There are `vocab_size` ids. The end token `end_id` has the largest one, so that pooling at the largest id (golden
+    Q10) reads its position.
     """
 
     def __init__(self, inner: tokenizers.Tokenizer, name: str = "the tokenizer") -> None:
@@ -29,17 +29,17 @@ class Tokenizer:
         self.vocab_size: int = inner.get_vocab_size()
         if len(empty) != 2 or empty[1] != self.vocab_size - 1:
             raise UserError(
-                f"{name} is not of CLIP's kind: it must put a start and an end token around a text, "
-                "and the end token must have the largest id"
+                f"{name} is not of CLIP's kind: it must put a start and an end token around a text, and the end token "
+                "must have the largest id"
             )
         self.start_id, self.end_id = empty
         self._inner = inner
 
     def encode(self, texts: Sequence[str], length: int) -> tuple[np.ndarray, np.ndarray]:
-        """Texts to (ids i32 (L, length), mask bool (L, length)).
+        """Return (ids i32 (L, length), mask bool (L, length)) of L texts.
 
-        A long text keeps its first tokens and the end token; a short one is padded with the end token. The mask is
-        true on real tokens, the first end token included. Raises UserError for a length below 2.
+        A long text keeps its first tokens and the end token. A short text is padded with the end token. The mask is
+        true on real tokens including the first end token. Raises UserError for a length below 2.
         """
         if length < 2:
             raise UserError(f"a text needs room for a start and an end token, not a length of {length}")
@@ -54,26 +54,26 @@ class Tokenizer:
         return ids, mask
 
     def longest(self, texts: Sequence[str]) -> int:
-        """Tokens of the longest of `texts`, start and end included; 2 without any."""
+        """Return the number of tokens of the longest text, start and end included; 2 without texts."""
         starts = range(0, len(texts), 10_000)
         parts = (self._inner.encode_batch_fast(list(texts[start : start + 10_000])) for start in starts)
-        return max((len(one.ids) for part in parts for one in part), default=2)
+        return max((len(encoding.ids) for part in parts for encoding in part), default=2)
 
     def save(self, path: str | Path) -> None:
-        """Write a tokenizer.json that `load_tokenizer` reads, whole or not at all; `path` is the file or its folder."""
+        """Write a tokenizer.json for `load_tokenizer`; `path` is the file or its folder."""
         path = Path(path)
         target = path / "tokenizer.json" if path.suffix != ".json" else path
         atomic_write(target, self._inner.to_str())
 
 
 def load_tokenizer(path: str | Path) -> Tokenizer:
-    """Read a `tokenizer.json`, given as the file or its folder. Raises UserError when it is missing or unfit."""
+    """Load a `tokenizer.json`; `path` is the file or its folder. Raises UserError if it is missing or unfit."""
     path = Path(path).expanduser()
     if not path.exists() and path.name != "tokenizer.json":
-        raise UserError(f"there is no tokenizer at {path}, nor anything else; give a tokenizer.json, or its folder")
+        raise UserError(f"there is no tokenizer at {path}; give a tokenizer.json or its folder")
     file = path / "tokenizer.json" if path.is_dir() else path
     if not file.is_file():
-        raise UserError(f"there is no tokenizer {file}; give the tokenizer.json that lies beside CLIP's weights")
+        raise UserError(f"there is no tokenizer {file}; give the tokenizer.json in the folder of CLIP's weights")
     try:
         inner = tokenizers.Tokenizer.from_file(str(file))
     except Exception as error:  # the library raises plain Exception
@@ -82,10 +82,10 @@ def load_tokenizer(path: str | Path) -> Tokenizer:
 
 
 def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
-    """A byte-level BPE tokenizer of at most `vocab_size` ids trained on `captions`; the same captions, the same ids.
+    """Train a byte-level BPE tokenizer of at most `vocab_size` ids; the same captions give the same ids.
 
-    Any text can be encoded (lower case, runs of space as one). Start and end token take the last two ids. Raises
-    UserError when `vocab_size` has no room for the 256 bytes and these two, or when there is no caption.
+    It encodes any text, in lower case and with single spaces. The start and end token take the last two ids. Raises
+    UserError if there is no caption, or if `vocab_size` is below 258 (the 256 bytes and these two).
     """
     texts = sorted(set(captions))
     if not texts:

@@ -1,7 +1,7 @@
-"""Image transforms: pure functions (image, rng) -> image, uint8 RGB in and out, at the sizes the model wants.
+"""Image transforms: pure functions from images (and a generator) to images, uint8 RGB in and out.
 
-Normalisation happens on the device; its constants are in `anytouch_jax.config`. What is random comes from the
-generator that is given, and `augmentation_rng` makes one from (seed, epoch, row) alone.
+Normalisation happens on the device, with the constants in `anytouch_jax.config`. All randomness comes from the
+generator argument, which `augmentation_rng` makes from (seed, epoch, row).
 """
 
 from __future__ import annotations
@@ -14,28 +14,16 @@ import cv2
 import numpy as np
 
 from anytouch_jax.config import DataConfig
-from anytouch_jax.data.images import ImageError, decode
-
-__all__ = [
-    "ImageError",
-    "augmentation_rng",
-    "colour_jitter",
-    "decode",
-    "orient_frame",
-    "subtract_background",
-    "touch_evaluation",
-    "touch_transform",
-    "vision_evaluation",
-    "vision_transform",
-]  # fmt: skip
+from anytouch_jax.data.images import ImageError
 
 _GREY = (0.2989, 0.587, 0.114)  # torchvision's weights of red, green, blue
 Flip = Literal["none", "across", "down"]
-TOUCH, VISION = 0, 1  # the two streams of one row's augmentation
+TOUCH, VISION = 0, 1  # the two random streams of a row's augmentation
+UNTOUCHED = 128  # grey level of an untouched gel after background subtraction
 
 
 def augmentation_rng(seed: int, epoch: int, row: int, stream: int = TOUCH) -> np.random.Generator:
-    """The generator of a row's augmentation: a function of (seed, epoch, row), apart for touch and vision."""
+    """Return the generator of a row's augmentation, a function of (seed, epoch, row) and of the stream."""
     return np.random.default_rng([seed % 2**63, epoch, row, stream])
 
 
@@ -46,18 +34,18 @@ def touch_transform(
     config: DataConfig,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), one draw for all frames.
+    """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), with one draw for all frames.
 
-    The whole image is resized (no crop), flipped in both directions with probability `config.flip` each, turned, moved
-    and scaled about its middle by up to `config.affine` (what comes in at an edge is its mirror image), then jittered
-    in colour by `config.jitter` (the release's augmentation but for `affine`). `out`: where to write, else a new array.
+    The whole image is resized (no crop), and flipped in each direction with probability `config.flip`. It is then
+    rotated, shifted and scaled by up to `config.affine` (edges are mirrored; not in the release), and its colours are
+    jittered by `config.jitter`. The result is written into `out` or a new array.
     """
     across, down = rng.random(2) < config.flip
     out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
     plain = np.empty(out.shape[1:], np.uint8) if across or down else None
     for target, frame in zip(out, frames, strict=True):
         _resize(frame, target if plain is None else plain)
-        if plain is not None:  # NumPy takes thirty times as long
+        if plain is not None:  # NumPy takes thirty times longer
             cv2.flip(plain, -1 if across and down else int(across), dst=target)
     if any(config.affine):
         warp = _affine(size, rng, config.affine)
@@ -67,16 +55,16 @@ def touch_transform(
 
 
 def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, float]) -> np.ndarray:
-    """A random map of pixels f64 (2, 3): a turn and a growth about the middle, then a move (`config.Data.affine`)."""
-    turn, grow, across, down = rng.uniform(-1, 1, 4)
+    """Return a random affine map of pixels, f64 (2, 3): rotation and scaling about the centre, then a shift."""
+    angle, scale, across, down = rng.uniform(-1, 1, 4)
     degrees, share, growth = spread
-    middle, move = (size - 1) / 2, np.array([across, down]) * share * size
-    warp = cv2.getRotationMatrix2D((middle, middle), turn * degrees, (1 + growth) ** grow)
-    return np.column_stack([warp[:, :2], warp[:, 2] + move])
+    centre, shift = (size - 1) / 2, np.array([across, down]) * share * size
+    warp = cv2.getRotationMatrix2D((centre, centre), angle * degrees, (1 + growth) ** scale)
+    return np.column_stack([warp[:, :2], warp[:, 2] + shift])
 
 
 def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None) -> np.ndarray:
-    """Resize a still or a clip without randomness: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), into `out`."""
+    """Resize a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), written into `out` or a new array."""
     out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
     for target, frame in zip(out, frames, strict=True):
         _resize(frame, target)
@@ -84,36 +72,35 @@ def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: 
 
 
 def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
-    """A frame (h, w, c) turned clockwise by 0, 90, 180 or 270 degrees, then mirrored across (left and right exchanged)
-    or down (top and bottom)."""
+    """Return a frame (h, w, c) rotated clockwise by 0, 90, 180 or 270 degrees, then mirrored.
+
+    "across" exchanges left and right, "down" exchanges top and bottom.
+    """
     frame = np.rot90(frame, -rotate // 90) if rotate else frame
     return {"none": frame, "across": frame[:, ::-1], "down": frame[::-1]}[flip]
 
 
-UNTOUCHED = 128  # grey level of a gel that nothing touches, once it is subtracted
-
-
 def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:
-    """Each of T frames u8 (h, w, 3) less the untouched gel, on middle grey: frame - background + 128, clipped to u8.
+    """Return background-subtracted frames: frame - background + 128, clipped to u8, for each of T frames u8 (h, w, 3).
 
-    A background of another size is resized to the frame's.
+    The background is an image of the untouched gel. It is resized to the frame's size if they differ.
     """
 
-    def less(frame: np.ndarray) -> np.ndarray:
+    def subtract(frame: np.ndarray) -> np.ndarray:
         height, width = frame.shape[:2]
-        same = background.shape[:2] == (height, width)
-        gel = background if same else cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA)
+        gel = background
+        if gel.shape[:2] != (height, width):
+            gel = cv2.resize(gel, (width, height), interpolation=cv2.INTER_AREA)
         return cv2.addWeighted(frame, 1.0, gel, -1.0, UNTOUCHED)
 
-    return [less(frame) for frame in frames]
+    return [subtract(frame) for frame in frames]
 
 
 def _resize(frame: np.ndarray, target: np.ndarray) -> None:
-    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:  # OpenCV would write elsewhere
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:  # else OpenCV would not write into `target`
         raise ImageError(f"a frame must be RGB uint8 (height, width, 3), not {frame.dtype} {frame.shape}")
-    smaller = min(frame.shape[:2]) > len(target)
-    how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    cv2.resize(frame, (target.shape[1], len(target)), dst=target, interpolation=how)
+    interpolation = cv2.INTER_AREA if min(frame.shape[:2]) > len(target) else cv2.INTER_LINEAR
+    cv2.resize(frame, (target.shape[1], len(target)), dst=target, interpolation=interpolation)
 
 
 def colour_jitter(
@@ -122,11 +109,11 @@ def colour_jitter(
     jitter: tuple[float, float, float, float],
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Brightness, contrast, saturation and hue in a random order, the same for all frames: u8 (T, h, w, 3) -> same.
+    """Jitter brightness, contrast, saturation and hue in a random order, the same for all frames u8 (T, h, w, 3).
 
-    torchvision's ColorJitter on floats: factors in 1 +- jitter (at least 0), hue turned by up to +-jitter of a circle,
-    each step clipped. All is float32 with one rounding at the end, so the error is half a grey level. `out`: where to
-    write, also `frames` itself.
+    This is torchvision's ColorJitter on floats: factors in 1 +- jitter (at least 0), hue rotated by up to +-jitter of
+    a circle, each step clipped. float32 with one rounding at the end keeps the error at half a grey level. The result
+    is written into `out` (`frames` is allowed) or a new array.
     """
     spread = np.asarray(jitter)
     low, high = np.maximum(0.0, 1.0 - spread), 1.0 + spread
@@ -145,32 +132,32 @@ _IDENTITY = np.eye(3, 4)
 
 
 class _Jitter:
-    """One frame on its way, f32 in 0..255: brightness, contrast and saturation are affine maps of a pixel's colour.
+    """One frame under jitter, f32 in 0..255. Brightness, contrast and saturation are affine maps of a pixel's colour.
 
-    `pending` (3, 4) is the map that is still to be applied to `here`. Maps are put together until a value could leave
-    the range (`low` and `high` bound them), where the picture has to be made and clipped, or until the hue is turned.
+    `pending` (3, 4) is the map that is not yet applied to `image`. Maps are composed until a value could leave the
+    range, which `low` and `high` bound, or until the hue changes. Then the image is computed and clipped.
     """
 
-    def __init__(self, frame: np.ndarray, here: np.ndarray, spare: np.ndarray) -> None:
-        np.copyto(here, frame)
-        self.here, self.spare, self.pending = here, spare, _IDENTITY
+    def __init__(self, frame: np.ndarray, image: np.ndarray, spare: np.ndarray) -> None:
+        np.copyto(image, frame)
+        self.image, self.spare, self.pending = image, spare, _IDENTITY
         self.low, self.high = float(frame.min()), float(frame.max())
 
     def apply(self, steps: Sequence[tuple[int, float]], target: np.ndarray) -> None:
-        """Take the steps (operation, factor) in order and round the result into `target` u8."""
+        """Apply the steps (operation, factor) in order and round the result into `target` u8."""
         for operation, factor in steps:
             if operation == _HUE:
-                self._turn(factor)
+                self._rotate_hue(factor)
             else:
                 self._blend(operation, factor)
-        self._settle()
-        cv2.convertScaleAbs(self.here, dst=target)
+        self._apply_pending()
+        cv2.convertScaleAbs(self.image, dst=target)
 
     def _blend(self, operation: int, factor: float) -> None:
-        """Mix with black (0), with the mean grey of the picture (1), or with each pixel's own grey (2)."""
+        """Blend with black (0), with the mean grey of the image (1), or with the grey of each pixel (2)."""
         step, low, high = _IDENTITY * factor, 0.0, 0.0
         if operation == 1:
-            mean = self.pending @ (*cv2.mean(self.here)[:3], 1.0)
+            mean = self.pending @ (*cv2.mean(self.image)[:3], 1.0)
             low = high = float(np.dot(mean, _GREY))
             step[:, 3] = (1 - factor) * low
         elif operation == 2:
@@ -181,37 +168,37 @@ class _Jitter:
         linear[:, 3] += step[:, 3]
         self.pending = linear
         if self.low < 0 or self.high > 255:
-            self._settle()
+            self._apply_pending()
             self._clip()
 
-    def _settle(self) -> None:
+    def _apply_pending(self) -> None:
         if self.pending is not _IDENTITY:
-            cv2.transform(self.here, self.pending.astype(np.float32), dst=self.spare)
-            self.here, self.spare, self.pending = self.spare, self.here, _IDENTITY
+            cv2.transform(self.image, self.pending.astype(np.float32), dst=self.spare)
+            self.image, self.spare, self.pending = self.spare, self.image, _IDENTITY
 
     def _clip(self) -> None:
         if self.high > 255:
-            cv2.threshold(self.here, 255, 0, cv2.THRESH_TRUNC, dst=self.here)
+            cv2.threshold(self.image, 255, 0, cv2.THRESH_TRUNC, dst=self.image)
         if self.low < 0:
-            cv2.threshold(self.here, 0, 0, cv2.THRESH_TOZERO, dst=self.here)
+            cv2.threshold(self.image, 0, 0, cv2.THRESH_TOZERO, dst=self.image)
         self.low, self.high = max(self.low, 0.0), min(self.high, 255.0)
 
-    def _turn(self, factor: float) -> None:
-        """Turn the hue; a pixel's largest and smallest value stay, so the bounds do."""
-        self._settle()
-        cv2.cvtColor(self.here, cv2.COLOR_RGB2HSV, dst=self.spare)
+    def _rotate_hue(self, factor: float) -> None:
+        """Rotate the hue; the largest and the smallest value of a pixel stay, and so do the bounds."""
+        self._apply_pending()
+        cv2.cvtColor(self.image, cv2.COLOR_RGB2HSV, dst=self.spare)
         hue = self.spare[..., 0]
-        np.add(hue, np.float32(360 * (factor % 1.0)), out=hue)  # the way back takes angles above 360, not below 0
-        cv2.cvtColor(self.spare, cv2.COLOR_HSV2RGB, dst=self.here)
+        np.add(hue, np.float32(360 * (factor % 1.0)), out=hue)  # HSV2RGB accepts angles above 360 but not below 0
+        cv2.cvtColor(self.spare, cv2.COLOR_HSV2RGB, dst=self.image)
 
 
 def vision_transform(
     image: np.ndarray, size: int, rng: np.random.Generator, rotation: float = 20.0, flip: float = 0.5
 ) -> np.ndarray:
-    """Augment an ordinary picture u8 (h, w, 3) -> u8 (size, size, 3): rotation, horizontal flip, CLIP's resize.
+    """Augment a photograph u8 (h, w, 3) -> u8 (size, size, 3): rotation, horizontal flip, CLIP's resize.
 
-    The picture is turned by up to +-`rotation` degrees about its centre (corners black), flipped with probability
-    `flip`, then resized and cropped as by `vision_evaluation`.
+    It is rotated by up to +-`rotation` degrees about its centre (corners black), flipped with probability `flip`, then
+    resized and cropped as by `vision_evaluation`.
     """
     angle = rng.uniform(-rotation, rotation)
     across = rng.random() < flip
@@ -226,10 +213,11 @@ def vision_transform(
 
 
 def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
-    """CLIP's preparation without randomness: bicubic resize of the short side, centre crop; u8 (size, size, 3).
+    """Resize the short side (bicubic) and crop the centre, as CLIP does: u8 (h, w, 3) -> u8 (size, size, 3).
 
-    The kernel widens with the reduction (no aliasing), as in PIL; a picture more than 6 times too large is first
-    averaged down to about 3 times.
+    The kernel widens with the reduction, as in Pillow, so nothing aliases. An image more than 6 times too large is
+    first averaged down to about 3 times. Pillow itself rounds between the two passes: 13 % of the pixels would change
+    by one level.
     """
     image = _shrink(image, size)
     height, width = image.shape[:2]
@@ -241,9 +229,9 @@ def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _weigh(image: np.ndarray, first: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Rows (n, c) -> (size, c): row i is the sum over k of weights[k, i] * image[first[i] + k].
+    """Return rows (n, c) -> (size, c): row i is the sum over k of weights[k, i] * image[first[i] + k].
 
-    Tap by tap and not as a matrix product: BLAS threads beside those of the loader cost fifty times its work.
+    It adds tap by tap, because a matrix product takes fifty times longer when its BLAS threads meet the loader's.
     """
     out = np.zeros((len(first), image.shape[1]), np.float32)
     part = np.empty_like(out)
@@ -255,7 +243,7 @@ def _weigh(image: np.ndarray, first: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def _shrink(image: np.ndarray, size: int) -> np.ndarray:
-    """A much too large picture averaged down by a whole factor."""
+    """Return a much too large image averaged down by a whole factor."""
     factor = min(image.shape[:2]) // (3 * size)
     if factor < 2:
         return image
@@ -265,8 +253,11 @@ def _shrink(image: np.ndarray, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _bicubic(before: int, after: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """A bicubic resize from `before` to `after` pixels, the central `size` of them: the first source pixel of each
-    i64 (size,) and the weights f32 (taps, size) of it and the following ones."""
+    """Return the weights of a bicubic resize from `before` to `after` pixels, for the central `size` of them.
+
+    They are the first source pixel of each, i64 (size,), and the weights of it and the following pixels, f32 (taps,
+    size).
+    """
     scale = before / after
     start = round((after - size) / 2)
     centre = (np.arange(start, start + size) + 0.5) * scale

@@ -529,7 +529,7 @@ def test_a_png_is_walked_before_it_is_decoded(spoil, words, monkeypatch):
 
 
 @pytest.mark.parametrize("first", [4, 60000])
-def test_a_tiff_that_declares_two_sizes_goes_by_the_larger(tmp_path, first):
+def test_a_tiff_that_declares_two_sizes_is_refused(tmp_path, first):
     data = bytearray(_encoded(".tiff"))
     order = "little" if data[:2] == b"II" else "big"
     at = int.from_bytes(data[4:8], order)
@@ -542,7 +542,7 @@ def test_a_tiff_that_declares_two_sizes_goes_by_the_larger(tmp_path, first):
     )
     data[4:8] = len(data).to_bytes(4, order)
     (tmp_path / "two.tiff").write_bytes(bytes(data) + (count + 4).to_bytes(2, order) + sizes + body + bytes(4))
-    with pytest.raises(ImageError, match="60000 x 60000"):
+    with pytest.raises(ImageError, match="a tag twice"):
         decode(tmp_path / "two.tiff")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights.release import read_weights
+from anytouch_jax.weights.load import read_weights
 from anytouch_jax.weights.torch_file import read_torch
 
 RNG = np.random.default_rng(0)

@@ -1,19 +1,27 @@
-"""Checkpoints of a run: the one file that knows Orbax (its v1 API), and a flat safetensors export.
+"""Checkpoints of a run: the one file that knows Orbax (its v1 API), and the record that each checkpoint has of itself.
 
 A checkpoint is a folder `<checkpoints>/<step>` that appears whole or not at all: everything is written under another
-name, then renamed. It describes itself (io/record.py): the run's config as JSON, the caller's metadata (sensors by
-name, preprocessing, source) and the metrics. Arrays are stored by name, so that parameters can be read without the
-optimiser that trained them, and on another number of devices.
+name, then renamed. Its `checkpoint.json` stores the run's config, the caller's metadata, the metrics, and the size and
+checksum of every file. A folder is read only if its files match that record. Arrays are stored by name, so that
+parameters can be read without the optimiser, and on another number of devices.
 """
+
+# Orbax's `training.Checkpointer` has policies for what is kept, and renames a folder itself once the arrays are
+# written. Our record needs the checksums of the written files, and must be in the folder before that rename. With
+# Orbax's rename, a kill between the two left a checkpoint that could not be verified. So the rename is ours.
 
 from __future__ import annotations
 
 import errno
 import json
+import logging
 import math
+import os
 import re
 import shutil
+import sys
 import threading
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -25,39 +33,50 @@ import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from anytouch_jax.weights.echoes import echo_less
-from anytouch_jax.weights.record import CheckpointError, checked, read_record, resolve, steps, write_record
-from anytouch_jax.weights.tensors import write_safetensors
+from anytouch_jax.errors import UserError
 from anytouch_jax.weights.tree import flatten, nest
-
-__all__ = [
-    "CheckpointError",
-    "Checkpoints",
-    "export_safetensors",
-    "load_params",
-    "read_metadata",
-    "steps",
-]
 
 Tree = Any
 
+RECORD, FORMAT = "checkpoint.json", "anytouch_jax.checkpoint.1"
+PARTIAL = "partial"  # a metric of checkpoints whose loss covers fewer steps than that of others
+_STEP = re.compile(r"\d{8,}")
 _UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")  # being written or removed, by us or by Orbax
-_AVERAGE = "opt_state/ema/"
-_SHOWN = 5  # names listed in one error message
-_TRIES = 3  # to read the latest checkpoint of a run that goes on
+_AVERAGE = "opt_state/ema/"  # runs of an older version may have an average of the parameters
+_LISTED = 5  # names in one error message
+_TRIES = 3  # to read the latest checkpoint of a running run
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost
+_CHUNK = 1 << 22
+_ORBAX = threading.Lock()  # Orbax allows one running operation a process: a load during a save ends the save
 
 
-PARTIAL = "partial"  # among a checkpoint's metrics: its loss is of fewer steps than those of others
-_ONE = threading.Lock()  # Orbax keeps one running operation a process: a load beside a save ends the save
-echo_less()
+class CheckpointError(UserError):
+    """A checkpoint that cannot be written or read; the message is one sentence that names the path."""
+
+
+def quiet_hook(hook: Callable[..., Any]) -> Callable[..., Any]:
+    """Return an exception hook that drops what Tensorstore's threads raise after the first failed write.
+
+    The other writes of a checkpoint would each print a traceback on a full disk.
+    """
+
+    def quiet(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if kind is not RuntimeError or str(error) != "Event loop is closed":
+            hook(kind, error, trace)
+
+    return quiet
+
+
+# Orbax logs the traceback of every error in its threads, which it raises too.
+logging.getLogger("absl").addFilter(lambda record: "_SignalingThread" not in record.getMessage())
+sys.excepthook = quiet_hook(sys.excepthook)
 
 
 class Checkpoints:
-    """The checkpoints of one run: asynchronous saves; the last `keep` and the best (lowest `loss`) are kept.
+    """The checkpoints of one run: asynchronous saves, of which the last `keep` and the best (lowest `loss`) are kept.
 
     `config_json` and `metadata` (JSON values) are stored with every checkpoint. Leftovers of a killed run in `folder`
-    are removed. Every process of a multi-process run makes one; process 0 does the housekeeping.
+    are removed. Every process of a multi-process run makes one; process 0 renames and removes.
     """
 
     def __init__(self, folder: str | Path, *, keep: int, config_json: str, metadata: dict[str, Any]) -> None:
@@ -73,8 +92,7 @@ class Checkpoints:
         self._worker = ThreadPoolExecutor(1, "checkpoint")
         self._pending: tuple[Path, Future[None], Callable[[], None]] | None = None
         self._saved: set[int] = set()
-        self._losses: dict[int, float] = {}
-        with self._sentence(self.folder):
+        with self._one_sentence(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._sweep()
 
@@ -82,13 +100,14 @@ class Checkpoints:
         """Start saving `state`, a pytree of arrays; it may be donated or changed as soon as this returns.
 
         Waits for the previous save first, and raises its CheckpointError. A step that this object has saved already
-        is left alone; one from an earlier life of the run is replaced when the new one is complete.
+        is skipped. One that an earlier process saved is replaced when the new one is complete.
         """
         self.wait()
         if step in self._saved:
             return
         target = self.folder / f"{step:08d}"
-        leaves = {name: _owned(leaf) for name, leaf in flatten(state).items()}
+        # A numpy array may be written to while the save runs.
+        leaves = {n: x if isinstance(x, jax.Array) else np.array(x) for n, x in flatten(state).items()}
         numbers = {name: float(value) for name, value in metrics.items()}
         content = {
             **self._described,
@@ -99,59 +118,61 @@ class Checkpoints:
         arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
         context = ocp.Context()
         context.array.saving.use_compression = False  # trained weights do not shrink, and a save takes twice as long
-        end_turn = _turn()
+        release = _acquire_orbax()
         try:
-            with self._sentence(target), context:
+            with self._one_sentence(target), context:
                 response = ocp.save_async(_writing(target), nest(arrays))
-            self._pending = target, self._worker.submit(self._finish, target, response, content, end_turn), end_turn
+            self._pending = target, self._worker.submit(self._finish, target, response, content, release), release
         except BaseException:
-            end_turn()
+            release()
             raise
 
     def wait(self) -> None:
-        """Block until the running save is on disk. Raises CheckpointError when it failed (a full disk)."""
+        """Block until the running save is on disk. Raises CheckpointError if it failed (a full disk)."""
         if self._pending is None:
             return
         (target, future, _), self._pending = self._pending, None
-        with self._sentence(target):
+        with self._one_sentence(target):
             try:
                 future.result()
-            finally:  # also after a failure: the other processes are waiting
-                _barrier(f"saved {target.name}")
+            finally:  # also after a failure: the other processes are waiting for process 0 to rename
+                if jax.process_count() > 1:
+                    from jax.experimental import multihost_utils
+
+                    multihost_utils.sync_global_devices(f"saved {target.name}")
         self._saved.add(int(target.name))
 
     def latest(self) -> int | None:
-        """The last complete step on disk, or None."""
+        """Return the last complete step on disk, or None."""
         return max(steps(self.folder), default=None)
 
     def restore(self, abstract_state: Tree, step: int | None = None) -> Tree:
-        """The state of `step` (None: the latest), with the structure and shardings of `abstract_state`.
+        """Return the state of `step` (None: the latest), with the structure and shardings of `abstract_state`.
 
-        `abstract_state` is a tree of `jax.ShapeDtypeStruct` (or arrays); a leaf without sharding goes to the first
-        device. Raises CheckpointError when there is no such checkpoint, when it is damaged, or when names, shapes
-        or types differ from those wanted.
+        `abstract_state` is a tree of `jax.ShapeDtypeStruct` or arrays. A leaf without sharding goes to the first
+        device. Raises CheckpointError if the checkpoint is missing or damaged, or if names, shapes or types differ.
         """
         self.wait()
         folder = resolve(self.folder, step)
         record = checked(folder)
         wanted = {name: _abstract(leaf) for name, leaf in flatten(abstract_state).items()}
         _compare(folder, wanted, _forms(record))
-        found = _load(folder, {name: like for name, like in wanted.items() if math.prod(like.shape)})
+        arrays = _load(folder, {name: like for name, like in wanted.items() if math.prod(like.shape)})
         leaves = [
-            found[name] if name in found else jax.device_put(np.zeros(like.shape, like.dtype), like.sharding)
+            arrays[name] if name in arrays else jax.device_put(np.zeros(like.shape, like.dtype), like.sharding)
             for name, like in wanted.items()
         ]
         return jax.tree.unflatten(jax.tree.structure(abstract_state), leaves)
 
     def close(self) -> None:
-        """Finish the running save and its housekeeping. Raises CheckpointError when the save failed."""
+        """Finish the running save and its housekeeping. Raises CheckpointError if the save failed."""
         self.wait()
         self._worker.shutdown()
 
     def leave(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """`close` at the end of a context; after an error in one of several processes, without waiting for the others.
+        """`close` at the end of a context; after an error in one of several processes, do not wait for the others.
 
-        Its running save is then given half a minute, or nothing where another process is lost: it could not end.
+        The running save then gets half a minute, or no time if another process is lost: it could not end.
         """
         if error is None or jax.process_count() == 1:
             self.close()
@@ -161,14 +182,14 @@ class Checkpoints:
                 self._pending[1].result(timeout=_PATIENCE)
         self._worker.shutdown(wait=False, cancel_futures=True)
         if self._pending is not None:
-            self._pending[2]()  # what never ends, or was cancelled, keeps nobody from reading
+            self._pending[2]()  # a save that never ends, or was cancelled, must not block a load
 
-    def _finish(self, target: Path, response: Any, content: dict[str, Any], end_turn: Callable[[], None]) -> None:
-        """On the worker thread: when the arrays are on disk, write the record, rename, remove what is not kept."""
+    def _finish(self, target: Path, response: Any, content: dict[str, Any], release: Callable[[], None]) -> None:
+        """Write the record once the arrays are on disk, rename, and remove old checkpoints (on the worker thread)."""
         try:
             response.result()
         finally:
-            end_turn()
+            release()
         if jax.process_index() != 0:
             return
         writing = _writing(target)
@@ -176,16 +197,8 @@ class Checkpoints:
         if target.exists():
             _discard(target)
         writing.rename(target)
-        self._losses[int(target.name)] = _loss(target)
-        self._prune()
-
-    def _prune(self) -> None:
         present = steps(self.folder)
-        for step in set(present) - set(self._losses):
-            self._losses[step] = _loss(self.folder / f"{step:08d}")
-        best = min(present, key=lambda step: (self._losses[step], -step))
-        kept = {best, *present[-self._keep :]} if math.isfinite(self._losses[best]) else set(present[-self._keep :])
-        for step in set(present) - kept:
+        for step in set(present) - {best_of(self.folder), *present[-self._keep :]}:
             _discard(self.folder / f"{step:08d}")
 
     def _sweep(self) -> None:
@@ -195,11 +208,11 @@ class Checkpoints:
                     shutil.rmtree(entry, ignore_errors=True)
 
     @contextmanager
-    def _sentence(self, path: Path) -> Iterator[None]:
-        """Turn an error of the storage layers while writing into a CheckpointError; the debris is removed."""
+    def _one_sentence(self, path: Path) -> Iterator[None]:
+        """Turn an error of the storage layers while writing into a CheckpointError, and remove the debris."""
         try:
             yield
-        except Exception as error:  # Orbax and tensorstore wrap OSError in several kinds
+        except Exception as error:  # Orbax and tensorstore wrap OSError in several types
             self._sweep()
             reason = " ".join(str(error).split())[:300]
             full = getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error)
@@ -208,7 +221,7 @@ class Checkpoints:
 
 
 def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]:
-    """What a checkpoint says of itself: `step`, `config` (JSON), `metrics` and the metadata given when it was saved.
+    """Return the metadata that a checkpoint was saved with, and its `step`, `config` (JSON) and `metrics`.
 
     `folder` is a run, its checkpoints folder, or one checkpoint. Raises CheckpointError.
     """
@@ -216,11 +229,11 @@ def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]
 
 
 def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    """(parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
+    """Return (parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
 
-    `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen`
-    of the state together, their average where the run keeps one (optim.ema); the optimiser's other arrays are not read.
-    Where the run goes on meanwhile and removes the latest, that after it is read. Raises CheckpointError.
+    `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen` of the
+    state together. The optimiser's arrays are not read. If a running run removes the latest checkpoint meanwhile, the
+    next one is read. Raises CheckpointError.
     """
     for _ in range(_TRIES if step is None else 1):
         target = resolve(Path(folder), step)
@@ -234,36 +247,25 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
 
 def _params_of(target: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     record = checked(target)
-    chosen = {
+    wanted = {
         name: np.zeros(like.shape, like.dtype)
         for name, like in _forms(record).items()
         if name.startswith(("trainable/", "frozen/", _AVERAGE))
     }
-    if not chosen:
-        raise CheckpointError(f"checkpoint {target} holds no parameters (nothing under trainable/ or frozen/)")
-    found = chosen | _load(target, {name: like for name, like in chosen.items() if like.size})
-    trained = {name.split("/", 1)[1]: leaf for name, leaf in found.items() if not name.startswith(_AVERAGE)}
-    averaged = {name.removeprefix(_AVERAGE): leaf for name, leaf in found.items() if name.startswith(_AVERAGE)}
+    if not wanted:
+        raise CheckpointError(f"checkpoint {target} has no parameters (nothing under trainable/ or frozen/)")
+    arrays = wanted | _load(target, {name: like for name, like in wanted.items() if like.size})
+    trained = {name.split("/", 1)[1]: leaf for name, leaf in arrays.items() if not name.startswith(_AVERAGE)}
+    averaged = {name.removeprefix(_AVERAGE): leaf for name, leaf in arrays.items() if name.startswith(_AVERAGE)}
     return nest(trained | averaged), record["config"], _description(record)
 
 
-def export_safetensors(path: str | Path, params: Tree, metadata: Mapping[str, str]) -> None:
-    """Write a parameter tree to one safetensors file, names joined with "/"; whole or not at all."""
-    write_safetensors(path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata)
-
-
-def _turn() -> Callable[[], None]:
-    """Wait until no other operation of Orbax runs; gives what ends this one's turn, on any thread, and may be called
-    again."""
-    _ONE.acquire()
-    turn = ExitStack()
-    turn.callback(_ONE.release)
-    return turn.close
-
-
-def _owned(leaf: Any) -> Any:
-    """The leaf, safe against later changes: a numpy array may be written to while the save runs."""
-    return leaf if isinstance(leaf, jax.Array) else np.array(leaf)
+def _acquire_orbax() -> Callable[[], None]:
+    """Wait until no other operation of Orbax runs; return its release, which any thread may call, also twice."""
+    _ORBAX.acquire()
+    stack = ExitStack()
+    stack.callback(_ORBAX.release)
+    return stack.close
 
 
 def _writing(target: Path) -> Path:
@@ -278,22 +280,14 @@ def _discard(target: Path) -> None:
     shutil.rmtree(doomed, ignore_errors=True)
 
 
-def _barrier(name: str) -> None:
-    """In a multi-process run: no process goes on before process 0 has renamed the folder."""
-    if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
-
-        multihost_utils.sync_global_devices(name)
-
-
 def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
-    """The named arrays; any others in the checkpoint are not read. The kind of the abstract leaf decides the kind."""
+    """Return the named arrays, of the types of their abstract leaves; other arrays are not read."""
     if not abstract:
         return {}
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     try:
-        with _ONE, context:
+        with _ORBAX, context:
             return flatten(ocp.load(folder, nest(abstract)))
     except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
         reason = " ".join(str(error).split())[:300]
@@ -305,7 +299,7 @@ def _forms(record: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raise CheckpointError that names up to five entries when a checkpoint is not of the wanted form."""
+    """Raise CheckpointError that names up to five entries if a checkpoint does not have the wanted form."""
 
     def form(like: Any) -> str:
         return "nothing" if like is None else f"{tuple(like.shape)} {np.dtype(like.dtype)}"
@@ -318,7 +312,7 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
     if differing:
         raise CheckpointError(
             f"checkpoint {folder} does not fit this configuration, use the preset and settings it was trained with; "
-            f"{len(differing)} entries differ ({'; '.join(differing[:_SHOWN])}{'; ...' * (len(differing) > _SHOWN)})"
+            f"{len(differing)} entries differ ({'; '.join(differing[:_LISTED])}{'; ...' * (len(differing) > _LISTED)})"
         )
 
 
@@ -332,17 +326,124 @@ def _description(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _loss(folder: Path) -> float:
-    """The loss a checkpoint was saved with; infinite when unknown or of few steps, so that it is never the best."""
+    """Return the loss of a checkpoint; infinite if unknown or of few steps, so that it is never the best."""
     try:
         metrics = read_record(folder)["metrics"]
-    except CheckpointError:  # a damaged one is left for `restore` to report
+    except CheckpointError:  # `restore` reports a damaged one
         return math.inf
     loss = metrics.get("loss")
     return math.inf if loss is None or metrics.get(PARTIAL) else loss
 
 
 def best_of(folder: Path) -> int | None:
-    """The step of the checkpoint of lowest loss in a folder of them; None where none is known."""
+    """Return the step of lowest loss in a folder of checkpoints, the latest of equals; None if no loss is known."""
     losses = {step: _loss(folder / f"{step:08d}") for step in steps(folder)}
     best = min(losses, key=lambda step: (losses[step], -step), default=None)
     return best if best is not None and math.isfinite(losses[best]) else None
+
+
+def steps(folder: str | Path) -> list[int]:
+    """Return the complete steps in a folder of checkpoints, in ascending order."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        return []
+    return sorted(int(entry.name) for entry in folder.iterdir() if _STEP.fullmatch(entry.name) and entry.is_dir())
+
+
+def resolve(folder: Path, step: int | None) -> Path:
+    """Return the folder of one checkpoint, from a run, a folder of checkpoints or that folder itself."""
+    folder = folder.absolute()
+    if (folder / "checkpoints").is_dir():
+        folder = folder / "checkpoints"
+    elif _STEP.fullmatch(folder.name) and folder.is_dir() and not steps(folder):
+        if step is not None and step != int(folder.name):
+            raise CheckpointError(f"{folder} is the checkpoint of step {int(folder.name)}, not of step {step}")
+        return folder
+    if folder.is_file():
+        raise CheckpointError(f"{folder} is a file; give the folder of a run, which has checkpoints")
+    present = steps(folder)
+    if not present:
+        raise CheckpointError(f"there is no complete checkpoint in {folder}; train first, or give another folder")
+    if step is not None and step not in present:
+        listed = ", ".join(map(str, present[-10:]))
+        raise CheckpointError(f"there is no checkpoint of step {step} in {folder}; it has {listed}")
+    return folder / f"{present[-1] if step is None else step:08d}"
+
+
+def write_record(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write `content` (JSON values) and every file's size and CRC-32: the last file of a save."""
+    files = {
+        path.relative_to(folder).as_posix(): [path.stat().st_size, _checksum(path)]
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != RECORD
+    }
+    plain = json.loads(json.dumps({"format": FORMAT, **content, "files": files}, allow_nan=False))
+    body = json.dumps(plain, sort_keys=True)
+    with open(folder / RECORD, "w", encoding="utf-8") as file:
+        file.write(f'{{"checksum": {zlib.crc32(body.encode())}, "record": {body}}}\n')
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the record of a checkpoint folder. Raises CheckpointError if it is missing, foreign or damaged."""
+    path = folder / RECORD
+    if not path.is_file():
+        raise CheckpointError(f"{folder} is not a checkpoint of this program: it has no {RECORD}")
+    try:
+        outer = json.loads(path.read_text(encoding="utf-8"))
+        record = outer["record"]
+        whole = outer["checksum"] == zlib.crc32(json.dumps(record, sort_keys=True).encode())
+    except (ValueError, KeyError, TypeError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} cannot be read") from None
+    if not whole:
+        raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} was altered")
+    if record.get("format") != FORMAT:
+        raise CheckpointError(f"checkpoint {folder} has format {record.get('format')!r}; this program reads {FORMAT!r}")
+    return record
+
+
+def checked(folder: Path) -> dict[str, Any]:
+    """Return the record of a checkpoint whose files are whole; an error names an older step that is."""
+    try:
+        return _verified(folder)
+    except CheckpointError as error:
+        older = [step for step in reversed(steps(folder.parent)) if step < int(folder.name)]
+        intact = next((step for step in older if _is_intact(folder.parent / f"{step:08d}")), None)
+        advice = (
+            "no older checkpoint is intact"
+            if intact is None
+            else f"step {intact} is intact, remove {folder.name} to go on from there"
+        )
+        raise CheckpointError(f"{error}; {advice}") from None
+
+
+def _verified(folder: Path) -> dict[str, Any]:
+    """Return the record after comparing every file with it. Raises CheckpointError that names the first bad file."""
+    record = read_record(folder)
+    for name, (size, checksum) in record["files"].items():
+        path = folder / name
+        if not path.is_file():
+            problem = "is missing"
+        elif path.stat().st_size != size:
+            problem = f"has {path.stat().st_size} bytes instead of {size}"
+        elif _checksum(path) != checksum:
+            problem = "was altered"
+        else:
+            continue
+        raise CheckpointError(f"checkpoint {folder} is damaged: its file {name} {problem}")
+    return record
+
+
+def _is_intact(folder: Path) -> bool:
+    with suppress(CheckpointError):
+        return bool(_verified(folder))
+    return False
+
+
+def _checksum(path: Path) -> int:
+    value = 0
+    with open(path, "rb") as file:
+        while chunk := file.read(_CHUNK):
+            value = zlib.crc32(chunk, value)
+    return value

@@ -1,47 +1,129 @@
-"""Tensors of a file by torch.save (.pth, .pt, .bin), without torch: the zip form and the older plain form."""
+"""PyTorch files (.pth, .pt, .bin) read without torch, in the zip form and in the form before torch 1.6.
+
+A pickle is a program for a stack machine. It is run by the standard library's `pickle._Unpickler`, cut down to data:
+a class or function in it is only a name, looked up in `_BUILDERS` and never imported. Anything else is an error.
+"""
 
 from __future__ import annotations
 
 import io
+import math
 import os
+import pickle
+import pickletools
+import reprlib
 import struct
 import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal
 
 import numpy as np
 
-from anytouch_jax.weights.tensors import WeightsError, existing
-from anytouch_jax.weights.unpickle import Record, Storage, Tensor, read_pickle
+from anytouch_jax.weights.safetensors import WeightsError, existing_file
 
+# Storages of torch, as the numpy type of their bytes; bfloat16 is widened by `Tensor.read`.
+STORAGES = {
+    "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "BFloat16Storage": "u2", "LongStorage": "i8",
+    "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
+}  # fmt: skip
+_REPEATS = 1 << 20  # a tensor larger than its storage (stride 0) may have this many elements
+_GROWTH, _SPARE = 8, 1 << 26  # the tensors of a file may take 8 times its bytes, and 64 MiB more
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
 
 
 def read_torch(path: str | Path) -> dict[str, np.ndarray]:
-    """The state_dict of a torch file, by its own names; `{'model': ...}` and `{'state_dict': ...}` are opened.
+    """Return the state_dict of a torch file; `{'model': ...}` and `{'state_dict': ...}` are opened.
 
-    bfloat16 comes as float32, every other type as it is. No code in the file is ever run. Raises WeightsError: a
-    truncated or foreign file, an object that is neither a tensor nor a plain container.
+    bfloat16 becomes float32, other types are unchanged. No code in the file is run. Raises WeightsError for a
+    truncated or foreign file, and for an object that is neither a tensor nor a plain container.
     """
-    path = existing(path)
+    path = existing_file(path)
     try:
         with open(path, "rb") as file:
-            zipped = zipfile.is_zipfile(file)
+            zipped, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
             file.seek(0)
-            reader = _Zip(file) if zipped else _Legacy(file)
-            return {name: tensor.read(reader.load, reader.byteorder) for name, tensor in _state(reader.content).items()}
+            reader = _Zip(file, size) if zipped else _Legacy(file)
+            tensors = _state(reader.content)
+            if sum(tensor.nbytes for tensor in tensors.values()) > _GROWTH * size + _SPARE:
+                raise ValueError("its tensors are many times larger than the file")
+            return {name: tensor.read(reader.load, reader.byteorder) for name, tensor in tensors.items()}
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
-    except Exception as error:  # damaged bytes raise whatever they suggest
+    except Exception as error:  # damaged bytes raise any type of error
         raise WeightsError(f"{path} is damaged or not a torch file ({type(error).__name__}: {error})") from error
+
+
+@dataclass(frozen=True)
+class Name:
+    """A class or function that a pickle mentions."""
+
+    name: str
+
+
+@dataclass
+class Record:
+    """An object whose class is not rebuilt (argparse.Namespace, torch.device): its name and its fields."""
+
+    name: str
+    fields: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Storage:
+    """A block of numbers elsewhere in the file: its key there, its kind in `STORAGES`, its length."""
+
+    key: str
+    kind: str
+    length: int
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The type of one element in the file."""
+        return np.dtype(STORAGES[self.kind])
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """A view of a storage: `offset` and `stride` in elements. Nothing is read until `read`."""
+
+    storage: Storage
+    offset: int
+    shape: tuple[int, ...]
+    stride: tuple[int, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """The bytes of the values."""
+        return math.prod(self.shape) * self.storage.dtype.itemsize
+
+    def read(self, load: Callable[[Storage], bytes], byteorder: Literal["<", ">"] = "<") -> np.ndarray:
+        """Return the values, given the bytes of the storage. Raises ValueError if the view leaves its storage."""
+        data = load(self.storage)
+        if len(data) != self.storage.length * self.storage.dtype.itemsize:
+            raise ValueError(f"storage {self.storage.key} has {len(data)} bytes, not those it announces")
+        flat = np.frombuffer(data, self.storage.dtype.newbyteorder(byteorder))
+        if 0 in self.shape:
+            values = np.empty(self.shape, flat.dtype)
+        else:
+            last = self.offset + sum((size - 1) * step for size, step in zip(self.shape, self.stride, strict=True))
+            if last >= len(flat):
+                raise ValueError(f"a tensor of shape {self.shape} reaches beyond its storage of {len(flat)} elements")
+            steps = tuple(step * flat.itemsize for step in self.stride)
+            values = np.lib.stride_tricks.as_strided(flat[self.offset :], self.shape, steps, writeable=False)
+        values = values.astype(flat.dtype.newbyteorder("="), order="C")
+        if self.storage.kind == "BFloat16Storage":  # the upper half of a float32
+            return (values.astype(np.uint32) << 16).view(np.float32)
+        return values
 
 
 class _Zip:
     """torch.save since 1.6: a zip with data.pkl and one record a storage."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self.size = os.fstat(file.fileno()).st_size
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self.size = size
         self.archive = zipfile.ZipFile(file)
         names = self.archive.namelist()
         pickles = [name for name in names if name == "data.pkl" or name.endswith("/data.pkl")]
@@ -52,7 +134,7 @@ class _Zip:
             raise WeightsError("a TorchScript program, not plain weights; save its state_dict() instead")
         order = self._read("byteorder") if f"{self.root}byteorder" in names else b"little"
         self.byteorder: Literal["<", ">"] = ">" if order.strip() == b"big" else "<"
-        self.content = read_pickle(io.BytesIO(self._read("data.pkl")))
+        self.content = _read_pickle(io.BytesIO(self._read("data.pkl")))
 
     def load(self, storage: Storage) -> bytes:
         return self._read(f"data/{storage.key}")
@@ -70,13 +152,13 @@ class _Legacy:
     byteorder: Literal["<", ">"] = "<"
 
     def __init__(self, file: IO[bytes]) -> None:
-        if read_pickle(file) != _LEGACY_MAGIC:
+        if _read_pickle(file) != _LEGACY_MAGIC:
             raise ValueError("no magic number of torch.save")
-        read_pickle(file)  # protocol version
-        read_pickle(file)  # sizes of C types on the machine that wrote it
-        self.content = read_pickle(file)
-        keys = read_pickle(file)
-        widths = {s.key: s.dtype.itemsize for s in _storages(self.content)}
+        _read_pickle(file)  # protocol version
+        _read_pickle(file)  # sizes of C types on the machine that wrote it
+        self.content = _read_pickle(file)
+        keys = _read_pickle(file)
+        widths = {storage.key: storage.dtype.itemsize for storage in _storages(self.content)}
         self.data: dict[str, bytes] = {}
         for key in keys:
             (length,) = struct.unpack("<q", file.read(8))
@@ -89,40 +171,192 @@ class _Legacy:
 
 
 def _storages(content: Any) -> list[Storage]:
-    """Every storage that an unpickled object refers to."""
-    found, todo, seen = [], [content], set()
+    """Return every storage that an unpickled object refers to."""
+    storages, todo, visited = [], [content], set()
     while todo:
         item = todo.pop()
-        if id(item) in seen:  # a pickle may refer to itself
+        if id(item) in visited:  # a pickle may refer to itself
             continue
-        seen.add(id(item))
+        visited.add(id(item))
         match item:
             case Tensor(storage=storage):
-                found.append(storage)
+                storages.append(storage)
             case dict():
                 todo += item.values()
             case list() | tuple():
                 todo += item
             case Record(fields=fields):
                 todo += fields.values()
-    return found
+    return storages
 
 
 def _state(content: Any) -> dict[str, Tensor]:
-    """The tensors by name, out of the usual wrappings of a state_dict."""
+    """Return the tensors by name, out of the usual wrappings of a state_dict."""
     for wrapper in _WRAPPERS:
         if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
             content = content[wrapper]
             break
     if not isinstance(content, dict) or not content:
-        raise WeightsError(f"it holds no state_dict, but {type(content).__name__}")
-    foreign = [
-        str(name) for name, value in content.items() if not (isinstance(name, str) and isinstance(value, Tensor))
-    ]
-    if foreign:
-        raise WeightsError(
-            f"it holds no state_dict: {', '.join(foreign[:5])} {'is' if len(foreign) == 1 else 'are'} no tensor"
-        )
+        raise WeightsError(f"it has no state_dict, but {type(content).__name__}")
+    others = [str(name) for name, value in content.items() if not (isinstance(name, str) and isinstance(value, Tensor))]
+    if others:
+        verb = "is" if len(others) == 1 else "are"
+        raise WeightsError(f"it has no state_dict: {', '.join(others[:5])} {verb} no tensor")
     if all(name.startswith("module.") for name in content):  # DistributedDataParallel
         content = {name.removeprefix("module."): value for name, value in content.items()}
     return content
+
+
+# The pickle machine ---------------------------------------------------------------------------------------------------
+
+
+def _size(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"{type(value).__name__} where a size was expected")
+    return value
+
+
+def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> Tensor:
+    if not isinstance(storage, Storage) or not isinstance(shape, tuple) or not isinstance(stride, tuple):
+        raise ValueError("a tensor without storage, shape or stride")
+    shape, stride = tuple(map(_size, shape)), tuple(map(_size, stride))
+    if len(shape) != len(stride) or len(shape) > 32:
+        raise ValueError(f"a tensor with shape {shape} and stride {stride}")
+    if math.prod(shape) > max(storage.length, _REPEATS):
+        raise ValueError(f"a tensor of shape {shape} over a storage of {storage.length} elements")
+    return Tensor(storage, _size(offset), shape, stride)
+
+
+def _key(key: Any) -> Any:
+    if not isinstance(key, str | bytes | int | float | None):
+        raise ValueError(f"{type(key).__name__} as the key of a dictionary or set")
+    return key
+
+
+_BUILDERS: dict[str, Callable[..., Any]] = {
+    "torch._utils._rebuild_tensor": _tensor,
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": lambda data, *_: data,
+    "torch.Size": lambda values=(): tuple(values),
+    "torch.device": lambda *args: Record("torch.device", {"args": args}),
+    "collections.OrderedDict": lambda pairs=(): {_key(key): value for key, value in pairs},
+    "argparse.Namespace": lambda: Record("argparse.Namespace"),
+}
+_INERT = {f"torch.{kind}" for kind in STORAGES}
+_INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")}
+# Operations that only make data. BYTEARRAY8 is left out: it allocates whatever size it is given.
+_DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4
+    FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING BINBYTES
+    SHORT_BINBYTES BINBYTES8 EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET TUPLE TUPLE1 TUPLE2 TUPLE3 LIST APPEND APPENDS
+    PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL BINPERSID""".split()
+# These are replaced below. A dictionary's own hash of a tuple nested 150,000 times would end the process.
+_GUARDED = "DICT SETITEM SETITEMS ADDITEMS FROZENSET REDUCE NEWOBJ BUILD GET BINGET LONG_BINGET INST".split()
+
+
+class _Dispatch(dict[int, Any]):
+    def __missing__(self, code: int) -> Any:
+        known = pickletools.code2op.get(chr(code))
+        raise _refused(known.name if known else f"operation {code}")
+
+
+def _refused(name: str) -> WeightsError:
+    return WeightsError(
+        f"the pickle wants {name!r}, which is neither a tensor nor a plain container; it was refused and nothing was "
+        "run: save the weights as a plain state_dict or as safetensors"
+    )
+
+
+class _Unpickler(pickle._Unpickler):
+    """The standard library's reader in Python, without any operation that imports or calls.
+
+    The reader in C is not used: a deep tuple as a key ends the process in it, and one memo index takes 64 GiB.
+    """
+
+    def find_class(self, module: str, name: str) -> Any:
+        full = f"{module}.{name}"
+        if full not in _BUILDERS and full not in _INERT:
+            raise _refused(full)
+        return Name(full)
+
+    def persistent_load(self, pid: Any) -> Storage:
+        match pid:
+            case ("storage", Name(name), str(key), str(), int(length), *rest) if rest in ([], [None]):
+                kind = name.removeprefix("torch.")
+                if kind not in STORAGES:
+                    raise ValueError(f"a storage of kind {name}")
+                return Storage(key, kind, _size(length))
+        raise ValueError(f"the pickle refers to {reprlib.repr(pid)}")
+
+    def load_inst(self) -> None:
+        raise _refused(" ".join(self.readline()[:-1].decode() for _ in range(2)))
+
+    def load_reduce(self) -> None:
+        args, function = self.stack.pop(), self.stack.pop()
+        if not isinstance(function, Name) or function.name not in _BUILDERS or not isinstance(args, tuple):
+            raise ValueError(f"the pickle calls {reprlib.repr(function)}")
+        self.stack.append(_BUILDERS[function.name](*args))
+
+    load_newobj = load_reduce
+
+    def load_build(self) -> None:
+        state, target = self.stack.pop(), self.stack[-1]
+        if isinstance(target, Record) and isinstance(state, dict):
+            target.fields.update(state)
+        elif not isinstance(target, dict):  # the attributes of an OrderedDict (_metadata) are dropped
+            raise ValueError(f"the pickle sets the state of {type(target).__name__}")
+
+    def _set(self, target: Any, items: list[Any]) -> None:
+        if not isinstance(target, dict) or len(items) % 2:
+            raise ValueError("the pickle sets items of something that is no dictionary")
+        target.update(zip(map(_key, items[::2]), items[1::2], strict=True))
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.stack.append({})
+        self._set(self.stack[-1], items)
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set(self.stack[-1], [key, value])
+
+    def load_setitems(self) -> None:
+        items = self.pop_mark()
+        self._set(self.stack[-1], items)
+
+    def load_additems(self) -> None:
+        items = self.pop_mark()
+        if not isinstance(self.stack[-1], set):
+            raise ValueError("the pickle adds to something that is no set")
+        self.stack[-1].update(map(_key, items))
+
+    def load_frozenset(self) -> None:
+        items = self.pop_mark()
+        self.stack.append(frozenset(map(_key, items)))
+
+    def load_get(self) -> None:
+        self.stack.append(self.memo[int(self.readline()[:-1])])
+
+    def load_binget(self) -> None:
+        self.stack.append(self.memo[self.read(1)[0]])
+
+    def load_long_binget(self) -> None:
+        self.stack.append(self.memo[struct.unpack("<I", self.read(4))[0]])
+
+    dispatch = _Dispatch(
+        {getattr(pickle, name)[0]: pickle._Unpickler.dispatch[getattr(pickle, name)[0]] for name in _DATA}
+    )
+
+
+for _name in _GUARDED:
+    _Unpickler.dispatch[getattr(pickle, _name)[0]] = getattr(_Unpickler, f"load_{_name.lower()}")
+
+
+def _read_pickle(file: IO[bytes]) -> Any:
+    """Return the object pickled at the position of `file`: plain containers, numbers, text, Tensor, Record and Name.
+
+    Raises WeightsError that names the class or function if the pickle wants any other, ValueError for a damaged one.
+    """
+    try:
+        return _Unpickler(file, encoding="latin1").load()
+    except IndexError:
+        raise ValueError("the pickle uses a value that is not there") from None

@@ -1,4 +1,4 @@
-"""Nested dicts of arrays and their flat form, a dict from "touch/blocks/norm1/scale" to the array."""
+"""Parameter trees: nested dicts of arrays, and their flat form by name ("touch/blocks/norm1/scale")."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from anytouch_jax.errors import UserError
 
 
 def flatten(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
-    """Leaves of a pytree by name, the path joined with "/" (keys, field names, indices).
+    """Return the leaves of a pytree by name: the keys, field names and indices of the path, joined with "/".
 
-    Raises UserError when two leaves get the same name.
+    Raises UserError if two leaves get the same name.
     """
     flat: dict[str, Any] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)[0]:
@@ -26,9 +26,9 @@ def flatten(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """The nested dict whose leaves have these names; the inverse of `flatten` for nested dicts.
+    """Return the nested dict whose leaves have these names, the inverse of `flatten` for nested dicts.
 
-    Raises UserError when one name is the beginning of another.
+    Raises UserError if one name is the beginning of another.
     """
     tree: dict[str, Any] = {}
     for name, leaf in flat.items():
@@ -44,12 +44,14 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def between(first: Mapping[str, Any], second: Mapping[str, Any], share: float) -> dict[str, Any]:
-    """Parameters `share` of the way from `first` to `second` (WiSE-FT, Wortsman et al. 2022); what `first` has not is
-    as in `second`. Raises UserError for arrays of different shapes."""
-    start, found = flatten(first), flatten(second)
-    for name in start.keys() & found.keys():
-        if np.shape(start[name]) != np.shape(found[name]):
-            raise UserError(f"{name} is {np.shape(start[name])} in the one and {np.shape(found[name])} in the other")
-        found[name] = (1 - share) * np.asarray(start[name]) + share * np.asarray(found[name])
-    return nest(found)
+def interpolate(first: Mapping[str, Any], second: Mapping[str, Any], share: float) -> dict[str, Any]:
+    """Return parameters `share` of the way from `first` to `second` (WiSE-FT, Wortsman et al. 2022).
+
+    Arrays that `first` lacks are those of `second`. Raises UserError for arrays of different shapes.
+    """
+    start, end = flatten(first), flatten(second)
+    for name in start.keys() & end.keys():
+        if np.shape(start[name]) != np.shape(end[name]):
+            raise UserError(f"{name} has shape {np.shape(start[name])} in one and {np.shape(end[name])} in the other")
+        end[name] = (1 - share) * np.asarray(start[name]) + share * np.asarray(end[name])
+    return nest(end)

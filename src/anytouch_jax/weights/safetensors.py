@@ -1,4 +1,4 @@
-"""Flat files of arrays: safetensors in and out (atomic), npz in. Names stay as they are in the file."""
+"""Files of flat arrays: safetensors in and out, npz in."""
 
 from __future__ import annotations
 
@@ -11,6 +11,12 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path
+from anytouch_jax.weights.tree import flatten
+
+# Metadata of our files: heads, activation and training data leave no trace in shapes.
+MODEL_KEY = "anytouch_jax.model"
+BACKGROUND_KEY = "anytouch_jax.background"
+SEEN_KEY = "anytouch_jax.seen"
 
 
 class WeightsError(UserError):
@@ -31,33 +37,37 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
             save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, part, dict(metadata))
             umask = os.umask(0)
             os.umask(umask)
-            os.chmod(part, 0o666 & ~umask)  # the library gives a file that only its owner may read
-    except Exception as error:  # the library wraps OSError in its own kind
+            os.chmod(part, 0o666 & ~umask)  # the library writes a file that only its owner may read
+    except Exception as error:  # the library wraps OSError in its own type
         advice = "; free some space" if "No space left" in str(error) else ""
         raise WeightsError(f"could not write {path}: {error}{advice}") from error
 
 
+def export_safetensors(path: str | Path, params: Any, metadata: Mapping[str, str]) -> None:
+    """Write a parameter tree to one safetensors file, names joined with "/". Raises WeightsError."""
+    write_safetensors(path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata)
+
+
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """(arrays in their stored types, metadata) of a safetensors file. Raises WeightsError."""
+    """Return (arrays in their stored types, metadata) of a safetensors file. Raises WeightsError."""
+    import ml_dtypes  # noqa: F401  gives numpy the name bfloat16
     from safetensors import safe_open
 
-    path = existing(path)
+    path = existing_file(path)
     try:
-        import ml_dtypes  # noqa: F401  gives numpy the name bfloat16
-
         with safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
-    except Exception as error:  # a foreign file raises whatever its bytes suggest
+    except Exception as error:  # a foreign file raises any type of error
         raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
 
 
-def read_metadata(path: str | Path) -> dict[str, str]:
-    """The metadata of a safetensors file, without its arrays; nothing for a file of another kind."""
+def read_file_metadata(path: str | Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file without its arrays; {} for a file of another type."""
     from safetensors import safe_open
 
     if Path(path).suffix != ".safetensors":
         return {}
-    path = existing(path)
+    path = existing_file(path)
     try:
         with safe_open(path, framework="numpy") as file:
             return dict(file.metadata() or {})
@@ -66,8 +76,8 @@ def read_metadata(path: str | Path) -> dict[str, str]:
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Arrays of an npz file; pickled objects are refused. Raises WeightsError."""
-    path = existing(path)
+    """Return the arrays of an npz file; pickled objects are refused. Raises WeightsError."""
+    path = existing_file(path)
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
@@ -75,8 +85,8 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
         raise WeightsError(f"{path} is not a whole npz file of plain arrays: {error}") from error
 
 
-def existing(path: str | Path) -> Path:
-    """`path` when it is a file. Raises WeightsError."""
+def existing_file(path: str | Path) -> Path:
+    """Return `path` if it is a file. Raises WeightsError."""
     path = Path(path)
     if not path.is_file():
         raise WeightsError(
@@ -86,5 +96,5 @@ def existing(path: str | Path) -> Path:
 
 
 def as_float32(array: Any) -> np.ndarray:
-    """The array in float32; exact for float32, float16 and bfloat16."""
+    """Return the array in float32; exact for float32, float16 and bfloat16."""
     return np.asarray(array, dtype=np.float32)

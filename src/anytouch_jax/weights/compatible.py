@@ -1,0 +1,131 @@
+"""Compatibility of weights with a model: checks that name the missing options, resized positions, sensor rows by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
+from anytouch_jax.errors import UserError
+
+Params = dict[str, Any]
+
+# Settings that shapes depend on, and settings that leave no trace in shapes.
+SHAPED: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
+SHAPED += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
+SHAPELESS = ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")
+
+
+def check_activation(path: Path, trained: str | None, config: Config) -> None:
+    """Raise UserError if weights were trained with another activation than the run's; None means unknown."""
+    ours = config.model.activation
+    if trained not in (None, ours):
+        raise UserError(f"{path} was trained with {trained}, this run would use {ours}: add --model.activation {trained}")
+
+
+def check_preset(path: Path, before: Config, config: Config) -> None:
+    """Raise UserError if a run has another preset than this run, and a touch encoder of another size."""
+    theirs, ours = ((model.touch.width, model.touch.depth) for model in (before.model, config.model))
+    if theirs != ours and before.preset not in (config.preset, "custom"):
+        raise UserError(
+            f"{path} has preset {before.preset}, this run would have preset {config.preset}: add --preset "
+            f"{before.preset}"
+        )
+
+
+def check_form(
+    path: Path, before: ModelConfig, config: Config, names: Sequence[str] = (*SHAPED, *SHAPELESS)
+) -> None:
+    """Raise UserError with all the missing options if weights belong to another network than the run's."""
+    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in names}
+    differing = {name: (theirs, ours) for name, (theirs, ours) in pairs.items() if theirs != ours}
+    if differing:
+        trained = ", ".join(f"{name} {theirs}" for name, (theirs, _) in differing.items())
+        used = ", ".join(str(ours) for _, ours in differing.values())
+        options = " ".join(f"--model.{name.replace('_', '-')} {theirs}" for name, (theirs, _) in differing.items())
+        raise UserError(f"{path} was trained with {trained}, this run would use {used}: add {options}")
+
+
+def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:
+    """Raise UserError if CLIP's image tower has another size than the run's image tower or, with `touch`, encoder."""
+    theirs = (clip.touch.width, clip.touch.depth, clip.patch)
+    for name, stack in (("image tower", config.model.image), ("touch encoder", config.model.touch if touch else None)):
+        if stack is None or (ours := (stack.width, stack.depth, config.model.patch)) == theirs:
+            continue
+        sizes = [f"width {width}, depth {depth} and patches of {patch}" for width, depth, patch in (theirs, ours)]
+        raise UserError(
+            f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset large fits ViT-L/14, "
+            "--preset base fits ViT-B/16; add the one that fits, or give other --clip-weights"
+        )
+
+
+def match_sensors(table: np.ndarray, stored: Sequence[str], wanted: Sequence[str]) -> np.ndarray:
+    """Return a table with one row a sensor (R, ...), its rows rearranged by name from `stored` to `wanted`.
+
+    A sensor that is not stored starts from the universal row, which was trained to serve it.
+    """
+    return np.stack([table[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
+
+
+def map_sensors(touch: Params, model: ModelConfig, change: Callable[[np.ndarray], np.ndarray]) -> Params:
+    """Return a touch encoder whose tables with one row a sensor are changed: tokens, and patch kernels of each sensor."""
+    changed = {"sensor_tokens": change(np.asarray(touch["sensor_tokens"]))}
+    if model.patch_encoder == "sensor":
+        changed["patch"] = {"kernel": change(np.asarray(touch["patch"]["kernel"]))}
+    return touch | changed
+
+
+def serve_unseen(touch: Params, model: ModelConfig, trained: Sequence[str], *, universal_drawn: bool) -> Params:
+    """Return a touch encoder in which sensors outside `trained` have the universal row (Sec. 3.5, at inference).
+
+    Where training never drew the universal row (`universal_drawn`), the mean of the trained rows replaces it.
+    """
+    rows = [row for row, name in enumerate(model.sensors) if name in trained and name != UNIVERSAL]
+    unseen = [row for row in range(len(model.sensors)) if row not in rows]
+    if not rows:
+        return touch
+
+    def served(table: np.ndarray) -> np.ndarray:
+        table = np.array(table)
+        table[unseen] = table[model.universal_row] if universal_drawn else table[rows].mean(axis=0)
+        return table
+
+    return map_sensors(touch, model, served)
+
+
+_A = -0.75  # the constant of torch's bicubic; jax.image and PIL use -0.5
+
+
+def resize_position(table: np.ndarray, rows: int) -> np.ndarray:
+    """Return a (1 + M, D) table of a square grid resized to (`rows`, D); row 0, the class token's, is unchanged.
+
+    Equal to torch's `interpolate(mode="bicubic", align_corners=False, antialias=False)`, computed in float64.
+    Raises ValueError if either grid is not square.
+    """
+    old, new = math.isqrt(len(table) - 1), math.isqrt(rows - 1)
+    if old**2 != len(table) - 1 or new**2 != rows - 1 or not old or not new:
+        raise ValueError(f"a position table of {len(table)} rows cannot become {rows}: the grids must be square")
+    weights = _bicubic(old, new)
+    grid = table[1:].astype(np.float64).reshape(old, old, -1)
+    grid = np.einsum("ij,jkd->ikd", weights, grid)
+    grid = np.einsum("kl,ild->ikd", weights, grid)
+    return np.concatenate([table[:1], grid.reshape(new * new, -1).astype(table.dtype)])
+
+
+def _bicubic(old: int, new: int) -> np.ndarray:
+    """Return the (new, old) matrix of the four-tap cubic filter; taps beyond the border fall on the border."""
+    centre = (np.arange(new) + 0.5) * old / new - 0.5
+    base = np.floor(centre).astype(int)
+    matrix = np.zeros((new, old))
+    for tap in range(-1, 3):
+        distance = np.abs(centre - (base + tap))
+        near = ((_A + 2) * distance - (_A + 3)) * distance**2 + 1
+        far = _A * (((distance - 5) * distance + 8) * distance - 4)
+        weight = np.where(distance <= 1, near, far)
+        np.add.at(matrix, (np.arange(new), np.clip(base + tap, 0, old - 1)), weight)
+    return matrix

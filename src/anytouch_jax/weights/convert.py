@@ -1,0 +1,248 @@
+"""Weight conversion: files of the authors, HF CLIP and OpenCLIP to our parameters, and back to the authors' layout.
+
+Every key of a file is accounted for. One error counts the keys that are unknown, missing or of another shape.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
+from anytouch_jax.weights.compatible import match_sensors, resize_position
+from anytouch_jax.weights.keymaps import SAME, Entry, KeyMap, Shape, Weights, param_shapes
+from anytouch_jax.weights.keymaps.anytouch import PROBE, STAGE1, STAGE2
+from anytouch_jax.weights.keymaps.hf_clip import HF_CLIP
+from anytouch_jax.weights.keymaps.openclip import OPENCLIP
+from anytouch_jax.weights.safetensors import WeightsError, as_float32
+from anytouch_jax.weights.tree import flatten, nest
+
+Params = dict[str, Any]
+
+# Parts that some model of ours has, and the classifier that came with a probe file.
+_OWN_PARTS = ("touch", "decoder", "image", "lora", "text", "logit_scale", "matcher", "force", "head")
+_LISTED = 6  # names in one error message
+_HEAD = frozenset(("head.weight", "head.bias"))
+
+
+def _no_model(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
+    raise WeightsError("a file in our names does not store its model; use the configuration it was saved with")
+
+
+OWN = KeyMap(
+    "own",
+    lambda weights: any(key.startswith(("touch/", "image/")) for key in weights),
+    lambda model: [Entry(name, name, SAME) for name in param_shapes(model)],
+    _no_model,
+    towers={part: rf"{part}(/.*)?" for part in _OWN_PARTS},
+)
+KEYMAPS = {keymap.name: keymap for keymap in (STAGE2, STAGE1, PROBE, OPENCLIP, HF_CLIP, OWN)}
+
+
+def detect_layout(weights: Weights) -> str:
+    """Return the name of the key map that a file follows: "stage1", "stage2", "probe", "clip", "openclip" or "own".
+
+    Raises WeightsError if none matches.
+    """
+    for keymap in KEYMAPS.values():
+        if keymap.matches(weights):
+            return keymap.name
+    names = ", ".join(list(weights)[:5]) or "no arrays"
+    raise WeightsError(f"these are not weights of AnyTouch, HF CLIP or OpenCLIP: the file has {names}")
+
+
+def detect_model(weights: Weights, *, heads: int | None = None, decoder_heads: int | None = None) -> ModelConfig:
+    """Return the model that a file was made for, from the shapes of its arrays.
+
+    Head counts leave no trace. `heads` of the touch and image towers is width / 64 unless given, as in CLIP.
+    `decoder_heads` is width / 32, as in the authors' decoder. A CLIP file gets the authors' decoder sizes.
+    Raises WeightsError.
+    """
+    layout = detect_layout(weights)
+    try:
+        return KEYMAPS[layout].detect(weights, heads, decoder_heads)
+    except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
+        raise WeightsError(
+            f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
+        ) from None
+
+
+def to_params(weights: Weights, model: ModelConfig, *, ignore: Collection[str] = ()) -> Params:
+    """Return the parameters of a file as a nested dict of float32 arrays under our names.
+
+    The key map is detected. Left out are towers and heads that `model` lacks, buffers, the authors' unused arrays
+    (golden Q2) and the keys in `ignore`. Position tables of another image size are resized. A probe file gives its
+    classifier as `head`. Raises WeightsError.
+    """
+    layout, shapes = detect_layout(weights), param_shapes(model)
+    entries = KEYMAPS[layout].entries(model)
+    if layout == "own":  # a file of stage 1 has no towers
+        parts = {key.split("/")[0] for key in weights}
+        entries = [entry for entry in entries if entry.name.split("/")[0] in parts]
+    head = _HEAD if layout == "probe" and weights.keys() >= _HEAD else frozenset()
+    left_out = {key for key in weights if key in ignore or key in head or _is_left_out(key, layout, model)}
+    arrays = {
+        entry.key: _fit(weights[entry.key], entry, model)
+        for entry in {entry.key: entry for entry in entries}.values()
+        if entry.key in weights
+    }
+    _account(layout, weights, arrays, _file_shapes(entries, shapes), left_out)
+    flat: dict[str, Any] = {}
+    for entry in entries:
+        array = entry.layout.read(_third(arrays[entry.key], entry.part))
+        if entry.layer is None:
+            flat[entry.name] = array
+        else:
+            flat.setdefault(entry.name, {})[entry.layer] = array
+    if head:
+        flat |= {"head/kernel": weights["head.weight"].T, "head/bias": weights["head.bias"]}
+    return nest({name: _assemble(value) for name, value in flat.items()})
+
+
+def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False) -> dict[str, np.ndarray]:
+    """Return the parameters under the authors' names: stage 2 if `params` has a tower, else stage 1.
+
+    Arrays that the authors' loader expects and never reads are filled in. The matching MLP of the paper has no place
+    in those files: it is refused, or stored as `cross_sensor_mlp.*` with `allow_extra`. Raises WeightsError.
+    """
+    flat = {name: as_float32(array) for name, array in flatten(params).items()}
+    keymap = STAGE2 if "image" in params or "text" in params else STAGE1
+    if model.match_head == "mlp" and keymap is STAGE2 and not allow_extra:
+        raise WeightsError(
+            "the matching MLP of recipe paper has no counterpart in the authors' files; allow extra keys to store it"
+        )
+    if model.patch_encoder != "shared":
+        ours = "one for each" if model.patch_encoder == "sensor" else "convolutions"
+        raise WeightsError(f"the authors' files have one patch projection for all sensors; this model has {ours}")
+    if model.sensors[-1] != UNIVERSAL:
+        raise WeightsError(
+            f"the authors' files keep the universal tokens in the last row; here it is {model.sensors[-1]!r}"
+        )
+    shapes, entries = param_shapes(model), keymap.entries(model)
+    check_shapes("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
+    arrays = {e.key: e.layout.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
+    for key, source in keymap.unused.items():
+        theirs = arrays[source]
+        arrays[key] = theirs.mean(axis=1, dtype=np.float64) if theirs.ndim == 5 else theirs
+    return {key: np.array(array, np.float32, order="C") for key, array in arrays.items()}
+
+
+def _keymap(model: ModelConfig, layout: str | None) -> KeyMap:
+    return KEYMAPS[layout or ("stage2" if model.image or model.text else "stage1")]
+
+
+def release_shapes(model: ModelConfig, layout: str | None = None) -> dict[str, Shape]:
+    """Return key -> shape of a file of `model`: stage 2 if it has a tower, else stage 1, or the layout given.
+
+    The classifier of a probe file is not included: its size depends on the task.
+    """
+    keymap = _keymap(model, layout)
+    shapes = _file_shapes(keymap.entries(model), param_shapes(model))
+    for key, source in keymap.unused.items():
+        theirs = shapes[source]
+        shapes[key] = (theirs[0], *theirs[2:]) if len(theirs) == 5 else theirs
+    return shapes
+
+
+def release_names(model: ModelConfig, layout: str | None = None) -> dict[str, str]:
+    """Return key -> our parameter name, for the keys of `release_shapes` that are used."""
+    return {entry.key: entry.name for entry in _keymap(model, layout).entries(model)}
+
+
+def check_shapes(title: str, flat: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
+    """Raise WeightsError that names the first parameters that are missing, unknown or of another shape."""
+    problems = [f"{name} is missing" for name in wanted if name not in flat]
+    problems += [f"{name} is unknown" for name in flat if name not in wanted]
+    problems += [
+        f"{name} has {tuple(flat[name].shape)} instead of {shape}"
+        for name, shape in wanted.items()
+        if name in flat and tuple(flat[name].shape) != tuple(shape)
+    ]
+    if problems:
+        raise WeightsError(f"the {title} do not fit this model: {_first(problems)}")
+
+
+def _is_left_out(key: str, layout: str, model: ModelConfig) -> bool:
+    """Return whether a key is known and not needed: an unused array, a buffer, a part that `model` lacks."""
+    keymap, parts = KEYMAPS[layout], {name.split("/")[0] for name in param_shapes(model)}
+    absent = (pattern for part, pattern in keymap.towers.items() if part not in parts)
+    buffer = layout != "own" and re.fullmatch(r"(.*\.)?(position_ids|attn_mask)", key) is not None
+    return buffer or key in keymap.unused or any(re.fullmatch(pattern, key) for pattern in absent)
+
+
+def _fit(array: np.ndarray, entry: Entry, model: ModelConfig) -> np.ndarray:
+    """Return the array in float32, its grid of positions and its sensor rows fitted to the model."""
+    array = as_float32(array)
+    if entry.name in ("touch/position", "image/position", "decoder/position"):
+        table = array[0] if array.ndim == 3 and len(array) == 1 else array
+        square = table.ndim == 2 and round((len(table) - 1) ** 0.5) ** 2 == len(table) - 1 > 0
+        if square and len(table) != model.patches + 1:
+            return resize_position(table, model.patches + 1).reshape(*array.shape[:-2], model.patches + 1, -1)
+    if entry.name == "touch/sensor_tokens" and array.ndim == 3 and len(array) == len(SENSORS) != len(model.sensors):
+        return match_sensors(array, SENSORS, model.sensors)
+    return array
+
+
+def _third(array: np.ndarray, part: int | None) -> np.ndarray:
+    """Return query, key or value from a kernel that stacks all three on axis 0."""
+    return array if part is None else array[part * len(array) // 3 : (part + 1) * len(array) // 3]
+
+
+def _assemble(value: Any) -> np.ndarray:
+    """Return one parameter, its layers stacked on axis 0. Each number is copied once."""
+    if not isinstance(value, dict):
+        return np.array(value, np.float32, order="C")
+    stacked = np.empty((len(value), *value[0].shape), np.float32)
+    for layer, array in value.items():
+        stacked[layer] = array
+    return stacked
+
+
+def _file_shapes(entries: Sequence[Entry], shapes: Mapping[str, Shape]) -> dict[str, Shape]:
+    """Return key -> shape in the file, by writing an array of zeros that takes no memory."""
+    theirs: dict[str, Shape] = {}
+    for entry in entries:
+        shape = shapes[entry.name][entry.layer is not None :]
+        written = entry.layout.write(np.broadcast_to(np.float32(0), shape)).shape
+        theirs[entry.key] = written if entry.part is None else (3 * written[0], *written[1:])
+    return theirs
+
+
+def _account(
+    layout: str, weights: Weights, arrays: Weights, wanted: Mapping[str, Shape], left_out: Collection[str]
+) -> None:
+    """Raise WeightsError unless the file has the wanted keys, in the wanted shapes, and no others."""
+    unknown = [key for key in weights if key not in wanted and key not in left_out]
+    missing = [key for key in wanted if key not in weights]
+    shapes = [
+        f"{key} has {tuple(weights[key].shape)} instead of {wanted[key]}"
+        for key, array in arrays.items()
+        if tuple(array.shape) != wanted[key]
+    ]
+    lists = {"unknown keys": unknown, "missing keys": missing, "other shapes": shapes}
+    problems = [f"{title} ({len(rows)}): {_first(rows)}" for title, rows in lists.items() if rows]
+    if problems:
+        hint = _hint((*unknown, *missing))
+        raise WeightsError(f"the {layout} weights do not fit this model; {'; '.join(problems)}{hint}")
+
+
+def _first(rows: Sequence[str]) -> str:
+    """Return the first rows, and the number of the others."""
+    more = len(rows) - _LISTED
+    return ", ".join(rows) if more <= 0 else f"{', '.join(rows[:_LISTED])} and {more} more"
+
+
+def _hint(keys: Sequence[str]) -> str:
+    """Return the setting of the model that explains a difference in keys, if there is one."""
+    hints = {
+        r".*sensor_token_proj\.weight": "model.decoder_sensor_tokens",
+        r".*lora_[AB].*": "model.lora_rank",
+        r"cross_sensor_(head|mlp)\..*": "model.match_head",
+        r".*\.(layers|resblocks|touch_decoder_blocks)\.\d+\..*": "the depths of the model (or another preset)",
+    }
+    matching = (setting for pattern, setting in hints.items() if any(re.fullmatch(pattern, key) for key in keys))
+    setting = next(matching, None)
+    return f"; look at {setting}" if setting else ""

@@ -1,0 +1,141 @@
+"""Key maps: which array of a weights file is which parameter of the model.
+
+A family of weights is one module of this folder. It lists the keys of its files, and detects its files by their keys.
+Our names are those of `Net.abstract()`: paths joined with "/", blocks stacked on axis 0, kernels as (in, out).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+
+from anytouch_jax.config import ModelConfig, Stack, TextTower
+from anytouch_jax.nn.functional import build
+from anytouch_jax.weights.tree import flatten
+
+Weights = Mapping[str, np.ndarray]
+Shape = tuple[int, ...]
+PROJECTIONS = ("query", "key", "value", "out")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How an array of the file becomes ours (`read`) and ours becomes theirs (`write`). Both are exact."""
+
+    read: Callable[[np.ndarray], np.ndarray]
+    write: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One array of a file: its `key`, our parameter `name`, its `layer` in a stack, its third (`part`) of a kernel."""
+
+    key: str
+    name: str
+    layout: Layout
+    layer: int | None = None
+    part: int | None = None
+
+
+@dataclass(frozen=True)
+class KeyMap:
+    """A kind of weights file.
+
+    `matches` detects it. `entries` lists the arrays that fill a model. `detect` returns the model that made the file;
+    its last arguments are the head counts of the towers and the decoder, which leave no trace in shapes.
+    `unused` maps a key that no code reads to the key it is made from: a copy, or the mean over frames if it has fewer
+    axes (golden Q2). `towers` matches the keys of each part that a model may lack.
+    """
+
+    name: str
+    matches: Callable[[Weights], bool]
+    entries: Callable[[ModelConfig], list[Entry]]
+    detect: Callable[[Weights, int | None, int | None], ModelConfig]
+    unused: Mapping[str, str] = field(default_factory=dict)
+    towers: Mapping[str, str] = field(default_factory=dict)
+
+
+@lru_cache(maxsize=8)
+def _shapes(model: ModelConfig) -> dict[str, Shape]:
+    return {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
+
+
+def param_shapes(model: ModelConfig) -> dict[str, Shape]:
+    """Return name -> shape of every parameter of a model."""
+    return dict(_shapes(model))
+
+
+def _read_patch(weight: np.ndarray) -> np.ndarray:  # (D, colour, row, col) -> (P*P*3, D)
+    return weight.transpose(2, 3, 1, 0).reshape(-1, len(weight))
+
+
+def _write_patch(kernel: np.ndarray) -> np.ndarray:
+    side = math.isqrt(kernel.shape[0] // 3)
+    return kernel.reshape(side, side, 3, -1).transpose(3, 2, 0, 1)
+
+
+def _read_clip_patch(weight: np.ndarray) -> np.ndarray:  # (D, frame, colour, row, col) -> (frames, P*P*3, D), golden Q1
+    return np.stack([_read_patch(weight[:, frame]) for frame in range(weight.shape[1])])
+
+
+def _write_clip_patch(kernel: np.ndarray) -> np.ndarray:
+    return np.stack([_write_patch(frame) for frame in kernel], axis=1)
+
+
+SAME = Layout(lambda x: x, lambda x: x)
+LINEAR = Layout(lambda x: x.T, lambda x: x.T)
+ROW = Layout(lambda x: x[0], lambda x: x[None])
+TOKEN = Layout(lambda x: x[0, 0], lambda x: x[None, None])
+PATCH = Layout(_read_patch, _write_patch)
+CLIP_PATCH = Layout(_read_clip_patch, _write_clip_patch)
+
+
+def linear(theirs: str, ours: str) -> list[Entry]:
+    """Return the entries of a torch Linear layer."""
+    return [Entry(f"{theirs}.weight", f"{ours}/kernel", LINEAR), Entry(f"{theirs}.bias", f"{ours}/bias", SAME)]
+
+
+def norm(theirs: str, ours: str) -> list[Entry]:
+    """Return the entries of a LayerNorm."""
+    return [Entry(f"{theirs}.weight", f"{ours}/scale", SAME), Entry(f"{theirs}.bias", f"{ours}/bias", SAME)]
+
+
+def stacked(theirs: str, ours: str, depth: int, block: Iterable[Entry]) -> Iterator[Entry]:
+    """Yield the entries of `depth` blocks, each with the entries of `block`."""
+    block = list(block)
+    for layer in range(depth):
+        for entry in block:
+            yield Entry(f"{theirs}.{layer}.{entry.key}", f"{ours}/{entry.name}", entry.layout, layer, entry.part)
+
+
+def detect_stack(weights: Weights, prefix: str, head_width: int, heads: int | None = None) -> Stack:
+    """Return the sizes of the blocks under `prefix`, from the kernels of their feed-forward layers.
+
+    `heads` is width / `head_width` unless given. Raises KeyError if there are no blocks.
+    """
+    pattern = re.compile(
+        re.escape(prefix) + r"\.(?:encoder\.|base_model\.model\.|layers\.|transformer\.|resblocks\.)*(\d+)\."
+        r"(?:mlp\.fc1|mlp\.c_fc|intermediate\.dense)\.weight"
+    )
+    shapes = {int(match[1]): array.shape for key, array in weights.items() if (match := pattern.fullmatch(key))}
+    if not shapes:
+        raise KeyError(f"{prefix} blocks")
+    mlp, width = shapes[0]
+    return Stack(width, max(shapes) + 1, heads or max(1, width // head_width), mlp)
+
+
+def detect_text(weights: Weights, blocks: str, token: str, position: str) -> TextTower | None:
+    """Return the sizes of a text tower from the keys of its tables; None if the file has no such tower."""
+    if token not in weights:
+        return None
+    return TextTower(detect_stack(weights, blocks, 64), vocab=len(weights[token]), length=len(weights[position]))
+
+
+def image_side(position: np.ndarray, patch: np.ndarray) -> int:
+    """Return the pixels on a side of the images, from a position table and a patch kernel."""
+    return round((len(position) - 1) ** 0.5) * int(patch.shape[-1])

@@ -1,0 +1,139 @@
+"""Weights of the authors' AnyTouch: stage 1, stage 2 (with towers), and probes (with a classifier)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
+from anytouch_jax.weights.keymaps import (
+    CLIP_PATCH,
+    LINEAR,
+    ROW,
+    SAME,
+    TOKEN,
+    Entry,
+    KeyMap,
+    Weights,
+    detect_stack,
+    image_side,
+    linear,
+    norm,
+    stacked,
+)
+from anytouch_jax.weights.keymaps.hf_clip import DECODER, TOWERS, detect_text_tower, towers, vision
+
+_STAGE2 = "touch_mae_model."
+_CLIP_PATCH = "video_patch_embedding.weight"
+_PROBE_PATCH = "touch_model.embeddings.patch_embedding.weight"
+_DECODER_BLOCK = [
+    *linear("attention.attention.query", "attention/query"),
+    *linear("attention.attention.key", "attention/key"),
+    *linear("attention.attention.value", "attention/value"),
+    *linear("attention.output.dense", "attention/out"),
+    *linear("intermediate.dense", "mlp/up"),
+    *linear("output.dense", "mlp/down"),
+    *norm("layernorm_before", "norm1"),
+    *norm("layernorm_after", "norm2"),
+]
+
+
+def _touch(model: ModelConfig, prefix: str = "", patch: str = _CLIP_PATCH) -> Iterator[Entry]:
+    yield Entry(f"{prefix}sensor_token", "touch/sensor_tokens", SAME)
+    yield Entry(f"{prefix}{patch}", "touch/patch/kernel", CLIP_PATCH)
+    yield from vision(f"{prefix}touch_model", "touch", model.touch.depth)
+    yield Entry(f"{prefix}touch_projection.weight", "touch/projection/kernel", LINEAR)
+
+
+def _decoder(model: ModelConfig, prefix: str = "") -> Iterator[Entry]:
+    yield Entry(f"{prefix}mask_token", "decoder/mask_token", TOKEN)
+    yield Entry(f"{prefix}decoder_pos_embed", "decoder/position", ROW)
+    if model.decoder_sensor_tokens:
+        yield Entry(f"{prefix}sensor_token_proj.weight", "decoder/sensor_projection/kernel", LINEAR)
+    yield from stacked(f"{prefix}touch_decoder_blocks", "decoder/blocks", model.decoder.depth, _DECODER_BLOCK)
+    yield from linear(f"{prefix}decoder_embed", "decoder/embed")
+    yield from norm(f"{prefix}decoder_norm", "decoder/norm")
+    yield from linear(f"{prefix}decoder_pred", "decoder/still_head")
+    yield from linear(f"{prefix}decoder_pred_video", "decoder/clip_head")
+
+
+def _stage2(model: ModelConfig) -> list[Entry]:
+    entries = [*_touch(model, _STAGE2), *_decoder(model, _STAGE2), *towers(model, lora=bool(model.lora_rank))]
+    if model.match_head == "linear":
+        entries += linear("cross_sensor_head", "matcher")
+    elif model.match_head == "mlp":  # only in our files: the authors' head is linear
+        entries += [*linear("cross_sensor_mlp.up", "matcher/up"), *linear("cross_sensor_mlp.down", "matcher/down")]
+    return entries
+
+
+def _sizes(weights: Weights, heads: int | None, prefix: str = "", patch_key: str = _CLIP_PATCH) -> dict[str, Any]:
+    """Return the settings of the touch encoder."""
+    patch, tokens = weights[f"{prefix}{patch_key}"], weights[f"{prefix}sensor_token"]
+    numbered = (*(f"sensor{row}" for row in range(len(tokens) - 1)), UNIVERSAL)
+    position = weights[f"{prefix}touch_model.embeddings.position_embedding.weight"]
+    return {
+        "image_size": image_side(position, patch),
+        "patch": patch.shape[-1],
+        "embed": weights[f"{prefix}touch_projection.weight"].shape[0],
+        "touch": detect_stack(weights, f"{prefix}touch_model", 64, heads),
+        "frames": patch.shape[1],
+        "sensors": SENSORS if len(tokens) == len(SENSORS) else numbered,
+        "sensor_tokens": tokens.shape[1],
+        "decoder_sensor_tokens": f"{prefix}sensor_token_proj.weight" in weights,
+    }
+
+
+def _detect_stage1(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
+    decoder = detect_stack(weights, "touch_decoder_blocks", 32, decoder_heads)
+    return ModelConfig(decoder=decoder, **_sizes(weights, heads))
+
+
+def _detect_stage2(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
+    ranks = [array.shape[0] for key, array in weights.items() if "lora_A" in key]
+    linear_head, mlp_head = (f"cross_sensor_{part}.weight" in weights for part in ("head", "mlp.up"))
+    return ModelConfig(
+        decoder=detect_stack(weights, f"{_STAGE2}touch_decoder_blocks", 32, decoder_heads),
+        image=detect_stack(weights, "vision_model", 64, heads),
+        text=detect_text_tower(weights),
+        match_head="mlp" if mlp_head else "linear" if linear_head else "none",
+        lora_rank=ranks[0] if ranks else 0,
+        **_sizes(weights, heads, _STAGE2),
+    )
+
+
+def _detect_probe(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
+    return ModelConfig(decoder=DECODER, **_sizes(weights, heads, patch_key=_PROBE_PATCH))
+
+
+def _unused(prefix: str = "") -> dict[str, str]:
+    inner = f"{prefix}touch_model.embeddings."
+    return {
+        f"{inner}patch_embedding.weight": f"{prefix}{_CLIP_PATCH}",
+        f"{prefix}video_position_embedding.weight": f"{inner}position_embedding.weight",
+    }
+
+
+_TOWERS = TOWERS | {"matcher": r"cross_sensor_.*"}
+STAGE1 = KeyMap(
+    "stage1",
+    lambda weights: _CLIP_PATCH in weights,
+    lambda model: [*_touch(model), *_decoder(model)],
+    _detect_stage1,
+    _unused(),
+    _TOWERS,
+)
+STAGE2 = KeyMap(
+    "stage2",
+    lambda weights: any(key.startswith(_STAGE2) for key in weights),
+    _stage2,
+    _detect_stage2,
+    _unused(_STAGE2),
+    _TOWERS,
+)
+PROBE = KeyMap(
+    "probe",
+    lambda weights: _PROBE_PATCH in weights,
+    lambda model: list(_touch(model, patch=_PROBE_PATCH)),
+    _detect_probe,
+    towers=_TOWERS,
+)

@@ -22,8 +22,9 @@ from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import checkpoint, release
-from anytouch_jax.weights.resize import resize_position
+from anytouch_jax.weights import checkpoint, convert, safetensors
+from anytouch_jax.weights.compatible import resize_position
+from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
 
 TESTS = Path(__file__).parent
@@ -142,9 +143,9 @@ def parts(params, *names):
 
 def as_used(run, result):
     """What a run learned, the rows of sensors that it never saw served by the universal tokens."""
-    _, text, told = checkpoint.load_params(run)
-    assert 0 < len(told["seen"]) < len(SENSORS)
-    return release.served(result.params, from_json(text), told)
+    loaded = load_model(run)
+    assert 0 < len(loaded.trained_sensors) < len(SENSORS)
+    return loaded.params
 
 
 def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp_path):
@@ -167,8 +168,8 @@ def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp
     assert train(config, tmp_path / "r", said, init=init, stop_after=2).step == 2
     assert not any("is not read" in line for line in said)
     assert train(config, tmp_path / "r", said, init=run, clip="other.bin", stop_after=2).step == 2
-    assert "was begun without --clip: other.bin is not read" in "".join(said)
-    assert f"was begun from {init}: {run} is not read" in said[-1] + "".join(said)
+    assert "--clip-weights (nothing): other.bin is not read" in "".join(said)
+    assert f"was started with --init {init}: {run} is not read" in said[-1] + "".join(said)
     last = train(config, tmp_path / "r", said)
     assert (last.resumed, last.step, last.traces) == (2, 4, 1)
     wanted, found = arrays_of(whole), arrays_of(last)
@@ -219,9 +220,9 @@ def clip_folder(folder, config):
     model = replace(config.model, text=replace(config.model.text, vocab=tokenizer.vocab_size))
     params = build(model).init(jax.random.key(9))
     plain = replace(model, lora_rank=0)
-    full = release.to_release({n: p for n, p in params.items() if n != "lora"}, plain, allow_extra=True)
-    keys = release.release_names(plain, "clip")
-    release.write_safetensors(folder / "model.safetensors", {key: full[key] for key in keys}, {"format": "pt"})
+    full = convert.to_release({n: p for n, p in params.items() if n != "lora"}, plain, allow_extra=True)
+    keys = convert.release_names(plain, "clip")
+    safetensors.write_safetensors(folder / "model.safetensors", {key: full[key] for key in keys}, {"format": "pt"})
     return replace(config, model=model), params
 
 
@@ -286,7 +287,7 @@ def test_clip_weights_of_another_size_are_one_short_sentence(world, tmp_path):
         assert (
             f"model.safetensors has width 16, depth 2 and patches of 7, this run's {name} {told}: --preset" in message
         )
-        assert "large is for ViT-L/14, --preset base for ViT-B/16" in message and len(message) < 400
+        assert "--preset large fits ViT-L/14" in message and len(message) < 400
 
 
 # Mistakes -----------------------------------------------------------------------------------------------------------
@@ -313,7 +314,7 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     assert f"this run would use {stack.heads}: add --model.touch.heads" in refused(other, tmp_path / "b", init=run)
     narrow = replace(stage2.model.touch, width=8)
     other = replace(stage2, preset="small", model=replace(stage2.model, touch=narrow))
-    assert "would be of preset small: add --preset tiny" in refused(other, tmp_path / "b", init=run)
+    assert "would have preset small: add --preset tiny" in refused(other, tmp_path / "b", init=run)
     pretrained = run_config(world, 2, towers="pretrained")
     assert "--clip" in refused(pretrained, tmp_path / "c")
     assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")
@@ -359,7 +360,7 @@ def test_settings_that_would_do_nothing_are_one_sentence(world, tmp_path):
     config = replace(config, optim=replace(config.optim, accumulate=2))
     assert "--optim.accumulate must be 1 in stage 2" in refused(config, tmp_path / "r")
     both = refused(run_config(world), tmp_path / "r", init="a.pth", clip="b.safetensors")
-    assert "--clip is not read beside --init" in both and not (tmp_path / "r").exists()
+    assert "--init and --clip-weights" in both and not (tmp_path / "r").exists()
 
 
 @pytest.mark.parametrize("form", ["run", "file"])
@@ -369,7 +370,7 @@ def test_weights_for_another_image_size_have_their_positions_resized(straight, w
     if form == "file":
         model = from_json((run / "config.json").read_text()).model
         init = tmp_path / "w.safetensors"
-        release.write_safetensors(init, release.to_release(before, model), {release.MODEL_KEY: to_json(model)})
+        safetensors.write_safetensors(init, convert.to_release(before, model), {safetensors.MODEL_KEY: to_json(model)})
     said: list[str] = []
     params = train(run_config(world, model={"image_size": 56}), tmp_path / "r", said, init=init, stop_after=0).params
     for part in ("touch", "decoder"):
@@ -377,7 +378,7 @@ def test_weights_for_another_image_size_have_their_positions_resized(straight, w
         rows = len(params[part]["position"])
         assert rows == 1 + 4 * (len(table) - 1)
         np.testing.assert_allclose(params[part]["position"], resize_position(table, rows), atol=1e-6)
-    assert f"the positions of {init} are resized for pictures of 56 pixels" in said
+    assert f"the positions of {init} are resized for images of 56 pixels" in said
 
 
 def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):
@@ -403,13 +404,13 @@ def test_touches_shown_otherwise_than_to_stage_one_are_told_of(tmp_path):
     for name, one, told in (("same", config, False), ("other", other, True)):
         said: list[str] = []
         train(one, tmp_path / name, said, init=tmp_path / "one", stop_after=0)
-        assert any("trained with --loader.background keep, this run with subtract" in line for line in said) == told
+        assert any("trained with --data.background keep, this run with subtract" in line for line in said) == told
 
     release_file = tmp_path / "one.safetensors"  # the same is told of weights that say how they saw touches
     assert main(["convert", str(tmp_path / "one"), str(release_file)]) == 0
     said = []
     train(other, tmp_path / "third", said, init=release_file, stop_after=0)
-    assert any("trained with --loader.background keep, this run with subtract" in line for line in said)
+    assert any("trained with --data.background keep, this run with subtract" in line for line in said)
 
 
 def test_what_starts_anew_is_told_of(straight, world, tmp_path):
@@ -417,8 +418,8 @@ def test_what_starts_anew_is_told_of(straight, world, tmp_path):
     for name, init, told in (("a", straight[0], False), ("b", tmp_path / "two", True)):
         said: list[str] = []
         train(run_config(world, 2), tmp_path / name, said, init=init, stop_after=0)
-        assert any("the touch encoder and the decoder are taken; " in line for line in said) == told
-    assert any("image, " in line and line.endswith("start anew") for line in said)
+        assert any("gives the touch encoder and the decoder; " in line for line in said) == told
+    assert any("image, " in line and line.endswith("start untrained") for line in said)
 
 
 def test_two_processes_never_train_one_run(straight, world, tmp_path):
@@ -487,7 +488,7 @@ def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path
 def test_the_authors_weights_start_sensors_that_they_never_saw_from_the_universal_tokens(world, tmp_path):
     config, init = run_config(world), tmp_path / "authors.safetensors"
     params = build(config.model).init(jax.random.key(5))
-    release.write_safetensors(init, release.to_release(params, config.model), {"format": "pt"})
+    safetensors.write_safetensors(init, convert.to_release(params, config.model), {"format": "pt"})
     first = train(config, tmp_path / "r", init=init, stop_after=1).params["touch"]["sensor_tokens"]  # at a rate of 0
     stored = np.asarray(params["touch"]["sensor_tokens"])
     for row in range(len(SENSORS)):
@@ -496,7 +497,7 @@ def test_the_authors_weights_start_sensors_that_they_never_saw_from_the_universa
     said: list[str] = []
     train(run_config(world, model={"sensors": ("digit", "gelsight_mini", "universal")}), tmp_path / "few", said,
           init=init, stop_after=0)  # fmt: skip
-    assert any(line.startswith(f"the tokens of gelsight, gelslim, duragel in {init} are left behind") for line in said)
+    assert any(line.startswith(f"the tokens of gelsight, gelslim, duragel in {init} are left out") for line in said)
 
 
 def test_tokens_of_a_sensor_that_are_left_behind_are_told_of(world, tmp_path):

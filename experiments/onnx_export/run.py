@@ -24,7 +24,7 @@ from anytouch_jax.encoder.encoder import check_frames, load_encoder
 from anytouch_jax.encoder.export import call_of
 from anytouch_jax.encoder.names import describes
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights.checkpoint import export_safetensors
+from anytouch_jax.weights.safetensors import export_safetensors
 
 BATCHES = (1, 5)
 

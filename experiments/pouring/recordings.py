@@ -191,14 +191,17 @@ def compare(said: Array, trials: Trials, rate: float) -> Agreement:
 def save_policy(folder: Path, policy: Touch) -> None:
     """Write the MLP to `policy.npz` and the encoder beside it, each in one move. Raises UserError."""
     from anytouch_jax.config import to_json
-    from anytouch_jax.weights import checkpoint, release
+    from anytouch_jax.weights import safetensors
 
     folder.mkdir(parents=True, exist_ok=True)
     encoder, head = policy.encoder, policy.head
-    about = {release.MODEL_KEY: to_json(encoder.config.model), release.BACKGROUND_KEY: encoder.config.data.background}
+    about = {
+        safetensors.MODEL_KEY: to_json(encoder.config.model),
+        safetensors.BACKGROUND_KEY: encoder.config.data.background,
+    }
     if encoder.seen is not None:
-        about[release.SEEN_KEY] = ",".join(encoder.seen)
-    checkpoint.export_safetensors(folder / WEIGHTS, encoder.params, about)
+        about[safetensors.SEEN_KEY] = ",".join(encoder.seen)
+    safetensors.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
     told = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}

@@ -9,7 +9,7 @@ from pathlib import Path
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
-from anytouch_jax.weights.tree import between
+from anytouch_jax.weights.tree import interpolate
 from experiments.tables import cuts, plan
 from experiments.tables.plan import Size, Training
 from experiments.tables.work import Work
@@ -64,5 +64,5 @@ def encoders(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, En
     """Those of `train`, and the one half-way from AnyTouch's stage 1 to its stage 2."""
     found = {name: load_encoder(run) for name, run in train(work, size, seed, taken).items()}
     first, second = found["stage1"], found["anytouch"]
-    params = between(first.params, second.params, SHARE)
+    params = interpolate(first.params, second.params, SHARE)
     return found | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}

@@ -23,7 +23,7 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, from_json, to_json
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part, build
 from anytouch_jax.objectives import normalise_touch
-from anytouch_jax.weights.tensors import read_safetensors, write_safetensors
+from anytouch_jax.weights.safetensors import read_safetensors, write_safetensors
 from anytouch_jax.weights.tree import flatten, nest
 from experiments.translation.networks import (
     Critic,

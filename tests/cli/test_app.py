@@ -24,8 +24,8 @@ from anytouch_jax.config import SENSORS, to_json
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train import mesh
-from anytouch_jax.weights import release
-from anytouch_jax.weights.checkpoint import export_safetensors
+from anytouch_jax.weights import load, safetensors
+from anytouch_jax.weights.safetensors import export_safetensors
 
 SIZES = [
     "--model.image-size",
@@ -472,7 +472,9 @@ def test_convert_to_the_authors_names_and_back(tmp_path, tiny_run, capsys):
 def test_what_the_authors_files_cannot_hold_is_one_sentence(tmp_path, capsys):
     model = touch_model()
     params = build(model).init(jax.random.key(0))
-    export_safetensors(tmp_path / "own.safetensors", {"touch": params["touch"]}, {release.MODEL_KEY: to_json(model)})
+    export_safetensors(
+        tmp_path / "own.safetensors", {"touch": params["touch"]}, {safetensors.MODEL_KEY: to_json(model)}
+    )
     told = mistake(capsys, "convert", tmp_path / "own.safetensors", tmp_path / "theirs.safetensors")
     assert "lacks a touch encoder or a decoder" in told and "--names own" in told
     assert not (tmp_path / "theirs.safetensors").exists()
@@ -482,9 +484,9 @@ def test_convert_brings_the_universal_tokens_to_the_last_row(tmp_path):
     # A sensor added at the end of the table stands behind them; the authors' code reads the last row.
     model = touch_model(sensors=(*SENSORS, "mine"))
     params = build(model).init(jax.random.key(0))
-    export_safetensors(tmp_path / "own.safetensors", params, {release.MODEL_KEY: to_json(model)})
+    export_safetensors(tmp_path / "own.safetensors", params, {safetensors.MODEL_KEY: to_json(model)})
     assert run("convert", tmp_path / "own.safetensors", tmp_path / "theirs.safetensors") == 0
-    table = release.read_weights(tmp_path / "theirs.safetensors")["sensor_token"]
+    table = load.read_weights(tmp_path / "theirs.safetensors")["sensor_token"]
     np.testing.assert_array_equal(table[-1], params["touch"]["sensor_tokens"][SENSORS.index("universal")])
     np.testing.assert_array_equal(table[-2], params["touch"]["sensor_tokens"][-1])
     assert load_encoder(tmp_path / "theirs.safetensors").sensor_row("mine") == len(SENSORS) - 1

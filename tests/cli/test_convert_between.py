@@ -13,13 +13,13 @@ from anytouch_jax.config import to_json
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import release
-from anytouch_jax.weights.tree import between, flatten
+from anytouch_jax.weights import load, safetensors
+from anytouch_jax.weights.tree import flatten, interpolate
 
 
 def write(path, model, params, **told):
     arrays = {name: np.asarray(array) for name, array in flatten(params).items()}
-    release.write_safetensors(path, arrays, {release.MODEL_KEY: to_json(model)} | told)
+    safetensors.write_safetensors(path, arrays, {safetensors.MODEL_KEY: to_json(model)} | told)
     return path
 
 
@@ -36,7 +36,7 @@ def test_every_weight_lies_the_asked_share_from_the_first_to_the_second(two, tmp
     target = tmp_path / "between.safetensors"
     for share in (0, 0.25, 1):
         assert not anytouch("convert", second, target, "--names", "own", "--between", first, "--share", share).status
-        found = release.read_weights(target)
+        found = load.read_weights(target)
         start, end = (flatten(one) for one in params)
         assert found.keys() == end.keys()
         for name, weights in found.items():
@@ -44,16 +44,16 @@ def test_every_weight_lies_the_asked_share_from_the_first_to_the_second(two, tmp
             np.testing.assert_allclose(weights, expected, rtol=1e-6, atol=1e-7)
     clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
     np.testing.assert_array_equal(load_encoder(target).embed(clip), load_encoder(second).embed(clip))
-    assert release.read_metadata(target)["source"] == f"1 of the way from {first} to {second}"
+    assert safetensors.read_file_metadata(target)["source"] == f"1 of the way from {first} to {second}"
 
 
 def test_what_the_first_has_not_stays_as_in_the_second():
     first, second = {"touch": {"a": np.zeros(2)}, "decoder": np.ones(3)}, {"touch": {"a": np.ones(2)}, "text": 5.0}
-    found = between(first, second, 0.5)
+    found = interpolate(first, second, 0.5)
     assert found.keys() == {"touch", "text"} and found["text"] == 5.0
     np.testing.assert_array_equal(found["touch"]["a"], [0.5, 0.5])
-    with pytest.raises(UserError, match="a is \\(3,\\) in the one and \\(2,\\) in the other"):
-        between({"a": np.zeros(3)}, {"a": np.zeros(2)}, 0.5)
+    with pytest.raises(UserError, match="a has shape \\(3,\\) in one and \\(2,\\)"):
+        interpolate({"a": np.zeros(3)}, {"a": np.zeros(2)}, 0.5)
 
 
 def test_a_run_and_its_stage_1(tiny_run, tmp_path, anytouch):
@@ -72,7 +72,7 @@ def test_mistakes(two, tmp_path, mistake):
     assert "--share does nothing without --between" in mistake(*words, "--share", 0.25)
     other = write(tmp_path / "other.safetensors", replace(touch_model(), norm_eps=1e-3), params)
     assert "of different networks (norm_eps)" in mistake(*words, "--between", other)
-    seen = write(tmp_path / "seen.safetensors", touch_model(), params, **{release.BACKGROUND_KEY: "subtract"})
+    seen = write(tmp_path / "seen.safetensors", touch_model(), params, **{safetensors.BACKGROUND_KEY: "subtract"})
     assert "of different networks (background)" in mistake(*words, "--between", seen)
     assert "nowhere" in mistake(*words, "--between", tmp_path / "nowhere.safetensors")
     assert "is a file that is read" in mistake("convert", second, first, "--names", "own", "--between", first)

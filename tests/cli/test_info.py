@@ -9,8 +9,8 @@ from tiny_models import touch_model
 
 from anytouch_jax.config import to_json
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import release
-from anytouch_jax.weights.checkpoint import export_safetensors
+from anytouch_jax.weights import convert, safetensors
+from anytouch_jax.weights.safetensors import export_safetensors
 
 
 def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
@@ -40,7 +40,7 @@ def test_a_damaged_checkpoint_is_told_of(anytouch, tiny_run, tmp_path):
         file.write(b"not what was here")
     said = anytouch("info", tmp_path / "run")
     assert said.status == 0 and "a run of stage 1" in said.out
-    assert "is damaged: its file" in said.out and "there is no intact older checkpoint" in said.out
+    assert "is damaged: its file" in said.out and "no older checkpoint is intact" in said.out
 
 
 def test_weights_tell_whose_names_they_have(anytouch, tmp_path):
@@ -49,16 +49,16 @@ def test_weights_tell_whose_names_they_have(anytouch, tmp_path):
     model = touch_model()
     params = build(model).init(jax.random.key(0))
     ours, theirs = tmp_path / "ours.safetensors", tmp_path / "theirs.safetensors"
-    export_safetensors(ours, params, {release.MODEL_KEY: to_json(model), release.SEEN_KEY: "digit"})
-    release.write_safetensors(theirs, release.to_release(params, model), {release.MODEL_KEY: to_json(model)})
+    export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model), safetensors.SEEN_KEY: "digit"})
+    safetensors.write_safetensors(theirs, convert.to_release(params, model), {safetensors.MODEL_KEY: to_json(model)})
     assert "by our own names" in (said := anytouch("info", ours)).out and "trained on: digit;" in said.out
     assert "by the authors (stage1) names" in (said := anytouch("info", theirs)).out and "is not told" in said.out
     for kind, told in (("sensor", "patches of 7, each sensor by its own;"), ("convolutional", "read by convolutions;")):
         other = touch_model(patch_encoder=kind)
-        export_safetensors(theirs, build(other).init(jax.random.key(0)), {release.MODEL_KEY: to_json(other)})
+        export_safetensors(theirs, build(other).init(jax.random.key(0)), {safetensors.MODEL_KEY: to_json(other)})
         assert told in anytouch("info", theirs).out
     params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
-    export_safetensors(ours, params, {release.MODEL_KEY: to_json(model)})
+    export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model)})
     assert "not finite: nothing can be embedded" in anytouch("info", ours).out
 
 

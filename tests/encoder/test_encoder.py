@@ -27,7 +27,7 @@ from anytouch_jax.encoder.encoder import (
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import checkpoint, release
+from anytouch_jax.weights import checkpoint, convert, load, safetensors
 
 RNG = np.random.default_rng(0)
 CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)
@@ -111,9 +111,9 @@ def test_a_sensor_of_the_table_that_training_never_saw_is_told_of(encoder, tmp_p
     own, said = replace(encoder, universal_drawn=False), []
     assert [own.sensor_row(name, said.append) for name in ("digit", "tacto", "universal", "mine")] == [1, 7, 9, 9]
     assert len(said) == 3 and all("using the mean of the tokens that training saw" in line for line in said)
-    about = {release.MODEL_KEY: to_json(encoder.config.model), release.SEEN_KEY: "digit"}
+    about = {safetensors.MODEL_KEY: to_json(encoder.config.model), safetensors.SEEN_KEY: "digit"}
     params = build(encoder.config.model).init(jax.random.key(0))
-    release.write_safetensors(tmp_path / "w.safetensors", release.to_release(params, encoder.config.model), about)
+    safetensors.write_safetensors(tmp_path / "w.safetensors", convert.to_release(params, encoder.config.model), about)
     assert load_encoder(tmp_path / "w.safetensors").seen == ("digit",)
 
 
@@ -140,9 +140,9 @@ def test_an_encoder_of_a_weights_file(tmp_path):
         here = replace(model, touch=replace(wide, heads=heads))
         made = random_encoder(Config(here), seed=3)
         params = build(here).init(jax.random.key(1))
-        metadata = {release.MODEL_KEY: to_json(here)} if about else {}
+        metadata = {safetensors.MODEL_KEY: to_json(here)} if about else {}
         path = tmp_path / f"{heads}.safetensors"
-        release.write_safetensors(path, release.to_release(params, here), metadata)
+        safetensors.write_safetensors(path, convert.to_release(params, here), metadata)
         found = load_encoder(path)
         np.testing.assert_array_equal(found.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
         assert found.config.model.touch == here.touch
@@ -154,9 +154,9 @@ def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_
     """The release trained rows 0 to 4 of its table and the universal one; 5 to 8 are as they were drawn."""
     params = build(touch_model()).init(jax.random.key(1))
     stored = np.asarray(params["touch"]["sensor_tokens"])
-    authors, ours = release.to_release(params, touch_model()), {release.MODEL_KEY: to_json(touch_model())}
-    release.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
-    release.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
+    authors, ours = convert.to_release(params, touch_model()), {safetensors.MODEL_KEY: to_json(touch_model())}
+    safetensors.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
+    safetensors.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
     encoder, untold = (load_encoder(tmp_path / f"{name}.safetensors") for name in ("authors", "untold"))
     assert encoder.seen == ("gelsight", "digit", "gelslim", "gelsight_mini", "duragel") and untold.seen is None
     tokens = encoder.params["touch"]["sensor_tokens"]
@@ -167,7 +167,7 @@ def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_
     assert encoder.sensor_row("9dtact", said.append) == 5 and "was not drawn in training" in said[0]
     # through `convert` the numbers of the file stay, and what they are of is told
     assert main(["convert", str(tmp_path / "authors.safetensors"), str(tmp_path / "again.safetensors")]) == 0
-    again = release.read_weights(tmp_path / "again.safetensors")
+    again = load.read_weights(tmp_path / "again.safetensors")
     np.testing.assert_array_equal(again["sensor_token"], stored)
     found = load_encoder(tmp_path / "again.safetensors")
     assert found.seen == encoder.seen
@@ -182,15 +182,15 @@ def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
     with pytest.raises(UserError, match="unknown type"):
         load_encoder(world)
     np.savez(tmp_path / "features.npz", values=np.zeros((2, 3), np.float32), path=np.array(["a.png", "b.png"]))
-    with pytest.raises(UserError, match=r"features\.npz holds no weights: path is <U5, not numbers"):
+    with pytest.raises(UserError, match=r"features\.npz has no weights: path is <U5, not numbers"):
         load_encoder(tmp_path / "features.npz")
 
 
 def test_weights_that_are_not_finite_embed_nothing(tmp_path, tiny_run):
     params, text, _ = checkpoint.load_params(tiny_run)
     params["touch"]["class_token"] = np.full_like(params["touch"]["class_token"], np.nan)
-    about = {release.MODEL_KEY: to_json(from_json(text).model)}
-    checkpoint.export_safetensors(tmp_path / "w.safetensors", params, about)
+    about = {safetensors.MODEL_KEY: to_json(from_json(text).model)}
+    safetensors.export_safetensors(tmp_path / "w.safetensors", params, about)
     with pytest.raises(UserError, match="weights that are not finite: its training diverged"):
         load_encoder(tmp_path / "w.safetensors")
 

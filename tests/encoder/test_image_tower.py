@@ -15,7 +15,7 @@ from anytouch_jax.encoder.image_tower import image_tower_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
-from anytouch_jax.weights import checkpoint, release
+from anytouch_jax.weights import checkpoint, convert, safetensors
 
 RNG = np.random.default_rng(0)
 STILLS = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
@@ -54,10 +54,10 @@ def test_a_clip_gives_the_embedding_of_its_mean_frame(tmp_path):
 def test_the_tower_of_clip_weights(tmp_path):
     model = replace(full_model(), match_head="linear")
     params = build(model).init(jax.random.key(9))
-    full = release.to_release(params, model)
-    keys = release.release_names(model, "clip")
+    full = convert.to_release(params, model)
+    keys = convert.release_names(model, "clip")
     file = tmp_path / "clip.safetensors"
-    release.write_safetensors(file, {key: full[key] for key in keys}, {release.MODEL_KEY: to_json(model)})
+    safetensors.write_safetensors(file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)})
     wanted = build(model).apply(params, "embed_image", normalise_touch(STILLS))
     np.testing.assert_allclose(image_tower_encoder(file).embed(STILLS), wanted, atol=2e-5)
 

@@ -14,9 +14,11 @@ from tiny_models import tiny_config, touch_model
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.touch import windows
-from anytouch_jax.weights import fits
-from anytouch_jax.weights.release import WeightsError, inflate, to_release
-from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights import compatible
+from anytouch_jax.weights.convert import to_release
+from anytouch_jax.weights.keymaps import param_shapes
+from anytouch_jax.weights.load import inflate
+from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten
 
 RNG = np.random.default_rng(0)
@@ -106,4 +108,4 @@ def test_an_image_tower_has_no_projection_to_give():
 def test_weights_of_another_patch_encoder_are_told_with_the_option_that_lacks():
     config = tiny_config(1, patch_encoder="convolutional")
     with pytest.raises(UserError, match=r"add --model.patch-encoder shared"):
-        fits.same_form(Path("run"), replace(config.model, patch_encoder="shared"), config)
+        compatible.check_form(Path("run"), replace(config.model, patch_encoder="shared"), config)

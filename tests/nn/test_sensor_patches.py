@@ -12,8 +12,10 @@ from tiny_models import full_model, tiny_config, touch_model
 
 from anytouch_jax.config import baselines
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights.release import WeightsError, serve_unseen, to_release
-from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.compatible import serve_unseen
+from anytouch_jax.weights.convert import to_release
+from anytouch_jax.weights.keymaps import param_shapes
+from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten
 
 RNG = np.random.default_rng(0)

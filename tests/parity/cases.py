@@ -25,7 +25,7 @@ from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, tokens
 from anytouch_jax.train.optim import learning_rate, moments, optimizer
 from anytouch_jax.train.step import TrainState, init_state, make_step, merge
-from anytouch_jax.weights import release
+from anytouch_jax.weights import convert
 from tests.parity import weights
 from tests.parity.golden_files import (
     GRADIENT,
@@ -180,8 +180,8 @@ def _optimizer_batch(case: Case, net: Net, i: int) -> tuple[jax.Array, jax.Array
 
 def _compare_final(case: Case, params: Params, state: TrainState, config: Config) -> None:
     """Parameters after the steps: movement within 1e-5 absolute, untouched ones bit-equal, per-parameter counts."""
-    before = release.to_release(params, config.model)
-    after = release.to_release(merge(state.trainable, state.frozen), config.model)
+    before = convert.to_release(params, config.model)
+    after = convert.to_release(merge(state.trainable, state.frozen), config.model)
     noisy = case.info.get("rounding_sensitive", {}).get("parameters", {})
     summed = float(np.sum(case.info["lr"]))
     for name in case.info["arrays"]:
@@ -199,7 +199,7 @@ def _compare_final(case: Case, params: Params, state: TrainState, config: Config
         moments(state.opt_state, state.trainable),
     )
     full = merge(counts, jax.tree.map(lambda p: np.zeros(p.shape, np.float32), state.frozen))
-    for key, value in release.to_release(full, config.model).items():
+    for key, value in convert.to_release(full, config.model).items():
         expected = case.info["adam_step_count"].get(key)
         ours = 0 if key in dead else int(np.max(value, initial=0))
         if expected is not None and ours != expected:

@@ -28,7 +28,7 @@ from anytouch_jax.config import (
     TextTower,
 )
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights import release
+from anytouch_jax.weights import convert
 
 Arrays = dict[str, np.ndarray]
 
@@ -186,7 +186,7 @@ def golden_params(folder: Path, file: str, model: ModelConfig, scale: Any = None
         weights = {k: v for k, v in weights.items() if not k.endswith("sensor_token_proj.weight")}
     if scale is not None:
         weights = {key: scale(key, value) for key, value in weights.items()}
-    return release.to_params(weights, model)
+    return convert.to_params(weights, model)
 
 
 def channel_last(pixels: np.ndarray, *, clip: bool = True) -> np.ndarray:

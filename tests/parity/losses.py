@@ -16,7 +16,7 @@ from anytouch_jax.config import Config
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, masking
 from anytouch_jax.train.step import merge, split, used_parameters
-from anytouch_jax.weights import release
+from anytouch_jax.weights import convert
 from tests.parity.golden_files import GRADIENT, KEY_BIAS, Case, channel_last, golden_config, golden_params, read_arrays
 
 Params = dict[str, Any]
@@ -56,14 +56,14 @@ def _gradients(value: Value, params: Params, inputs: Any, exact: Any, net: Net, 
     used = used_parameters(lambda p: value(merge(p, frozen), exact, net=net, config=config), trainable)
     zeros = jax.tree.map(np.zeros_like, frozen)
     flags = merge(jax.tree.map(lambda u, g: np.full(g.shape, u, np.float32), used, grads), zeros)
-    named, live = (release.to_release(tree, config.model) for tree in (merge(grads, zeros), flags))
+    named, live = (convert.to_release(tree, config.model) for tree in (merge(grads, zeros), flags))
     dead = dead_keys(config)
     return {key: None if key in dead or not np.any(live[key]) else array for key, array in named.items()}
 
 
 def dead_keys(config: Config) -> set[str]:
     """Keys of the authors' files that nothing reads (golden Q2)."""
-    return set(release.release_shapes(config.model)) - set(release.release_names(config.model))
+    return set(convert.release_shapes(config.model)) - set(convert.release_names(config.model))
 
 
 def _compare_gradients(

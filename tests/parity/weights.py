@@ -11,16 +11,15 @@ import numpy as np
 
 from anytouch_jax.config import Config, ModelConfig, Stack, preset
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import release
-from anytouch_jax.weights.names import Layout
-from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights import convert, load
+from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten, nest
 from tests.parity.golden_files import Arrays, Case, read_arrays
 
 STAGE1 = preset("large", recipe="release")
 STAGE2 = preset("large", stage=2, recipe="release", towers="pretrained")
 # entry of K_manifest -> the layout of that file and the preset that it is a file of
-_FULL_SIZE: dict[str, tuple[Layout, Config]] = {
+_FULL_SIZE: dict[str, tuple[str, Config]] = {
     "stage1": ("stage1", STAGE1),
     "stage2": ("stage2", STAGE2),
     "probe_material": ("probe", STAGE1),
@@ -33,7 +32,7 @@ def manifest(case: Case) -> None:
     """Keys and shapes of the four full-size files against preset large; decay groups and freezing against our rules."""
     for kind, (layout, config) in _FULL_SIZE.items():
         rows = [row for row in case.info[kind]["state_dict"] if not row[0].startswith("head.")]
-        ours = release.release_shapes(config.model, layout)
+        ours = convert.release_shapes(config.model, layout)
         _same(case, f"{kind}/keys", ours, {key: tuple(shape) for key, shape, *_ in rows})
         if layout in ("stage1", "stage2"):
             shapes = {name: tuple(leaf.shape) for name, leaf in flatten(build(config.model).abstract()).items()}
@@ -43,7 +42,7 @@ def manifest(case: Case) -> None:
 
 def _groups(case: Case, kind: str, config: Config, rows: Iterable[Any]) -> None:
     """The decay group of every array that something reads; `text` runs without gradient there (golden Q10)."""
-    names, ours, theirs = release.release_names(config.model), {}, {}
+    names, ours, theirs = convert.release_names(config.model), {}, {}
     for key, _, _, group in rows:
         if key in names:
             name = names[key]
@@ -72,9 +71,9 @@ def loading_map(case: Case) -> None:
     """
     model1, model2 = _two_layers()
     files = {
-        "clip": _values(release.release_shapes(model2, "clip"), 1),
-        "mae": _values(release.release_shapes(model1), 2),
-        "stage2": _values(release.release_shapes(model2), 3),
+        "clip": _values(convert.release_shapes(model2, "clip"), 1),
+        "mae": _values(convert.release_shapes(model1), 2),
+        "stage2": _values(convert.release_shapes(model2), 3),
     }
     for name, sources in case.info.items():
         if isinstance(sources, dict) and "_from_" in name:
@@ -111,10 +110,10 @@ def _stage_map(
 ) -> None:
     fresh = nest(_values(param_shapes(model), 4))
     begun = "stage1" in name and not name.startswith("stage1")
-    stage1 = release.to_params(files["mae"], _two_layers()[0]) if begun else None
-    merged = release.first_params(fresh, model, stage1=stage1, clip=files["clip"])
-    ours, before = release.to_release(merged, model), release.to_release(fresh, model)
-    used = release.release_names(model)
+    stage1 = convert.to_params(files["mae"], _two_layers()[0]) if begun else None
+    merged = load.first_params(fresh, model, stage1=stage1, clip=files["clip"])
+    ours, before = convert.to_release(merged, model), convert.to_release(fresh, model)
+    used = convert.release_names(model)
     for key in used:
         source = sources.get(key, "nowhere")
         expected = before[key] if source == _FRESH else _expected(key, source, files) if key in sources else None
@@ -129,7 +128,7 @@ def _probe_map(
     """A probe's file, filled as the map says, is read as the touch encoder of its source."""
     (source,) = {value.partition(":")[0] for value in sources.values() if value != _FRESH}
     probe = {key: _expected(key, value, files) for key, value in sources.items() if value != _FRESH}
-    ours, theirs = (flatten(release.to_params(w, model)["touch"]) for w in (probe, files[source]))
+    ours, theirs = (flatten(convert.to_params(w, model)["touch"]) for w in (probe, files[source]))
     _equal(case, f"{name}/touch", ours, theirs)
 
 
@@ -142,11 +141,11 @@ def parameters(case: Case) -> None:
 def checkpoint(case: Case) -> None:
     """A `.pth` in the authors' format gives exactly the parameters stored beside it."""
     stage = 2 if case.name.startswith("stage2") else 1
-    weights = release.read_weights(case.folder / case.name)
+    weights = load.read_weights(case.folder / case.name)
     stored = read_arrays(case.folder / f"stage{stage}_params.npz")
     extra = {key for key in stored if key not in weights and key.endswith("sensor_token_proj.weight")}
     beside = {key: value for key, value in stored.items() if key not in extra}
-    ours, theirs = (flatten(release.to_params(w, release.detect_model(w))) for w in (weights, beside))
+    ours, theirs = (flatten(convert.to_params(w, convert.detect_model(w))) for w in (weights, beside))
     _equal(case, "parameters", ours, theirs)
 
 

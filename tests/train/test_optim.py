@@ -14,7 +14,7 @@ from anytouch_jax.config import preset
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, moments, optimizer, schedule
-from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten
 
 PEAK, FLOOR = 2e-4, 1e-6

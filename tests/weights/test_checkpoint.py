@@ -24,16 +24,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import checkpoint
-from anytouch_jax.weights.checkpoint import (
-    CheckpointError,
-    Checkpoints,
-    export_safetensors,
-    load_params,
-    read_metadata,
-    steps,
-)
-from anytouch_jax.weights.echoes import without_echoes
-from anytouch_jax.weights.tensors import read_safetensors
+from anytouch_jax.weights.checkpoint import CheckpointError, Checkpoints, load_params, quiet_hook, read_metadata, steps
+from anytouch_jax.weights.safetensors import export_safetensors, read_safetensors
 from anytouch_jax.weights.tree import flatten, nest
 
 METADATA = {"sensors": ["digit", "universal"], "preprocessing": {"mean": [0.5], "size": 112}, "source": "a test"}
@@ -292,7 +284,7 @@ def test_nothing_there_is_one_sentence(tmp_path):
     foreign = tmp_path / "new" / "00000003"
     foreign.mkdir()
     (foreign / "notes.txt").write_text("not ours")
-    with pytest.raises(CheckpointError, match=r"not a checkpoint of this program.*step 2 beside it is intact"):
+    with pytest.raises(CheckpointError, match=r"not a checkpoint of this program.*step 2 is intact"):
         load_params(tmp_path / "new")
     assert (foreign / "notes.txt").read_text() == "not ours"
 
@@ -314,13 +306,13 @@ def test_any_damaged_file_is_named_and_the_older_step_is_intact(tmp_path, damage
         if damage == "gone":
             path.unlink()
         for attempt in (lambda: saver.restore(jax.eval_shape(state_of)), lambda: load_params(tmp_path / "run")):
-            with pytest.raises(CheckpointError, match="step 1 beside it is intact") as caught:
+            with pytest.raises(CheckpointError, match="step 1 is intact") as caught:
                 attempt()
             assert str(target) in str(caught.value) and path.name in str(caught.value)
             assert "\n" not in str(caught.value)
     same(saver.restore(jax.eval_shape(state_of), 1), state_of(1))
     (tmp_path / "run" / "00000001" / "checkpoint.json").unlink()
-    with pytest.raises(CheckpointError, match="no intact older checkpoint"):
+    with pytest.raises(CheckpointError, match="no older checkpoint is intact"):
         load_params(tmp_path / "run")
 
 
@@ -501,7 +493,7 @@ def test_names_and_trees():
 
 def test_the_writes_after_the_one_that_failed_are_not_told_of():
     told: list[str] = []
-    hook = without_echoes(lambda kind, error, trace: told.append(str(error)))
+    hook = quiet_hook(lambda kind, error, trace: told.append(str(error)))
     for error in (RuntimeError("Event loop is closed"), RuntimeError("no such thing"), OSError("Event loop is closed")):
         hook(type(error), error, None)
     assert told == ["no such thing", "Event loop is closed"]

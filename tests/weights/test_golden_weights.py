@@ -9,8 +9,9 @@ import pytest
 from places import SHARED
 
 from anytouch_jax.config import Stack
-from anytouch_jax.weights.release import detect_model, read_weights, release_names, to_params, to_release
-from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.convert import detect_model, release_names, to_params, to_release
+from anytouch_jax.weights.keymaps import param_shapes
+from anytouch_jax.weights.load import read_weights
 from anytouch_jax.weights.tree import flatten
 from tests.parity import weights as parity_weights
 from tests.parity.golden_files import Case

@@ -11,22 +11,18 @@ import pytest
 from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig, Stack, TextTower, preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights.release import (
-    WeightsError,
-    clip_to_touch,
+from anytouch_jax.weights.compatible import match_sensors
+from anytouch_jax.weights.convert import (
     detect_layout,
     detect_model,
-    first_params,
-    match_sensors,
-    model_of,
-    read_weights,
     release_names,
     release_shapes,
     to_params,
     to_release,
-    write_safetensors,
 )
-from anytouch_jax.weights.shapes import param_shapes
+from anytouch_jax.weights.keymaps import param_shapes
+from anytouch_jax.weights.load import clip_to_touch, first_params, model_of_file, read_weights
+from anytouch_jax.weights.safetensors import WeightsError, write_safetensors
 from anytouch_jax.weights.tree import flatten, nest
 
 STAGE1 = ModelConfig(28, 14, 12, Stack(16, 2, 4, 24), Stack(8, 3, 2, 20))
@@ -406,8 +402,8 @@ def test_detects_heads_as_clip_and_the_authors_choose_them():
 def test_the_activation_of_clip_is_what_stands_beside_it(tmp_path, beside, activation):
     for name, content in beside.items():
         (tmp_path / name).write_text(json.dumps(content))
-    assert model_of(tmp_path / "clip.bin", weights_of(STAGE2, "clip")).activation == activation
-    assert model_of(tmp_path / "x.bin", weights_of(STAGE1)).activation == "gelu"  # the authors' own
+    assert model_of_file(tmp_path / "clip.bin", weights_of(STAGE2, "clip")).activation == activation
+    assert model_of_file(tmp_path / "x.bin", weights_of(STAGE1)).activation == "gelu"  # the authors' own
 
 
 def test_an_activation_that_the_network_lacks_is_refused(tmp_path):
@@ -419,7 +415,7 @@ def test_an_activation_that_the_network_lacks_is_refused(tmp_path):
     ):
         file.write_text(text)
         with pytest.raises(WeightsError, match=word):
-            model_of(tmp_path / "clip.bin", clip)
+            model_of_file(tmp_path / "clip.bin", clip)
 
 
 def test_foreign_weights_are_named():
@@ -431,8 +427,8 @@ def test_foreign_weights_are_named():
     del broken["sensor_token"]
     with pytest.raises(UserError, match="sensor_token"):
         detect_model(broken)
-    with pytest.raises(UserError, match="cannot be told"):
-        detect_model(weights_of(STAGE1) | {"touch_model.embeddings.patch_embedding.weight": np.float32(0)})
+    with pytest.raises(UserError, match="cannot be detected"):
+        detect_model(weights_of(STAGE1) | {"video_patch_embedding.weight": np.float32(0)})
 
 
 @pytest.mark.parametrize("model", [STAGE1, STAGE2], ids=["stage1", "stage2"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anytouch_jax.weights.resize import resize_position
+from anytouch_jax.weights.compatible import resize_position
 
 # torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
 UP = [

@@ -25,7 +25,7 @@ import numpy as np
 
 from anytouch_jax.evaluate import plots, statistics
 from anytouch_jax.train.step import merge
-from anytouch_jax.weights import release
+from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import machine, speed, speed_report, variants
 from experiments.benchmarks.pytorch.keys import renamed
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
@@ -88,7 +88,7 @@ def batch_file(work: Workload, path: Path) -> None:
     part = batch if not hasattr(batch, "align") else batch.align or batch.match
     present = {k: v for k, v in part._asdict().items() if v is not None}
     arrays = {k: v.astype(np.int64) if v.dtype == np.int32 else v for k, v in present.items()}
-    release.write_safetensors(path, {**arrays, "noise": noise}, {})
+    safetensors.write_safetensors(path, {**arrays, "noise": noise}, {})
 
 
 def reference(work: Workload, params: Any) -> dict[str, Any]:
@@ -105,13 +105,13 @@ def reference(work: Workload, params: Any) -> dict[str, Any]:
     return {
         "output": values["output"],
         "loss": float(values["loss"]),
-        "gradient": release.to_release(gradient, work.config.model),
+        "gradient": convert.to_release(gradient, work.config.model),
     }
 
 
 def rival_errors(loss: float, file: Path, exact: dict[str, Any]) -> dict[str, float]:
     """Relative errors of a rival, as `speed.errors` has them for ours."""
-    found = release.read_weights(file)
+    found = load.read_weights(file)
     errors = {"output": speed.relative([found.pop("output")], [exact["output"]])}
     if "loss" not in exact:
         return errors
@@ -147,7 +147,9 @@ def compare(
     with TemporaryDirectory() as name:
         folder, worker = Path(name), Worker(python)
         try:
-            release.write_safetensors(folder / "weights.safetensors", release.to_release(params, work.config.model), {})
+            safetensors.write_safetensors(
+                folder / "weights.safetensors", convert.to_release(params, work.config.model), {}
+            )
             batch_file(work, folder / "batch.safetensors")
             files = {"weights": str(folder / "weights.safetensors"), "batch": str(folder / "batch.safetensors")}
             about = worker.ask(do="setup", work=spec(work), **files)

@@ -21,7 +21,7 @@ Loaded = tuple[dict[str, Any], ModelConfig, dict[str, str]]  # parameters, their
 def run(options: Convert) -> int:
     """Write a run or a weights file as safetensors, by the authors' key names or by ours."""
     from anytouch_jax.config import to_json
-    from anytouch_jax.weights import checkpoint, release
+    from anytouch_jax.weights import convert, safetensors
 
     source, other = options.source, options.between
     if options.target.suffix != ".safetensors":
@@ -40,63 +40,49 @@ def run(options: Convert) -> int:
         raise UserError(f"{source} lacks a touch encoder or a decoder, which the authors' files hold: add --names own")
     if options.names == "release" and model.sensors[-1] != UNIVERSAL:
         params, model = _universal_last(params, model)
-    about |= {release.MODEL_KEY: to_json(model)}
+    about |= {safetensors.MODEL_KEY: to_json(model)}
     if options.names == "own":
-        checkpoint.export_safetensors(options.target, params, about)
+        safetensors.export_safetensors(options.target, params, about)
     else:
         if "matcher" in params and model.match_head == "mlp":
             log("the matching MLP of recipe paper is stored as cross_sensor_mlp.*: the authors' code does not read it")
         if "force" in params:
             log("the force heads are left out: the authors' files have none (--names own keeps them)")
             params = {name: tree for name, tree in params.items() if name != "force"}
-        arrays = release.to_release(params, model, allow_extra=True)
-        release.write_safetensors(options.target, arrays, about | {"format": "pt"})
+        arrays = convert.to_release(params, model, allow_extra=True)
+        safetensors.write_safetensors(options.target, arrays, about | {"format": "pt"})
     print(f"{options.target}: written")
     return 0
 
 
 def _loaded(source: Path) -> Loaded:
     """The parameters of a run or a file as they are used, the model, and what a file says of them."""
-    from anytouch_jax.config import from_json
-    from anytouch_jax.weights import checkpoint, release
+    from anytouch_jax.weights import load
 
-    about = {"source": str(source)}
-    if source.is_dir():
-        params, text, told = checkpoint.load_params(source)
-        config = from_json(text)
-        about |= {release.BACKGROUND_KEY: config.data.background}
-        if "touch" in params and "seen" in told:
-            about |= {release.SEEN_KEY: ",".join(told["seen"])}
-        return release.served(params, config, told), config.model, about
-    kept = release.read_metadata(source)
-    about |= {key: kept[key] for key in (release.BACKGROUND_KEY,) if key in kept}
-    weights = release.read_weights(source)
-    model = release.model_of(source, weights)
-    params = release.to_params(weights, model)
-    seen = release.seen_by_file(kept, model) if "touch" in params else None
-    return params, model, about | ({} if seen is None else {release.SEEN_KEY: ",".join(seen)})
+    loaded = load.load_model(source, stored_rows=True)
+    return loaded.params, loaded.config.model, loaded.export_metadata()
 
 
 def _between(first: Loaded, second: Loaded, options: Convert) -> dict[str, Any]:
     """Parameters on the way from `first` to `second`. Raises UserError where they are not of one network."""
-    from anytouch_jax.weights import release, tree
+    from anytouch_jax.weights import safetensors, tree
 
     names = ("touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "activation", "sensors")
     other = [name for name in names if getattr(first[1], name) != getattr(second[1], name)]
-    if first[2].get(release.BACKGROUND_KEY, "keep") != second[2].get(release.BACKGROUND_KEY, "keep"):
+    if first[2].get(safetensors.BACKGROUND_KEY, "keep") != second[2].get(safetensors.BACKGROUND_KEY, "keep"):
         other.append("background")
     if other:
         raise UserError(
             f"{options.between} and {options.source} are of different networks ({', '.join(other)}): --between takes "
             "what SOURCE was trained from, as its stage 1"
         )
-    return tree.between(first[0], second[0], options.share)
+    return tree.interpolate(first[0], second[0], options.share)
 
 
 def _universal_last(params: dict[str, Any], model: ModelConfig) -> tuple[dict[str, Any], ModelConfig]:
     """The same model with its universal tokens in the last row, where the authors' code looks for them (id -1)."""
-    from anytouch_jax.weights import release
+    from anytouch_jax.weights import compatible
 
     names = (*(name for name in model.sensors if name != UNIVERSAL), UNIVERSAL)
-    rows = release.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
+    rows = compatible.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
     return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(model, sensors=names)

@@ -46,7 +46,7 @@ def _lines(path: Path) -> list[str]:
 def _folder(path: Path) -> list[str]:
     """A run, else the manifest that is meant: by its name, or the only one."""
     from anytouch_jax.data.manifest.schema import is_manifest
-    from anytouch_jax.weights.record import steps
+    from anytouch_jax.weights.checkpoint import steps
 
     found = [one for one in sorted(path.iterdir()) if one.suffix.lower() in _TABLES and is_manifest(one)]
     named = [one for one in found if one.stem == "manifest"] or found
@@ -59,7 +59,7 @@ def _folder(path: Path) -> list[str]:
 def _run(path: Path) -> list[str]:
     from anytouch_jax.config import from_json
     from anytouch_jax.weights import checkpoint
-    from anytouch_jax.weights.record import CheckpointError, checked, resolve
+    from anytouch_jax.weights.checkpoint import CheckpointError, checked, resolve
 
     about = checkpoint.read_metadata(path)
     try:
@@ -113,14 +113,14 @@ def _sensors(model: ModelConfig, seen: Sequence[str] | None) -> str:
 
 
 def _weights(path: Path) -> list[str]:
-    from anytouch_jax.weights import release
-    from anytouch_jax.weights.detect import detect_layout
+    from anytouch_jax.weights import load, safetensors
+    from anytouch_jax.weights.convert import detect_layout
 
-    weights, told = release.read_weights(path), release.read_metadata(path)
+    weights, told = load.read_weights(path), safetensors.read_file_metadata(path)
     names = {"own": "our own", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
     layout = detect_layout(weights)
-    model = release.model_of(path, weights)
-    seen = release.seen_by_file(told, model)
+    model = load.model_of_file(path, weights)
+    seen = load.trained_sensors(told, model)
     count = sum(array.size for array in weights.values())
     finite = all(np.isfinite(array).all() for array in weights.values() if array.dtype.kind == "f")
     return [
@@ -158,7 +158,7 @@ def _manifest(path: Path) -> list[str]:
 
 def _features(path: Path) -> list[str]:
     """What `anytouch embed` wrote; [] for another .npz."""
-    from anytouch_jax.weights.tensors import read_npz
+    from anytouch_jax.weights.safetensors import read_npz
 
     arrays = read_npz(path)
     if not {"features", "rows"} <= arrays.keys():

@@ -26,7 +26,7 @@ from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses
 from anytouch_jax.train.metrics import Record
-from anytouch_jax.weights import checkpoint, release
+from anytouch_jax.weights import checkpoint, compatible
 
 Params = dict[str, Any]
 Log = Callable[[str], None]
@@ -185,7 +185,7 @@ def _with_row(
             f"{run} does not tell on which sensors it was trained: the tokens of {sensor} start from the universal ones"
         )
     drawn = config.objective.universal_start + config.objective.universal_end > 0
-    served = release.serve_unseen(params["touch"], model, about.get("seen", ()), universal_drawn=drawn)
+    served = compatible.serve_unseen(params["touch"], model, about.get("seen", ()), universal_drawn=drawn)
     start = np.asarray(served["sensor_tokens"])[model.universal_row]
     tokens = np.asarray(params["touch"]["sensor_tokens"])
     if sensor not in model.sensors:

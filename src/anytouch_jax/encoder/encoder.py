@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from anytouch_jax.config import UNIVERSAL, Config, DataConfig, ModelConfig, check_spelling, from_json
+from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -26,7 +26,7 @@ from anytouch_jax.files import atomic_path
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
-from anytouch_jax.weights import checkpoint, release
+from anytouch_jax.weights import load
 
 Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
@@ -42,7 +42,7 @@ class Encoder:
     """A touch encoder with its parameters. `source` says where they came from.
 
     `seen`: the sensors that it was trained on, None where nothing tells. `universal_drawn`: whether training drew the
-    universal tokens; else the mean over the sensors seen stands in their place (`release.serve_unseen`).
+    universal tokens; else the mean over the sensors seen stands in their place (`compatible.serve_unseen`).
     """
 
     config: Config
@@ -188,31 +188,16 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     training did with such. Raises UserError when there is no touch encoder, or weights that are not finite.
     """
     path = Path(path)
-    if not path.exists():
-        raise UserError(f"no run folder or weights file at {path}")
-    if path.is_dir():
-        params, config_json, about = checkpoint.load_params(path, step)
-        config = from_json(config_json)
-        seen, params = about.get("seen"), release.served(params, config, about)
-        drawn = config.objective.universal_start + config.objective.universal_end > 0
-    else:
+    if path.is_file():
         _refuse_features(path)
-        weights = release.read_weights(path)
-        model = release.model_of(path, weights)
-        told = release.read_metadata(
-            path
-        )  # of a run without universal tokens `anytouch convert` wrote their mean there
-        seen, drawn = release.seen_by_file(told, model), True
-        shown: Any = told.get(release.BACKGROUND_KEY, "keep")
-        params, config = release.to_params(weights, model), Config(model, data=DataConfig(background=shown))
-        if seen is not None and "touch" in params:
-            params |= {"touch": release.serve_unseen(params["touch"], model, seen, universal_drawn=True)}
-    if "touch" not in params:
-        raise UserError(f"{path} holds no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
-    if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(params["touch"])):
-        raise UserError(f"{path} holds weights that are not finite: its training diverged; take an earlier checkpoint")
-    known = None if seen is None else tuple(seen)
-    return Encoder(_touch_only(config), {"touch": params["touch"]}, str(path), known, drawn)
+    loaded = load.load_model(path, step=step)
+    if "touch" not in loaded.params:
+        raise UserError(f"{path} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
+    touch = loaded.params["touch"]
+    if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(touch)):
+        raise UserError(f"{path} has weights that are not finite: its training diverged; take an earlier checkpoint")
+    config = _touch_only(loaded.config)
+    return Encoder(config, {"touch": touch}, str(path), loaded.trained_sensors, loaded.universal_drawn)
 
 
 def _refuse_features(path: Path) -> None:

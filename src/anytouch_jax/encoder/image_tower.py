@@ -8,13 +8,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from anytouch_jax.config import Config, from_json
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.lora import merge_lora
-from anytouch_jax.weights import checkpoint, release
+from anytouch_jax.weights import load
 
 
 def image_tower_encoder(path: str | Path) -> Encoder:
@@ -23,16 +22,8 @@ def image_tower_encoder(path: str | Path) -> Encoder:
     A still gives exactly the tower's embedding of that image; a clip that of its mean frame. There are no sensor
     tokens. Call it CLIP only where the weights are CLIP's. Raises UserError when there is no image tower.
     """
-    path = Path(path)
-    if not path.exists():
-        raise UserError(f"no run folder or weights file at {path}")
-    if path.is_dir():
-        params, text, _ = checkpoint.load_params(path)
-        config: Config = from_json(text)
-    else:
-        weights = release.read_weights(path)
-        model = release.model_of(path, weights)
-        params, config = release.to_params(weights, model), Config(model)
+    loaded = load.load_model(path)
+    params, config = loaded.params, loaded.config
     stack = config.model.image
     if stack is None or "image" not in params:
         raise UserError(f"{path} holds no image tower; give a stage-2 run with one, or CLIP weights")
@@ -42,5 +33,5 @@ def image_tower_encoder(path: str | Path) -> Encoder:
         match_head="none", lora_rank=0, force_head=False,
     )  # fmt: skip
     fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
-    touch = release.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
+    touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
     return Encoder(replace(config, model=bare), touch, f"{path} (image tower)")

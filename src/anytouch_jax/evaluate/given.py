@@ -12,7 +12,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import text_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.battery_features import Store
-from anytouch_jax.weights.tensors import read_npz
+from anytouch_jax.weights.safetensors import read_npz
 
 Array = npt.NDArray[Any]
 

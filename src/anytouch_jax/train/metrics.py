@@ -15,7 +15,7 @@ from typing import Any, TextIO
 from anytouch_jax.config import Config, from_json, to_json
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_write, lock
-from anytouch_jax.weights.record import read_record, steps
+from anytouch_jax.weights.checkpoint import read_record, steps
 
 # Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
 HARMLESS = {

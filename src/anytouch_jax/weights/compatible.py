@@ -1,4 +1,4 @@
-"""Compatibility of weights with a model: checks that name the missing options, resized positions, sensor rows by name."""
+"""Compatibility of weights with a model: checks of its form, resized positions, sensor rows by name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def check_activation(path: Path, trained: str | None, config: Config) -> None:
     """Raise UserError if weights were trained with another activation than the run's; None means unknown."""
     ours = config.model.activation
     if trained not in (None, ours):
-        raise UserError(f"{path} was trained with {trained}, this run would use {ours}: add --model.activation {trained}")
+        raise UserError(
+            f"{path} was trained with {trained}, this run would use {ours}: add --model.activation {trained}"
+        )
 
 
 def check_preset(path: Path, before: Config, config: Config) -> None:
@@ -38,9 +40,7 @@ def check_preset(path: Path, before: Config, config: Config) -> None:
         )
 
 
-def check_form(
-    path: Path, before: ModelConfig, config: Config, names: Sequence[str] = (*SHAPED, *SHAPELESS)
-) -> None:
+def check_form(path: Path, before: ModelConfig, config: Config, names: Sequence[str] = (*SHAPED, *SHAPELESS)) -> None:
     """Raise UserError with all the missing options if weights belong to another network than the run's."""
     pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in names}
     differing = {name: (theirs, ours) for name, (theirs, ours) in pairs.items() if theirs != ours}
@@ -73,8 +73,8 @@ def match_sensors(table: np.ndarray, stored: Sequence[str], wanted: Sequence[str
 
 
 def map_sensors(touch: Params, model: ModelConfig, change: Callable[[np.ndarray], np.ndarray]) -> Params:
-    """Return a touch encoder whose tables with one row a sensor are changed: tokens, and patch kernels of each sensor."""
-    changed = {"sensor_tokens": change(np.asarray(touch["sensor_tokens"]))}
+    """Return a touch encoder with its tables of sensors changed: the tokens, and the patch kernels if each has one."""
+    changed: Params = {"sensor_tokens": change(np.asarray(touch["sensor_tokens"]))}
     if model.patch_encoder == "sensor":
         changed["patch"] = {"kernel": change(np.asarray(touch["patch"]["kernel"]))}
     return touch | changed

@@ -92,7 +92,7 @@ def to_params(weights: Weights, model: ModelConfig, *, ignore: Collection[str] =
     _account(layout, weights, arrays, _file_shapes(entries, shapes), left_out)
     flat: dict[str, Any] = {}
     for entry in entries:
-        array = entry.layout.read(_third(arrays[entry.key], entry.part))
+        array = entry.conversion.read(_third(arrays[entry.key], entry.part))
         if entry.layer is None:
             flat[entry.name] = array
         else:
@@ -123,7 +123,7 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
         )
     shapes, entries = param_shapes(model), keymap.entries(model)
     check_shapes("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
-    arrays = {e.key: e.layout.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
+    arrays = {e.key: e.conversion.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
     for key, source in keymap.unused.items():
         theirs = arrays[source]
         arrays[key] = theirs.mean(axis=1, dtype=np.float64) if theirs.ndim == 5 else theirs
@@ -206,7 +206,7 @@ def _file_shapes(entries: Sequence[Entry], shapes: Mapping[str, Shape]) -> dict[
     theirs: dict[str, Shape] = {}
     for entry in entries:
         shape = shapes[entry.name][entry.layer is not None :]
-        written = entry.layout.write(np.broadcast_to(np.float32(0), shape)).shape
+        written = entry.conversion.write(np.broadcast_to(np.float32(0), shape)).shape
         theirs[entry.key] = written if entry.part is None else (3 * written[0], *written[1:])
     return theirs
 

@@ -34,7 +34,9 @@ Params = dict[str, Any]
 
 _RELEASE_SENSORS = SENSORS[:5]  # the authors' weights were trained on these, and on the universal tokens
 _PATTERNS = ("*.safetensors", "*.bin", "*.pth", "*.pt")
-_NO_CLIP = "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in its folder"
+_NO_CLIP = (
+    "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in its folder"
+)
 
 
 @dataclass(frozen=True)
@@ -71,10 +73,11 @@ class Start(NamedTuple):
     trained_sensors: tuple[str, ...]
 
 
-def load_model(path: str | Path, *, step: int | None = None) -> Loaded:
+def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool = False) -> Loaded:
     """Load a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
 
-    `step` chooses a checkpoint of a run, the latest by default. Raises UserError.
+    `step` chooses a checkpoint of a run, the latest by default. With `stored_rows` the rows of a file for sensors
+    outside its training are unchanged, as a conversion needs them. Raises UserError.
     """
     path = Path(path)
     if not path.exists():
@@ -92,14 +95,14 @@ def load_model(path: str | Path, *, step: int | None = None) -> Loaded:
         background: Any = file_metadata.get(BACKGROUND_KEY, "keep")
         params, config = to_params(weights, model), Config(model, data=DataConfig(background=background))
         # A run without universal tokens was exported with the mean of its sensors in their place.
-        trained, drawn, from_run = _trained_sensors(file_metadata, model), True, False
+        trained, drawn, from_run = trained_sensors(file_metadata, model), True, False
         metadata = dict(file_metadata)
-    if trained is not None and "touch" in params:
+    if trained is not None and "touch" in params and (from_run or not stored_rows):
         params |= {"touch": serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
     return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)
 
 
-def _trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[str, ...] | None:
+def trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[str, ...] | None:
     """Return the sensors that a file was trained on: as its metadata says, or the authors' for a file of theirs."""
     if SEEN_KEY in metadata:
         return tuple(metadata[SEEN_KEY].split(","))
@@ -114,9 +117,8 @@ def load_init(
     `init`, a run or a weights file, gives the touch encoder and the decoder. `clip`, CLIP weights, gives the towers
     and, without `init`, the touch encoder. Raises UserError if either does not fit the run.
     """
-    if config.towers == "pretrained" and clip is None:
-        raise UserError(_NO_CLIP)
-    notes, trained = [], ()
+    notes: list[str] = []
+    trained: tuple[str, ...] = ()
     stage1, towers = None, None
     if init is not None:
         loaded = load_model(init)

@@ -23,8 +23,8 @@ import numpy as np
 
 from anytouch_jax.weights.safetensors import WeightsError, existing_file
 
-# Storages of torch, as the numpy type of their bytes; bfloat16 is widened by `Tensor.read`.
-STORAGES = {
+# Storages of torch, as the numpy type of their bytes; bfloat16 is widened by `_Tensor.read`.
+_STORAGES = {
     "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "BFloat16Storage": "u2", "LongStorage": "i8",
     "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
 }  # fmt: skip
@@ -57,14 +57,14 @@ def read_torch(path: str | Path) -> dict[str, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Name:
+class _Name:
     """A class or function that a pickle mentions."""
 
     name: str
 
 
 @dataclass
-class Record:
+class _Object:
     """An object whose class is not rebuilt (argparse.Namespace, torch.device): its name and its fields."""
 
     name: str
@@ -72,8 +72,8 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Storage:
-    """A block of numbers elsewhere in the file: its key there, its kind in `STORAGES`, its length."""
+class _Storage:
+    """A block of numbers elsewhere in the file: its key there, its kind in `_STORAGES`, its length."""
 
     key: str
     kind: str
@@ -82,11 +82,11 @@ class Storage:
     @property
     def dtype(self) -> np.dtype:
         """The type of one element in the file."""
-        return np.dtype(STORAGES[self.kind])
+        return np.dtype(_STORAGES[self.kind])
 
 
 @dataclass(frozen=True)
-class Tensor:
+class _Tensor:
     """A view of a storage: `offset` and `stride` in elements. Nothing is read until `read`."""
 
     storage: Storage
@@ -99,7 +99,7 @@ class Tensor:
         """The bytes of the values."""
         return math.prod(self.shape) * self.storage.dtype.itemsize
 
-    def read(self, load: Callable[[Storage], bytes], byteorder: Literal["<", ">"] = "<") -> np.ndarray:
+    def read(self, load: Callable[[_Storage], bytes], byteorder: Literal["<", ">"] = "<") -> np.ndarray:
         """Return the values, given the bytes of the storage. Raises ValueError if the view leaves its storage."""
         data = load(self.storage)
         if len(data) != self.storage.length * self.storage.dtype.itemsize:
@@ -136,7 +136,7 @@ class _Zip:
         self.byteorder: Literal["<", ">"] = ">" if order.strip() == b"big" else "<"
         self.content = _read_pickle(io.BytesIO(self._read("data.pkl")))
 
-    def load(self, storage: Storage) -> bytes:
+    def load(self, storage: _Storage) -> bytes:
         return self._read(f"data/{storage.key}")
 
     def _read(self, name: str) -> bytes:
@@ -166,11 +166,11 @@ class _Legacy:
                 raise ValueError(f"storage {key!r} is of unknown type or length")
             self.data[key] = file.read(length * widths[key])
 
-    def load(self, storage: Storage) -> bytes:
+    def load(self, storage: _Storage) -> bytes:
         return self.data[storage.key]
 
 
-def _storages(content: Any) -> list[Storage]:
+def _storages(content: Any) -> list[_Storage]:
     """Return every storage that an unpickled object refers to."""
     storages, todo, visited = [], [content], set()
     while todo:
@@ -179,18 +179,18 @@ def _storages(content: Any) -> list[Storage]:
             continue
         visited.add(id(item))
         match item:
-            case Tensor(storage=storage):
+            case _Tensor(storage=storage):
                 storages.append(storage)
             case dict():
                 todo += item.values()
             case list() | tuple():
                 todo += item
-            case Record(fields=fields):
+            case _Object(fields=fields):
                 todo += fields.values()
     return storages
 
 
-def _state(content: Any) -> dict[str, Tensor]:
+def _state(content: Any) -> dict[str, _Tensor]:
     """Return the tensors by name, out of the usual wrappings of a state_dict."""
     for wrapper in _WRAPPERS:
         if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
@@ -198,7 +198,9 @@ def _state(content: Any) -> dict[str, Tensor]:
             break
     if not isinstance(content, dict) or not content:
         raise WeightsError(f"it has no state_dict, but {type(content).__name__}")
-    others = [str(name) for name, value in content.items() if not (isinstance(name, str) and isinstance(value, Tensor))]
+    others = [
+        str(name) for name, value in content.items() if not (isinstance(name, str) and isinstance(value, _Tensor))
+    ]
     if others:
         verb = "is" if len(others) == 1 else "are"
         raise WeightsError(f"it has no state_dict: {', '.join(others[:5])} {verb} no tensor")
@@ -216,15 +218,15 @@ def _size(value: Any) -> int:
     return value
 
 
-def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> Tensor:
-    if not isinstance(storage, Storage) or not isinstance(shape, tuple) or not isinstance(stride, tuple):
+def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> _Tensor:
+    if not isinstance(storage, _Storage) or not isinstance(shape, tuple) or not isinstance(stride, tuple):
         raise ValueError("a tensor without storage, shape or stride")
     shape, stride = tuple(map(_size, shape)), tuple(map(_size, stride))
     if len(shape) != len(stride) or len(shape) > 32:
         raise ValueError(f"a tensor with shape {shape} and stride {stride}")
     if math.prod(shape) > max(storage.length, _REPEATS):
         raise ValueError(f"a tensor of shape {shape} over a storage of {storage.length} elements")
-    return Tensor(storage, _size(offset), shape, stride)
+    return _Tensor(storage, _size(offset), shape, stride)
 
 
 def _key(key: Any) -> Any:
@@ -238,25 +240,29 @@ _BUILDERS: dict[str, Callable[..., Any]] = {
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_parameter": lambda data, *_: data,
     "torch.Size": lambda values=(): tuple(values),
-    "torch.device": lambda *args: Record("torch.device", {"args": args}),
+    "torch.device": lambda *args: _Object("torch.device", {"args": args}),
     "collections.OrderedDict": lambda pairs=(): {_key(key): value for key, value in pairs},
-    "argparse.Namespace": lambda: Record("argparse.Namespace"),
+    "argparse.Namespace": lambda: _Object("argparse.Namespace"),
 }
-_INERT = {f"torch.{kind}" for kind in STORAGES}
+_INERT = {f"torch.{kind}" for kind in _STORAGES}
 _INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")}
 # Operations that only make data. BYTEARRAY8 is left out: it allocates whatever size it is given.
 _DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4
     FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING BINBYTES
     SHORT_BINBYTES BINBYTES8 EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET TUPLE TUPLE1 TUPLE2 TUPLE3 LIST APPEND APPENDS
-    PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL BINPERSID""".split()
-# These are replaced below. A dictionary's own hash of a tuple nested 150,000 times would end the process.
-_GUARDED = "DICT SETITEM SETITEMS ADDITEMS FROZENSET REDUCE NEWOBJ BUILD GET BINGET LONG_BINGET INST".split()
+    PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL BINPERSID"""
+# Operations replaced in `_Unpickler`. Hashing a tuple that is nested 150,000 times would end the process.
+_GUARDED = "DICT SETITEM SETITEMS ADDITEMS FROZENSET REDUCE NEWOBJ BUILD GET BINGET LONG_BINGET INST"
 
 
 class _Dispatch(dict[int, Any]):
     def __missing__(self, code: int) -> Any:
-        known = pickletools.code2op.get(chr(code))
+        known = vars(pickletools)["code2op"].get(chr(code))  # absent from typeshed
         raise _refused(known.name if known else f"operation {code}")
+
+
+def _code(name: str) -> int:
+    return int(getattr(pickle, name)[0])
 
 
 def _refused(name: str) -> WeightsError:
@@ -272,19 +278,25 @@ class _Unpickler(pickle._Unpickler):
     The reader in C is not used: a deep tuple as a key ends the process in it, and one memo index takes 64 GiB.
     """
 
+    stack: list[Any]
+    memo: dict[int, Any]
+    read: Callable[[int], bytes]
+    readline: Callable[[], bytes]
+    pop_mark: Callable[[], list[Any]]
+
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module}.{name}"
         if full not in _BUILDERS and full not in _INERT:
             raise _refused(full)
-        return Name(full)
+        return _Name(full)
 
-    def persistent_load(self, pid: Any) -> Storage:
+    def persistent_load(self, pid: Any) -> _Storage:
         match pid:
-            case ("storage", Name(name), str(key), str(), int(length), *rest) if rest in ([], [None]):
+            case ("storage", _Name(name), str(key), str(), int(length), *rest) if rest in ([], [None]):
                 kind = name.removeprefix("torch.")
-                if kind not in STORAGES:
+                if kind not in _STORAGES:
                     raise ValueError(f"a storage of kind {name}")
-                return Storage(key, kind, _size(length))
+                return _Storage(key, kind, _size(length))
         raise ValueError(f"the pickle refers to {reprlib.repr(pid)}")
 
     def load_inst(self) -> None:
@@ -292,7 +304,7 @@ class _Unpickler(pickle._Unpickler):
 
     def load_reduce(self) -> None:
         args, function = self.stack.pop(), self.stack.pop()
-        if not isinstance(function, Name) or function.name not in _BUILDERS or not isinstance(args, tuple):
+        if not isinstance(function, _Name) or function.name not in _BUILDERS or not isinstance(args, tuple):
             raise ValueError(f"the pickle calls {reprlib.repr(function)}")
         self.stack.append(_BUILDERS[function.name](*args))
 
@@ -300,7 +312,7 @@ class _Unpickler(pickle._Unpickler):
 
     def load_build(self) -> None:
         state, target = self.stack.pop(), self.stack[-1]
-        if isinstance(target, Record) and isinstance(state, dict):
+        if isinstance(target, _Object) and isinstance(state, dict):
             target.fields.update(state)
         elif not isinstance(target, dict):  # the attributes of an OrderedDict (_metadata) are dropped
             raise ValueError(f"the pickle sets the state of {type(target).__name__}")
@@ -342,17 +354,15 @@ class _Unpickler(pickle._Unpickler):
     def load_long_binget(self) -> None:
         self.stack.append(self.memo[struct.unpack("<I", self.read(4))[0]])
 
-    dispatch = _Dispatch(
-        {getattr(pickle, name)[0]: pickle._Unpickler.dispatch[getattr(pickle, name)[0]] for name in _DATA}
-    )
+    dispatch = _Dispatch((_code(name), pickle._Unpickler.dispatch[_code(name)]) for name in _DATA.split())
 
 
-for _name in _GUARDED:
-    _Unpickler.dispatch[getattr(pickle, _name)[0]] = getattr(_Unpickler, f"load_{_name.lower()}")
+for _name in _GUARDED.split():
+    _Unpickler.dispatch[_code(_name)] = getattr(_Unpickler, f"load_{_name.lower()}")
 
 
 def _read_pickle(file: IO[bytes]) -> Any:
-    """Return the object pickled at the position of `file`: plain containers, numbers, text, Tensor, Record and Name.
+    """Return the object pickled at the position of `file`: plain containers, numbers, text, _Tensor, _Object and _Name.
 
     Raises WeightsError that names the class or function if the pickle wants any other, ValueError for a damaged one.
     """

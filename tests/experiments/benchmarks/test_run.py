@@ -8,7 +8,7 @@ import pytest
 from tiny_models import tiny_config
 
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import release
+from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import memory, speed, startup, workloads
 from experiments.benchmarks import run as bench
 
@@ -138,16 +138,16 @@ def rival():
 def test_the_rival_gets_the_same_numbers_under_the_authors_names(rival, tmp_path):
     work = workloads.Workload("stage2 align", tiny_config(2, "release"), 4, 4)
     rival.batch_file(work, tmp_path / "batch.safetensors")
-    found = release.read_weights(tmp_path / "batch.safetensors")
+    found = load.read_weights(tmp_path / "batch.safetensors")
     batch, noise = rival.given(work)
     np.testing.assert_array_equal(found["clip"], batch.align.clip)
     np.testing.assert_array_equal(found["noise"], noise)
     assert found["clip"].dtype == np.uint8 and found["text_row"].dtype == np.int64
     spec = json.loads(json.dumps(rival.spec(work)))
     assert spec["kind"] == "align" and spec["kept"] == 4 and spec["weights"] == [0.5, 1.0, 0.1]
-    named = release.release_names(work.config.model)
+    named = convert.release_names(work.config.model)
     assert set(named) == set(
-        release.to_release(build(work.config.model).init(rival.jax.random.key(0)), work.config.model)
+        convert.to_release(build(work.config.model).init(rival.jax.random.key(0)), work.config.model)
     ) - rival.UNUSED | ({k for k in named if k in rival.UNUSED})
     old = "touch_mae_model.touch_decoder_blocks.0.attention.output.dense.weight"
     assert rival.renamed(old) == "touch_mae_model.touch_decoder_blocks.0.attention.o_proj.weight"
@@ -167,7 +167,7 @@ def test_what_differs_is_not_timed(rival):
 def test_a_gradient_that_the_rival_lacks_is_noticed(rival, tmp_path):
     exact = {"output": np.ones(2), "loss": 2.0, "gradient": {"a": np.ones(2), "b": np.ones(2)}}
     file = tmp_path / "values.safetensors"
-    release.write_safetensors(file, {"output": np.ones(2, np.float32), "grad/a": np.full(2, 1.5, np.float32)}, {})
+    safetensors.write_safetensors(file, {"output": np.ones(2, np.float32), "grad/a": np.full(2, 1.5, np.float32)}, {})
     with pytest.raises(SystemExit, match="no gradient for"):
         rival.rival_errors(2.0, file, exact)
     exact["gradient"]["b"] = np.zeros(2)

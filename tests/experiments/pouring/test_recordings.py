@@ -16,7 +16,7 @@ from tiny_models import tiny_config
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights.sensors import serve_unseen
+from anytouch_jax.weights.compatible import serve_unseen
 from experiments.pouring import policy as pouring_policy
 from experiments.pouring import recordings, tuning
 from experiments.pouring import trials as pouring

@@ -18,7 +18,7 @@ from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.objectives import normalise_touch
-from anytouch_jax.weights.tensors import write_safetensors
+from anytouch_jax.weights.safetensors import write_safetensors
 from anytouch_jax.weights.tree import flatten
 from experiments.translation import training
 from experiments.translation.figures import picture_grid

@@ -24,7 +24,7 @@ PROJECTIONS = ("query", "key", "value", "out")
 
 
 @dataclass(frozen=True)
-class Layout:
+class Conversion:
     """How an array of the file becomes ours (`read`) and ours becomes theirs (`write`). Both are exact."""
 
     read: Callable[[np.ndarray], np.ndarray]
@@ -37,7 +37,7 @@ class Entry:
 
     key: str
     name: str
-    layout: Layout
+    conversion: Conversion
     layer: int | None = None
     part: int | None = None
 
@@ -87,12 +87,12 @@ def _write_clip_patch(kernel: np.ndarray) -> np.ndarray:
     return np.stack([_write_patch(frame) for frame in kernel], axis=1)
 
 
-SAME = Layout(lambda x: x, lambda x: x)
-LINEAR = Layout(lambda x: x.T, lambda x: x.T)
-ROW = Layout(lambda x: x[0], lambda x: x[None])
-TOKEN = Layout(lambda x: x[0, 0], lambda x: x[None, None])
-PATCH = Layout(_read_patch, _write_patch)
-CLIP_PATCH = Layout(_read_clip_patch, _write_clip_patch)
+SAME = Conversion(lambda x: x, lambda x: x)
+LINEAR = Conversion(lambda x: x.T, lambda x: x.T)
+ROW = Conversion(lambda x: x[0], lambda x: x[None])
+TOKEN = Conversion(lambda x: x[0, 0], lambda x: x[None, None])
+PATCH = Conversion(_read_patch, _write_patch)
+CLIP_PATCH = Conversion(_read_clip_patch, _write_clip_patch)
 
 
 def linear(theirs: str, ours: str) -> list[Entry]:
@@ -110,7 +110,7 @@ def stacked(theirs: str, ours: str, depth: int, block: Iterable[Entry]) -> Itera
     block = list(block)
     for layer in range(depth):
         for entry in block:
-            yield Entry(f"{theirs}.{layer}.{entry.key}", f"{ours}/{entry.name}", entry.layout, layer, entry.part)
+            yield Entry(f"{theirs}.{layer}.{entry.key}", f"{ours}/{entry.name}", entry.conversion, layer, entry.part)
 
 
 def detect_stack(weights: Weights, prefix: str, head_width: int, heads: int | None = None) -> Stack:

@@ -156,7 +156,7 @@ def test_checkpoints_that_do_not_fit_their_parameters_are_failed_cases(tmp_path,
     (folder / "stage1_tiny.pth").write_bytes(b"")
     for dropped, wrong in (("head", []), ("touch_decoder_blocks.1", None)):
         fewer = {name: array for name, array in stored.items() if dropped not in name}
-        monkeypatch.setattr(weights.release, "read_weights", lambda path, fewer=fewer: fewer)
+        monkeypatch.setattr(weights.load, "read_weights", lambda path, fewer=fewer: fewer)
         found = [row for row in cases.run(folder) if not row.good]
         assert {row.case for row in found} == ({"stage1_tiny.pth"} if wrong is None else set())
     whole = (folder / "stage1_params.npz").read_bytes()

@@ -89,7 +89,7 @@ class _Storage:
 class _Tensor:
     """A view of a storage: `offset` and `stride` in elements. Nothing is read until `read`."""
 
-    storage: Storage
+    storage: _Storage
     offset: int
     shape: tuple[int, ...]
     stride: tuple[int, ...]

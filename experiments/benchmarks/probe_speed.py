@@ -24,8 +24,8 @@ import time
 import numpy as np
 from sklearn.linear_model import LogisticRegression
 
-from anytouch_jax.evaluate import heads, logistic
-from anytouch_jax.evaluate.heads import Problem
+from anytouch_jax.evaluate import logistic
+from anytouch_jax.evaluate.array_probes import linear_probe
 from experiments.tables import asked
 
 ROWS, OTHERS = asked.number("ROWS", 100_000), 10_000
@@ -36,15 +36,15 @@ mixing = np.linalg.qr(rng.normal(size=(WIDTH, WIDTH)))[0] * np.geomspace(1, 100,
 labels = rng.integers(CLASSES, size=ROWS + 2 * OTHERS)
 hidden = rng.normal(size=(len(labels), WIDTH)) + 0.12 * rng.normal(size=(CLASSES, WIDTH))[labels]
 features = (hidden @ mixing).astype(np.float32)
-train, val, test = slice(ROWS), slice(ROWS, ROWS + OTHERS), slice(ROWS + OTHERS, None)
+train = slice(ROWS)
+split = np.repeat(["train", "val", "test"], [ROWS, OTHERS, OTHERS])
 
 # %%
 start, spent = time.perf_counter(), time.process_time()
-path = heads.fit("linear", Problem(features[train], labels[train], features[val], features[test], CLASSES))
-option = heads.choose(path.val, labels[val], CLASSES)
-accuracy = heads.score(path.final(option), labels[test], CLASSES)
+result = linear_probe(features, labels, np.arange(len(labels)), split, seeds=0)
+accuracy, penalty = result.accuracy, result.penalty
 wall, spent = time.perf_counter() - start, time.process_time() - spent
-penalty = path.options[option]
+assert penalty is not None
 print(f"{ROWS} features of {WIDTH}, {CLASSES} classes, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}:")
 print(
     f"{wall:.1f} s ({spent:.1f} s of processor) with the choice of the penalty ({penalty:g}), accuracy {accuracy:.3f}"

@@ -19,7 +19,7 @@ from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder, text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.battery_features import digest
+from anytouch_jax.evaluate.feature_cache import encoder_digest
 from anytouch_jax.files import atomic_write
 from experiments.tables import cuts, plan
 from experiments.tables.plan import Leaf
@@ -64,7 +64,7 @@ def adapted(work: Work, run: Path, data: Path, frames: int, labels: str | None =
     where `anytouch adapt` fails.
     """
     out = work.folder / "trained" / f"{run.name}-{'told' if labels else 'adapted'}{frames}"
-    note, of = out / "adapted.json", {"run": digest(load_encoder(run)), "data": cuts.content_hash(data)}
+    note, of = out / "adapted.json", {"run": encoder_digest(load_encoder(run)), "data": cuts.content_hash(data)}
     if not (note.exists() and json.loads(note.read_text(encoding="utf-8")) == of):
         shutil.rmtree(out, ignore_errors=True)  # begun and not finished
         table = manifests.read(data)

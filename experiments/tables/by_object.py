@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.evaluate import probe, statistics
+from anytouch_jax.evaluate import array_probes, statistics
 from anytouch_jax.evaluate.statistics import markdown
 
 Right = dict[str, list[np.ndarray]]  # by name: for every seed, how many each object has right
@@ -27,10 +27,10 @@ def probed(
     the test split, by label; `commonest` is the commonest answer of train there."""
     found = {}
     for label, values in labels.items():
-        told = {"commonest": probe.majority(values, groups, split)}
+        told = {"commonest": array_probes.majority_baseline(values, groups, split)}
         for name, x in features.items():
-            scaling: probe.Scaling = "common" if name == "pixels" else "column"
-            told[name] = probe.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
+            scaling: array_probes.Scaling = "common" if name == "pixels" else "column"
+            told[name] = array_probes.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
         outcomes = {name: one.outcome for name, one in told.items() if one.outcome is not None}
         found[label] = by_object(outcomes["commonest"].groups, {name: one.correct for name, one in outcomes.items()})
     return found

@@ -34,7 +34,7 @@ import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder
-from anytouch_jax.evaluate import plots, probe, tasks
+from anytouch_jax.evaluate import array_probes, plots, tasks
 from anytouch_jax.evaluate.statistics import markdown
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
@@ -61,12 +61,12 @@ if not TABLE:
 
 
 # %%
-def moments(name: str) -> tasks.Selection:
-    found = tasks.select(table, tasks.task_of(name), LONGEST)
+def moments(name: str) -> tasks.TaskRows:
+    found = tasks.select(table, tasks.find_task(name), LONGEST)
     kept = np.flatnonzero(np.isin(found.sensors, encoder.config.model.sensors))
     if len(kept) > ROWS:
         kept = np.sort(np.random.default_rng(0).choice(kept, ROWS, replace=False))
-    return tasks.Selection._make([*(one[kept] for one in found[:-1]), found.notes])
+    return found.take(kept)
 
 
 if not TABLE:
@@ -80,10 +80,10 @@ def scores(values: np.ndarray) -> dict[str, dict[str, Any]]:
     for name, one in chosen.items():
         given = (values[np.searchsorted(rows, one.rows[:, 0])], one.labels, one.groups, one.split)
         if name == "force":
-            fit = probe.regression_probe(*given)
+            fit = array_probes.regression_probe(*given)
             result[name] = {"mean": fit.r2, "low": fit.low, "high": fit.high, "test": fit.n_test, "chance": 0.0}
         else:
-            hit = probe.linear_probe(*given, seeds=0)
+            hit = array_probes.linear_probe(*given, seeds=0)
             result[name] = {"mean": hit.accuracy, "low": hit.low, "high": hit.high, "test": hit.n_test}
             result[name] |= {"chance": hit.baseline, "balanced": hit.balanced_accuracy}
     return result

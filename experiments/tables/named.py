@@ -47,7 +47,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import baseline
+from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
 from anytouch_jax.evaluate.statistics import markdown, seed_interval
 from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch
@@ -223,9 +223,9 @@ def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Wo
     named = (anytouch, Encoder(fresh.config, {"touch": params}, "trained with labels"), fresh)
     rows = contact_rows(table, cuts.SPLITS)
     found = [embed_rows(one, table, rows, pooling="both", log=silent)[1] for one in named]
-    pixels = baseline.background_difference(table, rows)
+    pixels = background_difference(table, rows)
     features = dict(zip(NAMES, found, strict=True))
-    features["pixels"] = baseline.reduce(pixels, text_column(table, "split")[rows] == "train")
+    features["pixels"] = principal_components(pixels, text_column(table, "split")[rows] == "train")
     return {
         "settings": SETTINGS,
         "anytouch": f"{last.key} (weights {anytouch.mark})",

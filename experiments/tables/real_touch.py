@@ -34,12 +34,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from anytouch_jax.cli.options import Probe
 from anytouch_jax.config import Config, from_json
 from anytouch_jax.data.loading.samples import SampleReader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder
-from anytouch_jax.evaluate import probe_command, statistics
+from anytouch_jax.evaluate import statistics
+from anytouch_jax.evaluate.array_probes import majority_baseline
+from anytouch_jax.evaluate.feature_cache import pixel_features
+from anytouch_jax.evaluate.probing import label_rows, pixel_components, probe_rows
 from anytouch_jax.evaluate.reconstruction import pixel_scores
 from anytouch_jax.files import atomic_write
 from anytouch_jax.nn.functional import build
@@ -93,8 +95,8 @@ class Labelled(NamedTuple):
 
 
 net = build(config.model)
-probe_options = Probe(data=(DATA,), label="object", where=("label.contact_score", 7.0), sensor="gelsight_mini")
-task = probe_command.read_task(probe_options, print)
+FIRM: dict[str, Any] = {"where": ("label.contact_score", 7.0), "sensor": "gelsight_mini"}
+task, subsets = label_rows(manifest, "object", **FIRM)
 names = sorted(set(task.labels[task.split == "train"]))
 
 
@@ -104,7 +106,7 @@ def labelled_batches(start: int, stop: int) -> Iterator[Any]:
     rows = np.flatnonzero(task.split == "train")
     for step in range(start, stop):
         chosen = np.random.default_rng([config.run.seed, step]).choice(rows, config.data.batch_size)
-        clips = np.stack([reader.touch(task.rows[[i]], step) for i in chosen])
+        clips = np.stack([reader.touch(task.rows[i], step) for i in chosen])
         sensor = np.full(len(chosen), config.model.sensor_row("gelsight_mini"), np.int32)
         yield step, Labelled(clips, sensor, np.array([names.index(task.labels[i]) for i in chosen], np.int32)), {}
 
@@ -139,13 +141,12 @@ encoders: dict[str, Encoder] = {
     "stage 2": load_encoder(STAGE2),
     "trained with labels": train_with_labels(),
 }
-features = {name: embed_rows(encoder, manifest, task.rows, 1, "both")[1] for name, encoder in encoders.items()}
-found = [
-    one for name, values in features.items() for one in probe_command.probe_features(probe_options, task, values, name)
-]
-raw = probe_command.raw_features(task)
-found += probe_command.probe_features(probe_options, task, raw, "raw pixels", "common")
-found.append(probe_command.probe.majority(task.labels, task.groups, task.split, subsets=task.subsets))
+features = {name: embed_rows(encoder, manifest, task.rows[:, 0], 1, "both")[1] for name, encoder in encoders.items()}
+found = [one for name, values in features.items() for one in probe_rows(values, task, name, subsets=subsets)]
+pixels_of_rows = pixel_features(manifest)
+raw = pixel_components(pixels_of_rows, task)
+found += probe_rows(raw, task, "raw pixels", scaling="common", subsets=subsets)
+found.append(majority_baseline(task.labels, task.groups, task.split, subsets=subsets))
 write("## Object, test recordings, contact frames\n")
 write(statistics.to_table(found))
 record["object"] = json.loads(statistics.to_json(found))
@@ -182,15 +183,15 @@ write()
 # Slip is mostly decided by the object (its majority flag alone scores 85 % on test), so only objects never seen count.
 
 # %%
-slip_options = replace(probe_options, label="slip", leave_out="object")
-slip = probe_command.read_task(slip_options, print)
+slip, slip_subsets = label_rows(manifest, "slip", leave_out="object", **FIRM)
+held_out: dict[str, Any] = {"leave_out": "object", "subsets": slip_subsets}
 slips = []
 for name, encoder in encoders.items():
     if name == "trained with labels":
         continue  # it has been told the objects
-    values = embed_rows(encoder, manifest, slip.rows, 1, "both")[1]
-    slips += probe_command.probe_features(slip_options, slip, values, name)
-slips += probe_command.probe_features(slip_options, slip, probe_command.raw_features(slip), "raw pixels", "common")
+    values = embed_rows(encoder, manifest, slip.rows[:, 0], 1, "both")[1]
+    slips += probe_rows(values, slip, name, **held_out)
+slips += probe_rows(pixel_components(pixels_of_rows, slip), slip, "raw pixels", scaling="common", **held_out)
 write("## Slip, objects left out, contact frames of all splits\n")
 write(statistics.to_table(slips))
 record["slip"] = json.loads(statistics.to_json(slips))

@@ -16,9 +16,10 @@ from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.encoder.image_tower import image_tower_encoder
-from anytouch_jax.evaluate import battery, geometry, retrieval
-from anytouch_jax.evaluate.baseline import background_difference
+from anytouch_jax.evaluate import geometry, retrieval
 from anytouch_jax.evaluate.contacts import contact_vector
+from anytouch_jax.evaluate.feature_cache import background_difference
+from anytouch_jax.evaluate.probing import run_tasks
 from anytouch_jax.evaluate.tasks import Task
 from experiments.tables import adaptation, cuts, plan, real
 from experiments.tables.plan import Leaf
@@ -61,12 +62,12 @@ def quiet(_: str) -> None:
 def _probes(
     leaf: Leaf, work: Work, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
-    """Rows of the battery on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
+    """Rows of `run_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
     table = manifests.read(work.folder / dataset / file)
     shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows, "cache": work.folder / "cache"}
     shared |= options
-    return [{"view": view} | one for one in battery.run(encoder, table, tasks, **shared)]
+    return [{"view": view} | one for one in run_tasks(encoder, table, tasks, **shared)]
 
 
 def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
@@ -215,7 +216,7 @@ def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
     encoder, found = encoder_of(leaf, work), []
     options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocols": BOTH}
     for view in ("during", "after"):
-        task = Task("grasp", "label.held", which="all", where=("label.moment", view))
+        task = Task("grasp", "label.held", which="all", where=(("label.moment", view),))
         found += _probes(leaf, work, f"own/{cuts.GRASP}", (task,), view, encoder, **options)
     return {"rows": found, "data": ["own", "own/grasp"]}
 

@@ -41,8 +41,9 @@ import numpy as np
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
-from anytouch_jax.evaluate import baseline, retrieval
+from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
+from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
 from anytouch_jax.evaluate.statistics import markdown
 from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import VERSION
@@ -169,7 +170,7 @@ def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, A
     table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
     rows = deepest_rows(table, table.rows_of("test"))
     found = features(encoders, seed, table, rows, "class")
-    found |= {"pixels": baseline.background_difference(table, rows), "vector": contact_vector(table, rows)}
+    found |= {"pixels": background_difference(table, rows), "vector": contact_vector(table, rows)}
     scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(True,), metrics={"vector": "euclidean"})
     pooled = {one.name: one.found for one in scored if one.query_sensor == retrieval.ALL and one.found}
     groups = pooled["stage 2"].groups
@@ -183,7 +184,7 @@ def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any
     rows = np.concatenate([deepest_rows(table, table.rows_of(split)) for split in ("train", "val", "test")])
     split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
     found = features(encoders, seed, table, rows, "both")
-    found["pixels"] = baseline.reduce(baseline.background_difference(table, rows), split == "train")
+    found["pixels"] = principal_components(background_difference(table, rows), split == "train")
     labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in (*NAMED, *UNNAMED)}
     return {"data": table.content_hash} | probed(found, labels, groups, split)
 

@@ -13,7 +13,7 @@ WORK = {
     "contact": "anytouch_jax.data.prepare.contact.contact_scores",
     "verify": "anytouch_jax.data.prepare.verify.verify",
     "export": "anytouch_jax.encoder.encoder.load_encoder",
-    "probe": "anytouch_jax.evaluate.probe_command.run_probes",
+    "probe": "anytouch_jax.evaluate.probing.probe_label",
     "retrieve": "anytouch_jax.data.manifest.manifest.read",
     "bench": "experiments.benchmarks.machine.describe",
     "annotate": "anytouch_jax.data.prepare.captions.annotate",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from touch_world import make_touches
 
-from anytouch_jax.evaluate import probe_command
+from anytouch_jax.evaluate import feature_cache
 
 BATTERY = "nothing without --tasks or --benchmark"
 LABEL = "nothing beside --tasks or --benchmark"
@@ -54,14 +54,14 @@ def touches(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--label", "object"], "no class of test is in train: whole ones are held out there"),
-        (["--label", "force"], "a measured quantity and no class"),
-        (["--label", "split"], "the label has one class only"),
-        (["--tasks", "material", "--order", "shuffled"], "--order does nothing for stills, which these tasks are of"),
+        (["--label", "object"], "class of test is in train"),
+        (["--label", "force"], "a measured quantity"),
+        (["--label", "split"], "on every row of train"),
+        (["--tasks", "material", "--order", "shuffled"], "--order has no effect on stills"),
     ],
 )
 def test_a_label_that_cannot_be_probed_is_told_before_the_work(anytouch, touches, monkeypatch, words, told):
-    monkeypatch.setattr(probe_command, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
+    monkeypatch.setattr(feature_cache.FeatureStore, "get", lambda *_, **__: pytest.fail("the work was begun"))
     said = anytouch("probe", "--data", touches, *words)
     assert said.status == 1 and told in said.err.splitlines()[-1] and "Traceback" not in said.err
 

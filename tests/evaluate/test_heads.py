@@ -1,196 +1,251 @@
-"""The heads: their optimum, their options, their steps; and logistic regression against scikit-learn's."""
+"""Heads on frozen features: their optimum, their options, their steps; saved heads."""
 
 from __future__ import annotations
 
-from functools import partial
-from types import SimpleNamespace
+from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import log_loss
+from task_world import blobs
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import heads, logistic
-from anytouch_jax.evaluate.heads import Problem, Recipe, choose, fit
+from anytouch_jax.evaluate import heads
+from anytouch_jax.evaluate.heads import GradientRecipe, LinearModel, ProbeHead, fit_head, linear_path
+from anytouch_jax.evaluate.splits import best_option
 
-RNG = np.random.default_rng(0)
-
-
-def blobs(n: int = 600, d: int = 24, classes: int = 4, apart: float = 1.0, seed: int = 0):
-    """Correlated features, as a network's are: spreads from 1 to 100, then standardised; class numbers."""
-    rng = np.random.default_rng(seed)
-    mixed = np.linalg.qr(rng.normal(size=(d, d)))[0] * np.geomspace(1, 100, d)
-    y = rng.integers(classes, size=n)
-    x = (rng.normal(size=(n, d)) + apart * rng.normal(size=(classes, d))[y]) @ mixed
-    return ((x - x.mean(0)) / x.std(0)).astype(np.float32), y
+FIT, TEST = slice(0, 500), slice(500, 700)
 
 
-@pytest.mark.parametrize("classes", [2, 3, 20])
-@pytest.mark.parametrize("penalty", [1.0, 0.01, 0.0001])
-def test_the_optimum_is_scikit_learns(classes, penalty):
-    x, y = blobs(classes=classes)
-    ours = list(logistic.path(x, y, classes, [1.0, penalty][penalty == 1.0 :]))[-1]
-    model = LogisticRegression(C=1 / (penalty * len(y)), tol=1e-8, max_iter=5000)
-    model.fit(x.astype(np.float64), y)
-    theirs = log_loss(y, model.predict_proba(x), labels=range(classes)) + penalty / 2 * np.sum(model.coef_**2)
-    assert ours.finished
-    assert abs(ours.loss - theirs) < 1e-4
-    said, weights = x @ ours.weights + ours.bias, ours.weights
-    exact = np.mean(np.logaddexp(0, -np.where(y == 1, 1, -1) * said[:, 0])) if classes == 2 else np.mean(
-        np.log(np.exp(said).sum(1)) - said[np.arange(len(y)), y])  # fmt: skip
-    assert exact + penalty / 2 * np.sum(weights**2) == pytest.approx(ours.loss, abs=1e-5)
-    assert np.mean(ours(x) == model.predict(x)) > 0.99
-
-
-def test_a_start_saves_steps_and_changes_nothing(monkeypatch):
-    x, y = blobs()
-    calls = []
-    plain = logistic._log_loss
-    monkeypatch.setattr(logistic, "_log_loss", lambda *a: calls.append(1) or plain(*a))
-    cold = next(logistic.path(x, y, 4, [0.001]))
-    took = len(calls)
-    warm = next(logistic.path(x, y, 4, [0.001], cold))
-    assert len(calls) - took < took / 3
-    assert warm.loss == pytest.approx(cold.loss, abs=1e-6)
-
-
-def test_more_features_than_rows_is_no_obstacle():
-    x, y = blobs(n=30, d=80, classes=3, apart=3.0)
-    found = next(logistic.path(x, y, 3, [0.01]))
-    assert np.isfinite(found.loss) and np.mean(found(x) == y) == 1.0
-    constant = np.concatenate([x, np.zeros((30, 4), np.float32)], 1)
-    assert next(logistic.path(constant, y, 3, [0.01])).loss == pytest.approx(found.loss, abs=1e-4)
-
-
-def problem(classes: int = 4, **changes) -> Problem:
+def data(classes: int = 4):
     x, y = blobs(900, classes=max(classes, 2))
-    target = y if classes else x @ np.arange(x.shape[1]) * 0.1 + 5
-    cut = (slice(0, 500), slice(500, 700), slice(700, 900))
-    return Problem(x[cut[0]], target[cut[0]], x[cut[1]], x[cut[2]], classes)._replace(**changes)
+    return x, y if classes else x @ np.arange(x.shape[1]) * 0.1 + 5
 
 
-def truth(classes: int = 4):
-    x, y = blobs(900, classes=max(classes, 2))
-    return (y if classes else x @ np.arange(x.shape[1]) * 0.1 + 5)[700:]
+def scores(head: ProbeHead, classes: int, start=None) -> list[float]:
+    x, y = data(classes)
+    fitted = fit_head(head, x[FIT], y[FIT], classes, start=start)
+    return [heads.score(predicted, y[TEST], classes) for predicted in fitted.predict(x[TEST])]
 
 
-@pytest.mark.parametrize("head", ["linear", "knn", "gradient"])
+@pytest.mark.parametrize("name", ["linear", "knn", "gradient"])
 @pytest.mark.parametrize("classes", [2, 4])
-def test_every_head_learns_classes(head, classes):
-    path = fit(head, problem(classes), Recipe(epochs=20, batch=64, rate=0.01))
-    assert len(path.options) == len(path.val) == len(path.test)
-    assert all(len(one) == 200 for one in (*path.val, *path.test))
-    best = choose(path.test, truth(classes), classes)
-    assert heads.score(path.final(best), truth(classes), classes) > 0.95
-    np.testing.assert_array_equal(path.final(best), path.test[best])
+def test_every_head_learns_classes(name, classes):
+    head = ProbeHead(name, recipe=GradientRecipe(epochs=20, batch=64, rate=0.01))
+    x, y = data(classes)
+    assert len(fit_head(head, x[FIT], y[FIT], classes).options) == len(scores(head, classes))
+    assert max(scores(head, classes)) > 0.95
 
 
-@pytest.mark.parametrize(("head", "least"), [("linear", 0.999), ("knn", 0.3), ("gradient", 0.9)])
-def test_every_head_learns_a_number(head, least):
-    path = fit(head, problem(0), Recipe(epochs=60, batch=64, rate=0.05))
-    best = path.final(choose(path.test, truth(0), 0))
-    assert 1 + heads.score(best, truth(0), 0) / np.var(truth(0)) > least
+@pytest.mark.parametrize(("name", "least"), [("linear", 0.999), ("knn", 0.3), ("gradient", 0.9)])
+def test_every_head_learns_a_number(name, least):
+    head = ProbeHead(name, recipe=GradientRecipe(epochs=60, batch=64, rate=0.05))
+    assert 1 + max(scores(head, 0)) / np.var(data(0)[1][TEST]) > least
 
 
-def test_scaling_of_the_features_does_not_matter_to_the_linear_head():
-    factor, plain = np.geomspace(0.01, 100, 24).astype(np.float32), problem()
-
-    def scaled(factor, shift, **changes):
-        parts = {name: getattr(plain, name) * factor + shift for name in ("x", "val", "test")}
-        return np.array(fit("linear", plain._replace(**parts, **changes)).test)
-
-    assert np.mean(scaled(1, 0) == scaled(factor, 3)) > 0.99
-    common = scaled(7, 0, scaling="common")
-    assert np.mean(common == scaled(1, 0, scaling="common")) > 0.99
-
-
-def test_many_rows_choose_on_some_and_report_a_fit_on_all(monkeypatch):
-    x, y = blobs(900, apart=0.3)
-    hard = problem()._replace(x=x[:500], y=y[:500], val=x[500:700], test=x[700:])
-    whole = fit("linear", hard)
-    monkeypatch.setattr("anytouch_jax.evaluate.choices.SELECT_ROWS", 100)
-    few, option = fit("linear", hard), 3
-    assert np.mean(few.test[option] == whole.test[option]) < 1.0  # chosen by a fit on 100 rows
-    assert np.mean(few.final(option) == whole.test[option]) > 0.99  # reported by one on all
-
-
-def test_one_class_is_what_is_said():
-    one = problem()._replace(y=np.full(500, 2))
-    for head in ("linear", "knn", "gradient"):
-        path = fit(head, one)
-        assert set(path.final(0)) == {2} and len(path.val[0]) == len(path.test[0]) == 200
-
-
-def test_the_middle_of_equals_is_chosen():
-    right, wrong = np.array([1, 1]), np.array([1, 0])
-    assert choose([wrong, right, right, right, wrong], right, 2) == 2
-    assert choose([np.array([2.0, 2.0]), np.array([1.0, 1.5])], np.array([1.0, 1.0]), 0) == 1
+@pytest.mark.parametrize("name", ["linear", "knn", "gradient"])
+def test_a_single_class_is_predicted_everywhere(name):
+    x, _ = data()
+    for predicted in fit_head(ProbeHead(name), x[FIT], np.full(500, 2), 4).predict(x[TEST])[-1:]:
+        assert np.mean(predicted == 2) > 0.99
 
 
 def test_an_unknown_head_is_refused():
-    with pytest.raises(UserError, match="no head 'forest'; choose among linear"):
-        fit("forest", problem())
+    with pytest.raises(UserError, match="forest"):
+        scores(ProbeHead("forest"), 4)
 
 
-def test_the_gradient_head_takes_adamw_steps():
-    """Against optax: decoupled decay on weights and bias, beta2 0.99."""
-    recipe = Recipe(rate=0.1, decay=0.2)
-    ours = [RNG.normal(size=(3, 2)).astype(np.float32), RNG.normal(size=2).astype(np.float32)]
-    theirs = [one.copy() for one in ours]
-    moments = [[np.zeros_like(one) for one in ours] for _ in range(2)]
-    tx = optax.adamw(0.1, b1=0.9, b2=0.99, eps=1e-8, weight_decay=0.2)
-    state = tx.init(theirs)
-    for step in range(1, 5):
-        slopes = [RNG.normal(size=one.shape).astype(np.float32) for one in ours]
-        heads._adamw(ours, slopes, moments, 0.1, step, recipe)
-        updates, state = tx.update(slopes, state, theirs)
-        theirs = optax.apply_updates(theirs, updates)
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+# ---- linear heads ------------------------------------------------------------------------------------------
+
+
+def weights_of(model: LinearModel) -> np.ndarray:
+    assert model.fit is not None
+    return model.fit.weights
+
+
+def test_logistic_regression_is_at_its_optimum():
+    x, y = blobs(classes=3)
+    x = x * 3 + 1
+    (model,) = linear_path(x, y, [0.1])
+    scaled = (x - x.mean(0)) / x.std(0)
+    logits = scaled @ weights_of(model) + model.fit.bias
+    share = np.exp(logits - logits.max(1, keepdims=True))
+    share /= share.sum(1, keepdims=True)
+    gradient = (share - np.eye(3)[y]).T @ scaled / len(y) + 0.1 * weights_of(model).T
+    assert np.abs(gradient).max() < 5e-3
+
+
+def test_a_penalty_means_the_same_for_any_number_of_rows():
+    x, y = blobs()
+    (once,), (thrice,) = linear_path(x, y, [0.1]), linear_path(np.tile(x, (3, 1)), np.tile(y, 3), [0.1])
+    np.testing.assert_allclose(weights_of(thrice), weights_of(once), atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["linear", "knn"])
+@pytest.mark.parametrize("classes", [2, 4])
+def test_a_row_that_counts_twice_is_a_row_given_twice(name, classes):
+    x, y = blobs(classes=classes)
+    times = np.random.default_rng(0).integers(0, 4, len(y))
+    kept, head = times > 0, ProbeHead(name)
+    counted = fit_head(head, x[kept], y[kept], classes, weights=times[kept].astype(np.float32)).predict(x)
+    repeated = fit_head(head, np.repeat(x, times, 0), np.repeat(y, times), classes).predict(x)
+    assert np.mean(np.array(counted) == np.array(repeated)) > 0.99
+
+
+def test_scaling_of_the_features_does_not_matter_to_the_linear_head():
+    factor, (x, y) = np.geomspace(0.01, 100, 24).astype(np.float32), data()
+
+    def predicted(scale, shift, **changes):
+        return np.array(fit_head(ProbeHead("linear", **changes), x[FIT] * scale + shift, y[FIT], 4).predict(
+            x[TEST] * scale + shift))  # fmt: skip
+
+    assert np.mean(predicted(1, 0) == predicted(factor, 3)) > 0.99
+    assert np.mean(predicted(7, 0, scaling="common") == predicted(1, 0, scaling="common")) > 0.99
+
+
+def test_a_start_changes_no_prediction():
+    x, y = data()
+    start = linear_path(x[FIT], y[FIT], [0.01])[0]
+    assert scores(ProbeHead(options=(0.001,)), 4, start) == pytest.approx(
+        scores(ProbeHead(options=(0.001,)), 4), abs=0.006
+    )
+
+
+def test_ridge_equals_its_normal_equations():
+    x, y = data(0)
+    y = y + np.random.default_rng(0).normal(size=len(y))
+    scaled = (x - x.mean(0)) / x.std(0)
+    weights = np.linalg.solve(scaled.T @ scaled / len(x) + 0.3 * np.eye(24), scaled.T @ (y - y.mean()) / len(x))
+    np.testing.assert_allclose(heads.fit_ridge(x, y, [0.3])(x)[0], scaled @ weights + y.mean(), atol=1e-4)
+
+
+# ---- nearest neighbours ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 5, 20])
+@pytest.mark.parametrize("columns", [3, 20, 700, 3001])
+def test_nearest_equals_sorting_everything(k, columns):
+    rng = np.random.default_rng(0)
+    train, scored = (rng.normal(size=(n, 16)).astype(np.float32) for n in (columns, 9))
+    ids, cosines = heads.nearest(train, scored, k)
+    expected = np.argsort(-(scored @ train.T), axis=1)[:, :k]
+    np.testing.assert_array_equal(ids, expected)
+    np.testing.assert_allclose(cosines, np.take_along_axis(scored @ train.T, expected, 1), rtol=1e-5)
+
+
+def test_votes():
+    labels = np.array([[0, 1, 1], [2, 0, 0], [1, 2, 0], [0, 1, 2]])
+    cosines = np.array([[0.99, 0.1, 0.1], [0.9, 0.8, 0.7], [0.2, 0.9, 0.5], [0.3, 0.2, 0.1]])
+    np.testing.assert_array_equal(heads.vote(labels, cosines, 3), [1, 0, 2, 0])
+
+
+# ---- the authors' gradient-trained head --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("classes", [0, 2, 4])
-def test_the_gradient_heads_slope_is_that_of_its_loss(classes):
-    said = RNG.normal(size=(6, classes if classes > 2 else 1)).astype(np.float32)
-    y = RNG.integers(classes, size=6) if classes else RNG.normal(size=6)
-    wanted = heads._wanted(y, classes, 0.0, 1.0)
-    losses = {
-        0: lambda z: jnp.mean((z - wanted) ** 2) / 2,
-        2: lambda z: optax.sigmoid_binary_cross_entropy(z, wanted).mean(),
-        4: lambda z: optax.softmax_cross_entropy(z, wanted).mean(),
-    }
-    np.testing.assert_allclose(heads._slope(said, wanted, classes), jax.grad(losses[classes])(said), atol=1e-6)
+def test_the_gradient_head_takes_adamw_steps_of_its_loss(classes):
+    """The first step of Adam is the sign of the gradient; decoupled decay shrinks weights and bias."""
+    rng = np.random.default_rng(1)
+    x, params = (
+        rng.normal(size=(6, 3)).astype(np.float32),
+        [
+            rng.normal(size=(3, max(1, classes * (classes > 2)))),
+        ],
+    )
+    params = (jnp.asarray(params[0], jnp.float32), jnp.asarray(rng.normal(size=params[0].shape[1]), jnp.float32))
+    y = rng.integers(classes, size=6) if classes else rng.normal(size=6).astype(np.float32)
+    target = y.astype(np.int32 if classes > 2 else np.float32)
+    logits = x @ params[0] + params[1][None]
+    predicted = np.asarray(logits)[:, 0] if classes == 0 else 1 / (1 + np.exp(-np.asarray(logits)[:, 0]))
+    if classes > 2:
+        predicted = np.asarray(jnp.exp(logits) / jnp.exp(logits).sum(1, keepdims=True)) - np.eye(classes)[y]
+        slope = predicted
+    else:
+        slope = (predicted - target)[:, None]
+    init, step = heads._gradient_step(GradientRecipe(decay=0.2), classes)
+    (weights, bias), _ = step(params, init(params), x, target, np.float32(0.1))
+    np.testing.assert_allclose(weights, params[0] * (1 - 0.02) - 0.1 * np.sign(x.T @ slope), atol=1e-5)
+    np.testing.assert_allclose(bias, params[1] * (1 - 0.02) - 0.1 * np.sign(slope.sum(0)), atol=1e-5)
 
 
-def test_the_gradient_head_is_drawn_from_its_seed_and_ends_at_rate_zero(monkeypatch):
-    recipe = Recipe(epochs=3, batch=100, rate=0.01)
-    first, again, other = (fit("gradient", problem(seed=seed), recipe) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.test, again.test)
-    assert (np.array(first.test) != np.array(other.test)).any()
-    rates = []
-    plain = heads._adamw
-    monkeypatch.setattr(heads, "_adamw", lambda *a: rates.append(a[3]) or plain(*a))
-    fit("gradient", problem(), recipe)
-    assert len(rates) == 15 and rates[0] == pytest.approx(0.01) and 0 < rates[-1] < 0.0002
-    assert np.all(np.diff(rates) < 0)
+def test_the_gradient_head_is_drawn_from_its_seed_and_its_rate_falls_to_zero(monkeypatch):
+    x, y = data()
+    plain, rates = heads._gradient_step, []
+
+    def watched(recipe, classes):
+        init, step = plain(recipe, classes)
+        return init, lambda *a: rates.append(float(a[-1])) or step(*a)
+
+    monkeypatch.setattr(heads, "_gradient_step", watched)
+    head = ProbeHead("gradient", recipe=GradientRecipe(epochs=3, batch=100, rate=0.01))
+    first, again, other = (np.array(fit_head(replace(head, seed=seed), x[FIT], y[FIT], 4).predict(x[TEST]))
+                           for seed in (0, 0, 1))  # fmt: skip
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+    assert len(rates) == 45 and rates[0] == pytest.approx(0.01) and 0 < rates[14] < 0.0002
+    assert np.all(np.diff(rates[:15]) < 0)
 
 
-def test_the_gradient_head_sees_features_as_they_are():
+def test_the_gradient_head_reads_unscaled_features():
     """As in the released code nothing is standardised: shrunken features learn less in the same steps."""
-    small = problem()
-    small = small._replace(x=small.x * 1e-3, val=small.val * 1e-3, test=small.test * 1e-3)
-    recipe = Recipe(epochs=2, batch=100)
-    scores = [heads.score(fit("gradient", one, recipe).test[-1], truth(), 4) for one in (problem(), small)]
-    assert scores[0] > scores[1]
+    (x, y), head = data(), ProbeHead("gradient", recipe=GradientRecipe(epochs=2, batch=100))
+    plain, small = (fit_head(head, rows[FIT], y[FIT], 4).predict(rows[TEST])[-1] for rows in (x, x * 1e-3))
+    assert np.mean(plain == y[TEST]) > np.mean(small == y[TEST])
 
 
-def test_threads_are_limited_for_small_fits_only(monkeypatch):
-    asked = []
-    monkeypatch.setattr(logistic, "_libraries", lambda: SimpleNamespace(limit=lambda limits: asked.append(limits)))
-    for size in (1e3, 1e9):
-        partial(logistic.threads, size)()
-    assert asked == [1, None]
+def test_the_gradient_head_equals_a_run_of_optax():
+    x, y = data(2)
+    recipe = GradientRecipe(epochs=2, batch=50, rate=0.01, decay=0.1)
+    predicted = fit_head(ProbeHead("gradient", recipe=recipe), x[FIT], y[FIT], 2).predict(x[TEST])[-1]
+    rng = np.random.default_rng(0)
+    w, b = 0.01 * rng.standard_normal((24, 1)), rng.uniform(-1, 1, 1) / np.sqrt(24)
+    tx = optax.adamw(optax.cosine_decay_schedule(0.01, 20), b1=0.9, b2=0.99, weight_decay=0.1)
+    params = (jnp.asarray(w, jnp.float32), jnp.asarray(b, jnp.float32))
+    state = tx.init(params)
+    for _ in range(2):
+        for rows in rng.permutation(500).reshape(10, 50):
+            p = 1 / (1 + np.exp(-(x[rows] @ np.asarray(params[0]) + np.asarray(params[1]))))
+            slope = (p - y[rows][:, None]) / 50
+            updates, state = tx.update((jnp.asarray(x[rows].T @ slope), jnp.asarray(slope.sum(0))), state, params)
+            params = optax.apply_updates(params, updates)
+    expected = (x[TEST] @ np.asarray(params[0]) + np.asarray(params[1]))[:, 0] > 0
+    assert np.mean(predicted == expected) > 0.99
+
+
+# ---- saved heads -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("classes", [2, 3])
+def test_a_saved_head_gives_the_same_predictions(tmp_path, classes):
+    x, y = blobs(classes=classes)
+    names = np.array(["a", "b", "c"][:classes])
+    (model,) = linear_path(x, y, [0.01])
+    about = {"label": "shape", "pooling": "mean", "frames": 3, "fingerprint": "f"}
+    heads.save_head(tmp_path / "h.npz", heads.linear_head(model, names, **about))
+    head = heads.load_head(tmp_path / "h.npz")
+    labels, p = head(x)
+    np.testing.assert_array_equal(labels, names[model(x)])
+    np.testing.assert_allclose(p.sum(1), 1, atol=1e-6)
+    assert p.shape == (len(x), classes) and {name: getattr(head, name) for name in about} == about
+    head.check("here", "f", "mean", 3)
+    for wrong in (("other", "mean", 3), ("f", "class", 3), ("f", "mean", 1), ("f", "mean", 3, "sum")):
+        with pytest.raises(UserError):
+            head.check("here", *wrong)
+
+
+def test_heads_of_the_first_release_still_load(tmp_path):
+    arrays = {"classes": np.array(["a", "b"]), "weights": np.ones((2, 1)), "bias": np.zeros(1), "mean": np.zeros(2),
+              "scale": np.ones(2), "label": "l", "pooling": "both", "frames": 1, "mark": "12ab"}  # fmt: skip
+    np.savez(tmp_path / "h.npz", format="anytouch_jax.head.1", **arrays)
+    head = heads.load_head(tmp_path / "h.npz")
+    assert head.fingerprint == "12ab" and head([[3.0, 0.0], [-3.0, 0.0]])[0].tolist() == ["b", "a"]
+    np.savez(tmp_path / "other.npz", format="another")
+    for name in ("other.npz", "gone.npz"):
+        with pytest.raises(UserError, match=name):
+            heads.load_head(tmp_path / name)
+
+
+def test_the_middle_of_equals_is_selected():
+    assert best_option([0.5, 1.0, 1.0, 1.0, 0.5]) == 2
+    assert best_option([-4.0, -0.1]) == 1

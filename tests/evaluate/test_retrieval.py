@@ -13,8 +13,8 @@ from touch_world import SENSORS, make_touches
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
-from anytouch_jax.evaluate.baseline import background_difference
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
+from anytouch_jax.evaluate.feature_cache import background_difference
 from anytouch_jax.evaluate.galleries import draw_galleries, score
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval, difference
 from anytouch_jax.evaluate.statistics import mean_interval, plain

@@ -21,7 +21,7 @@ from anytouch_jax.errors import UserError
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder, Features
     from anytouch_jax.encoder.stream import Embedded
-    from anytouch_jax.evaluate.saved_heads import Head
+    from anytouch_jax.evaluate.heads import LinearHead
 
 _MANIFESTS = (".csv", ".parquet")
 
@@ -30,7 +30,7 @@ def run(options: Embed) -> int:
     """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
     _refuse_unused(options)
     from anytouch_jax.encoder import encoder as features
-    from anytouch_jax.evaluate.saved_heads import load_head
+    from anytouch_jax.evaluate.heads import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     if not (options.stream and str(options.out) == "-"):
@@ -83,7 +83,7 @@ def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
     } | (of_frames if shown else {})
 
 
-def _named(found: Features, head: Head | None) -> Features:
+def _named(found: Features, head: LinearHead | None) -> Features:
     """Features with what a head says of them: `label` (n,) and its probability `p` (n,)."""
     if head is None:
         return found
@@ -91,7 +91,7 @@ def _named(found: Features, head: Head | None) -> Features:
     return replace(found, said={"label": label, "p": p.max(1)})
 
 
-def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
+def _stream(encoder: Encoder, options: Embed, head: LinearHead | None) -> int:
     """Embed a camera or a video frame by frame: features to an .npz, or as JSON lines; then the latency budget."""
     from anytouch_jax.encoder import encoder as features
     from anytouch_jax.encoder import stream
@@ -129,7 +129,7 @@ def _stream(encoder: Encoder, options: Embed, head: Head | None) -> int:
     return 0
 
 
-def _print_line(one: Embedded, rate: float, head: Head | None) -> None:
+def _print_line(one: Embedded, rate: float, head: LinearHead | None) -> None:
     values = [float(str(value)) for value in one.values]  # the shortest digits that give the same float32
     line: dict[str, Any] = {"frame": one.number, "time": round(one.number / rate if rate else one.at, 6)}
     if head is not None:

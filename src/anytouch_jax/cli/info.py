@@ -171,7 +171,7 @@ def _features(path: Path) -> list[str]:
 
 def _head(path: Path) -> list[str]:
     """What `anytouch probe --save` wrote; [] for another .npz."""
-    from anytouch_jax.evaluate.saved_heads import load_head
+    from anytouch_jax.evaluate.heads import load_head
 
     try:
         head = load_head(path)
@@ -179,5 +179,5 @@ def _head(path: Path) -> list[str]:
         return []
     return [
         f"{path}: the linear head of a probe for {head.label}: {', '.join(head.classes)}",
-        f"of features of {len(head.mean)}: --pooling {head.pooling} --frames {head.frames}, encoder {head.mark}",
+        f"of features of {len(head.mean)}: --pooling {head.pooling} --frames {head.frames}, encoder {head.fingerprint}",
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.console import Console
 from rich.markdown import Markdown
 
@@ -11,13 +13,13 @@ from anytouch_jax.cli.unused import refuse
 from anytouch_jax.cli.words import log
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_write
 
 _OF_LABEL = ("label", "group", "leave_out", "where", "sensor", "save")
 _OF_SPLITS = ("group", "seeds", "protocol", "save")  # of a label; --leave-out has folds instead
 _OF_BATTERY = (
     "join", "heads", "order", "train_sensors", "test_sensors", "train_units", "test_units", "max_rows", "cache",
 )  # fmt: skip
+_SIDES = ("train_sensors", "test_sensors", "train_units", "test_units")
 _OF_TASKS = ("frames", "pooling", "join", "heads", "protocol")  # a benchmark has the authors'
 
 
@@ -37,21 +39,31 @@ def run(options: Probe) -> int:
     if options.cache is not None:
         check_home(options.cache, "--cache")
     enable_compilation_cache()
-    if options.tasks or options.benchmark:
-        from anytouch_jax.evaluate import battery_command
+    from anytouch_jax.evaluate import probing, statistics
 
-        battery = battery_command.run_battery(options, log)
-        table, record = battery_command.to_table(battery), battery_command.to_json(battery)
+    shared: dict[str, Any] = {name: getattr(options, name) for name in ("features", "seeds", "controls", "out")}
+    sides = {name: _names(getattr(options, name)) for name in _SIDES} | {"max_rows": options.max_rows}
+    if options.tasks and options.benchmark:
+        raise UserError("give --benchmark, which has its own settings, or --tasks, not both")
+    if options.benchmark:
+        shared |= sides | {"cache": options.cache, "log": log}
+        table = probing.task_table(probing.probe_benchmark(options.run, options.data, options.benchmark, **shared))
+    elif options.tasks:
+        names: tuple[str, ...] = ("protocol", "frames", "pooling", "join", "order", "cache")
+        shared |= sides | {name: getattr(options, name) for name in names} | {"log": log}
+        tasks = "all" if options.tasks == "all" else _names(options.tasks)
+        heads = _names(options.heads)
+        table = probing.task_table(probing.probe_tasks(options.run, options.data, tasks, heads=heads, **shared))
     else:
-        from anytouch_jax.evaluate import statistics
-        from anytouch_jax.evaluate.probe_command import run_probes
-
-        found = run_probes(options, log)
-        table, record = statistics.to_table(found), statistics.to_json(found)
+        names = ("group", "leave_out", "where", "sensor", "pooling", "protocol", "save")
+        shared |= {name: getattr(options, name) for name in names} | {"frames": options.frames or 1, "log": log}
+        table = statistics.to_table(probing.probe_label(options.run, options.data, options.label, **shared))
     Console().print(Markdown(table)) if Console().is_terminal else print(table)
-    if options.out is not None:
-        atomic_write(options.out, record)
     return 0
+
+
+def _names(text: str) -> Any:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def check_options(options: Probe) -> None:

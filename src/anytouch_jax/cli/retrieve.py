@@ -28,8 +28,8 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import encoder as features
     from anytouch_jax.evaluate import retrieval
-    from anytouch_jax.evaluate.baseline import background_difference
     from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
+    from anytouch_jax.evaluate.feature_cache import background_difference
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
     from anytouch_jax.evaluate.statistics import markdown, plain
     from anytouch_jax.train.mesh import enable_compilation_cache

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.choices import thinned
+from anytouch_jax.evaluate.splits import subsample
 
 Array = npt.NDArray[Any]
 MOST = 4000  # rows that pairwise figures look at
@@ -40,7 +40,7 @@ def uniformity(features: Array) -> float:
 
     Between -8 (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are looked at.
     """
-    x = _unit(thinned(np.asarray(features), MOST))
+    x = _unit(subsample(np.asarray(features), MOST))
     if len(x) < 2:
         raise UserError("uniformity needs two rows or more")
     likeness = (x @ x.T)[np.triu_indices(len(x), 1)]
@@ -54,11 +54,11 @@ def silhouette(features: Array, labels: Any) -> float | None:
     """
     from sklearn.metrics import silhouette_score
 
-    labels = thinned(np.asarray(labels).astype(str), MOST)
+    labels = subsample(np.asarray(labels).astype(str), MOST)
     count = len(np.unique(labels))
     if not 2 <= count < len(labels):
         return None
-    return float(silhouette_score(_unit(thinned(np.asarray(features), MOST)), labels, metric="cosine"))
+    return float(silhouette_score(_unit(subsample(np.asarray(features), MOST)), labels, metric="cosine"))
 
 
 def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:

@@ -1,136 +1,474 @@
-"""Probes of frozen features, from models and manifests to a table."""
+"""Probes of frozen features from models and manifests: a label column, named tasks, or a public benchmark.
+
+A task selects rows and labels. Features are computed once, groups are split, heads are fitted and scored. Frames are
+never flipped or otherwise augmented. The protocols are those of `array_probes`. In tasks, "honest" splits whole groups
+(objects, recordings) again by every seed, and "published" keeps the manifest's split.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+import json
 from collections.abc import Callable, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from anytouch_jax.encoder.encoder import Join, Pooling
-from anytouch_jax.evaluate import battery_command, probe_command, statistics
-from anytouch_jax.evaluate.battery_features import Order
-from anytouch_jax.evaluate.heads import HeadName
-from anytouch_jax.evaluate.statistics import Protocol
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.config import preset
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import Encoder, Join, Pooling, check_frames, load_encoder, random_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import feature_cache, logistic, splits, statistics
+from anytouch_jax.evaluate.array_probes import (
+    LabelledFeatures,
+    check_rows,
+    knn_probe,
+    leave_groups_out,
+    linear_probe,
+    majority_baseline,
+    select_option,
+    unlearned_note,
+)  # fmt: skip
+from anytouch_jax.evaluate.feature_cache import FeatureStore, Order
+from anytouch_jax.evaluate.heads import (
+    GradientRecipe,
+    HeadName,
+    ProbeHead,
+    Scaling,
+    fit_head,
+    linear_head,
+    majority_class,
+    save_head,
+)  # fmt: skip
+from anytouch_jax.evaluate.splits import RowRoles, Split
+from anytouch_jax.evaluate.statistics import GroupSums, ProbeResult, Protocol
+from anytouch_jax.evaluate.tasks import (
+    TASKS,
+    Task,
+    TaskRows,
+    available_tasks,
+    described_subsets,
+    find_benchmark,
+    find_task,
+    label_task,
+    select,
+)  # fmt: skip
 from anytouch_jax.files import atomic_write
 
+Array = npt.NDArray[Any]
 Log = Callable[[str], None]
 Paths = Sequence[str | Path]
+Names = Sequence[str] | None
+RAW, RANDOM = "raw pixels", "random encoder"
+
+
+class _Source(NamedTuple):
+    """Features with their name; `encoder` is None for a features file and for raw pixels."""
+
+    name: str
+    store: FeatureStore
+    encoder: Encoder | None
+    scaling: Scaling = "column"
+
+
+class _Sides(NamedTuple):
+    """Sensors and units (patterns) to fit on and to test on; None: all."""
+
+    train_sensors: Names = None
+    test_sensors: Names = None
+    train_units: Names = None
+    test_units: Names = None
+
+
+class _Settings(NamedTuple):
+    """How every task is probed: seeds, heads, protocols, the recipe of the gradient head, the order of frames."""
+
+    seeds: int
+    heads: Sequence[HeadName]
+    protocols: Sequence[Protocol]
+    recipe: GradientRecipe
+    order: Order
+
+
+class _Plan(NamedTuple):
+    """A task with the rows that can be fitted on or tested, their roles and class names, and the length of a clip."""
+
+    task: Task
+    rows: TaskRows
+    roles: RowRoles
+    names: Array
+    frames: int
+    notes: list[str]
 
 
 def probe_label(
-    models: Paths,
-    data: Paths,
-    label: str = "object",
-    *,
-    features: Paths = (),
-    group: str = "",
-    leave_out: str | None = None,
-    where: tuple[str, float] | None = None,
-    sensor: str | None = None,
-    frames: int = 1,
-    pooling: Pooling = "class",
-    seeds: int = 5,
-    protocol: Protocol = "honest",
-    controls: bool = True,
-    save: Path | None = None,
-    out: Path | None = None,
+    models: Paths, data: Paths, label: str = "object", *, features: Paths = (), group: str = "",
+    leave_out: str | None = None, where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
+    pooling: Pooling = "class", join: Join = "mean", seeds: int = 5, protocol: Protocol = "honest",
+    controls: bool = True, cache: Path | None = None, save: Path | None = None, out: Path | None = None,
     log: Log = print,
-) -> list[Any]:
-    """Probe a label column with the features of every model, of features files and of the controls.
+) -> list[Any]:  # fmt: skip
+    """Probe a label column with features of every model, of features files, and of the controls.
 
-    Print the results with `statistics.to_table`. `save`: write the linear head of the only model. `out`: write JSON.
+    `group` is the column that no split cuts. `leave_out` tests every value of a column held out, instead of the splits.
+    `where` keeps rows whose column exceeds a number. `save` writes the linear head of the only model, `out` the results
+    as JSON. Print the results with `statistics.to_table`. Raises UserError.
     """
-    options: Any = SimpleNamespace(
-        run=tuple(map(Path, models)), data=tuple(map(Path, data)), features=tuple(map(Path, features)), label=label,
-        group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames, pooling=pooling, seeds=seeds,
-        protocol=protocol, controls=controls, save=save,
-    )  # fmt: skip
-    results = probe_command.run_probes(options, log)
+    if save is not None and len(models) != 1:
+        raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
+    table = manifests.read([str(path) for path in data])
+    filters: dict[str, Any] = {"group": group, "leave_out": leave_out, "where": where, "sensor": sensor}
+    rows, subsets = label_rows(table, label, **filters, frames=frames)
+    log(f"{len(rows.rows)} of {len(table)} rows take part")
+    if leave_out is not None and len(np.unique(rows.groups)) == 1:
+        raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
+    split = rows.split if leave_out is None else np.full(len(rows.split), "train")
+    check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
+    results: list[Any] = []
+    for source in _sources(table, models, features, controls, frames, cache, pooling=pooling, join=join):
+        if source.encoder is not None:
+            for name in sorted(set(rows.sensors)):
+                source.encoder.sensor_row(name, log)  # warns of universal tokens
+        values = pixel_components(source.store, rows) if source.name == RAW else source.store.get(rows.rows, frames)
+        found = probe_rows(
+            values, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds, scaling=source.scaling,
+            subsets=subsets,
+        )  # fmt: skip
+        if save is not None and source.encoder is not None and source.name != RANDOM:
+            model, names = found[0].outcome.fitted  # type: ignore[union-attr, misc]
+            about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
+            save_head(save, linear_head(model, names, fingerprint=source.encoder.mark, **about))
+            log(f"{save}: the linear head")
+        results += found
+        log(f"probed {source.name}")
+    if leave_out is None:
+        results.append(majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
     if out is not None:
         atomic_write(out, statistics.to_json(results))
     return results
 
 
-def probe_tasks(
-    models: Paths,
-    data: Paths,
-    tasks: Sequence[str] | Literal["all"] = "all",
-    *,
-    features: Paths = (),
-    heads: Sequence[HeadName] = ("linear",),
-    seeds: int = 5,
-    protocol: Protocol = "honest",
-    frames: int | None = None,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    order: Order = "right",
-    train_sensors: Sequence[str] | None = None,
-    test_sensors: Sequence[str] | None = None,
-    train_units: Sequence[str] | None = None,
-    test_units: Sequence[str] | None = None,
-    max_rows: int | None = None,
-    controls: bool = True,
-    cache: Path | None = None,
-    out: Path | None = None,
-    log: Log = print,
-) -> dict[str, Any]:
-    """Probe named tasks with the features of every model, of features files and of the controls.
+def label_rows(
+    table: Manifest, label: str, *, group: str = "", leave_out: str | None = None,
+    where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
+) -> tuple[TaskRows, dict[str, Array]]:  # fmt: skip
+    """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named."""
+    task = label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
+    rows = select(table, task, frames)
+    column, name = (task.label, "classes") if leave_out is None else (task.groups[0], f"{leave_out}s")
+    return rows, described_subsets(table, column, rows.rows[:, 0], name)
 
-    Print the result with `task_table`. `protocol` "published" reports both protocols. `out`: write JSON.
+
+def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
+    """Return the principal components of raw pixels, fitted on the rows of train (on all without these)."""
+    train = rows.split == "train"
+    return feature_cache.principal_components(store.get(rows.rows, 1), train if train.any() else ~train)
+
+
+def probe_rows(
+    features: Array, rows: TaskRows, name: str, *, leave_out: str | None = None, protocol: Protocol = "honest",
+    seeds: int = 5, scaling: Scaling = "column", subsets: dict[str, Array] | None = None,
+) -> list[ProbeResult]:  # fmt: skip
+    """Return the linear and kNN results of features (n, d) on the rows of a task, or that of held-out groups."""
+    if leave_out is not None:
+        name = f"{name}: linear, {leave_out} left out"
+        return [leave_groups_out(features, rows.labels, rows.groups, scaling=scaling, subsets=subsets, name=name)]
+    arrays, shared = (features, rows.labels, rows.groups, rows.split), {"protocol": protocol, "seeds": seeds}
+    options: dict[str, Any] = shared | {"subsets": subsets}
+    linear = linear_probe(*arrays, scaling=scaling, name=f"{name}: linear", **options)
+    return [linear, knn_probe(*arrays, name=f"{name}: kNN", **options)]
+
+
+def probe_tasks(
+    models: Paths, data: Paths, tasks: Sequence[str] | Literal["all"] = "all", *, features: Paths = (),
+    heads: Sequence[HeadName] = ("linear",), seeds: int = 5, protocol: Protocol = "honest", frames: int | None = None,
+    pooling: Pooling = "class", join: Join = "mean", order: Order = "right", train_sensors: Names = None,
+    test_sensors: Names = None, train_units: Names = None, test_units: Names = None, max_rows: int | None = None,
+    controls: bool = True, cache: Path | None = None, out: Path | None = None, log: Log = print,
+) -> dict[str, Any]:  # fmt: skip
+    """Probe named tasks with features of every model, of features files, and of the controls.
+
+    `protocol` "published" reports both protocols. `order` shuffles the frames of clips, or repeats the last one.
+    `train_sensors` and its siblings name sensors and units (patterns) to fit on and to test on. `out` writes JSON.
+    Tasks that cannot be probed are left out with their reason. Print the result with `task_table`. Raises UserError.
     """
-    return _battery(
-        models, data, features, "all" if tasks == "all" else ",".join(tasks), "", out, log,
-        heads=",".join(heads), seeds=seeds, protocol=protocol, frames=frames, pooling=pooling, join=join, order=order,
-        max_rows=max_rows, controls=controls, cache=cache, train_sensors=",".join(train_sensors or ()),
-        test_sensors=",".join(test_sensors or ()), train_units=",".join(train_units or ()),
-        test_units=",".join(test_units or ()),
-    )  # fmt: skip
+    table = manifests.read([str(path) for path in data])
+    every = tasks == "all" or list(tasks) == ["all"]
+    names = available_tasks(table) if every else tuple(tasks)
+    if not names:
+        raise UserError("The manifest has no label of any task. `anytouch probe label` takes any column.")
+    if order != "right" and all((frames or find_task(name).frames) == 1 for name in names):
+        raise UserError("--order has no effect on stills. Leave it out, or give --frames.")
+    if features and order != "right":
+        raise UserError("--order has no effect on --features, whose frames are encoded already. Leave one of them out.")
+    sides, plans, left_out = _Sides(train_sensors, test_sensors, train_units, test_units), list[_Plan](), {}
+    for name in names:
+        task = find_task(name)
+        try:
+            plans.append(_plan(table, task, frames, sides, max_rows))
+        except UserError as error:
+            left_out[name] = str(error).removeprefix(f"Task {name}: ")
+    if not plans:
+        raise UserError(" ".join(f"Task {name}: {reason}" for name, reason in left_out.items()))
+    if every:
+        left_out |= {name: "The manifest has no such label." for name in TASKS if name not in names}
+    for name, reason in left_out.items():
+        log(f"{name}: not probed ({reason})")
+    sources = _sources(table, models, features, controls, frames or 1, cache, pooling=pooling, join=join, order=order)
+    if join != "mean":
+        for encoder in (source.encoder for source in sources if source.encoder is not None):
+            if (frames or 1) <= encoder.config.model.frames:
+                raise UserError("--join has no effect without --frames longer than a clip of the model.")
+    protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else ("honest",)
+    settings = _Settings(seeds, heads, protocols, GradientRecipe(), order)
+    return _report(table, data, sources, plans, settings, sides, left_out, None, out, log)
 
 
 def probe_benchmark(
-    models: Paths,
-    data: Paths,
-    benchmark: str,
-    *,
-    features: Paths = (),
-    seeds: int = 5,
-    train_sensors: Sequence[str] | None = None,
-    test_sensors: Sequence[str] | None = None,
-    train_units: Sequence[str] | None = None,
-    test_units: Sequence[str] | None = None,
-    max_rows: int | None = None,
-    controls: bool = True,
-    cache: Path | None = None,
-    out: Path | None = None,
-    log: Log = print,
-) -> dict[str, Any]:
+    models: Paths, data: Paths, benchmark: str, *, features: Paths = (), seeds: int = 5, train_sensors: Names = None,
+    test_sensors: Names = None, train_units: Names = None, test_units: Names = None, max_rows: int | None = None,
+    controls: bool = True, cache: Path | None = None, out: Path | None = None, log: Log = print,
+) -> dict[str, Any]:  # fmt: skip
     """Probe a public benchmark with the authors' pooling, head and settings, by both protocols.
 
-    Print the result with `task_table`. `out`: write JSON.
+    `out` writes JSON. Print the result with `task_table`. Raises UserError.
     """
-    return _battery(
-        models, data, features, "", benchmark, out, log,
-        heads="linear", seeds=seeds, protocol="honest", frames=None, pooling="class", join="mean", order="right",
-        max_rows=max_rows, controls=controls, cache=cache, train_sensors=",".join(train_sensors or ()),
-        test_sensors=",".join(test_sensors or ()), train_units=",".join(train_units or ()),
-        test_units=",".join(test_units or ()),
-    )  # fmt: skip
+    setting = find_benchmark(benchmark)
+    table = manifests.read([str(path) for path in data])
+    sides = _Sides(train_sensors, test_sensors, train_units, test_units)
+    plans = [_plan(table, setting.task, None, sides, max_rows)]
+    encoding: dict[str, Any] = {"pooling": setting.pooling, "universal": setting.universal}
+    sources = _sources(table, models, features, controls, setting.task.frames, cache, **encoding)
+    settings = _Settings(seeds, ("gradient",), ("published", "honest"), setting.recipe, "right")
+    return _report(table, data, sources, plans, settings, sides, {}, setting.paper, out, log)
 
 
-def _battery(
-    models: Paths, data: Paths, features: Paths, tasks: str, benchmark: str, out: Path | None, log: Log, **rest: Any
-) -> dict[str, Any]:
-    options: Any = SimpleNamespace(
-        run=tuple(map(Path, models)), data=tuple(map(Path, data)), features=tuple(map(Path, features)), tasks=tasks,
-        benchmark=benchmark, **rest,
-    )  # fmt: skip
-    results = battery_command.run_battery(options, log)
+def run_tasks(
+    encoder: Encoder | FeatureStore | None, table: Manifest, names: Sequence[str | Task], *, cache: Path | None = None,
+    seeds: int = 5, frames: int | None = None, pooling: Pooling = "class", join: Join = "mean",
+    protocols: Sequence[Protocol] = ("honest",), order: Order = "right", head_names: Sequence[HeadName] = ("linear",),
+    recipe: GradientRecipe | None = None, universal: bool = False, max_rows: int | None = None, **sides: Names,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Probe features of an encoder, of a store, or (None) of raw pixels on tasks of a manifest.
+
+    Returns a JSON-ready dict for each task, head and protocol. Keys: task, head, protocol; metric, "accuracy" in 0..1
+    or "r2"; mean over seeds, low, high (95 % over seeds and test groups), values (one a seed); train, test (rows);
+    groups (tested); classes; chance, the score of the most frequent class or the mean of train; chosen options; frames;
+    order; notes. A regression also has mae, mae_low, mae_high and chance_mae in `unit`.
+
+    `frames` replaces that of each task. `universal`: universal tokens for all sensors. `sides`: train_sensors,
+    test_sensors, train_units, test_units. Raises UserError.
+    """
+    if encoder is None:
+        source = _Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common")
+    elif isinstance(encoder, FeatureStore):
+        source = _Source("features", encoder, None)
+    else:
+        options: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
+        source = _Source("encoder", feature_cache.encoder_features(encoder, table, folder=cache, **options), encoder)
+    plans = [_plan(table, find_task(name), frames, _Sides(**sides), max_rows) for name in names]
+    return _run_plans(source, plans, _Settings(seeds, head_names, protocols, recipe or GradientRecipe(), order))
+
+
+def _sources(
+    table: Manifest, models: Paths, features: Paths, controls: bool, frames: int, cache: Path | None,
+    order: Order = "right", **encoding: Any,
+) -> list[_Source]:  # fmt: skip
+    """Return models, the random encoder, features files and raw pixels, in this order."""
+    encoders = {str(path): load_encoder(path) for path in models}
+    if controls:
+        first = next(iter(encoders.values()), None)
+        encoders[RANDOM] = random_encoder(first.config if first else preset("tiny"))
+    sources = []
+    for name, encoder in encoders.items():
+        check_frames(encoder.config.model, frames)
+        store = feature_cache.encoder_features(encoder, table, order=order, folder=cache, **encoding)
+        sources.append(_Source(name, store, encoder))
+    sources += [_Source(str(path), feature_cache.file_features(Path(path), table), None) for path in features]
+    if controls:
+        sources.append(_Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common"))
+    if not sources:
+        raise UserError("There is nothing to probe. Give --model or --features, or keep the controls.")
+    return sources
+
+
+def _plan(table: Manifest, task: Task, frames: int | None, sides: _Sides, max_rows: int | None) -> _Plan:
+    """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them. Raises UserError."""
+    for name, count in (("max_rows", max_rows), ("frames", frames)):
+        if count is not None and count < 1:
+            raise UserError(f"{name} must be at least 1, not {count}.")
+    rows = select(table, task, frames)
+    rows = rows.take(np.flatnonzero(np.logical_or(*_side_masks(rows, sides))))
+    used = np.flatnonzero(splits.split_scheme(_roles(task, rows, sides)[0])[1])
+    rows = rows.take(splits.subsample(used, max_rows or len(used)))
+    roles, names = _roles(task, rows, sides)
+    scheme, _, why = splits.split_scheme(roles)
+    notes = [*rows.notes, why]
+    notes += [f"{name.replace('_', ' ')} {', '.join(some)}" for name, some in sides._asdict().items() if some]
+    if scheme == "split" and not roles.measured:
+        notes += unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
+    return _Plan(task, rows, roles, names, frames or task.frames, [note for note in notes if note])
+
+
+def _side_masks(rows: TaskRows, sides: _Sides) -> list[Array]:
+    """Return which rows may be fitted on and which may be tested. Raises UserError for an unknown sensor or unit."""
+    masks = []
+    for sensors, units in ((sides.train_sensors, sides.train_units), (sides.test_sensors, sides.test_units)):
+        mask = np.ones(len(rows.labels), bool)
+        for patterns, column, kind in ((sensors, rows.sensors, "sensor"), (units, rows.units, "unit")):
+            known = np.unique(column)
+            for pattern in patterns or ():
+                if not any(fnmatch(name, pattern) for name in known):
+                    raise UserError(f"No row has the {kind} {pattern!r}. There are {', '.join(known) or 'none'}.")
+            if patterns:
+                mask &= np.isin(column, [name for name in known if any(fnmatch(name, one) for one in patterns)])
+        masks.append(mask)
+    return masks
+
+
+def _roles(task: Task, rows: TaskRows, sides: _Sides) -> tuple[RowRoles, Array]:
+    """Return the roles of the rows and the class names. Raises UserError if nothing is left to fit on or to test."""
+    measured = task.kind == "regression"
+    names, y = (np.array([], str), rows.labels) if measured else np.unique(rows.labels, return_inverse=True)
+    test = rows.split == "test"
+    may_fit, may_test = _side_masks(rows, sides)
+    roles = RowRoles(y, rows.groups, ~test, test, may_fit, may_test, measured)
+    for mask, purpose in ((roles.tested, "test"), (roles.may_fit, "train")):
+        if not mask.any():
+            raise UserError(f"Task {task.name}: no row is left to {purpose}. Check the splits, sensors and units.")
+    if measured and np.ptp(y[roles.tested]) == 0:
+        raise UserError(f"Task {task.name}: {task.label} is constant on test. R2 has no meaning there.")
+    if not measured and len(names) < 2:
+        raise UserError(f"Task {task.name}: the label is {str(names[0])!r} on every row. A probe needs two classes.")
+    return roles, names
+
+
+def _report(
+    table: Manifest, data: Paths, sources: Sequence[_Source], plans: Sequence[_Plan], settings: _Settings,
+    sides: _Sides, left_out: dict[str, str], paper: float | None, out: Path | None, log: Log,
+) -> dict[str, Any]:  # fmt: skip
+    results = []
+    for source in sources:
+        results += [{"features": source.name} | row for row in _run_plans(source, plans, settings)]
+        log(f"probed {source.name}")
+    configs = {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder}
+    report = {
+        "manifest": table.content_hash, "data": [str(path) for path in data], "paper": paper, "seeds": settings.seeds,
+        "sides": sides._asdict(), "runs": configs, "left_out": left_out, "results": results,
+    }  # fmt: skip
     if out is not None:
-        atomic_write(out, battery_command.to_json(results))
+        atomic_write(out, json.dumps(report, indent=2, allow_nan=False))
+    return report
+
+
+def _run_plans(source: _Source, plans: Sequence[_Plan], settings: _Settings) -> list[dict[str, Any]]:
+    if settings.seeds < 1:
+        raise UserError(f"seeds must be at least 1, not {settings.seeds}.")
+    for length in sorted({plan.frames for plan in plans}):  # one pass over the rows of all tasks
+        source.store.add(np.concatenate([p.rows.rows.ravel() for p in plans if p.frames == length]), length)
+    results = []
+    for plan in plans:
+        x = source.store.get(plan.rows.rows, plan.frames)
+        if not np.isfinite(x).all():
+            raise UserError(f"Task {plan.task.name}: features are NaN or infinite. Did the training diverge?")
+        if source.scaling == "common":  # components are fitted on rows that are never tested, if there are any
+            fitted = plan.roles.train if splits.split_scheme(plan.roles)[0] == "split" else np.ones(len(x), bool)
+            with logistic.threads(x.size * feature_cache.COMPONENTS):
+                x = feature_cache.principal_components(x, fitted, solver="randomized")
+        labelled = LabelledFeatures(x, plan.roles.y, plan.names, plan.roles.groups)
+        notes, encoder = list(plan.notes), source.encoder
+        if encoder is not None:
+            trained = encoder.config.model.sensors if encoder.seen is None else encoder.seen
+            unknown = sorted(set(plan.rows.sensors) - set(trained))
+            notes += [f"universal tokens for {', '.join(unknown)}"] if unknown else []
+        about = {"frames": plan.frames, "order": settings.order if plan.frames > 1 else "right"}
+        for name, protocol in itertools.product(settings.heads, settings.protocols):
+            head = ProbeHead(name, source.scaling, recipe=settings.recipe)
+            scored = _score(labelled, plan, head, protocol, settings.seeds)
+            names = {"task": plan.task.name, "head": name, "protocol": protocol}
+            results.append(names | scored | about | {"notes": notes + scored["notes"]})
     return results
 
 
-def task_table(results: dict[str, Any]) -> str:
-    """Return the results of `probe_tasks` or `probe_benchmark` as Markdown."""
-    return battery_command.to_table(results)
+def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Protocol, seeds: int) -> dict[str, Any]:
+    """Score a head on all splits of all seeds: a row of the result."""
+    roles, chosen, sizes, unfinished = plan.roles, list[float](), list[int](), 0
+    runs, baselines = list[GroupSums](), list[GroupSums]()
+    for seed in range(seeds):
+        cuts = splits.seeded_splits(roles, seed, protocol)
+        if seed and protocol == "published" and len(cuts) == 1 and head.name != "gradient":
+            runs.append(runs[0])  # nothing is drawn: every seed is the same fit
+            continue
+        predictions, constants = [], []
+        for cut in cuts:
+            option, predicted, finished = _predict(data, cut, dataclasses.replace(head, seed=seed), protocol)
+            unfinished += not finished
+            fitted = roles.y[cut.fit]
+            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else majority_class(fitted)))
+            predictions.append(predicted)
+            chosen.append(option)
+            sizes.append(len(cut.fit))
+        tested = np.concatenate([cut.test for cut in cuts])
+        runs.append(_sums(roles, tested, np.concatenate(predictions)))
+        baselines.append(_sums(roles, tested, np.concatenate(constants)))
+
+    def values(of: Callable[[Array], Array], several: Sequence[GroupSums] = runs) -> list[float]:
+        return [float(of(run.sums.sum(0))) for run in several]
+
+    metric = statistics.r2_of if roles.measured else statistics.mean_of
+    low, high = statistics.bootstrap_interval(runs, metric)
+    result: dict[str, Any] = {
+        "metric": "r2" if roles.measured else "accuracy", "mean": float(np.mean(values(metric))), "low": low,
+        "high": high, "values": values(metric), "train": round(float(np.mean(sizes))), "test": len(runs[0].groups),
+        "classes": data.names.tolist(), "chance": float(np.mean(values(metric, baselines))),
+    }  # fmt: skip
+    if roles.measured:
+        mae_low, mae_high = statistics.bootstrap_interval(runs, statistics.mae_of)
+        mae, chance = (float(np.mean(values(statistics.mae_of, several))) for several in (runs, baselines))
+        result |= {"mae": mae, "mae_low": mae_low, "mae_high": mae_high, "chance_mae": chance, "unit": plan.task.unit}
+    notes = [f"{unfinished} of {len(chosen)} fits did not converge"] if unfinished else []
+    return result | {"groups": len(np.unique(runs[0].groups)), "chosen": chosen, "notes": notes}
+
+
+def _predict(data: LabelledFeatures, cut: Split, head: ProbeHead, protocol: Protocol) -> tuple[float, Array, bool]:
+    """Return the selected option, its predictions for the test rows, and whether its fit converged."""
+    selected = select_option(head, data, cut, protocol)
+    fitted, index = selected.fitted, selected.place
+    assert fitted is not None  # an honest cut has rows of val
+    if head.name != "gradient" and len(cut.fit) > splits.SELECT_ROWS:
+        start = fitted.models[index] if fitted.models else None
+        head, index = dataclasses.replace(head, options=(selected.option,)), 0
+        fitted = fit_head(head, data.x[cut.fit], data.y[cut.fit], len(data.names), start=start)
+    finished = all(model.finished for model in fitted.models[index : index + 1])
+    return selected.option, fitted.predict(data.x[cut.test])[index], finished
+
+
+def _sums(roles: RowRoles, tested: Array, predicted: Array) -> GroupSums:
+    truth, groups = roles.y[tested], roles.groups[tested]
+    if not roles.measured:
+        return statistics.classification_sums(predicted == truth, groups)
+    return statistics.regression_sums(predicted - truth, truth - roles.y.mean(), groups)
+
+
+def task_table(report: dict[str, Any]) -> str:
+    """Return the result of `probe_tasks` or `probe_benchmark` as Markdown, with notes below."""
+    head = ("features", "task", "head", "protocol", "score", "95 %", "chance", "train", "test (groups)")
+    rows, notes = [], dict[str, None]()
+    for row in report["results"]:
+        r2 = row["metric"] == "r2"
+        factor, digits = (1.0, 3) if r2 else (100.0, 1)
+        score = f"R2 {row['mean']:.3f}, {row['mae']:.3g} {row['unit']}" if r2 else f"{100 * row['mean']:.1f} %"
+        chance = f"{row['chance_mae']:.3g} {row['unit']}" if r2 else f"{100 * row['chance']:.1f} %"
+        low, high = row["low"], row["high"]
+        interval = "-" if low is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
+        names = (row["features"], row["task"], row["head"], row["protocol"])
+        rows.append((*names, score, interval, chance, str(row["train"]), f"{row['test']} ({row['groups']})"))
+        notes |= dict.fromkeys(f"- {row['task']}: {note}" for note in row["notes"])
+    if report["paper"] is not None:
+        notes[f"- the paper reports {100 * report['paper']:.2f} % for AnyTouch, its epoch chosen on test"] = None
+    return "\n\n".join([statistics.markdown(head, rows), *(["\n".join(notes)] if notes else [])]) + "\n"

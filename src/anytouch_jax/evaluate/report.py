@@ -21,9 +21,9 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import baseline, geometry, matching, probe, retrieval, statistics
-from anytouch_jax.evaluate.baseline import background_difference
+from anytouch_jax.evaluate import array_probes, geometry, matching, retrieval, statistics
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
+from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
 from anytouch_jax.evaluate.sections import (  # fmt: skip
     Section,
     losses_section,
@@ -306,7 +306,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     table, rows, notes = study.manifest, study.rows, list(study.notes)
     features = {name: np.concatenate([study.classes[name], study.patches[name]], 1) for name in study.classes}
     if study.pixels is not None:
-        features[PIXELS] = baseline.reduce(study.pixels, study.split == "train")
+        features[PIXELS] = principal_components(study.pixels, study.split == "train")
     objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
     groups = np.where(objects == "", sequences, objects)
     found: dict[str, list[statistics.Result]] = {}
@@ -329,8 +329,8 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
 
 def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> statistics.Result:
     if measured:
-        return probe.regression_probe(x, labels, groups, split, name=name)
+        return array_probes.regression_probe(x, labels, groups, split, name=name)
     # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.
-    return probe.linear_probe(
+    return array_probes.linear_probe(
         x, labels, groups, split, name=name, seeds=0, scaling="common" if name == PIXELS else "column"
     )

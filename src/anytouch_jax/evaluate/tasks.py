@@ -1,9 +1,8 @@
-"""The tasks of the battery: which rows of a manifest, which label, and what must never stand on both sides of a split.
+"""Probing tasks: which rows of a manifest, which label, which groups never stand on both sides of a split.
 
-A direction is a label of the picture as it is: a flip of the picture changes it. Pre-training flips touches
-(`data.flip`, as the release), the positive of a matching pair independently of its anchor, which teaches the encoder to
-overlook directions. Probes see every frame unflipped. Whoever trains with direction labels sets `--loader.flip 0` (and
-turns nothing by `--loader.affine`), or changes the label with the picture by `mirrored`.
+A flip of a picture changes a direction label. Pre-training flips touches (`data.flip`, as the release), and flips the
+positive of a matching pair independently of its anchor. This teaches the encoder to overlook directions. Probes read
+every frame unflipped. To train with direction labels, set `--data.flip 0`, or change the label with `mirrored`.
 """
 
 from __future__ import annotations
@@ -16,32 +15,33 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest.manifest import KEYS, Manifest
 from anytouch_jax.data.prepare.contact import known_contact
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.encoder import Pooling, text_column
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.heads import GradientRecipe
 
 Array = npt.NDArray[Any]
 Which = Literal["all", "press", "contact", "moving"]
 
 FORCE, SCORE = 0.05, 7.0  # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
+GROUPS = ("grasp_group", "object", "touch")  # of a label probe: the first with a value that is not the label
 _TURNED = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 _ACROSS, _DOWN = {"right": "left", "left": "right"}, {"up": "down", "down": "up"}
 
 
 @dataclass(frozen=True)
 class Task:
-    """A question asked of frozen features.
+    """A question to ask of frozen features.
 
-    `label`: a column of the manifest; `classes`: the only values that take part (all without it); `above`: the label is
-    a number, and the class is whether it lies above. `groups`: columns of which the first with a value names what is
-    never on both sides of a split (then the sequence; "recording" is the sequence without its last part: several
-    touches of one video, and no group where all rows are of one). `frames`: 1,
-    or 3 for a clip that ends at the row. `which` rows: press, the deepest frame of a recording; contact, all that
-    touch; moving, the frame of a recording that slips most. `fingers`: the rows of a touch by two units, features
-    concatenated; `phase` "after": the frames after the grasp (Feel) instead of those during it. `where`: (column,
-    value) that a row must have. `listed`: test rows are those whose `downstream_test` names this list. `unit` of a
-    regression.
+    `label`: a column of the manifest. `classes`: the only values that take part. `above`: the label is a number, and
+    the class is whether it is larger. `groups`: columns of which the first with a value names the group of a row, else
+    its sequence. The group "recording" is the sequence without its last part. `frames`: 1, or the length of a clip that
+    ends at the row. `which` rows: "press", the deepest frame of a recording; "contact", all that touch; "moving", the
+    frame of a recording that slips most. `fingers`: rows of a touch by two units, features concatenated. `phase`
+    "after": the frames after the grasp (Feel). `where`: (column, text) must be equal, (column, number) must be
+    exceeded. `test_list`: test rows are those whose `downstream_test` names this list. `unit` of a regression.
     """
 
     name: str
@@ -54,8 +54,8 @@ class Task:
     above: float | None = None
     fingers: bool = False
     phase: Literal["during", "after"] = "during"
-    where: tuple[str, str] | None = None
-    listed: str | None = None
+    where: tuple[tuple[str, str | float], ...] = ()
+    test_list: str | None = None
     unit: str = ""
 
 
@@ -77,9 +77,54 @@ TASKS = {
 }
 
 
-class Selection(NamedTuple):
-    """The rows of a task: `rows` i64 (n, fingers) of the manifest, and of each its label (text, or f64 of a
-    regression), group, split (train, val, test), sensor and unit; `notes` on what was left out."""
+@dataclass(frozen=True)
+class Benchmark:
+    """A public benchmark of the paper with the authors' settings.
+
+    `universal`: universal tokens for all sensors. `paper`: accuracy of AnyTouch in the paper, its epoch chosen on test.
+    """
+
+    task: Task
+    pooling: Pooling
+    recipe: GradientRecipe
+    universal: bool
+    paper: float
+
+
+def _touch_and_go(name: str, label: str, test_list: str, paper: float) -> Benchmark:
+    task = Task(f"touch_and_go_{name}", label, groups=("recording",), which="all", test_list=test_list,
+                where=(("dataset", "touch_and_go"),))  # fmt: skip
+    return Benchmark(task, "class", GradientRecipe(batch=128, rate=2e-4, decay=0.05), False, paper)
+
+
+def _objectfolder(number: int, pooling: Pooling, batch: int, paper: float) -> Benchmark:
+    name = f"objectfolder{number}"
+    task = Task(f"{name}_material", "label.material", which="all", where=(("dataset", name),))
+    return Benchmark(task, pooling, GradientRecipe(batch=batch, rate=1e-3, decay=0.01), True, paper)
+
+
+# Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code, run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py
+# and downstream_dataset.py. A batch is of two devices together. Features are computed once, so training pictures are
+# not augmented: the release flips and jitters them, except for ObjectFolder 2.0.
+BENCHMARKS = {
+    benchmark.task.name: benchmark
+    for benchmark in (
+        _touch_and_go("material", "label.material", "material", 0.8082),
+        _touch_and_go("roughness", "label.rough", "rough", 0.8674),
+        _touch_and_go("hardness", "label.hardness", "material", 0.9468),
+        Benchmark(
+            Task("feel_grasp", "label.success", which="all", fingers=True, where=(("dataset", "feel"),)),
+            "class", GradientRecipe(batch=256, rate=1e-3, decay=0.05), False, 0.8053,
+        ),
+        _objectfolder(1, "mean", 128, 0.4962),
+        _objectfolder(2, "class", 256, 0.7602),
+    )
+}  # fmt: skip
+
+
+class TaskRows(NamedTuple):
+    """The rows of a task: `rows` i64 (n, fingers) of the manifest, and for each its label (text, or f64 of a
+    regression), group, split (train, val, test), sensor and unit. `notes` say which rows are left out."""
 
     rows: Array
     labels: Array
@@ -89,33 +134,88 @@ class Selection(NamedTuple):
     units: Array
     notes: tuple[str, ...]
 
+    def take(self, ids: Array) -> TaskRows:
+        """Return the rows with these places."""
+        return TaskRows._make([*(column[ids] for column in self[:-1]), self.notes])
 
-def task_of(task: str | Task) -> Task:
-    """The task of that name. Raises UserError."""
+
+def find_task(task: str | Task) -> Task:
+    """Return the task with that name. Raises UserError."""
     if isinstance(task, Task):
         return task
     if task not in TASKS:
-        raise UserError(f"there is no task {task!r}; choose among {', '.join(TASKS)}")
+        raise UserError(f"There is no task {task!r}. Choose among {', '.join(TASKS)}.")
     return TASKS[task]
 
 
-def available(table: Manifest) -> tuple[str, ...]:
-    """The tasks whose label the manifest holds on some row."""
-    columns = {name: _column_of(table, task) for name, task in TASKS.items()}
-    has = {name: bool(table.present(name).any()) for name in set(columns.values()) if name in table.table.column_names}
+def find_benchmark(name: str) -> Benchmark:
+    """Return the benchmark with that name. Raises UserError."""
+    if name not in BENCHMARKS:
+        raise UserError(f"There is no benchmark {name!r}. Choose among {', '.join(BENCHMARKS)}.")
+    return BENCHMARKS[name]
+
+
+def available_tasks(table: Manifest) -> tuple[str, ...]:
+    """Return the tasks for which the manifest has a label on some row."""
+    columns = {name: _label_column(table, task) for name, task in TASKS.items()}
+    paired = _has_values(table, _grasp_column(table)) and _has_values(table, "unit")
     return tuple(
-        name for name, task in TASKS.items() if has.get(columns[name]) and (not task.fingers or _paired(table))
+        name for name, task in TASKS.items() if _has_values(table, columns[name]) and (paired or not task.fingers)
     )
 
 
-def _column_of(table: Manifest, task: Task) -> str:
-    """The column of a task's label; the object is told by a column of its own where there is no label of it."""
-    lock = task.label == "label.object" and task.label not in table.table.column_names
-    return "object" if lock else task.label
+def label_task(
+    table: Manifest,
+    label: str,
+    *,
+    group: str = "",
+    where: tuple[str, float] | None = None,
+    sensor: str | None = None,
+) -> Task:
+    """Return the task of any label column, on all rows that pass the filters.
+
+    Columns may be given without "label.". `group` defaults to the first of GROUPS with a value that is not the label.
+    Raises UserError for a column or sensor that the manifest lacks.
+    """
+    conditions: list[tuple[str, str | float]] = [(find_column(table, where[0]), where[1])] if where else []
+    if sensor is not None:
+        if sensor not in (known := sorted(set(text_column(table, "sensor")))):
+            raise UserError(f"No row is of sensor {sensor!r}. The manifest has {', '.join(known)}.")
+        conditions.append(("sensor", sensor))
+    name, groups = label.removeprefix("label."), [group] if group else []
+    if not group:
+        groups = [one for one in GROUPS if one != name
+                  and any(_has_values(table, column) for column in (one, f"label.{one}"))]  # fmt: skip
+    columns = tuple(find_column(table, one) for one in groups[:1])
+    return Task(name, find_column(table, label), groups=columns, which="all", where=tuple(conditions))
+
+
+def find_column(table: Manifest, name: str) -> str:
+    """Return `label.<name>` or else `name`, whichever the manifest has. Raises UserError."""
+    columns = table.table.column_names
+    for candidate in (f"label.{name}", name):
+        if candidate in columns:
+            if pa.types.is_nested(table.column(candidate).type):
+                raise UserError(f"Column {candidate!r} holds lists. A probe needs one value a row.")
+            return candidate
+    raise UserError(f"The manifest has no column {name!r} or 'label.{name}'. It has {', '.join(columns)}.")
+
+
+def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> dict[str, Array]:
+    """Return masks over `rows` (n,): values of `column` that have an image or a caption in train, and the others.
+
+    Alignment may have named the first. Empty if all or none have.
+    """
+    values = text_column(table, column)
+    described = (table.present("image_path") | table.present("text")) & (text_column(table, "split") == "train")
+    mask = np.isin(values[rows], np.setdiff1d(values[described], [""]))
+    if mask.all() or not mask.any():
+        return {}
+    return {f"{name} with a photograph or caption": mask, f"{name} without": ~mask}
 
 
 def mirrored(label: str, value: str, *, across: bool = False, down: bool = False) -> str:
-    """What a direction label (column `label`) becomes when the picture is flipped left to right or upside down."""
+    """Return a direction label (column `label`) after the picture is flipped left to right or upside down."""
     if label == "label.twist" and across != down:
         return _TURNED.get(value, value)
     if label == "label.slide":
@@ -124,72 +224,92 @@ def mirrored(label: str, value: str, *, across: bool = False, down: bool = False
     return value
 
 
-def select(table: Manifest, task: Task, frames: int | None = None) -> Selection:
-    """The rows of a task, in the manifest's order. `frames` longer than the task's asks for rows that end such a clip.
+def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
+    """Return the rows of a task in the manifest's order; `frames` above the task's selects rows that end such a clip.
 
     A still (`frames` 1) of a task on clips takes the same rows as the clips do. Raises UserError without the label.
     """
-    task = replace(task, label=_column_of(table, task))
-    if task.label not in table.table.column_names or not table.present(task.label).any():
+    task = replace(task, label=_label_column(table, task))
+    if not _has_values(table, task.label):
         known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
-        raise UserError(f"task {task.name}: the manifest has no label in column {task.label!r}; it has {known}")
+        raise UserError(f"Task {task.name}: the manifest has no label in column {task.label!r}. It has {known}.")
     labels, split = _labels(table, task), _split(table, task)
-    has = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
-    kept = has & np.isin(split, ("train", "val", "test"))
-    if task.where is not None:
-        kept &= text_column(table, task.where[0]) == task.where[1]
+    kept = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
+    kept &= np.isin(split, ("train", "val", "test")) & ~np.isin(text_column(table, "sensor"), FIELD_SENSORS)
+    for column, value in task.where:
+        kept &= text_column(table, column) == value if isinstance(value, str) else _numbers(table, column) > value
     length = max(task.frames, frames or 1)
     if length > 1:
         kept &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
-    rows = _which(table, task.which, np.flatnonzero(kept))
-    read, told, notes = _fingers(table, task, rows) if task.fingers else (rows[:, None], rows, ())
-    if not len(read):
-        what = "two fingers of one touch" if task.fingers else "a label and contact"
-        raise UserError(f"task {task.name}: no row of split train, val or test has {what} (label {task.label!r})")
-    sensors, units = (text_column(table, name)[told] for name in ("sensor", "unit"))
-    return Selection(read, labels[told], _groups(table, task.groups)[told], split[told], sensors, units, notes)
+    first = _choose_frames(table, task.which, np.flatnonzero(kept))
+    rows, first, notes = _pair_fingers(table, task, first) if task.fingers else (first[:, None], first, ())
+    if not len(rows):
+        lacking = " and two fingers" if task.fingers else "" if task.which == "all" else " and contact"
+        raise UserError(
+            f"Task {task.name}: no row of split train, val or test has a label in {task.label!r}{lacking}. "
+            "Check the filters and the splits."
+        )
+    sensors, units = (text_column(table, name)[first] for name in ("sensor", "unit"))
+    return TaskRows(rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes)
+
+
+def label_text(value: Any) -> str:
+    """Return a class label as text, "" for None and NaN. Raises UserError for a measured quantity."""
+    if value is None:
+        return ""
+    if isinstance(value, float | np.floating):
+        if np.isnan(value):
+            return ""
+        if not np.isfinite(value) or value != int(value):
+            raise UserError(f"The label holds {value:g}, a measured quantity, not a class. Probe it as a number.")
+        return str(int(value))
+    return str(value)
+
+
+def _has_values(table: Manifest, column: str) -> bool:
+    return column in table.table.column_names and bool(table.present(column).any())
+
+
+def _label_column(table: Manifest, task: Task) -> str:
+    """Return the label column of a task; `object` falls back to the manifest's object column."""
+    fallback = task.label == "label.object" and task.label not in table.table.column_names
+    return "object" if fallback else task.label
 
 
 def _labels(table: Manifest, task: Task) -> Array:
     if task.kind == "regression" or task.above is not None:
-        number = _number(table, task.label)
+        number = _numbers(table, task.label)
         if task.above is None:
             return number
         return np.where(np.isfinite(number), np.where(number > task.above, "yes", "no"), "")
-    values = table.column(task.label).to_pylist()
-    texts = np.array([_text(value, task) for value in values], dtype=str)
+    try:
+        texts = np.array([label_text(value) for value in table.column(task.label).to_pylist()], dtype=str)
+    except UserError as error:
+        raise UserError(f"Task {task.name}, column {task.label!r}: {error}") from None
     return np.where(np.isin(texts, task.classes), texts, "") if task.classes else texts
 
 
-def _text(value: Any, task: Task) -> str:
-    if isinstance(value, float) and not np.isnan(value) and not value.is_integer():
-        raise UserError(f"task {task.name}: column {task.label!r} holds {value:g}, a measured quantity and no class")
-    if value is None or (isinstance(value, float) and np.isnan(value)):
-        return ""
-    return str(int(value)) if isinstance(value, bool | float) else str(value)
-
-
-def _number(table: Manifest, name: str) -> Array:
-    """A column as f64 (rows,), NaN where it is empty or not there."""
+def _numbers(table: Manifest, name: str) -> Array:
+    """Return a column as f64 (rows,), NaN where it is empty or missing."""
     if name not in table.table.column_names:
         return np.full(len(table), np.nan)
     try:
         return table.column(name).cast(pa.float64()).to_numpy().astype(np.float64)
     except pa.ArrowException:
-        raise UserError(f"column {name!r} holds text; this task needs numbers") from None
+        raise UserError(f"Column {name!r} holds text. This task needs numbers.") from None
 
 
 def _split(table: Manifest, task: Task) -> Array:
     split = text_column(table, "split")
-    if task.listed is None:
+    if task.test_list is None:
         return split
     if "downstream_test" not in table.table.column_names:
-        raise UserError(f"task {task.name} follows the authors' lists: index the data set again, for 'downstream_test'")
-    listed = [task.listed in name.split("+") for name in text_column(table, "downstream_test")]
+        raise UserError(f"Task {task.name} needs the column downstream_test. Index the data set again.")
+    listed = [task.test_list in name.split("+") for name in text_column(table, "downstream_test")]
     return np.where(listed, "test", "train")  # whichever list decided the split of this manifest
 
 
-def _which(table: Manifest, which: Which, rows: Array) -> Array:
+def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
     if which == "all":
         return rows
     rows = rows[_touching(table)[rows]]
@@ -197,35 +317,34 @@ def _which(table: Manifest, which: Which, rows: Array) -> Array:
         return rows
     sequence, frame = table.codes("sequence", own=True), np.asarray(table.column("frame_index"))
     if which == "press":
-        force = _number(table, "label.force")[rows]
+        force = _numbers(table, "label.force")[rows]
         known = np.isfinite(force)
-        best = _best(rows[known], sequence[rows[known]], force[known], np.zeros(known.sum()))
-        return np.sort(np.concatenate([rows[~known], best]))
+        deepest = _best_of_sequence(rows[known], sequence[rows[known]], force[known], np.zeros(known.sum()))
+        return np.sort(np.concatenate([rows[~known], deepest]))
     last = np.zeros(sequence.max() + 1)
     np.maximum.at(last, sequence, frame)
     late = -np.abs(frame - 2 / 3 * last[sequence])[rows]  # motion lasts from a third to five sixths of a recording
-    slip = np.nan_to_num(_number(table, "label.slip")[rows], nan=0.0).round(2)
-    return np.sort(_best(rows, sequence[rows], slip, late))
+    slip = np.nan_to_num(_numbers(table, "label.slip")[rows], nan=0.0).round(2)
+    return np.sort(_best_of_sequence(rows, sequence[rows], slip, late))
 
 
-def _best(rows: Array, sequence: Array, first: Array, second: Array) -> Array:
-    """Of each sequence the row of the largest `first`, then of the largest `second`, then the earliest."""
+def _best_of_sequence(rows: Array, sequence: Array, first: Array, second: Array) -> Array:
+    """Return the row of each sequence with the largest `first`, then the largest `second`, then the earliest."""
     order = np.lexsort((rows, -second, -first, sequence))
     return rows[order[np.unique(sequence[order], return_index=True)[1]]]
 
 
 def _touching(table: Manifest) -> Array:
-    """Whether a frame is contact, bool (rows,): by force, by mark (`anytouch contact`) or by score; all of a file
-    without these.
+    """Return whether each frame is contact, bool (rows,): by force, contact mark or contact score; all without these.
 
-    Force first: a mark or a score is of the picture, and would leave out soft objects, by sensors unequally.
+    Force comes first: a mark or a score depends on the picture, and would leave out soft objects, by sensors unequally.
     """
-    force, score = (_number(table, f"label.{name}") for name in ("force", "contact_score"))
+    force, contact_score = (_numbers(table, f"label.{name}") for name in ("force", "contact_score"))
     mark = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
         here = table.source == source
-        for values, least in ((force, FORCE), (mark, 0.5), (score, SCORE)):
+        for values, least in ((force, FORCE), (mark, 0.5), (contact_score, SCORE)):
             if np.isfinite(values[here]).any():
                 touches[here] = np.nan_to_num(values[here], nan=-1.0) > least
                 break
@@ -233,37 +352,32 @@ def _touching(table: Manifest) -> Array:
 
 
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
-    """The first column with a value names a row's group; the sequence where all are empty.
+    """Return the group of each row: the first column with a value, else the sequence.
 
-    Keys of joined manifests are their own: a recording of one file is not that of the same name in another.
+    Keys are made different between joined manifests: equal names of recordings are not the same recording.
     """
     sequence = text_column(table, "sequence")
-    file = np.array([f" of file {one}" if len(table.files) > 1 else "" for one in table.source], dtype=str)
-    found = np.char.add(np.char.add("sequence ", sequence), file)
+    file = np.array([f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str)
+    groups = np.char.add(np.char.add("sequence ", sequence), file)
     for name in reversed(columns):
         if name == "recording":
-            recordings = np.array([f"recording {one.rpartition('/')[0] or one}" for one in sequence])
-            found = np.char.add(recordings, file) if len(set(recordings)) > 1 else found
+            recordings = np.array([f"recording {key.rpartition('/')[0] or key}" for key in sequence])
+            groups = np.char.add(recordings, file) if len(set(recordings)) > 1 else groups
         elif name in table.table.column_names:
             values = text_column(table, name)
-            own = np.char.add(values, file) if name in KEYS else values
-            found = np.where(values != "", np.char.add(f"{name} ", own), found)
-    return found
+            keys = np.char.add(values, file) if name in KEYS else values
+            groups = np.where(values != "", np.char.add(f"{name} ", keys), groups)
+    return groups
 
 
-def _grasp(table: Manifest) -> str:
-    """The column that two fingers of one grasp share."""
+def _grasp_column(table: Manifest) -> str:
+    """Return the column that two fingers of one grasp share."""
     return "grasp_group" if "grasp_group" in table.table.column_names else "touch"
 
 
-def _paired(table: Manifest) -> bool:
-    return bool(table.present(_grasp(table)).any() and table.present("unit").any())
-
-
-def _fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tuple[str, ...]]:
-    """Rows (n, 2) to read, of the two units of each grasp in the order of the units' names; the row of each that has
-    the label; and what was left out."""
-    name = _grasp(table)
+def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return rows (n, 2) of the two units of each grasp, by the units' names; the labelled row of each; and notes."""
+    name = _grasp_column(table)
     rows = rows[table.present(name)[rows] & table.present("unit")[rows]]
     grasp, unit = table.codes(name, own=True)[rows], text_column(table, "unit")[rows]
     order = np.lexsort((unit, grasp))
@@ -271,21 +385,22 @@ def _fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tu
     starts, counts = np.unique(grasp, return_index=True, return_counts=True)[1:]
     whole = starts[counts == 2]
     whole = whole[unit[whole] != unit[whole + 1]]
-    read = rows[whole[:, None] + np.arange(2)]
+    pairs = rows[whole[:, None] + np.arange(2)]
     notes = [f"{len(starts) - len(whole)} grasps without two fingers left out"] if len(starts) > len(whole) else []
-    told = read[:, 0]
+    labelled = pairs[:, 0]
     if task.phase == "after":
-        read = _after(table, read)
-        there = (read >= 0).all(1)
-        read, told = read[there], told[there]
-        notes += [f"{np.sum(~there)} grasps without both frames after left out"] if not there.all() else []
-    order = np.argsort(told)
-    return read[order], told[order], tuple(notes)
+        pairs = _rows_after(table, pairs)
+        complete = (pairs >= 0).all(1)
+        pairs, labelled = pairs[complete], labelled[complete]
+        if not complete.all():
+            notes.append(f"{np.sum(~complete)} grasps without both frames after left out")
+    order = np.argsort(labelled)
+    return pairs[order], labelled[order], tuple(notes)
 
 
-def _after(table: Manifest, during: Array) -> Array:
-    """The rows after the grasp of these rows during it: sequence <grasp>/after/<finger>; -1 where there is none."""
+def _rows_after(table: Manifest, during: Array) -> Array:
+    """Return the rows after the grasp of rows during it, sequence <grasp>/after/<finger>; -1 for a missing one."""
     sequence, source = text_column(table, "sequence"), table.source
-    place = {(source[row], sequence[row]): row for row in range(len(table)) if "/after/" in sequence[row]}
-    found = [place.get((source[row], sequence[row].replace("/during/", "/after/")), -1) for row in during.ravel()]
-    return np.array(found, np.int64).reshape(during.shape)
+    places = {(source[row], sequence[row]): row for row in range(len(table)) if "/after/" in sequence[row]}
+    keys = [(source[row], sequence[row].replace("/during/", "/after/")) for row in during.ravel()]
+    return np.array([places.get(key, -1) for key in keys], np.int64).reshape(during.shape)

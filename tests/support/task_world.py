@@ -1,10 +1,11 @@
-"""Manifests without pictures for the battery, and features planted in place of an encoder's."""
+"""Manifests without pictures for probing tasks, and features like those of a network."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
@@ -66,3 +67,26 @@ def row(**changes: Any) -> dict[str, Any]:
     """A row that is complete but for what is asked."""
     plain = {"path": "a.png", "sensor": "digit", "sequence": "a", "frame_index": 0, "split": "train"}
     return plain | {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def blobs(n: int = 600, d: int = 24, classes: int = 4, apart: float = 1.0, seed: int = 0):
+    """Correlated features, as a network's are: spreads from 1 to 100, then standardised; class numbers."""
+    rng = np.random.default_rng(seed)
+    mixed = np.linalg.qr(rng.normal(size=(d, d)))[0] * np.geomspace(1, 100, d)
+    y = rng.integers(classes, size=n)
+    x = (rng.normal(size=(n, d)) + apart * rng.normal(size=(classes, d))[y]) @ mixed
+    return ((x - x.mean(0)) / x.std(0)).astype(np.float32), y
+
+
+def painted(folder: Path) -> Manifest:
+    """A small world on disk: brighter is harder pressed, with backgrounds."""
+    world = simulated(objects=8, each=2, frames=4)
+    rng, columns = np.random.default_rng(0), world.table.to_pydict()
+    columns["background_path"] = ["ground.png"] * len(world)
+    cv2.imwrite(str(folder / "ground.png"), np.full((32, 32, 3), 40, np.uint8))
+    for name, force in zip(columns["path"], columns["label.force"], strict=True):
+        image = 40 + 30 * force + rng.integers(0, 5, (32, 32, 3))
+        cv2.imwrite(str(folder / name), image.clip(0, 255).astype(np.uint8))
+    file = folder / "manifest.parquet"
+    manifests.write(manifests.from_columns(columns, file), file)
+    return manifests.read(file)

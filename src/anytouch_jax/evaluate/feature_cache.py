@@ -1,0 +1,312 @@
+"""Feature caches: features by manifest row, of an encoder, a features file or raw pixels; in memory and on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import jax
+import numpy as np
+import numpy.typing as npt
+from sklearn.decomposition import PCA
+
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import read_image
+from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import Encoder, Features, Join, Pooling, check_backgrounds, save_npz, text_column
+from anytouch_jax.errors import UserError
+
+Array = npt.NDArray[Any]
+Order = Literal["right", "shuffled", "repeated"]
+Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
+Size = tuple[int, int]  # rows, columns
+
+VERSION = 3  # of the features; a change to their computation raises it
+BATCH = 64
+RAW_SIZE = (240, 320)  # of a picture before its area averages
+SMALL = (24, 32)
+COMPONENTS = 200  # principal components of raw pixels
+
+
+class FeatureStore:
+    """Features by row and length of clip, each computed once and, with a `folder`, kept in one .npz a content.
+
+    `describe()` names everything else that they depend on. It is called only if there is a folder.
+    """
+
+    def __init__(
+        self, compute: Compute, describe: Callable[[], Mapping[str, Any]] = dict, folder: Path | None = None
+    ) -> None:
+        self._compute, self._folder = compute, folder
+        self._about = {} if folder is None else dict(describe())
+        self._rows: dict[int, Array] = {}
+        self._values: dict[int, Array] = {}
+
+    def add(self, rows: Array, frames: int) -> None:
+        """Compute the missing features of these rows (any shape) in one pass."""
+        if frames not in self._rows:
+            self._load(frames)
+        missing = np.setdiff1d(rows, self._rows[frames])
+        if not len(missing):
+            return
+        values = self._compute(missing, frames)
+        known = [self._values[frames], values] if len(self._rows[frames]) else [values]
+        every = np.concatenate([self._rows[frames], missing])
+        order = np.argsort(every)
+        self._rows[frames], self._values[frames] = every[order], np.concatenate(known)[order]
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            about = {"about": json.dumps(self._about | {"frames": frames}, sort_keys=True)}
+            save_npz(self.file(frames), Features(self._values[frames], self._rows[frames], {}), about)
+
+    def get(self, rows: Array, frames: int) -> Array:
+        """Return features f32 (n, k * d) of `rows` (n, k), those of a row joined."""
+        self.add(rows, frames)
+        places = np.searchsorted(self._rows[frames], rows)
+        return self._values[frames][places].reshape(len(rows), -1)
+
+    def file(self, frames: int) -> Path:
+        """Return the file of features of clips of this length."""
+        text = json.dumps(self._about | {"frames": frames}, sort_keys=True)
+        return Path(self._folder or ".") / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
+
+    def _load(self, frames: int) -> None:
+        self._rows[frames], self._values[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
+        if self._folder is None or not self.file(frames).exists():
+            return
+        broken = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+        with contextlib.suppress(*broken), self.file(frames).open("rb") as file, np.load(file) as arrays:
+            self._rows[frames], self._values[frames] = arrays["rows"], arrays["features"]
+
+
+def encoder_features(
+    encoder: Encoder,
+    table: Manifest,
+    *,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    order: Order = "right",
+    universal: bool = False,
+    folder: Path | None = None,
+) -> FeatureStore:
+    """Return the features of an encoder; `universal`: the universal tokens for every sensor."""
+
+    def describe() -> dict[str, Any]:
+        return _content(table, encoder_digest(encoder), order) | {
+            "pooling": pooling, "join": join, "universal": universal, "background": encoder.config.data.background,
+        }  # fmt: skip
+
+    def compute(rows: Array, frames: int) -> Array:
+        check_backgrounds(encoder, table, rows)
+        config = replace(encoder.config, data=replace(encoder.config.data, batch_size=BATCH))
+        kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
+        values, read, universal_row = [], 0, encoder.config.model.universal_row
+        for ids, part in evaluation(table, rows, config, kind, frames=frames, unknown="universal"):
+            clip = reorder_frames(part.clip[: len(ids)], ids, order)
+            clip = np.concatenate([clip, np.repeat(clip[-1:], BATCH - len(ids), axis=0)])  # one shape, one compilation
+            sensor = np.full(BATCH, universal_row, np.int32) if universal else part.sensor
+            values.append(encoder.embed(clip, sensor, pooling=pooling, join=join)[: len(ids)])
+            read += len(ids)
+        if read != len(rows):
+            raise UserError(f"{len(rows) - read} rows could not be read. Repair the manifest first.")
+        return np.concatenate(values)
+
+    return FeatureStore(compute, describe, folder)
+
+
+def pixel_features(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> FeatureStore:
+    """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
+    backgrounds: dict[Path, Array] = {}
+
+    def compute(rows: Array, frames: int) -> Array:
+        clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
+        windows = reorder_frames(clips[np.searchsorted(clips[:, -1], rows)], rows, order)
+        single, places = np.unique(windows, return_inverse=True)
+        pixels = np.stack([_row_pixels(table, int(row), backgrounds) for row in single])
+        last, differences = np.split(pixels, 2, axis=1)
+        places = places.reshape(windows.shape)
+        return np.concatenate([last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1)
+
+    return FeatureStore(compute, lambda: _content(table, "raw pixels in colour", order), folder)
+
+
+def file_features(path: Path, table: Manifest) -> FeatureStore:
+    """Return the features of an .npz file: arrays `features` (n, d) and `rows` (n,) of the manifest.
+
+    Raises UserError for another file, for features of another manifest (by `key/path`), and, when they are read, for
+    clips of another length (by `about/frames`) and for missing rows.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # a foreign file raises whatever its bytes suggest
+        raise UserError(f"{path} is not an npz file of plain arrays: {error}") from error
+    if not {"features", "rows"} <= arrays.keys():
+        raise UserError(f"{path} needs the arrays features (n, d) and rows (n,). It has {', '.join(arrays) or 'none'}.")
+    values, rows = arrays["features"], arrays["rows"]
+    numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
+    if values.ndim != 2 or not numeric or rows.shape != values.shape[:1]:
+        raise UserError(
+            f"{path} needs numbers features (n, d) and integers rows (n,), not {values.shape}, {rows.shape}."
+        )
+    if len(np.unique(rows)) < len(rows) or not len(rows) or rows.min() < 0 or rows.max() >= len(table):
+        raise UserError(f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}.")
+    paths = arrays.get("key/path")
+    if paths is not None and (paths != text_column(table, "path")[rows]).any() and len(table.files) == 1:
+        raise UserError(f"{path} holds features of another manifest. Its paths differ from those of these rows.")
+    order = np.argsort(rows)
+    rows, values = rows[order], values[order].astype(np.float32)
+
+    def compute(wanted: Array, frames: int) -> Array:
+        length = arrays.get("about/frames")
+        if length is not None and str(length) != str(frames):
+            raise UserError(f"{path} holds features of {length} frames a touch, not {frames}. Give --frames {length}.")
+        missing = len(np.setdiff1d(wanted, rows))
+        if missing:
+            raise UserError(f"{path} lacks {missing} of the {len(wanted)} rows to probe. Embed them too.")
+        return values[np.searchsorted(rows, wanted)]
+
+    return FeatureStore(compute)
+
+
+def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
+    """Return clips (n, T, ...) untouched, with frames shuffled (by the row's number), or with the last repeated."""
+    frames = clips.shape[1]
+    if order == "right" or frames == 1:
+        return clips
+    if order == "repeated":
+        return np.repeat(clips[:, -1:], frames, axis=1)
+    if order != "shuffled":
+        raise UserError(f"Unknown order {order!r}. Choose right, shuffled or repeated.")
+    return np.stack([clip[_derangement(frames, int(row))] for clip, row in zip(clips, rows, strict=True)])
+
+
+def _derangement(frames: int, row: int) -> Array:
+    rng = np.random.default_rng([13, row])
+    while True:
+        order = rng.permutation(frames)
+        if (order != np.arange(frames)).any():
+            return order
+
+
+def _content(table: Manifest, parameters: str, order: Order) -> dict[str, Any]:
+    return {
+        "version": VERSION,
+        "parameters": parameters,
+        "manifest": table.content_hash,
+        "pictures": image_digest(table),
+        "order": order,
+    }
+
+
+def encoder_digest(encoder: Encoder) -> str:
+    """Return SHA-256 over the parameters and the model config."""
+    digest = hashlib.sha256(json.dumps(asdict(encoder.config.model), sort_keys=True).encode())
+    leaves = jax.tree_util.tree_leaves_with_path(encoder.params)
+    for name, leaf in sorted((jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.view(np.uint8).data if array.size else b"")
+    return digest.hexdigest()
+
+
+def image_digest(table: Manifest, count: int = 32) -> str:
+    """Return SHA-256 over size and mtime of each frame (or its shard), all backgrounds and `count` sampled frames.
+
+    Pictures may change under an equal manifest. A copy of the folder that keeps its times has the same digest.
+    """
+    digest = hashlib.sha256()
+    files = distinct_files(table, ("path", "background_path"))
+    for row, column in zip(files.row, files.column, strict=True):
+        with contextlib.suppress(OSError, ValueError):  # an unreadable file raises when its features are computed
+            file = table.file(int(row), column)
+            if column == "background_path":
+                digest.update(read_file(file))
+                continue
+            shard = split_shard_path(file)
+            about = os.stat(shard[0] if shard else file)
+            digest.update(f"{about.st_size} {about.st_mtime_ns} ".encode())
+    for row in np.unique(np.linspace(0, len(table) - 1, count).astype(int)):
+        with contextlib.suppress(OSError, ValueError):
+            digest.update(read_file(table.file(int(row))))
+    return digest.hexdigest()
+
+
+def raw_pixels(frame: Array, background: Array | None, size: Size = SMALL) -> Array:
+    """Return pixels in colour and their difference from the background (0 without one), averaged down to `size`.
+
+    `frame`, `background`: u8 RGB (h, w, 3) -> f32 (2 * rows * columns * 3,) in 0..1. Raises UserError if shapes differ.
+    """
+    if frame.ndim != 3 or frame.shape[-1] != 3 or (background is not None and frame.shape != background.shape):
+        others = "" if background is None else f" and background {background.shape}"
+        raise UserError(f"Frame {frame.shape}{others} must have one shape (h, w, 3).")
+    pixels = _small(frame, size)
+    return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background, size)])
+
+
+def _row_pixels(table: Manifest, row: int, backgrounds: dict[Path, Array]) -> Array:
+    """Return `raw_pixels` of a manifest row; `backgrounds` caches what many rows share."""
+    frame, background = _same_size(read_image(table, row)), None
+    if table.value(row, "background_path") is not None:
+        file = table.file(row, "background_path")
+        if file not in backgrounds:
+            if len(backgrounds) >= 256:  # 230 kB each
+                backgrounds.clear()
+            backgrounds[file] = _same_size(read_image(table, row, "background_path"))
+        background = backgrounds[file]
+    return raw_pixels(frame, background)
+
+
+def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> Array:
+    """Return frames minus their backgrounds in RGB, averaged down to `size`: f32 (n, 3 * rows * columns) in -1..1.
+
+    Raises UserError that names a row without a background, or whose background has other proportions.
+    """
+    backgrounds: dict[Path, tuple[Array, float]] = {}
+    values = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
+    for place, row in enumerate(map(int, rows)):
+        if table.value(row, "background_path") is None:
+            raise UserError(f"{table.where(row)} has no background_path. Add one, or leave this baseline out.")
+        file = table.file(row, "background_path")
+        if file not in backgrounds:
+            background = read_image(table, row, "background_path")
+            backgrounds[file] = _small(background, size), background.shape[1] / background.shape[0]
+        frame, (small, proportion) = read_image(table, row), backgrounds[file]
+        if abs(frame.shape[1] / frame.shape[0] / proportion - 1) > 0.05:
+            raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame.")
+        values[place] = _small(frame, size) - small
+    return values
+
+
+def principal_components(
+    features: Array, train: Array, components: int = COMPONENTS, solver: Literal["full", "randomized"] = "full"
+) -> Array:
+    """Return `features` (n, d) on the principal components of their `train` (n,) rows, largest variance first.
+
+    Raises UserError if `train` is empty.
+    """
+    fitted = features[np.asarray(train, bool)]
+    if not len(fitted):
+        raise UserError("No row is marked as train. The principal components need some.")
+    pca = PCA(min(components, *fitted.shape), svd_solver=solver, random_state=0)
+    return np.asarray(pca.fit(fitted).transform(features), np.float32)
+
+
+def _same_size(image: Array) -> Array:
+    if image.shape[:2] == RAW_SIZE:
+        return image
+    return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
+
+
+def _small(image: Array, size: Size) -> Array:
+    """Return area averages, f32 (rows * columns * 3,) in 0..1, of a picture u8 (h, w, 3)."""
+    return cv2.resize(image.astype(np.float32) / 255, size[::-1], interpolation=cv2.INTER_AREA).ravel()

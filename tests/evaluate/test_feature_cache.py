@@ -1,0 +1,267 @@
+"""Feature caches: what is computed again, what is not; raw pixels; features files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from task_world import painted, simulated
+from tiny_models import tiny_config
+
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.prepare.shards import pack
+from anytouch_jax.encoder.encoder import Encoder, random_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import feature_cache
+from anytouch_jax.evaluate.feature_cache import (
+    encoder_digest,
+    encoder_features,
+    image_digest,
+    principal_components,
+    reorder_frames,
+)
+
+ROWS = np.arange(3)
+
+
+@pytest.fixture(scope="module")
+def subtracting(compiled_once) -> Encoder:
+    config = tiny_config()
+    return random_encoder(replace(config, data=replace(config.data, background="subtract")))
+
+
+def paint(file: Path, grey: int) -> None:
+    assert cv2.imwrite(str(file), np.full((28, 28, 3), grey, np.uint8))
+
+
+def world(folder: Path, gel: int) -> Manifest:
+    """Three touches over a gel of grey `gel`; pictures without compression, so that all are of one size."""
+    folder.mkdir()
+    columns = {
+        "path": [f"{i}.bmp" for i in ROWS],
+        "sensor": ["digit"] * 3,
+        "sequence": ["a"] * 3,
+        "frame_index": ROWS.tolist(),
+        "split": ["test"] * 3,
+        "background_path": ["background.bmp"] * 3,
+    }
+    for i in ROWS:
+        paint(folder / f"{i}.bmp", 100 + 20 * i)
+    paint(folder / "background.bmp", gel)
+    manifests.write(manifests.from_columns(columns, folder / "m.parquet"), folder / "m.parquet")
+    return manifests.read(folder / "m.parquet")
+
+
+def test_packs_of_one_table_with_other_gels_share_no_features(tmp_path, subtracting):
+    one, two = (manifests.read(pack(world(tmp_path / str(gel), gel), tmp_path / f"packed{gel}")) for gel in (100, 40))
+    assert one.content_hash == two.content_hash
+    shards = [one_of.file(0).parent for one_of in (one, two)]
+    for shard in shards:
+        os.utime(shard, ns=(1, 1))
+    assert shards[0].stat().st_size == shards[1].stat().st_size
+    assert image_digest(one) != image_digest(two)
+    first, second = (encoder_features(subtracting, table, folder=tmp_path) for table in (one, two))
+    assert np.abs(first.get(ROWS, 1) - second.get(ROWS, 1)).max() > 1e-3
+    before = image_digest(one)
+    os.utime(shards[0], ns=(2, 2))  # a pack that was written anew
+    assert image_digest(one) != before
+
+
+def test_another_picture_of_the_gel_is_seen_in_the_same_process(tmp_path, subtracting):
+    table = world(tmp_path / "world", 100)
+    first = encoder_features(subtracting, table).get(ROWS, 1)
+    paint(tmp_path / "world" / "background.bmp", 40)
+    again = encoder_features(subtracting, table).get(ROWS, 1)
+    assert np.abs(again - first).max() > 1e-3
+    second = encoder_features(subtracting, world(tmp_path / "new", 40)).get(ROWS, 1)
+    np.testing.assert_array_equal(again, second)
+
+
+# ---- an untrained encoder on pictures ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory) -> Manifest:
+    return painted(tmp_path_factory.mktemp("pictures"))
+
+
+@pytest.fixture(scope="module")
+def encoder(compiled_once) -> Encoder:
+    return random_encoder(tiny_config())
+
+
+def counted(monkeypatch) -> list[int]:
+    """Rows that are read, by every pass over a manifest."""
+    passes: list[int] = []
+
+    def counting(table, rows, *args, **options):
+        passes.append(len(rows))
+        return evaluation(table, rows, *args, **options)
+
+    monkeypatch.setattr(feature_cache, "evaluation", counting)
+    return passes
+
+
+def test_the_cache_goes_by_content(monkeypatch, encoder, pictures, tmp_path):
+    plain: dict[str, Any] = {"folder": tmp_path}
+    store = encoder_features(encoder, pictures, **plain)
+    files = {store.file(1), store.file(3)}
+    other = random_encoder(tiny_config(), seed=1)
+    assert encoder_digest(other) != encoder_digest(encoder) == encoder_digest(random_encoder(tiny_config()))
+    files.add(encoder_features(other, pictures, **plain).file(1))
+    for change in ({"pooling": "mean"}, {"join": "concat"}, {"order": "shuffled"}, {"universal": True}):
+        files.add(encoder_features(encoder, pictures, **plain | change).file(1))
+    files.add(encoder_features(encoder, simulated(objects=8), **plain).file(1))
+    assert len(files) == 8
+    copied = tmp_path / "elsewhere"
+    copied.mkdir()
+    for name in ["ground.png", *pictures.column("path").to_pylist()]:
+        shutil.copy2(pictures.files[0].parent / name, copied / name)
+    manifests.write(manifests.from_columns(pictures.table.to_pydict(), copied / "m.parquet"), copied / "m.parquet")
+    moved = manifests.read(copied / "m.parquet")
+    assert encoder_features(encoder, moved, **plain).file(1) == store.file(1)
+    middle = copied / pictures.value(len(pictures) // 2 + 1, "path")
+    middle.write_bytes(middle.read_bytes()[:-1] + b"x")  # of the same size
+    rewritten = encoder_features(encoder, moved, **plain).file(1)
+    assert rewritten != store.file(1)
+    (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
+    assert encoder_features(encoder, moved, **plain).file(1) != rewritten  # an equal table beside other pictures
+    before = encoder_features(encoder, moved, **plain).file(1)
+    cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))  # another photograph of the gel
+    assert encoder_features(encoder, moved, **plain).file(1) != before
+
+
+def test_a_broken_cache_is_made_again(monkeypatch, encoder, pictures, tmp_path):
+    rows = np.arange(4)
+    whole = encoder_features(encoder, pictures, folder=tmp_path)
+    values = whole.get(rows[:, None], 1)
+    whole.file(1).write_bytes(whole.file(1).read_bytes()[:200])
+    passes = counted(monkeypatch)
+    again = encoder_features(encoder, pictures, folder=tmp_path)
+    np.testing.assert_array_equal(again.get(rows[:, None], 1), values)
+    assert passes == [4]
+
+
+def test_the_order_of_frames(monkeypatch, encoder, pictures):
+    clips = np.arange(24).reshape(8, 3)
+    rows = np.arange(8)
+    np.testing.assert_array_equal(reorder_frames(clips, rows, "right"), clips)
+    np.testing.assert_array_equal(reorder_frames(clips, rows, "repeated"), np.repeat(clips[:, 2:], 3, 1))
+    mixed = reorder_frames(clips, rows, "shuffled")
+    assert (np.sort(mixed, 1) == clips).all() and (mixed != clips).any(1).all()
+    assert len({tuple(one - one.min()) for one in mixed}) > 2
+    np.testing.assert_array_equal(reorder_frames(clips[3:5], rows[3:5], "shuffled"), mixed[3:5])
+    np.testing.assert_array_equal(reorder_frames(clips[:, :1], rows, "shuffled"), clips[:, :1])
+    with pytest.raises(UserError, match="backwards"):
+        reorder_frames(clips, rows, "backwards")
+    ends = pictures.clips(3)[:6, -1]
+    stores = {o: encoder_features(encoder, pictures, order=o) for o in ("right", "shuffled", "repeated")}
+    values = {name: store.get(ends[:, None], 3) for name, store in stores.items()}
+    stills = stores["right"].get(ends[:, None], 1)
+    np.testing.assert_allclose(values["repeated"], stills, atol=2e-5)
+    assert np.abs(values["right"] - values["shuffled"]).max() > 1e-4
+    assert np.abs(values["right"] - values["repeated"]).max() > 1e-4
+
+
+def test_universal_tokens_for_sensors_that_the_model_knows(encoder, pictures):
+    known, universal = (encoder_features(encoder, pictures, universal=one) for one in (False, True))
+    rows = np.flatnonzero(np.array(pictures.column("sensor").to_pylist()) == "digit")[:3]
+    assert np.abs(known.get(rows[:, None], 1) - universal.get(rows[:, None], 1)).max() > 1e-4
+
+
+# ---- raw pixels ---------------------------------------------------------------------------------------------
+
+HALF = 24 * 32 * 3
+
+
+def noise(count: int, height: int = 48, width: int = 64, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, height, width, 3), np.uint8)
+
+
+def raw_pixels(frames: np.ndarray, backgrounds: np.ndarray) -> np.ndarray:
+    return np.stack([feature_cache.raw_pixels(*one) for one in zip(frames, backgrounds, strict=True)])
+
+
+def test_pixels_are_block_means_in_colour() -> None:
+    frames, backgrounds = noise(3), noise(3, seed=1)
+    features = raw_pixels(frames, backgrounds)
+    assert features.shape == (3, 2 * 24 * 32 * 3)
+    seen, behind = (
+        (one / 255).reshape(3, 24, 2, 32, 2, 3).mean((2, 4)).reshape(3, -1) for one in (frames, backgrounds)
+    )
+    np.testing.assert_allclose(features[:, :HALF], seen, atol=1e-6)
+    np.testing.assert_allclose(features[:, HALF:], seen - behind, atol=1e-6)
+    turned = raw_pixels(frames[..., ::-1], backgrounds)
+    assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, "a colour tells a slope: it is not lost"
+
+
+@pytest.mark.parametrize("shape", [(320, 240), (50, 77), (30, 33)])
+def test_any_size_is_averaged_by_area(shape: tuple[int, int]) -> None:
+    frame = noise(1, *shape)
+    fine = np.repeat(np.repeat(frame[0] / 255, 24, 0), 32, 1)  # 24 x 32 whole blocks, whatever the shape
+    expected = fine.reshape(24, shape[0], 32, shape[1], 3).mean((1, 3))
+    np.testing.assert_allclose(raw_pixels(frame, frame)[0, :HALF], expected.ravel(), atol=1e-5)
+
+
+def test_a_frame_like_its_background_has_no_difference() -> None:
+    frames = noise(4)
+    assert not raw_pixels(frames, frames)[:, HALF:].any()
+    assert raw_pixels(frames, noise(4, seed=2))[:, HALF:].any(axis=1).all()
+    assert not feature_cache.raw_pixels(frames[0], None)[HALF:].any()
+
+
+def test_components_are_those_of_train() -> None:
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(60, 10)) * np.array([9, 5, *[0.1] * 8])
+    train = np.arange(60) < 40
+    kept = principal_components(features, train, 2)
+    np.testing.assert_allclose(np.abs(np.corrcoef(kept[:, 0], features[:, 0])[0, 1]), 1, atol=0.02)
+    assert np.abs(kept[train].mean(0)).max() < 1e-5
+    wild = features.copy()
+    wild[~train] *= 100
+    np.testing.assert_allclose(principal_components(wild, train, 2)[train], kept[train], atol=1e-5)
+
+
+def test_few_rows_give_few_components() -> None:
+    frames = noise(12)
+    assert principal_components(raw_pixels(frames, noise(12, seed=1)), np.arange(12) < 9).shape == (12, 9)
+
+
+def test_shapes_that_differ_are_refused() -> None:
+    with pytest.raises(UserError, match="50, 64, 3"):
+        feature_cache.raw_pixels(noise(1)[0], noise(1, 50)[0])
+    with pytest.raises(UserError, match="train"):
+        principal_components(np.ones((3, 2)), np.zeros(3, bool))
+
+
+# ---- features files ----------------------------------------------------------------------------------------
+
+
+def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):
+    values, rows = np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32), np.arange(20, 2, -2)
+    np.savez(tmp_path / "f.npz", features=values, rows=rows)
+    store = feature_cache.file_features(tmp_path / "f.npz", pictures)
+    np.testing.assert_array_equal(store.get(np.array([[4], [20]]), 3), values[[8, 0]])
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"rows": None}, "rows"), ({"rows": np.arange(12) + 1000}, "rows"), ({"rows": np.zeros(12, int)}, "rows"),
+    ({"features": np.array(["a"] * 12)}, "features"), ({"key/path": np.array(["x.png"] * 12)}, "manifest"),
+    ({"about/frames": np.array("3")}, "--frames 3"), ({}, "lacks 3 "),
+])  # fmt: skip
+def test_a_features_file_that_does_not_fit_is_refused(pictures, tmp_path, change, words):
+    arrays = {"features": np.ones((12, 4)), "rows": np.arange(12)} | change
+    np.savez(tmp_path / "odd.npz", **{name: array for name, array in arrays.items() if array is not None})
+    with pytest.raises(UserError, match=f"odd.npz.*{words}"):
+        feature_cache.file_features(tmp_path / "odd.npz", pictures).get(np.arange(15)[:, None], 1)
+    (tmp_path / "odd.npz").write_bytes(b"no npz")
+    with pytest.raises(UserError, match="odd"):
+        feature_cache.file_features(tmp_path / "odd.npz", pictures)

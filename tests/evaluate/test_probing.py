@@ -1,0 +1,473 @@
+"""Probing tasks on features whose answer is known, from pictures, and the public benchmarks; label probes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from reader_world import fill
+from task_world import painted, row, simulated, table
+from tiny_models import tiny_config
+from touch_world import make_touches
+
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import feature_cache, heads
+from anytouch_jax.evaluate.feature_cache import FeatureStore
+from anytouch_jax.evaluate.heads import load_head
+from anytouch_jax.evaluate.probing import (
+    label_rows,
+    pixel_components,
+    probe_benchmark,
+    probe_label,
+    probe_tasks,
+    run_tasks,
+    task_table,
+)
+from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, find_benchmark, label_task, select
+
+WORLD = simulated()
+MANY = simulated(objects=60, each=4)  # enough groups for intervals that mean something
+
+
+def planted(values: Any) -> FeatureStore:
+    """Features that are `values(rows)` (n, d)."""
+    return FeatureStore(lambda rows, frames: np.asarray(values(rows), np.float32))
+
+
+def telling(world: Manifest, task: str, noise: float = 0.3) -> Any:
+    """Features that say the label of the task, in a linear code under noise."""
+    found = select(world, TASKS[task])
+    code = found.labels[:, None] if found.labels.dtype.kind == "f" else found.labels[:, None] == np.unique(found.labels)
+    rng = np.random.default_rng(0)
+    values = np.zeros((len(world), max(12, code.shape[1])))
+    values[found.rows[:, 0], : code.shape[1]] = code
+    values = values @ np.linalg.qr(rng.normal(size=values.shape[1:] * 2))[0] + noise * rng.normal(size=values.shape)
+    return lambda rows: values[rows]
+
+
+def noise(rows: Any) -> np.ndarray:
+    return np.stack([np.random.default_rng([5, row]).normal(size=12) for row in rows])
+
+
+@pytest.mark.parametrize("task", ["material", "slip", "twist", "slide", "object"])
+@pytest.mark.parametrize("head", ["linear", "knn"])
+def test_a_label_in_the_features_is_found(task, head):
+    store = planted(telling(MANY, task, 0.02))
+    (one,) = run_tasks(store, MANY, [task], seeds=3, head_names=(head,))
+    assert one["mean"] > 0.98 and one["high"] == 1.0
+    assert one["chance"] < 0.75 and len(one["values"]) == 3
+    assert (one["task"], one["head"], one["protocol"], one["metric"]) == (task, head, "honest", "accuracy")
+    json.dumps(one, allow_nan=False)
+
+
+@pytest.mark.parametrize("task", ["material", "twist", "slide"])
+def test_noise_is_chance_within_its_interval(monkeypatch, task):
+    store = planted(noise)
+    (one,) = run_tasks(store, MANY, [task], seeds=5)
+    assert one["low"] <= 1 / len(one["classes"]) <= one["high"]
+    assert one["high"] - one["low"] < 0.4
+
+
+def test_the_optimism_of_the_published_protocol_shows_on_noise(monkeypatch):
+    store = planted(noise)
+    recipe = heads.GradientRecipe(epochs=30, batch=32, rate=0.03)
+    found = run_tasks(store, MANY, ["material", "twist"], seeds=5, protocols=("published", "honest"),
+                        head_names=("linear", "knn", "gradient"), recipe=recipe)  # fmt: skip
+    scores = {(one["task"], one["head"], one["protocol"]): one["mean"] for one in found}
+    gains = [scores[t, h, "published"] - scores[t, h, "honest"] for t, h, p in scores if p == "honest"]
+    assert np.mean(gains) > 0.02
+    assert min(scores[t, "gradient", "published"] - scores[t, "gradient", "honest"] for t in ("material", "twist")) > 0
+
+
+def test_a_number_in_the_features_is_found(monkeypatch):
+    store = planted(telling(MANY, "force", 0.05))
+    (one,) = run_tasks(store, MANY, ["force"], seeds=2)
+    assert one["metric"] == "r2" and one["unit"] == "N" and one["classes"] == []
+    assert 0.97 < one["low"] <= one["mean"] <= one["high"] < 1
+    assert one["mae_low"] <= one["mae"] <= one["mae_high"] < 0.2 < one["chance_mae"]
+    assert abs(one["chance"]) < 0.05
+
+
+def test_a_number_that_is_not_there_has_no_r2(monkeypatch):
+    store = planted(noise)
+    (one,) = run_tasks(store, MANY, ["force"], seeds=2)
+    assert one["mean"] < 0.05 and one["mae"] == pytest.approx(one["chance_mae"], rel=0.1)
+
+
+def test_objects_never_trained_on_are_told_apart_by_other_touches(monkeypatch):
+    store = planted(telling(MANY, "object", 0.01))
+    (one,) = run_tasks(store, MANY, ["object"], seeds=2)
+    assert one["test"] == 15 * 4 * 2 and one["groups"] == 60  # objects of the test split, both sensors; touches
+    assert len(one["classes"]) == 15
+    assert any("folds" in note for note in one["notes"])
+
+
+def test_a_split_that_shares_objects_is_not_honest(monkeypatch):
+    """Features that know the object, not its material: a split by picture rewards them, the honest one does not."""
+    shared = simulated(objects=40, each=4, shared=True)
+    names = shared.codes("object")
+    store = planted(lambda rows: np.eye(40)[names[rows]])
+    found = run_tasks(store, shared, ["material"], seeds=2, protocols=("honest", "published"))
+    honest, published = found
+    assert published["mean"] == 1.0 and honest["mean"] < 0.5
+    assert any("groups" in note for note in honest["notes"])
+    assert honest["test"] == 40 * 4 * 2 and published["test"] == 40 * 2
+
+
+def test_sensors_and_units_learned_from_and_tested(monkeypatch):
+    codes, mark = MANY.codes("sensor"), telling(MANY, "material", 0.02)
+    store = planted(lambda rows: np.concatenate([mark(rows), codes[rows][:, None]], 1))
+    fits: list[tuple[Any, Any]] = []
+    plain = heads.fit_head
+
+    def watched(head, x, *rest, **options):
+        fitted = plain(head, x, *rest, **options)
+        return fitted._replace(predict=lambda rows: fits.append((x, rows)) or fitted.predict(rows))
+
+    monkeypatch.setattr(heads, "fit_head", watched)
+    (one,) = run_tasks(store, MANY, ["material"], seeds=1, train_sensors=["digit"], test_sensors=["duragel"])
+    (x, val), (_, test) = fits
+    assert len(set(x[:, -1])) == len(set(test[:, -1])) == 1
+    assert set(x[:, -1]) == set(val[:, -1]) != set(test[:, -1])
+    assert one["test"] == 15 * 4
+    (one,) = run_tasks(store, MANY, ["material"], seeds=1, train_units=["*_0"], test_units=["digit_1"])
+    assert one["test"] == 15 * 2
+    assert any("*_0" in note for note in one["notes"])
+
+
+def test_two_fingers_are_joined_row_by_row(monkeypatch):
+    """Success is the exclusive or of what the fingers feel: only the right pair in the right order can tell."""
+    rng, rows, felt = np.random.default_rng(0), [], []
+    for grasp in range(200):
+        a, b = rng.integers(2, size=2)
+        for finger, bit in rng.permutation([["A", a], ["B", b]]):
+            felt.append((finger == "B", int(bit)))
+            rows.append(row(path=f"{len(rows)}.png", sequence=f"g{grasp}/during/{finger}", unit=str(finger),
+                            split=("train", "test")[grasp % 2], object=f"o{grasp}", touch=f"g{grasp}",
+                            label__success=int(b)))  # fmt: skip
+    # A finger says its own bit in a place of its own: features (bit, is B); success is the bit of finger B.
+    store = planted(lambda rows: np.array([[felt[one][1], felt[one][0]] for one in rows], float))
+    (one,) = run_tasks(store, table(rows), ["grasp"], seeds=1)
+    assert one["mean"] == 1.0 and one["train"] == 80 and one["test"] == 100
+    store = planted(lambda rows: np.array([[felt[one][1] * (not felt[one][0]), 0] for one in rows], float))
+    (blind,) = run_tasks(store, table(rows), ["grasp"], seeds=1)
+    assert blind["mean"] < 0.7
+
+
+def test_max_rows_is_a_fixed_chance(monkeypatch):
+    store = planted(noise)
+    first, again = (run_tasks(store, MANY, ["material"], seeds=1, max_rows=200)[0] for _ in range(2))
+    assert first == again and 100 < first["train"] + first["test"] <= 200
+
+
+def test_what_cannot_be_probed_is_refused():
+    train = table([row(path=f"{i}.png", sequence=f"{i}", label__material="ab"[i % 2]) for i in range(4)])
+    for word, world, task, options in (
+        ("seeds", WORLD, "material", {"seeds": 0}),
+        ("max_rows", WORLD, "material", {"max_rows": -3}),
+        ("frames", WORLD, "material", {"frames": -1}),
+        ("taste", WORLD, "taste", {}),
+        ("forest", WORLD, "material", {"head_names": ("forest",)}),
+        ("lucky", WORLD, "material", {"protocols": ("lucky",)}),
+        ("'foam'", WORLD, Task("x", "label.material", classes=("foam",)), {}),
+        ("test", train, "material", {}),
+        ("gelsight", WORLD, "material", {"train_sensors": ["gelsight"]}),
+        ("cam0_", WORLD, "material", {"test_units": ["cam0_*"]}),
+    ):
+        with pytest.raises(UserError) as error:
+            run_tasks(planted(noise), world, [task], **{"seeds": 1} | options)
+        assert word in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(UserError, match="material"):
+        run_tasks(planted(lambda rows: np.full((len(rows), 3), np.nan)), WORLD, ["material"])
+
+
+# Real pictures and a real, untrained encoder.
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory) -> Manifest:
+    return painted(tmp_path_factory.mktemp("pictures"))
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory) -> Path:
+    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 8, "val": 4, "test": 4}, each=1)
+
+
+@pytest.fixture(scope="module")
+def encoder(compiled_once) -> Encoder:
+    return random_encoder(tiny_config())
+
+
+def counted(monkeypatch) -> list[int]:
+    """Rows that are read, by every pass over a manifest."""
+    passes: list[int] = []
+
+    def counting(table, rows, *args, **options):
+        passes.append(len(rows))
+        return evaluation(table, rows, *args, **options)
+
+    monkeypatch.setattr(feature_cache, "evaluation", counting)
+    return passes
+
+
+def test_nothing_is_encoded_twice(monkeypatch, encoder, pictures, tmp_path):
+    passes = counted(monkeypatch)
+    first = run_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
+    assert passes == [32]  # one pass for both tasks: they take the same rows
+    again = run_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
+    assert passes == [32] and first == again
+    run_tasks(encoder, pictures, ["material", "force"], cache=tmp_path, seeds=1, frames=1)
+    new = np.setdiff1d(select(pictures, TASKS["force"]).rows, select(pictures, TASKS["material"]).rows)
+    assert passes == [32, len(new)]  # what is known is not read again
+    assert len(list(tmp_path.iterdir())) == 1
+    run_tasks(encoder, pictures, ["force"], cache=tmp_path, seeds=1)
+    assert len(passes) == 3 and len(list(tmp_path.iterdir())) == 2  # clips are something else
+
+
+def test_a_sensor_that_training_never_saw_is_noted(encoder, pictures):
+    some = replace(encoder, seen=("digit",))  # the table of the model has it
+    (found,) = run_tasks(some, pictures, ["material"], seeds=1)
+    assert any("duragel" in note for note in found["notes"])
+
+
+def test_classes_that_were_never_learned_are_told(monkeypatch):
+    store = planted(noise)
+    rows = [
+        row(path=f"{i}.png", sequence=f"{i}", object=f"o{i // 2}", split="train" if i < 40 else "test",
+            label__material="ab"[i % 2] if i < 40 else "ac"[i % 2])
+        for i in range(60)
+    ]  # fmt: skip
+    (found,) = run_tasks(store, table(rows), ["material"], seeds=1)
+    assert any("10 test rows" in note and note.endswith("c") for note in found["notes"])
+
+
+def test_raw_pixels_see_the_force_and_their_own_cache(pictures, tmp_path):
+    (one,) = run_tasks(None, pictures, ["force"], seeds=1, cache=tmp_path)
+    assert one["mean"] > 0.9 and one["frames"] == 3
+    (file,) = tmp_path.iterdir()
+    stamp = file.stat().st_mtime_ns
+    assert run_tasks(None, pictures, ["force"], seeds=1, cache=tmp_path) == [one]
+    assert file.stat().st_mtime_ns == stamp
+    (still,) = run_tasks(None, pictures, ["force"], seeds=1, frames=1)
+    assert (still["frames"], still["test"]) == (1, one["test"])
+    store = feature_cache.pixel_features(pictures)
+    assert store.get(np.array([[2]]), 1).shape == (1, 2 * 2304) and store.get(np.array([[2]]), 3).shape == (1, 4 * 2304)
+
+
+# The public benchmarks, on trees laid out like the originals.
+
+
+def paint(root: Path) -> None:
+    """Give every picture under `root` bytes of its own, so that features differ."""
+    rng = np.random.default_rng(0)
+    for path in sorted(root.rglob("*.*g")):
+        cv2.imwrite(str(path), rng.integers(0, 255, (16, 16, 3), np.uint8))
+
+
+def touch_and_go(root: Path) -> None:
+    lists: dict[str, list[str]] = {name: [] for name in ("train", "test", "train_rough", "test_rough")}
+    for video in range(8):
+        for frame in range(10, 22):
+            name = f"v{video}/{frame:010d}.jpg"
+            fill(root, [f"dataset/v{video}/gelsight_frame/{frame:010d}.jpg"])
+            part = "test" if video % 2 and frame >= 18 else "train"
+            lists[part].append(f"{name},{(3, 7)[frame % 2]}")
+            rough = "train" if part == "test" else "test" if frame % 4 == 0 else "train"
+            lists[f"{rough}_rough"].append(f"{name},{frame // 2 % 2}")
+    for name, lines in lists.items():
+        (root / f"{name}.txt").write_text("\n".join(lines) + "\n")
+
+
+def feel(root: Path) -> None:
+    names = [f"thing{i}" for i in range(8)]
+    for name in names:
+        for phase in ("before", "during", "after"):
+            fill(root, [f"{name}/touch_{phase}/{n}_{finger}.png" for n in (0, 1) for finger in "AB"])
+    (root / "feel.csv").write_text("".join(f"{name},{n},{n}\n" for name in names for n in (0, 1)))
+    (root / "split_3.json").write_text(json.dumps({"train": names[:6], "test": names[6:]}))
+
+
+def objectfolder(root: Path) -> None:
+    ids = [*range(1, 7), *range(101, 107)]
+    for one in ids:
+        place = "obj1.0" if one <= 100 else "obj2.0/touch"
+        fill(root, [f"{place}/{one}/{n}.png" for n in range(4)])
+    (root / "obj2.0").mkdir(exist_ok=True)
+    (root / "obj2.0/label.json").write_text(json.dumps({str(one): one % 2 for one in ids}))
+    split = {"train": [[str(one), n] for one in ids for n in (0, 1, 2)], "test": [[str(one), 3] for one in ids]}
+    (root / "obj2.0/split.json").write_text(json.dumps(split))
+
+
+MAKERS = {
+    "touch_and_go": (touch_and_go, IndexOptions()),
+    "feel": (feel, IndexOptions(fold=3)),
+    "objectfolder": (objectfolder, IndexOptions()),
+}
+SIZES = {  # (train, test) of the authors' own split
+    "touch_and_go_material": (80, 16),
+    "touch_and_go_hardness": (80, 16),
+    "touch_and_go_roughness": (76, 20),
+    "feel_grasp": (12, 4),
+    "objectfolder1_material": (18, 6),
+    "objectfolder2_material": (18, 6),
+}
+
+
+@pytest.fixture(scope="module")
+def trees(tmp_path_factory) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for name, (make, options) in MAKERS.items():
+        root = tmp_path_factory.mktemp(name)
+        make(root)
+        paint(root)
+        found[name] = index(name, root, None, options=options).out
+    return found
+
+
+def source_of(benchmark: str) -> str:
+    return next(name for name in MAKERS if benchmark.startswith(name))
+
+
+QUICK = ("feel_grasp", "objectfolder1_material")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in BENCHMARKS]
+)
+def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
+    out, data = tmp_path / "result.json", trees[source_of(name)]
+    report = probe_benchmark([tiny_run], [data], name, seeds=1, cache=tmp_path / "cache", out=out, log=quiet)
+    record, printed = json.loads(out.read_text()), task_table(report)
+    assert name in printed and "raw pixels" in printed and "paper" in printed
+    published = {one["features"]: one for one in record["results"] if one["protocol"] == "published"}
+    assert {(one["train"], one["test"]) for one in published.values()} == {SIZES[name]}
+    assert len(published) == 3  # the run, a random encoder, raw pixels
+    assert {one["protocol"] for one in record["results"]} == {"published", "honest"}
+    assert record["manifest"] == manifests.read(data).content_hash
+    assert record["runs"][str(tiny_run)]["model"]["image_size"] == 28
+
+
+@pytest.mark.parametrize("name", list(BENCHMARKS))
+def test_honest_parts_videos_and_objects(name, trees):
+    found = select(manifests.read(trees[source_of(name)]), find_benchmark(name).task)
+    kinds = {one.split(" ")[0] for one in found.groups}
+    assert kinds == ({"recording"} if "touch_and_go" in name else {"object"})
+
+
+def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
+    out, data = tmp_path / "result.json", pictures.files[0]
+    np.savez(tmp_path / "f.npz", features=noise(np.arange(len(pictures))), rows=np.arange(len(pictures)))
+    options: dict[str, Any] = {"features": [tmp_path / "f.npz"], "heads": ("linear", "knn"), "test_units": ("*_1",)}
+    report = probe_tasks([tiny_run], [data], ("material", "force"), seeds=1, protocol="published", out=out, log=quiet,
+                         **options)  # fmt: skip
+    results = json.loads(out.read_text())["results"]
+    assert {one["task"] for one in results} == {"material", "force"}
+    assert {one["head"] for one in results} == {"linear", "knn"}
+    names = [str(tiny_run), "random encoder", str(tmp_path / "f.npz"), "raw pixels"]
+    assert list(dict.fromkeys(one["features"] for one in results)) == names
+    assert {one["protocol"] for one in results} == {"honest", "published"}
+    assert " N" in task_table(report)
+    for word, change in (("--order", {"order": "shuffled"}), ("--join", {"join": "sum"}), ("probe", {"models": []})):
+        changed = {
+            "models": [tiny_run],
+            "data": [data],
+            "tasks": ["material"],
+            "controls": False,
+            "log": quiet,
+        } | change
+        with pytest.raises(UserError, match=word):
+            probe_tasks(**changed)
+
+
+def test_a_task_that_cannot_be_probed_leaves_the_others(tmp_path):
+    columns, lines = WORLD.table.to_pydict(), []
+    slides = zip(columns["label.slide"], columns["split"], strict=True)
+    columns["label.slide"] = [None if split == "test" else one for one, split in slides]
+    data, features = tmp_path / "m.parquet", tmp_path / "f.npz"
+    manifests.write(manifests.from_columns(columns, data), data)
+    np.savez(features, features=noise(np.arange(len(WORLD))), rows=np.arange(len(WORLD)))
+    shared: dict[str, Any] = {"features": [features], "seeds": 1, "controls": False, "log": lines.append}
+    found = probe_tasks([], [data], ("material", "slide"), frames=1, **shared)
+    assert {one["task"] for one in found["results"]} == {"material"} and list(found["left_out"]) == ["slide"]
+    assert any("slide" in line for line in lines)
+    assert "grasp" in probe_tasks([], [data], "all", frames=1, **shared)["left_out"]
+    with pytest.raises(UserError, match="slide"):
+        probe_tasks([], [data], ("slide",), frames=1, **shared)
+
+
+def test_a_fit_that_does_not_converge_is_told_of(monkeypatch):
+    store = planted(telling(MANY, "material", noise=1.0))
+    (one,) = run_tasks(store, MANY, ["material"], seeds=2)
+    assert not any("converge" in note for note in one["notes"])
+    monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 1)
+    (one,) = run_tasks(store, MANY, ["material"], seeds=2)
+    assert one["notes"][-1].endswith("fits did not converge")
+
+
+# A label column.
+
+
+def quiet(_: str) -> None:
+    pass
+
+
+def test_a_label_probe_of_models_files_and_controls(touches, tiny_run, tmp_path):
+    """Features of a file score as the run that made them; a saved head predicts what was scored."""
+    table_ = manifests.read(touches)
+    features, head, out = tmp_path / "mine.npz", tmp_path / "head.npz", tmp_path / "r.json"
+    store = feature_cache.encoder_features(load_encoder(tiny_run), table_)
+    values = store.get(np.arange(len(table_))[:, None], 1)
+    np.savez(features, features=values, rows=np.arange(len(table_)))
+    results = probe_label(
+        [tiny_run], [touches], "hardness", features=[features], seeds=1, save=head, out=out, log=quiet
+    )
+    names = [str(tiny_run), "random encoder", str(features), "raw pixels"]
+    assert [one.probe for one in results[:-1]] == [f"{name}: {kind}" for name in names for kind in ("linear", "kNN")]
+    assert [replace(one, probe="") for one in results[:2]] == [replace(one, probe="") for one in results[4:6]]
+    assert len(json.loads(out.read_text())) == len(results) == 9
+    outcome, rows = results[0].outcome, select(table_, label_task(table_, "hardness"))
+    predicted = load_head(head)(values[rows.rows[outcome.rows, 0]])[0]
+    np.testing.assert_array_equal(predicted == rows.labels[outcome.rows], outcome.correct)
+
+
+def test_held_out_objects_of_a_label(touches):
+    results = probe_label([], [touches], "hardness", leave_out="object", log=quiet)
+    assert len(results) == 2 and all(one.n_test == one.n_train for one in results)
+
+
+@pytest.mark.parametrize(("label", "options", "word"), [
+    ("object", {}, "train"), ("force", {}, "label.force"), ("split", {}, "train"),
+    ("hardness", {"controls": False}, "nothing"), ("hardness", {"leave_out": "sensor", "sensor": "digit"}, "digit"),
+    ("hardness", {"models": ["a", "b"], "save": "h.npz"}, "one"),
+])  # fmt: skip
+def test_a_label_that_cannot_be_probed_is_refused_before_the_work(touches, monkeypatch, label, options, word):
+    monkeypatch.setattr(feature_cache.FeatureStore, "get", lambda *_: pytest.fail("the work was begun"))
+    with pytest.raises(UserError, match=word):
+        probe_label(**{"models": [], "data": [touches], "label": label, "log": quiet} | options)
+
+
+def test_raw_pixels_name_the_row_and_the_column_of_a_bad_picture(tmp_path):
+    for name in ("a.png", "gel.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((24, 32, 3), np.uint8))
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    columns = {
+        "path": ["a.png", "a.png"], "sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1],
+        "split": ["train", "test"], "object": ["a", "b"], "background_path": ["gel.png", "bad.png"],
+    }  # fmt: skip
+    for change, column in (({}, "'background_path'"), ({"path": ["a.png", "bad.png"]}, "'path'")):
+        path = tmp_path / "manifest.csv"
+        manifests.write(manifests.from_columns(columns | change, path), path)
+        world = manifests.read(path)
+        with pytest.raises(UserError, match=rf"row 1 of .*manifest\.csv, column {column}: .*bad\.png"):
+            pixel_components(feature_cache.pixel_features(world), label_rows(world, "object")[0])

@@ -1,0 +1,141 @@
+"""Splits keep whole groups on one side, whatever the manifest's split."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import splits
+from anytouch_jax.evaluate.splits import FOLDS, RowRoles, seeded_splits, split_scheme
+
+N = 240
+
+
+def rows(kind: str = "apart", **changes) -> RowRoles:
+    """60 groups of 4 rows. apart: three quarters teach; shared: every group does both; new: test has other classes."""
+    group = np.arange(N) // 4
+    test = {"apart": group % 4 == 3, "shared": np.arange(N) % 4 == 3, "new": group % 4 == 3}[kind]
+    y = np.where(test, 3 + group // 4 % 3, group % 3) if kind == "new" else group // 4 % 3
+    everything = np.ones(N, bool)
+    return RowRoles(y, np.array([f"g{one}" for one in group]), ~test, test, everything, everything)._replace(**changes)
+
+
+@pytest.mark.parametrize("kind", ["apart", "shared", "new"])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_group_is_ever_on_two_sides(kind, seed):
+    given = rows(kind)
+    tested = []
+    for cut in seeded_splits(given, seed, "honest"):
+        sides = [set(given.groups[part]) for part in cut]
+        assert all(sides) and not sides[0] & sides[1] and not sides[0] & sides[2] and not sides[1] & sides[2]
+        tested += cut.test.tolist()
+    wanted = np.flatnonzero(given.test) if kind != "shared" else np.arange(N)
+    assert sorted(tested) == wanted.tolist()  # every row once
+
+
+def test_a_split_that_parts_the_groups_is_kept():
+    given = rows()
+    (cut,) = seeded_splits(given, 0, "honest")
+    assert split_scheme(given)[0] == "split"
+    np.testing.assert_array_equal(cut.test, np.flatnonzero(given.test))
+    assert sorted([*cut.fit, *cut.val]) == np.flatnonzero(given.train).tolist()
+    assert len(cut.val) == len(np.flatnonzero(given.train)) // FOLDS
+
+
+def test_objects_left_out_are_dealt_within_the_test_rows():
+    given = rows("new")
+    how, used, _ = split_scheme(given)
+    assert how == "folds"
+    np.testing.assert_array_equal(used, given.test)
+    for protocol in ("honest", "published"):
+        found = seeded_splits(given, 0, protocol)
+        assert len(found) == FOLDS
+        assert all(given.test[one].all() for cut in found for one in cut)
+
+
+@pytest.mark.parametrize("protocol", ["honest", "published"])
+def test_what_only_test_has_is_dealt_within_test(protocol):
+    """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its class has."""
+    given = rows()
+    given = given._replace(y=np.linspace(0, 1, N), measured=True, may_fit=given.test, may_test=given.test)
+    how, used, _ = split_scheme(given)
+    assert how == "folds"
+    np.testing.assert_array_equal(used, given.test)
+    found = seeded_splits(given, 0, protocol)
+    assert len(found) == FOLDS and all(len(cut.fit) and given.test[one].all() for cut in found for one in cut)
+
+
+def test_every_class_is_learned_in_every_fold():
+    given = rows("shared")
+    for seed in range(5):
+        for cut in seeded_splits(given, seed, "honest"):
+            assert set(given.y[cut.fit]) == set(given.y[cut.test]) == {0, 1, 2}
+
+
+def test_seeds_deal_anew_and_equal_seeds_equally():
+    given = rows()
+    first, again, other = (seeded_splits(given, seed, "honest")[0].val for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert set(first) != set(other)
+
+
+@pytest.mark.parametrize("kind", ["apart", "shared"])
+def test_published_keeps_the_manifests_split_whatever_it_shares(kind):
+    given = rows(kind)
+    (cut,) = seeded_splits(given, 3, "published")
+    np.testing.assert_array_equal(cut.fit, np.flatnonzero(given.train))
+    np.testing.assert_array_equal(cut.test, np.flatnonzero(given.test))
+    assert not len(cut.val)
+
+
+@pytest.mark.parametrize("kind", ["apart", "shared", "new"])
+@pytest.mark.parametrize("protocol", ["honest", "published"])
+def test_sensors_and_units_teach_and_are_tested_apart(kind, protocol):
+    finger = np.arange(N) // 2 % 2 == 0
+    given = rows(kind, may_fit=finger, may_test=~finger)
+    for cut in seeded_splits(given, 0, protocol):
+        assert finger[cut.fit].all() and finger[cut.val].all() and not finger[cut.test].any()
+        assert len(cut.fit) and len(cut.test)
+
+
+def test_numbers_are_dealt_by_chance():
+    given = rows()._replace(y=np.linspace(0, 1, N), measured=True)
+    parts = {tuple(seeded_splits(given, seed, "honest")[0].val) for seed in range(3)}
+    assert len(parts) == 3
+
+
+def test_one_group_is_too_few():
+    with pytest.raises(UserError, match="'g'"):
+        seeded_splits(rows()._replace(groups=np.where(rows().test, "other", "g")), 0, "honest")
+    with pytest.raises(UserError, match="lucky"):
+        seeded_splits(rows(), 0, "lucky")
+
+
+@pytest.mark.parametrize("count", [2, 5, 7, 100])
+def test_folds_keep_groups_whole_and_spread_classes(count):
+    groups, y, left_out = np.repeat(np.arange(30), 5), np.repeat(np.arange(30) % 3, 5), []
+    for fit, out in splits.group_folds(np.arange(150), groups, y, count):
+        assert set(groups[fit]).isdisjoint(groups[out]) and len(fit) + len(out) == 150
+        if count == 5:
+            assert np.bincount(y[out]).tolist() == [10, 10, 10]
+        left_out.append(out)
+    assert len(left_out) == min(count, 30)
+    np.testing.assert_array_equal(np.sort(np.concatenate(left_out)), np.arange(150))
+
+
+def test_bootstraps_draw_whole_groups():
+    groups, rows = np.arange(60) // 4, np.arange(12, 60)
+    for kept, weights in splits.group_bootstraps(rows, groups, 3):
+        assert set(kept) <= set(rows) and weights.sum() == len(rows)
+        for group in np.unique(groups[kept]):
+            assert np.sum(groups[kept] == group) == 4 and len(set(weights[groups[kept] == group])) == 1
+    assert not list(splits.group_bootstraps(rows, groups, 0))
+
+
+def test_a_subsample_is_fixed_and_in_order():
+    rows = np.arange(100) * 3
+    few = splits.subsample(rows, 10)
+    np.testing.assert_array_equal(few, splits.subsample(rows, 10))
+    assert len(few) == 10 and set(few) <= set(rows) and (np.diff(few) > 0).all()
+    assert splits.subsample(rows, 100) is rows and splits.subsample(rows) is rows

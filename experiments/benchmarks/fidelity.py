@@ -21,7 +21,7 @@ from anytouch_jax.evaluate.statistics import markdown
 from anytouch_jax.sim.contact.mechanics import Contact, Fidelity, Gel, press
 from anytouch_jax.sim.contact.shear import Shear, shear_step
 from anytouch_jax.sim.recorder import Recorder
-from anytouch_jax.sim.scene import Scenes, cast, draw_recording, draw_touch
+from anytouch_jax.sim.scene import Scenes, draw_recording, draw_touch, objects_and_splits
 from anytouch_jax.sim.sensing.optics import render
 from anytouch_jax.sim.sensing.sensors import SENSORS
 from anytouch_jax.sim.sensing.units import identity_unit
@@ -274,7 +274,7 @@ def recording_speed(
     over `rounds`, all in turns.
     """
     scenes = Scenes(touches=batch, sensors=tuple(sensors), frames=frames, size=size)
-    objects, splits = cast(scenes)
+    objects, splits = objects_and_splits(scenes)
     touches = [draw_touch(scenes, number, splits) for number in range(batch)]
     asked = {name: [draw_recording(scenes, touch, name) for touch in touches] for name in sensors}
     recorder = Recorder(scenes, objects, batch)

@@ -145,7 +145,7 @@ def _constant(presses: Presses) -> Renderer:
 
 def _ours(name: str, presses: Presses, *, shadow: bool = True) -> Renderer:
     """Height map -> contact -> picture by the project's renderer, with the real background at full size."""
-    sensor, indenter = sensors.get(name), INDENTERS[name]
+    sensor, indenter = sensors.find_sensor(name), INDENTERS[name]
     unit, size = units.identity_unit(sensor), presses.background.shape[:2]
     behind = jnp.asarray(presses.background.transpose(2, 0, 1), jnp.float32) / 255
     cut = jax.jit(lambda c, r: calibration.ball_cut(c * PITCH, r * PITCH, indenter, size, PITCH))

@@ -18,7 +18,7 @@ from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Contact, Gel
 from anytouch_jax.sim.sensing import optics
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
-from anytouch_jax.sim.sensing.units import from_gel, gel_of
+from anytouch_jax.sim.sensing.units import gel_to_object, unit_gel
 from experiments.pouring.physics import Load, Setup
 
 SENSOR = SENSORS["gelsight_mini"]
@@ -44,7 +44,7 @@ class Grasp(NamedTuple):
 def surface(setup: Setup) -> Array:
     """Heights (ROWS, COLUMNS) mm of the cylinder over the round gel, 0 where it is met first."""
     x, y = mechanics.positions((ROWS, COLUMNS), PITCH)
-    u, v = from_gel(setup.unit, x, y)
+    u, v = gel_to_object(setup.unit, x, y)
     u, v = u - setup.place[0], v - setup.place[1]
     c, s = jnp.cos(setup.yaw), jnp.sin(setup.yaw)
     across = jnp.clip(c * u + s * v, -0.99 * setup.radius, 0.99 * setup.radius)
@@ -54,7 +54,7 @@ def surface(setup: Setup) -> Array:
 
 def hold(setup: Setup, side: int) -> tuple[Grasp, Contact]:
     """The gel's answers in one run, for pictures of `side` pixels, and the contact under the grip."""
-    gel, z = gel_of(SENSOR, setup.unit), surface(setup)
+    gel, z = unit_gel(SENSOR, setup.unit), surface(setup)
     press = jax.vmap(partial(mechanics.press, gel=gel, pitch=PITCH, iterations=40), in_axes=(None, 0))
     depths = jnp.geomspace(0.05, 2.0, 8)
     tried = press(z, depths).force

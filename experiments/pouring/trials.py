@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from anytouch_jax.evaluate.statistics import mean_interval
 from anytouch_jax.files import atomic_write
-from anytouch_jax.sim.sensing.units import stack
+from anytouch_jax.sim.sensing.units import stack_trees
 from experiments.pouring import physics, render
 from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
 
@@ -133,7 +133,7 @@ def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
     """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
     setups = [physics.draw_setup(task, np.random.default_rng([seed % 2**63, number])) for number in range(count)]
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(count))
-    return stack(setups), keys
+    return stack_trees(setups), keys
 
 
 @partial(jax.jit, static_argnames=("task",))

@@ -28,7 +28,7 @@ from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
-from anytouch_jax.sim.scene import cast
+from anytouch_jax.sim.scene import objects_and_splits
 from experiments.benchmarks import machine
 from experiments.tables import cuts, plan, scores
 from experiments.tables.cuts import content_hash
@@ -174,7 +174,7 @@ def check_objects(size: Size) -> None:
     """
     seen: dict[tuple[int, str], tuple[str, str]] = {}
     for one in plan.scenes(size):
-        things, splits = cast(_simulated(one, size))
+        things, splits = objects_and_splits(_simulated(one, size))
         for thing, split in zip(things, splits, strict=True):
             name, before = seen.setdefault((one.seed, thing.name), (one.name, split))
             if before != split:

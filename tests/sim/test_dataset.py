@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from blank_recorder import BlankRecorder
 
-from anytouch_jax.cli.app import main
 from anytouch_jax.config import preset
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
@@ -23,28 +23,9 @@ from anytouch_jax.sim.sensing.sensors import SENSORS
 SCENES = Scenes(touches=10, objects=24, seed=4, sensors=("digit", "tac3d"), size=32, frames=4, vision=0.5, text=0.5)
 
 
-class Blank:
-    """In the place of `Recorder`: takes that tell which recording they are of, without any physics."""
-
-    def __init__(self, scenes, objects, batch):
-        self.scenes = scenes
-
-    def record(self, recordings):
-        return [self.take(recording) for recording in recordings]
-
-    def take(self, recording):
-        frames, rng = self.scenes.frames, np.random.default_rng(recording.seed)
-        labels = {name: rng.random(frames) for name in ("force", "depth", "area", "x", "y", "slip")}
-        if SENSORS[recording.sensor].kind == "field":
-            return dataset.Take(None, None, rng.random((frames, 20, 20, 6), np.float32), labels)
-        picture = np.full((frames, 43, 32, 3), recording.seed % 251, np.uint8)
-        field = rng.random((frames, 12, 8, len(self.scenes.fields)), np.float32) if self.scenes.fields else None
-        return dataset.Take(picture, picture[0], field, labels)
-
-
 @pytest.fixture(autouse=True)
 def _no_physics(monkeypatch, compiled_once):
-    monkeypatch.setattr(dataset, "Recorder", Blank)
+    monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
 
 
 def tree(folder):
@@ -55,7 +36,7 @@ def tree(folder):
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "Recorder", Blank)
+        patch.setattr(dataset, "Recorder", BlankRecorder)
         dataset.simulate(SCENES, folder)
     return folder
 
@@ -73,7 +54,7 @@ def test_the_manifest_is_one_that_the_project_reads(made):
     assert len(clips) == 20 and all(len({rows[i]["unit"] for i in clip}) == 1 for clip in clips)
     pairs = {(row["touch"], row["sensor"]) for row in rows if row["touch"]}
     assert len(pairs) == 20
-    _, splits = scene.cast(SCENES)
+    _, splits = scene.objects_and_splits(SCENES)
     touches = [scene.draw_touch(SCENES, number, splits) for number in range(10)]
     units = [scene.draw_recording(SCENES, touch, sensor).unit for touch in touches for sensor in SCENES.sensors]
     tints = {tuple(unit.tint) for unit in units}
@@ -82,7 +63,7 @@ def test_the_manifest_is_one_that_the_project_reads(made):
 
 def test_shares_and_labels_are_as_drawn(made):
     rows = [row for row in manifests.read(made / "manifest.parquet").table.to_pylist() if row["touch"]]
-    things, splits = scene.cast(SCENES)
+    things, splits = scene.objects_and_splits(SCENES)
     for row in rows:
         touch = scene.draw_touch(SCENES, int(row["touch"]), splits)
         recording = scene.draw_recording(SCENES, touch, row["sensor"])
@@ -187,7 +168,7 @@ def test_a_finished_part_is_not_made_again(tmp_path, monkeypatch):
     first: list[int] = []  # touch of what is recorded
     full = True
 
-    class Telling(Blank):
+    class Telling(BlankRecorder):
         def record(self, recordings):
             first.append(recordings[0].touch.number)
             if full and first[-1] == dataset.GROUP:  # the second part
@@ -195,7 +176,7 @@ def test_a_finished_part_is_not_made_again(tmp_path, monkeypatch):
             return super().record(recordings)
 
     monkeypatch.setattr(dataset, "Recorder", Telling)
-    with pytest.raises(UserError, match="No space left on device; what is finished is kept, the same command goes on"):
+    with pytest.raises(UserError, match="No space left on device; finished touches are kept"):
         dataset.simulate(SCENES, tmp_path / "full")
     assert [path.name for path in (tmp_path / "full" / "parts").iterdir()] == ["00000.parquet"]
     shutil.copytree(tmp_path / "full", tmp_path / "cut")
@@ -236,7 +217,7 @@ def test_two_processes_do_not_simulate_into_one_folder(made):
 
 def test_a_part_is_told_of_when_its_files_are_on_the_disk(tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(dataset, "Recorder", Blank)
+    monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
     monkeypatch.setattr("os.sync", lambda: told.append(sorted(one.name for one in (tmp_path / "parts").iterdir())))
     dataset.simulate(SCENES, tmp_path)
     assert told == [[], ["00000.parquet"]]
@@ -259,65 +240,3 @@ def test_the_loader_trains_on_it(made):
     assert any("left out" in note and "tac3d" in note for note in loader.notes)
     assert batch.align.clip.shape == (4, 1, 28, 28, 3)
     assert batch.match is None  # one camera: nothing to match
-
-
-def test_a_mistake_on_the_command_line_is_one_sentence(tmp_path, capsys):
-    assert main(["simulate", "--out", str(tmp_path / "x"), "--sensors", "nose"]) == 1
-    assert capsys.readouterr().err.startswith("anytouch simulate: there is no sensor 'nose' to simulate; choose among")
-    assert main(["simulate", "--out", str(tmp_path / "x"), "--depth", "-1", "1"]) == 1
-    assert "depth is a range of mm" in capsys.readouterr().err and not (tmp_path / "x").exists()
-    assert main(["simulate", "--out", str(tmp_path / "x"), "--threads", "0"]) == 1
-    assert "threads must be at least 1, not 0" in capsys.readouterr().err and not (tmp_path / "x").exists()
-    (tmp_path / "file").write_text("")
-    for place in ("file", "file/below"):
-        assert main(["simulate", "--out", str(tmp_path / place), "--touches", "1"]) == 1
-        assert "is a file; give a folder" in capsys.readouterr().err
-
-
-def test_the_command_makes_a_data_set(tmp_path, capsys):
-    out = tmp_path / "scenes"
-    options = ["--touches", "2", "--sensors", "digit", "--objects", "6", "--frames", "2", "--size", "32"]
-    assert main(["simulate", "--out", str(out), *options]) == 0
-    said = capsys.readouterr().err
-    few, compiling, *_ = said.splitlines()
-    assert few == "no touch is of split val and test: more touches or more objects (some 16) give some"
-    assert compiling == "compiling the contact solver for digit: about a minute the first time"
-    assert "2 touches by digit" in said
-    assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
-
-
-def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(dataset, "GROUP", 1)
-    words = ["--sensors", "digit,tac3d", "--objects", "12", "--frames", "2", "--size", "32", "--vision", "0"]
-    args = ["simulate", "--out", str(tmp_path / "scenes"), "--touches", "25", *words]
-    assert main([*args, "--held-out", "0"]) == 0
-    first, *lines, last = capsys.readouterr().err.splitlines()
-    assert "digit, tac3d" in first and "25 touches by" in last
-    assert lines == [f"{done} of 25 touches" for done in (3, 5, 8, 10, 13, 15, 18, 20, 23, 25)]
-    assert main([*args, "--held-out", "0"]) == 0  # nothing is left to do, nothing is compiled
-    assert len(capsys.readouterr().err.splitlines()) == 1
-
-
-def test_frames_that_did_not_converge_are_counted(tmp_path, capsys, monkeypatch):
-    class Rough(Blank):
-        def take(self, recording):
-            take = super().take(recording)
-            return take._replace(labels=take.labels | {"converged": np.array([1.0, 0.0])})
-
-    monkeypatch.setattr(dataset, "Recorder", Rough)
-    words = ["--touches", "3", "--sensors", "digit", "--objects", "6", "--frames", "2", "--size", "32"]
-    assert main(["simulate", "--out", str(tmp_path), "--fidelity", "exact", *words]) == 0
-    assert "3 touches by digit; 3 of 6 frames did not converge (label.converged)" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--sensors", "tac3d", "--fields", "pressure"], "none of the sensors has a camera"),
-        (["--size", "8"], "size is 16 to 4096 pixels, or 0 for each sensor's own resolution, not 8"),
-        (["--size", "20000"], "size is 16 to 4096 pixels, or 0 for each sensor's own resolution, not 20000"),
-    ],
-)
-def test_what_would_do_nothing_is_refused(tmp_path, capsys, words, told):
-    assert main(["simulate", "--out", str(tmp_path / "x"), *words]) == 1
-    assert told in capsys.readouterr().err and not (tmp_path / "x").exists()

@@ -11,7 +11,7 @@ from anytouch_jax.sim import scene
 from anytouch_jax.sim.scene import Gesture, Scenes
 
 SCENES = Scenes(touches=60, objects=60, seed=3)
-THINGS, SPLITS = scene.cast(SCENES)
+THINGS, SPLITS = scene.objects_and_splits(SCENES)
 
 
 def recordings(scenes, number=0):
@@ -22,21 +22,21 @@ def recordings(scenes, number=0):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"sensors": ("digit", "nose")}, "no sensor 'nose'"),
+        ({"sensors": ("digit", "nose")}, "no simulated sensor 'nose'"),
         ({"sensors": ()}, "at least one"),
         ({"sensors": ("digit", "digit")}, "once"),
         ({"depth": (-0.1, 0.5)}, "depth is a range of mm from 0 on, lowest first, not -0.1 to 0.5"),
         ({"depth": (0.5, 0.1)}, "lowest first"),
-        ({"fields": ("heat",)}, "no field 'heat'"),
-        ({"touches": 0}, "touches must be at least 1"),
-        ({"vision": 1.5}, "vision is a share"),
-        ({"grade": "rough"}, "grade is fine or coarse"),
-        ({"units": "two"}, "units is each or one, not two"),
-        ({"seed": -1}, "seed must be at least 0, not -1"),
+        ({"fields": ("heat",)}, "no simulated field 'heat'"),
+        ({"touches": 0}, "touches must be 1 or more"),
+        ({"vision": 1.5}, "vision must be"),
+        ({"grade": "rough"}, "grade must be"),
+        ({"units": "two"}, "units must be"),
+        ({"seed": -1}, "seed must be 0 or more, not -1"),
         ({"depth": (0.5, 3.0)}, "depth 3 mm may go through the gel of"),
         ({"fields": ("shear", "shear")}, "each field once"),
-        ({"held_out": -0.3}, "held_out is a share from 0 to below 1, not -0.3"),
-        ({"first": -1}, "first must be at least 0, not -1"),
+        ({"held_out": -0.3}, "held_out must be"),
+        ({"first": -1}, "first must be 0 or more, not -1"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused(change, sentence):
@@ -56,7 +56,7 @@ def test_splits_share_no_pair_of_primitive_and_texture():
 @pytest.mark.parametrize("objects", range(12, 19))
 def test_few_objects_have_a_test_set_or_say_why_not(objects):
     try:
-        splits = scene.cast(replace(SCENES, objects=objects))[1]
+        splits = scene.objects_and_splits(replace(SCENES, objects=objects))[1]
     except UserError as error:
         assert f"--objects {objects} and --held-out 0.25: of {objects} objects only" in str(error)
     else:

@@ -80,9 +80,9 @@ def _ended_by_interrupt(bar: Progress) -> Iterator[None]:
 
 def _missing(scenes: Scenes) -> list[str]:
     """The splits that no touch is of, where objects are held out."""
-    from anytouch_jax.sim.scene import cast, draw_touch
+    from anytouch_jax.sim.scene import draw_touch, objects_and_splits
 
-    splits = cast(scenes)[1]
+    splits = objects_and_splits(scenes)[1]
     numbers = range(scenes.first, scenes.first + min(scenes.touches, len(splits)))  # by then each object had its turn
     there = {draw_touch(scenes, number, splits).split for number in numbers}
     return [name for name in ("val", "test") if scenes.held_out and name not in there]

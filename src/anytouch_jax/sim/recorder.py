@@ -1,7 +1,6 @@
-"""Recordings computed: surface under the gel, contact, shear, picture, for a batch of clips in one compiled program.
+"""Simulation of recordings: surface under the gel, contact, shear and image, for a batch of clips in one program.
 
-Only what is asked for is computed: a sensor of fields draws no picture, shear is solved where markers, fields or
-labels need it.
+Only requested outputs are computed. A field sensor renders no image. Shear is left out for stills.
 """
 
 from __future__ import annotations
@@ -15,26 +14,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Contact, Fidelity, Gel
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
 from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, look
-from anytouch_jax.sim.sensing.units import from_gel, gel_of, stack, turned
+from anytouch_jax.sim.sensing.units import gel_to_object, rotated, stack_trees, unit_gel
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object
 
-SPACING = 0.1  # mm a pixel of a relief
-RELIEF = 400  # pixels of a relief: 40 mm, more than any field turned by any angle, and its motion
-GRID = 96  # pixels of the contact's grid on the field's short side
+SPACING = 0.1  # mm between pixels of a height map
+RELIEF = 400  # pixels of a height map: 40 mm hold any rotated field and its motion
+GRID = 96  # pixels of the solve grid on the field's short side
 
 
-class Clip(NamedTuple):
-    """What a recording needs of a scene, T frames; every array may have a leading batch axis.
+class ClipInput(NamedTuple):
+    """The inputs of a simulated clip with T frames. Every array may have a leading batch axis.
 
-    `relief` (RELIEF, RELIEF) mm, the object's height map of SPACING mm a pixel; `place` (2,) mm on it; `start`,
-    `motion`, `depth`, `tilt` as in `scene.Recording`; `modulus` kPa of the object and its `friction` on the gel; `unit`
-    of the sensor; `seed` u32 of the image noise.
+    `relief` (RELIEF, RELIEF) mm is the object's height map with SPACING mm between pixels, and `place` (2,) mm the
+    touched place on it. `start`, `motion`, `depth` and `tilt` are as in `scene.Recording`. `modulus` is the object's
+    in kPa, `friction` that on the gel, `unit` the sensor unit, `seed` u32 that of the image noise.
     """
 
     relief: Any
@@ -49,13 +49,13 @@ class Clip(NamedTuple):
     seed: Any
 
 
-class Take(NamedTuple):
-    """What a recording gives, T frames; as numpy, one a recording, from `Recorder.record`.
+class ClipOutput(NamedTuple):
+    """A simulated clip with T frames.
 
-    `image` u8 (T, h, w, 3) and `background` u8 (h, w, 3), or None for a sensor of fields; `field` f32: (T, 20, 20, 6)
-    of such a sensor, displacement mm and force N, or (T, h0, w0, channels) of the fields asked for, or None; `labels`
-    f32 (T,): force N, depth mm of the deepest point, area mm2, x and y mm of the pressure's centroid in the picture,
-    slip (share of the contact that slides), and for fidelity exact whether it converged.
+    `image` u8 (T, h, w, 3) and `background` u8 (h, w, 3) are None for a field sensor. `field` f32 is (T, 20, 20, 6)
+    for a field sensor, displacement mm and force N. Otherwise it is (T, h, w, channels) of the requested fields, or
+    None. `labels` f32 (T,) are force N, depth mm of the deepest point, area mm2, x and y mm of the centre of pressure
+    in the image, slip (share of the contact that slides), and, for fidelity exact, whether the solver converged.
     """
 
     image: Any
@@ -65,47 +65,47 @@ class Take(NamedTuple):
 
 
 def solve_grid(sensor: Sensor) -> tuple[tuple[int, int], float]:
-    """Rows and columns of the contact's grid over a sensor's field, and its pitch in mm: square pixels."""
+    """Return (rows, columns) of the solve grid over a sensor's field, and its pitch in mm. Its pixels are square."""
     pitch = min(sensor.field) / GRID
     rows, columns = (4 * round(side / pitch / 4) for side in sensor.field)
     return (rows, columns), pitch
 
 
-def surfaces(clip: Clip, x: Array, y: Array) -> Array:
-    """Heights (T, h0, w0) mm of the object under the gel's points `x`, `y` mm; 0 where it is met first.
+def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
+    """Return heights (T, h, w) mm of the object under the gel's points `x`, `y` mm. The first contact is at 0.
 
-    The object turns and slides about the middle of the gel; its tilt is that of the sensor in the hand. The unit's own
-    mounting turns and moves all of it.
+    The object turns and slides about the middle of the gel. Its tilt is that of the sensor in the hand. The mounting of
+    the unit turns and moves everything.
     """
-    x, y = from_gel(clip.unit, x, y)
+    x, y = gel_to_object(clip.unit, x, y)
 
     def under(motion: Array) -> Array:
-        u, v = turned(x - motion[0], y - motion[1], -motion[2])
-        u, v = turned(u - clip.start[0], v - clip.start[1], -clip.start[2])
-        z = shapes.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
+        u, v = rotated(x - motion[0], y - motion[1], -motion[2])
+        u, v = rotated(u - clip.start[0], v - clip.start[1], -clip.start[2])
+        z = interpolation.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
         return z + clip.tilt[0] * x + clip.tilt[1] * y
 
-    # Several things are made of it: without the barrier XLA computes each of the sixteen reads of a point by itself.
+    # It has several users: without the barrier XLA repeats the sixteen reads of a point for each of them.
     z = jax.lax.optimization_barrier(jax.vmap(under)(clip.motion))
     return z - jnp.max(z[0])
 
 
-def gel_motion(clip: Clip) -> Array:
-    """Motion (T, 3) mm, mm, rad of the object from frame to frame in the gel's own frame; 0 in the first."""
+def gel_motion(clip: ClipInput) -> Array:
+    """Return the motion (T, 3) mm, mm, rad of the object between frames, in the gel's frame. It starts with 0."""
     steps = jnp.diff(clip.motion, axis=0, prepend=clip.motion[:1])
-    return jnp.stack([*turned(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
+    return jnp.stack([*rotated(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
 
 
-def record(
-    clip: Clip, *, sensor: Sensor, fidelity: Fidelity, size: int, fields: tuple[str, ...] = (), slides: bool = True
-) -> Take:
-    """One recording by `sensor`: contact of every frame, shear with its history, pictures and labels.
+def simulate_clip(
+    clip: ClipInput, *, sensor: Sensor, fidelity: Fidelity, size: int, fields: tuple[str, ...] = (), slides: bool = True
+) -> ClipOutput:
+    """Simulate one clip by `sensor`: contact of every frame, shear with its history, images and labels.
 
-    `size` pixels of the picture's short side; `slides` False leaves the shear out (stills, units without markers).
+    `size` is the short side of the image in pixels, 0 for the sensor's resolution. `slides` False omits shear.
     """
     (rows, columns), pitch = solve_grid(sensor)
     y, x = jnp.meshgrid(*((jnp.arange(n) - (n - 1) / 2) * pitch for n in (rows, columns)), indexing="ij")
-    gel = gel_of(sensor, clip.unit)
+    gel = unit_gel(sensor, clip.unit)
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
     relief = surfaces(clip, x, y)
     contact = jax.vmap(press)(relief, clip.depth)
@@ -115,14 +115,16 @@ def record(
     sheared = _sheared(clip, contact, squeezed, gel, pitch, fidelity) if slides else _unsheared(contact)
     labels = _labels(clip, contact, sheared, pitch) | {"depth": _depth(clip, relief)}
     if fidelity == "fast":
-        del labels["converged"]  # a few rounds are not meant to converge
+        del labels["converged"]  # a few iterations do not converge
     keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
     if squeezed is not None:
-        measure = partial(optics.field, pitch=pitch, points=sensor.resolution[0], noise=clip.unit.noise, gel=gel)
+        measure = partial(
+            optics.measure_field, pitch=pitch, points=sensor.resolution[0], noise=clip.unit.noise, gel=gel
+        )
         measured = jax.vmap(lambda *maps: measure(*maps[:-1], key=maps[-1]))(
             contact.displacement, sheared.displacement + squeezed, contact.pressure, sheared.traction, keys[1:]
         )
-        return Take(None, None, measured, labels)
+        return ClipOutput(None, None, measured, labels)
     shape = optics.picture_size(sensor, size)
     draw = partial(optics.render, pitch=pitch, sensor=sensor, unit=clip.unit, resolution=shape)
     behind = optics.backdrop(sensor, clip.unit, shape)
@@ -130,15 +132,15 @@ def record(
         contact.displacement, sheared.displacement, keys[1:]
     )
     background = optics.background(sensor, clip.unit, keys[0], resolution=shape)
-    seen = _fields(fields, contact, sheared, partial(optics.onto_picture, pitch=pitch, sensor=sensor, unit=clip.unit,
+    mapped = _fields(fields, contact, sheared, partial(optics.onto_picture, pitch=pitch, sensor=sensor, unit=clip.unit,
                                                      resolution=shape))  # fmt: skip
-    return Take(image, background, seen, labels)
+    return ClipOutput(image, background, mapped, labels)
 
 
 def _sheared(
-    clip: Clip, contact: Contact, squeezed: Array | None, gel: Gel, pitch: float, fidelity: Fidelity
+    clip: ClipInput, contact: Contact, squeezed: Array | None, gel: Gel, pitch: float, fidelity: Fidelity
 ) -> shear.Shear:
-    """The tangential state of every frame, each from the one before it."""
+    """Return the tangential state of every frame, computed from the previous one."""
 
     def step(state: shear.Shear, frame: tuple[Contact, Array, Array | None]) -> tuple[shear.Shear, shear.Shear]:
         state = shear.shear_step(
@@ -166,7 +168,7 @@ def _unsheared(contact: Contact) -> shear.Shear:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape)), still)
 
 
-def _labels(clip: Clip, contact: Contact, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
+def _labels(clip: ClipInput, contact: Contact, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
     centre = jax.vmap(lambda p: jnp.asarray(mechanics.centroid(p, pitch)))(contact.pressure)
     shown = (centre - clip.unit.window[None]) * clip.unit.mirror[None]
     return {
@@ -179,10 +181,10 @@ def _labels(clip: Clip, contact: Contact, sheared: shear.Shear, pitch: float) ->
     }
 
 
-def _depth(clip: Clip, relief: Array) -> Array:
-    """How far the object's highest point under the gel (`relief` (T, h, w) mm) lies below the untouched skin, mm (T,).
+def _depth(clip: ClipInput, relief: Array) -> Array:
+    """Return the depth mm (T,) of the object's highest point under the gel, from `relief` (T, h, w) mm.
 
-    Tilt and sliding bring other points under the gel, so it is not the depth that the hand goes for.
+    It differs from the depth of the hand, because tilt and sliding bring other points under the gel.
     """
     return jnp.maximum(clip.depth + jnp.max(relief, axis=(1, 2)), 0)
 
@@ -190,54 +192,54 @@ def _depth(clip: Clip, relief: Array) -> Array:
 def _fields(
     names: tuple[str, ...], contact: Contact, sheared: shear.Shear, onto_picture: Callable[..., Array]
 ) -> Array | None:
-    """The fields asked for at the pixels of the picture, as channels: displacement mm, pressure kPa, shear (2) mm."""
-    known = {
+    """Return the fields `names` at the image's pixels as channels: displacement mm, pressure kPa, shear (2) mm."""
+    compute = {
         "displacement": lambda: onto_picture(contact.displacement[..., None]),
-        "pressure": lambda: jnp.maximum(onto_picture(contact.pressure[..., None]), 0),  # a spline swings at an edge
+        "pressure": lambda: jnp.maximum(onto_picture(contact.pressure[..., None]), 0),  # a spline overshoots at an edge
         "shear": lambda: onto_picture(sheared.displacement, vectors=True),
     }
-    return jnp.concatenate([known[name]() for name in names], -1) if names else None
+    return jnp.concatenate([compute[name]() for name in names], -1) if names else None
 
 
-AT_ONCE = 24_000_000  # pixels that are computed at a time; some dozen float32 planes of them are in memory
+MAX_PIXELS = 24_000_000  # pixels of a batch; some dozen float32 planes of them are in memory
 
 
 class Recorder:
-    """Computes recordings of a data set in batches of one size, so that each sensor is compiled once.
+    """Simulates recordings of a data set in batches of one size, so that each sensor is compiled once.
 
-    Threads may share it, each with a sensor of its own.
+    Several threads may share it if each uses another sensor.
     """
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
         self._scenes, self._objects, self._batch = scenes, objects, batch
-        # Of a recording: a picture is at most twice as long as wide, and a sensor's own at most 480 pixels high.
+        # Pixels of a recording: an image is at most twice as long as wide, and a sensor's at most 480 pixels high.
         pixels = 2 * scenes.frames * (scenes.size or 480) ** 2
-        self._at_once = max(1, min(batch, AT_ONCE // pixels))
+        self._at_once = max(1, min(batch, MAX_PIXELS // pixels))
         self._relief = lru_cache(64)(lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING))
         self._programs: dict[str, Any] = {}
 
-    def record(self, recordings: Sequence[Recording]) -> list[Take]:
-        """The takes of at most `batch` recordings of one sensor, as numpy. Raises ValueError for more."""
+    def record(self, recordings: Sequence[Recording]) -> list[ClipOutput]:
+        """Return the clips of at most `batch` recordings of one sensor, as numpy. Raises ValueError for more."""
         count = len(recordings)
         if not 0 < count <= self._batch or len({r.sensor for r in recordings}) > 1:
             raise ValueError(f"record takes 1 to {self._batch} recordings of one sensor")
-        return [take for first in range(0, count, self._at_once) for take in self._take(recordings, first)]
+        return [output for first in range(0, count, self._at_once) for output in self._simulate(recordings, first)]
 
-    def _take(self, recordings: Sequence[Recording], first: int) -> list[Take]:
-        """The takes of as many recordings as memory allows, from the one of number `first` on."""
+    def _simulate(self, recordings: Sequence[Recording], first: int) -> list[ClipOutput]:
+        """Return the clips of as many recordings as memory allows, from number `first` on."""
         clips = [self._clip(recording) for recording in recordings[first : first + self._at_once]]
         count = len(clips)
-        clips += clips[-1:] * (self._at_once - count)  # one shape, one compilation
-        takes = jax.device_get(self._program(recordings[0].sensor)(stack(clips)))
-        return [jax.tree.map(lambda x, i=i: x[i], takes) for i in range(count)]
+        clips += clips[-1:] * (self._at_once - count)  # equal shapes compile once
+        outputs = jax.device_get(self._program(recordings[0].sensor)(stack_trees(clips)))
+        return [jax.tree.map(lambda x, i=i: x[i], outputs) for i in range(count)]
 
     def _program(self, name: str) -> Any:
         if name not in self._programs:
             scenes = self._scenes
             if SENSORS[name].kind == "image":
-                look(SENSORS[name])  # fitted to real presses once, outside of the program
+                look(SENSORS[name])  # is fitted to real presses once, outside of the program
             one = partial(
-                record,
+                simulate_clip,
                 sensor=SENSORS[name],
                 fidelity=scenes.fidelity,
                 size=scenes.size,
@@ -247,10 +249,10 @@ class Recorder:
             self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]
 
-    def _clip(self, recording: Recording) -> Clip:
+    def _clip(self, recording: Recording) -> ClipInput:
         touch = recording.touch
         thing = self._objects[touch.object]
-        return Clip(
+        return ClipInput(
             relief=self._relief(touch.object),
             place=np.asarray(touch.place, np.float32),
             start=np.asarray(recording.start, np.float32),

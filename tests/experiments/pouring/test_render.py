@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.sim.contact import mechanics, shear
-from anytouch_jax.sim.sensing.units import gel_of
+from anytouch_jax.sim.sensing.units import unit_gel
 from experiments.pouring import physics, render
 from experiments.pouring.physics import Load, Task
 
@@ -55,7 +55,7 @@ def test_the_grip_presses_with_its_force(held, setup):
 def test_a_unit_load_moves_the_skin_as_the_full_model_does(held, setup):
     """Sticking, by the weighted sum; and with a slipping rim, whose extra motion is Mindlin's."""
     grasp, contact = held
-    gel, pitch = gel_of(render.SENSOR, setup.unit), render.PITCH
+    gel, pitch = unit_gel(render.SENSOR, setup.unit), render.PITCH
     centre = mechanics.centroid(contact.pressure, pitch)
     step = jax.jit(partial(shear.shear_step, None, contact, gel=gel, pitch=pitch, centre=centre, iterations=300))
     for friction, motion in ((1e4, (0.0, 0.2, 0.0)), (0.7, (0.05, 0.25, 0.02)), (0.25, (0.0, 0.3, 0.0))):

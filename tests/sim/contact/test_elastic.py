@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from anytouch_jax.sim.contact import convolve, elastic
-from anytouch_jax.sim.contact.convolve import Plan
+from anytouch_jax.sim.contact import elastic
+from anytouch_jax.sim.contact.elastic import Plan
 from anytouch_jax.sim.contact.mechanics import Gel, sideways
 
 POISSON = 0.4
@@ -47,13 +47,13 @@ def test_fft_and_matrix_products_agree(monkeypatch):
         return plan.inverse(plan.even(plan.forward(field), jnp.asarray(plan.spectrum(coefficients), jnp.float32)))
 
     product = convolved()
-    monkeypatch.setattr(convolve, "MATMUL_LIMIT", 0)
+    monkeypatch.setattr(elastic, "MATMUL_LIMIT", 0)
     np.testing.assert_allclose(convolved(), product, atol=2e-5)
 
 
 @pytest.mark.parametrize("least", [1, 2, 23, 97, 211, 223, 1021])
 def test_padding_is_even_smooth_and_enough(least):
-    size = convolve._smooth(least)
+    size = elastic._smooth(least)
     assert size >= least and size % 2 == 0 and size <= 1.1 * least + 4
     for factor in (2, 3, 5, 7):
         while size % factor == 0:

@@ -10,7 +10,7 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact import elastic, mechanics
-from anytouch_jax.sim.contact.convolve import Plan
+from anytouch_jax.sim.contact.elastic import Plan
 from anytouch_jax.sim.contact.mechanics import Gel, press
 
 N = 64

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.sensing import markers, optics, units
+from anytouch_jax.sim.sensing import optics, units
 from anytouch_jax.sim.sensing.sensors import SENSORS, Markers
-from anytouch_jax.sim.world import splines
 
 SIZE = (48, 64)
 SLIM, DIGIT = SENSORS["gelslim"], SENSORS["digit"]
@@ -96,11 +95,11 @@ def test_mirror_turns_the_picture_over():
 
 def test_zoom_and_window_choose_the_part_of_the_field_that_is_shown():
     unit = PLAIN._replace(zoom=np.float32(0.5), window=np.array([2.5, -1.0], np.float32))
-    seen = optics.view(SLIM, unit, SIZE)
+    seen = optics.picture_view(SLIM, unit, SIZE)
     np.testing.assert_allclose([seen.x[0], seen.x[-1]], 2.5 + np.array([-5, 5]) * (1 - 1 / 64), rtol=1e-5)
     np.testing.assert_allclose(np.mean(seen.y), -1, atol=1e-5)
     np.testing.assert_allclose(seen.u, seen.x / 10, rtol=1e-6)
-    square = optics.view(SLIM, PLAIN, (40, 40))  # another shape: a centred square without stretching
+    square = optics.picture_view(SLIM, PLAIN, (40, 40))  # another shape: a centred square without stretching
     np.testing.assert_allclose(np.diff(square.x), np.diff(square.y), rtol=1e-4)
     assert abs(float(square.y[-1]) - SLIM.field[0] / 2) < 0.5
 
@@ -139,13 +138,13 @@ def test_markers_follow_the_skin_and_come_back_after_one_step_of_the_lattice():
     assert rest.shape == (*SIZE, 3)  # a sensor without markers draws none
     ink = Markers(pitch=2.0, radius=0.4)
     x, y = (jnp.asarray(a) for a in np.meshgrid(np.linspace(-5, 5, 101), np.linspace(-5, 5, 101)))
-    cover = partial(markers.coverage, ink, phase=jnp.zeros(2), size=1.0, soft=0.05, half=10.0)
+    cover = partial(optics.ink_coverage, ink, phase=jnp.zeros(2), size=1.0, soft=0.05, half=10.0)
     spots = np.asarray(cover(x, y))
     assert spots[50, 50] == 1 and spots[50, 60] == 0 and spots[50, 70] == 1  # lattice points at 0 and 2 mm
     assert abs(spots.mean() / (np.pi * 0.4**2 / 4) - 1) < 0.2
     # Material that has moved by +0.5 mm is seen 5 samples further right.
     np.testing.assert_allclose(np.asarray(cover(x - 0.5, y))[:, 5:], spots[:, :-5], atol=1e-4)
-    dashes = np.asarray(markers.coverage(Markers(2.0, 0.3, aspect=2.5), x, y, jnp.zeros(2), 1.0, 0.05, 10.0))
+    dashes = np.asarray(optics.ink_coverage(Markers(2.0, 0.3, aspect=2.5), x, y, jnp.zeros(2), 1.0, 0.05, 10.0))
     assert (dashes[50, 40:61] > 0.5).sum() > 2 * (dashes[40:61, 50] > 0.5).sum() - 3
     moved = STILL.at[..., 0].set(0.6)
     assert (levels(draw(FLAT, moved, unit, KEY)) != levels(draw(FLAT, STILL, unit, KEY))).mean() > 0.02
@@ -169,7 +168,7 @@ def test_a_batch_is_its_frames():
     rng = np.random.default_rng(3)
     several = [units.draw_unit(SLIM, rng) for _ in range(2)]
     dents, keys = jnp.stack([bump(2.0), bump(0, -2.0)]), jax.random.split(KEY, 2)
-    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), units.stack(several), keys)
+    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), units.stack_trees(several), keys)
     for i in range(2):
         np.testing.assert_allclose(levels(together[i]), levels(draw(dents[i], STILL, several[i], keys[i])), atol=1)
 
@@ -198,7 +197,7 @@ def test_the_field_adds_up_to_the_load():
     pressure, traction = rng.uniform(0, 50, (48, 48)), rng.normal(0, 9, (48, 48, 2))
     moved, sunk = rng.normal(0, 0.1, (48, 48, 2)), np.full((48, 48), 0.25)
     pitch = 17.0 / 48
-    measured = np.asarray(optics.field(*map(jnp.asarray, (sunk, moved, pressure, traction)), pitch))
+    measured = np.asarray(optics.measure_field(*map(jnp.asarray, (sunk, moved, pressure, traction)), pitch))
     assert measured.shape == (20, 20, 6) and measured.dtype == np.float32
     np.testing.assert_allclose(measured[..., 5].sum(), pressure.sum() * pitch**2 * 1e-3, rtol=1e-4)
     np.testing.assert_allclose(measured[..., 3:5].sum((0, 1)), traction.sum((0, 1)) * pitch**2 * 1e-3, atol=1e-4)
@@ -206,43 +205,20 @@ def test_the_field_adds_up_to_the_load():
     np.testing.assert_allclose(measured[..., 0].mean(), moved[..., 0].mean(), atol=1e-6)
     corner = np.zeros((48, 48))
     corner[1, 40] = 1.0
-    spot = np.asarray(optics.field(*map(jnp.asarray, (sunk, moved, corner, traction)), pitch))[..., 5]
+    spot = np.asarray(optics.measure_field(*map(jnp.asarray, (sunk, moved, corner, traction)), pitch))[..., 5]
     assert np.unravel_index(spot.argmax(), spot.shape) == (0, 16)  # rows are y, columns x
     with pytest.raises(UserError, match="one size"):
-        optics.field(jnp.zeros((4, 4)), jnp.zeros((4, 5, 2)), jnp.zeros((4, 4)), jnp.zeros((4, 4, 2)), pitch)
+        optics.measure_field(jnp.zeros((4, 4)), jnp.zeros((4, 5, 2)), jnp.zeros((4, 4)), jnp.zeros((4, 4, 2)), pitch)
 
 
 def test_the_noise_of_a_field_is_in_mm_and_in_what_the_gel_makes_of_it():
     still = [jnp.zeros((48, 48)), jnp.zeros((48, 48, 2)), jnp.zeros((48, 48)), jnp.zeros((48, 48, 2))]
-    noisy = partial(optics.field, *still, 17.0 / 48, noise=0.02, gel=SENSORS["tac3d"].gel)
+    noisy = partial(optics.measure_field, *still, 17.0 / 48, noise=0.02, gel=SENSORS["tac3d"].gel)
     seen = np.asarray(noisy(key=jax.random.key(3)))
     newton = 0.02 * 200.0 * 17.0 / 20 * 1e-3
     np.testing.assert_allclose(seen.std((0, 1)), [0.02] * 3 + [newton] * 3, rtol=0.15)
     assert np.abs(seen.mean((0, 1)) / seen.std((0, 1))).max() < 0.2
     assert not np.asarray(noisy()).any() and np.array_equal(noisy(key=jax.random.key(3)), seen)
-
-
-def test_the_spline_keeps_lines_differentiates_parabolas_and_repeats_the_edge():
-    at = jnp.array([3.0, 4.25, 7.5, 11.9])
-    value, slope = splines.spline(at, 16)
-    samples = jnp.arange(16.0)
-    np.testing.assert_allclose(value.sum(1), 1, rtol=1e-6)
-    np.testing.assert_allclose(value @ samples, at, rtol=1e-6)
-    np.testing.assert_allclose(slope @ samples**2, 2 * at, rtol=1e-5)
-    np.testing.assert_allclose(slope @ jnp.ones(16), 0, atol=1e-6)
-    outside = splines.spline(jnp.array([-9.0, 40.0]), 16)[0] @ samples
-    np.testing.assert_allclose(outside, [1 / 6, 15 - 1 / 6], rtol=1e-5)
-
-
-def test_blur_and_average_keep_the_mean():
-    np.testing.assert_allclose(splines.blur(12, 2.0).sum(1), 1, rtol=1e-6)
-    peak = splines.blur(41, 3.0)[20]
-    spread = np.sqrt((np.asarray(peak) * (np.arange(41) - 20) ** 2).sum())
-    assert abs(spread - 3) < 0.01
-    matrix = splines.average(10, 4)
-    np.testing.assert_allclose(matrix.sum(1), 1, rtol=1e-6)
-    np.testing.assert_allclose(matrix.sum(0), 0.4, rtol=1e-5)
-    np.testing.assert_allclose(matrix @ np.arange(10), [0.8, 3.2, 5.8, 8.2], rtol=1e-5)
 
 
 def test_steep_and_broken_surfaces_stay_pictures():
@@ -271,7 +247,7 @@ def test_markers_creep_outwards_in_a_dent(monkeypatch):
         seen.append((np.asarray(x), np.asarray(y)))
         return jnp.zeros(x.shape)
 
-    monkeypatch.setattr(optics.markers, "coverage", remember)
+    monkeypatch.setattr(optics, "ink_coverage", remember)
     for dent in (FLAT, bump()):
         optics.render(dent, STILL, PITCH, SLIM, MARKED, None, resolution=SIZE)
     (x, y), (came_x, came_y) = seen
@@ -283,7 +259,7 @@ def test_markers_creep_outwards_in_a_dent(monkeypatch):
 def test_a_bent_lattice_shrinks_outwards():
     ink = Markers(pitch=1.25, radius=0.1, bend=0.12)
     x = jnp.linspace(0, 9.9, 4001)[None]
-    spots = np.asarray(markers.coverage(ink, x, jnp.zeros((1, 1)), jnp.zeros(2), 1.0, 0.02, 10.0))[0] > 0.5
+    spots = np.asarray(optics.ink_coverage(ink, x, jnp.zeros((1, 1)), jnp.zeros(2), 1.0, 0.02, 10.0))[0] > 0.5
     edges = np.flatnonzero(np.diff(spots.astype(int)))  # the first spot, at 0, ends at the first
     middles = (edges[1:-1:2] + edges[2::2]) / 2 * 9.9 / 4000
     gaps = np.diff(np.concatenate([[0.0], middles]))

@@ -8,9 +8,9 @@ import pytest
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.sensing import photo
 from anytouch_jax.sim.sensing.photo import EXTENT, photograph
-from anytouch_jax.sim.world.objects import catalogue, draw
+from anytouch_jax.sim.world.objects import catalogue, draw_object
 
-BALL = draw("sphere", "smooth", "plastic", 5)
+BALL = draw_object("sphere", "smooth", "plastic", 5)
 BALL = dataclasses.replace(BALL, shape=dataclasses.replace(BALL.shape, size=8.0))
 
 
@@ -80,7 +80,7 @@ def fineness(image):
 def test_textures_can_be_seen(texture):
     plain, structured = (
         dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, size=60.0))
-        for thing in (draw("flat", t, "plastic", 4) for t in ("smooth", texture))
+        for thing in (draw_object("flat", t, "plastic", 4) for t in ("smooth", texture))
     )
     for seed in range(3):
         seen = [fineness(photograph(t, (0.0, 0.0), np.random.default_rng(seed), 160)) for t in (plain, structured)]
@@ -89,7 +89,7 @@ def test_textures_can_be_seen(texture):
 
 @pytest.mark.parametrize("colour", [(0.8, 0.15, 0.1), (0.1, 0.6, 0.15), (0.15, 0.2, 0.8)])
 def test_the_material_gives_its_colour(colour):
-    thing = painted(draw("flat", "weave", "fabric", 4), *colour)
+    thing = painted(draw_object("flat", "weave", "fabric", 4), *colour)
     for seed in range(4):
         seen = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 64)[24:40, 24:40].mean((0, 1))
         assert np.argmax(seen) == np.argmax(colour) and seen.max() > 1.5 * seen.min()
@@ -97,7 +97,7 @@ def test_the_material_gives_its_colour(colour):
 
 def test_gloss_makes_highlights():
     def brightest(material, seed):
-        thing = painted(draw("sphere", "smooth", material, 5), 0.3, 0.3, 0.3)
+        thing = painted(draw_object("sphere", "smooth", material, 5), 0.3, 0.3, 0.3)
         image = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96)[36:60, 36:60].max(-1)
         return float(image.max() - np.median(image))
 
@@ -112,7 +112,7 @@ def test_impossible_photographs_are_named():
 
 
 def test_the_border_of_the_picture_is_shaded_like_its_inside():
-    thing = draw("flat", "smooth", "plastic", 4)
+    thing = draw_object("flat", "smooth", "plastic", 4)
     thing = dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, size=90.0))
     for seed in range(3):
         image = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96).astype(np.float32).mean(-1)

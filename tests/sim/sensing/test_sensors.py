@@ -33,7 +33,7 @@ def test_the_records_are_whole_and_known_to_the_model():
 
 def test_an_unknown_sensor_and_one_without_pictures_are_named():
     with pytest.raises(UserError, match=r"'gelsigth'.*gelsight, gelsight_mini, gelslim"):
-        sensors.get("gelsigth")
+        sensors.find_sensor("gelsigth")
     with pytest.raises(UserError, match=r"tac3d has no pictures.*optics\.field"):
         sensors.look(SENSORS["tac3d"])
 
@@ -136,22 +136,22 @@ def test_units_stay_inside_the_field_and_carry_markers_by_share():
 def test_the_mounting_and_its_inverse():
     unit = units.draw_unit(DIGIT, np.random.default_rng(7))
     x, y = jnp.array([0.0, 3.0, -2.0]), jnp.array([0.0, 1.0, 5.0])
-    back = units.from_gel(unit, x, y)
-    there = np.stack(units.turned(*back, unit.rotation)) + unit.offset[:, None]
+    back = units.gel_to_object(unit, x, y)
+    there = np.stack(units.rotated(*back, unit.rotation)) + unit.offset[:, None]
     np.testing.assert_allclose(there, np.stack([x, y]), atol=1e-5)
-    np.testing.assert_allclose(units.from_gel(unit, *unit.offset), [0, 0], atol=1e-6)
+    np.testing.assert_allclose(units.gel_to_object(unit, *unit.offset), [0, 0], atol=1e-6)
     quarter = units.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
-    np.testing.assert_allclose(units.from_gel(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
-    np.testing.assert_array_equal(units.from_gel(units.identity_unit(DIGIT), x, y), [x, y])
+    np.testing.assert_allclose(units.gel_to_object(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
+    np.testing.assert_array_equal(units.gel_to_object(units.identity_unit(DIGIT), x, y), [x, y])
 
 
 def test_stacked_units_vmap():
     rng = np.random.default_rng(8)
     several = [units.draw_unit(DIGIT, rng) for _ in range(3)]
-    stacked = units.stack(several)
+    stacked = units.stack_trees(several)
     assert stacked.uneven.shape == (3, 5, 3)
-    moved = jax.vmap(lambda u: jnp.stack(units.from_gel(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
-    np.testing.assert_allclose(moved[2], units.from_gel(several[2], 1.0, 2.0), rtol=1e-6)
+    moved = jax.vmap(lambda u: jnp.stack(units.gel_to_object(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
+    np.testing.assert_allclose(moved[2], units.gel_to_object(several[2], 1.0, 2.0), rtol=1e-6)
 
 
 def test_the_side_of_a_dent_that_turns_away_from_a_light_is_in_its_shadow():

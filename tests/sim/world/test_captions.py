@@ -9,7 +9,7 @@ from anytouch_jax.sim.world import captions
 from anytouch_jax.sim.world.captions import caption
 from anytouch_jax.sim.world.materials import MATERIALS
 from anytouch_jax.sim.world.objects import NOUNS, catalogue, hardness_of, roughness_of
-from anytouch_jax.sim.world.shapes import PRIMITIVES
+from anytouch_jax.sim.world.primitives import PRIMITIVES
 
 THINGS = catalogue(0, 300)
 # What a caption would give away: kinds of primitive and things, materials, and all about the touch itself.

@@ -8,8 +8,10 @@ import pytest
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.world import objects
 from anytouch_jax.sim.world.materials import HARD, MATERIALS, SOFT, hardness_class
-from anytouch_jax.sim.world.objects import catalogue, combinations, draw, hardness_of, hold_out, roughness_of
-from anytouch_jax.sim.world.shapes import GRAINS, PRIMITIVES, TEXTURES, Shape, height, relief
+from anytouch_jax.sim.world.objects import catalogue, combinations, draw_object, hardness_of, hold_out, roughness_of
+from anytouch_jax.sim.world.primitives import PRIMITIVES
+from anytouch_jax.sim.world.shapes import Shape, height, relief
+from anytouch_jax.sim.world.textures import GRAINS, TEXTURES
 
 THINGS = catalogue(0)
 
@@ -117,7 +119,7 @@ def test_labels_have_three_classes_each_and_follow_the_object():
     assert set(roughness) == {"smooth", "textured", "rough"} and min(roughness.values()) >= 6
     for thing in THINGS:
         assert (roughness_of(thing) == "smooth") == (thing.shape.texture == "smooth")
-    thing = draw("sphere", "ridges", "foam", 1)
+    thing = draw_object("sphere", "ridges", "foam", 1)
     deep, shallow = (
         dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, texture_depth=d)) for d in (0.5, 0.05)
     )
@@ -150,7 +152,7 @@ def test_what_cannot_be_held_out_is_said():
     with pytest.raises(UserError, match="draw more objects"):
         hold_out(THINGS, 0.95, 0)
     with pytest.raises(UserError, match="only 0"):
-        hold_out([draw("cone", "sand", "cork", s) for s in range(3)], 0.5, 0)
+        hold_out([draw_object("cone", "sand", "cork", s) for s in range(3)], 0.5, 0)
 
 
 def test_impossible_requests_are_named():
@@ -159,4 +161,4 @@ def test_impossible_requests_are_named():
             catalogue(0, count)
     for bad in (("cube", "sand", "cork"), ("cone", "velvet", "cork"), ("cone", "sand", "butter")):
         with pytest.raises(UserError, match="there is no"):
-            draw(*bad, seed=0)
+            draw_object(*bad, seed=0)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from anytouch_jax.sim.world import textures
-from anytouch_jax.sim.world.shapes import GRAINS, TEXTURES, Shape, height
+from anytouch_jax.sim.world.shapes import Shape, height
+from anytouch_jax.sim.world.textures import GRAINS, TEXTURES
 
 
 def axes(count, pitch):
@@ -88,7 +89,7 @@ def test_normal_cdf():
 
 def test_irregularity_bends_a_pattern_by_what_it_says():
     x, y = axes(200, 0.3)
-    u, v = textures.warped(x, y, 1.5, 0.1, 3)
+    u, v = textures.warp(x, y, 1.5, 0.1, 3)
     assert np.std(u - x) == pytest.approx(0.15, rel=0.2) and np.std(v - y) == pytest.approx(0.15, rel=0.2)
     assert not np.array_equal(u - x, v - y)
-    assert textures.warped(x, y, 1.5, 0.0, 3)[0] is x
+    assert textures.warp(x, y, 1.5, 0.0, 3)[0] is x

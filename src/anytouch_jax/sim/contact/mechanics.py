@@ -16,8 +16,7 @@ import numpy as np
 from jax import Array
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.contact.convolve import Plan
-from anytouch_jax.sim.contact.elastic import is_infinite, normal_spectrum, sideways_kernel
+from anytouch_jax.sim.contact.elastic import Plan, is_infinite, normal_spectrum, sideways_kernel
 from anytouch_jax.sim.contact.solver import (
     OWN,
     Compliance,

@@ -15,8 +15,7 @@ import numpy as np
 from jax import Array
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.contact.convolve import Plan
-from anytouch_jax.sim.contact.elastic import is_infinite, tangential_spectra
+from anytouch_jax.sim.contact.elastic import Plan, is_infinite, tangential_spectra
 from anytouch_jax.sim.contact.mechanics import KPA_MM2, Contact, Fidelity, Gel, centroid, grids, positions
 from anytouch_jax.sim.contact.solver import Compliance, descent
 

@@ -25,8 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.sensing import shading
-from anytouch_jax.sim.world import splines
 
 Array = npt.NDArray[Any]
 
@@ -163,7 +163,7 @@ def settle(cut: jax.Array, pitch: float, reach: float) -> jax.Array:
     dent = jnp.maximum(cut, 0.0)
     for level in range(6):
         sigma = reach / pitch / 2 ** (0.8 * level)
-        rows, columns = splines.blur(cut.shape[0], sigma), splines.blur(cut.shape[1], sigma)
+        rows, columns = interpolation.blur(cut.shape[0], sigma), interpolation.blur(cut.shape[1], sigma)
         dent = jnp.maximum(rows @ dent @ columns.T, cut)
     return dent
 
@@ -180,9 +180,9 @@ def _features(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Tilt (h, w) twice and halo features (h, w, 3) of a press at the pixels `rows` x `columns`."""
     dent, pitch = press_dent(centre, radius, indenter, shape), COARSE * PITCH
-    ay, dy = splines.spline(jnp.asarray((rows + 0.5) / COARSE - 0.5), dent.shape[0])
-    ax, dx = splines.spline(jnp.asarray((columns + 0.5) / COARSE - 0.5), dent.shape[1])
-    by, bx = (splines.blur(n, indenter.halo / pitch) for n in dent.shape)
+    ay, dy = interpolation.spline(jnp.asarray((rows + 0.5) / COARSE - 0.5), dent.shape[0])
+    ax, dx = interpolation.spline(jnp.asarray((columns + 0.5) / COARSE - 0.5), dent.shape[1])
+    by, bx = (interpolation.blur(n, indenter.halo / pitch) for n in dent.shape)
     soft = by @ dent @ bx.T
     nx, ny = shading.tilt(ay @ dent @ dx.T / pitch, dy @ dent @ ax.T / pitch, 0.95)
     return nx, ny, jnp.stack([ay @ soft @ dx.T / pitch, dy @ soft @ ax.T / pitch, ay @ soft @ ax.T], -1)

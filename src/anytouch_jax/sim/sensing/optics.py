@@ -1,9 +1,9 @@
-"""From the skin's deformation to the picture that a camera sensor sees, and to the field that Tac3D measures.
+"""Renderer of tactile images from the deformation of the skin, and the field that Tac3D measures.
 
-Everything is products of small matrices along rows and columns (`splines`) and arithmetic that XLA fuses into one pass
-over the pixels, so a batch under `vmap` costs little more than its pixels. Order: resample and differentiate the
-displacement at the picture's pixels, colour change by normal and place (`shading`), soft shadow and light bleed from
-the blurred dent, background, markers, noise.
+Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into one pass over the
+pixels, so a batch under `vmap` costs little more than its pixels. The steps are: resample and differentiate the
+displacement at the pixels, colour change by normal and place (`shading`), soft shadow and light bleed from the blurred
+dent, background, markers, noise.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact.mechanics import KPA_MM2, Gel
-from anytouch_jax.sim.sensing import markers, shading
+from anytouch_jax.sim.sensing import shading
 from anytouch_jax.sim.sensing.sensors import Markers, Sensor, look
-from anytouch_jax.sim.sensing.units import Unit, turned
-from anytouch_jax.sim.world import splines
+from anytouch_jax.sim.sensing.units import Unit, rotated
 
 Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope
-SPREAD = 0.25  # mm that markers creep down a slope of one: incompressible gel gives way sideways
+SPREAD = 0.25  # mm that markers move down a slope of one: incompressible gel yields sideways
 
 
-class View(NamedTuple):
-    """Where the picture's columns and rows lie: `x` (W,) and `y` (H,) mm from the field's middle, `u`, `v` in -1..1."""
+class PictureView(NamedTuple):
+    """Places of the image's columns and rows: `x` (W,), `y` (H,) mm from the field's middle, and `u`, `v` in -1..1."""
 
     x: Array
     y: Array
@@ -36,31 +36,33 @@ class View(NamedTuple):
 
 
 def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
-    """(height, width) of a picture of the whole field with square pixels: a short side of `short` pixels, 0 for the
-    sensor's own resolution."""
+    """Return (height, width) of an image of the whole field with square pixels.
+
+    Its short side has `short` pixels. 0 is the sensor's resolution.
+    """
     if not short:
         return sensor.resolution
     scale = short / min(sensor.field)
     return round(sensor.field[0] * scale), round(sensor.field[1] * scale)
 
 
-def view(sensor: Sensor, unit: Unit, resolution: tuple[int, int]) -> View:
-    """The part of the field that a picture of (height, width) shows: the largest of its shape, zoomed and mirrored."""
+def picture_view(sensor: Sensor, unit: Unit, resolution: tuple[int, int]) -> PictureView:
+    """Return the part of the field in an image of (height, width): the largest of its shape, zoomed and mirrored."""
     height, width = resolution
     scale = min(sensor.field[0] / height, sensor.field[1] / width)
     x = unit.window[0] + unit.mirror[0] * unit.zoom * scale * (jnp.arange(width) + 0.5 - width / 2)
     y = unit.window[1] + unit.mirror[1] * unit.zoom * scale * (jnp.arange(height) + 0.5 - height / 2)
-    return View(x, y, 2 * x / sensor.field[1], 2 * y / sensor.field[0])
+    return PictureView(x, y, 2 * x / sensor.field[1], 2 * y / sensor.field[0])
 
 
 def backdrop(sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = None) -> Array:
-    """The untouched image of a unit without markers and noise, f32 (3, H, W) in 0..1.
+    """Return the untouched image of a unit without markers and noise, f32 (3, H, W) in 0..1.
 
-    Give it to `render` when many frames of one unit are rendered outside of one `vmap`.
+    Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
     """
-    base, place = look(sensor).base, view(sensor, unit, resolution or picture_size(sensor))
-    rows = splines.spline((place.v + 1) / 2 * base.shape[0] - 0.5, base.shape[0])[0]
-    columns = splines.spline((place.u + 1) / 2 * base.shape[1] - 0.5, base.shape[1])[0]
+    base, place = look(sensor).base, picture_view(sensor, unit, resolution or picture_size(sensor))
+    rows = interpolation.spline((place.v + 1) / 2 * base.shape[0] - 0.5, base.shape[0])[0]
+    columns = interpolation.spline((place.u + 1) / 2 * base.shape[1] - 0.5, base.shape[1])[0]
     image = jnp.einsum("ih,chw,jw->cij", rows, jnp.asarray(base.transpose(2, 0, 1)), columns)
     u, v = place.u[None, None, :], place.v[None, :, None]
     tilt = [weight[:, None, None] for weight in unit.uneven]
@@ -80,17 +82,16 @@ def render(
     shadow: bool = True,
     behind: Array | None = None,
 ) -> Array:
-    """The picture, u8 (H, W, 3) RGB, of a skin that is pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
+    """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
-    The grid's middle is the field's middle; outside of it its edge goes on. `tangential` (h, w, 2) mm (x, y) or None
-    moves the markers. `key` draws the noise, None leaves it out. `resolution` (height, width), by default square
-    pixels with a short side of 224; `sensor`, `resolution` and `shadow` are static under jit. `behind` is the
-    `backdrop` of the same unit and resolution. Zero displacement gives `background`. Raises UserError for a sensor
-    without pictures.
+    The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
+    mm (x, y) moves the markers. `key` draws the noise, and None omits it. `resolution` is (height, width), by default
+    square pixels with a short side of 224. `sensor`, `resolution` and `shadow` are static under jit. `behind` is the
+    `backdrop` of the same unit and resolution. Raises UserError for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
-    seen, place = look(sensor), view(sensor, unit, resolution)
-    photometry = seen.photometry if shadow else seen.plain
+    model, place = look(sensor), picture_view(sensor, unit, resolution)
+    photometry = model.photometry if shadow else model.plain
     matrices = _resample(displacement.shape, pitch, place)
     nx, ny = shading.tilt(*_slopes(displacement, matrices, pitch, sensor, unit), photometry.steepest)
     halo = None
@@ -98,7 +99,7 @@ def render(
         halo = _halo(displacement, matrices, pitch, sensor)
     glow: tuple[Array, ...] | None = None
     if shadow and halo is not None:
-        lit = (*turned(halo[0], halo[1], unit.light_angle), halo[2])
+        lit = (*rotated(halo[0], halo[1], unit.light_angle), halo[2])
         glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
     ink = None
     if sensor.markers is not None and halo is not None:
@@ -117,14 +118,14 @@ def render(
 
     if behind is None:
         behind = backdrop(sensor, unit, resolution)
-    # A loop over the channels, not a broadcast: what they share is computed once, and XLA's CPU backend cannot fuse the
+    # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU backend cannot fuse the
     # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
     planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind))
     return planes.transpose(1, 2, 0)
 
 
 def _channels(photometry: shading.Photometry, sensor: Sensor, unit: Unit, behind: Array) -> dict[str, Array]:
-    """What differs between the colour channels, each with a leading axis of three."""
+    """Return the inputs that differ between colour channels, each with a leading axis of three."""
     ink = sensor.markers.ink if sensor.markers else (0.0, 0.0, 0.0)
     return {
         "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0),
@@ -139,51 +140,51 @@ def _channels(photometry: shading.Photometry, sensor: Sensor, unit: Unit, behind
 def background(
     sensor: Sensor, unit: Unit, key: Array | None = None, *, resolution: tuple[int, int] | None = None
 ) -> Array:
-    """The no-contact frame of a unit, u8 (H, W, 3) RGB, with its markers; noise as in `render`."""
+    """Render the background image of a unit, u8 (H, W, 3) RGB, with its markers and noise as in `render`."""
     return render(jnp.zeros((8, 8)), None, 1.0, sensor, unit, key, resolution=resolution)
 
 
 def onto_picture(
     maps: Array, *, pitch: Any, sensor: Sensor, unit: Unit, resolution: tuple[int, int], vectors: bool = False
 ) -> Array:
-    """Maps (..., h, w, C) of the solve grid at the pixels of a unit's picture (height, width), mirrored as it is.
+    """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height, width).
 
-    `vectors`: the two channels are x and y of a vector, which is mirrored too.
+    With `vectors`, the two channels are x and y of a vector, which is mirrored with the image.
     """
-    ay, _, ax, _ = _resample(maps.shape[-3:-1], pitch, view(sensor, unit, resolution))
-    seen = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
-    return seen * unit.mirror.reshape((1,) * (seen.ndim - 1) + (2,)) if vectors else seen
+    ay, _, ax, _ = _resample(maps.shape[-3:-1], pitch, picture_view(sensor, unit, resolution))
+    mapped = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
+    return mapped * unit.mirror.reshape((1,) * (mapped.ndim - 1) + (2,)) if vectors else mapped
 
 
-def _resample(shape: tuple[int, ...], pitch: Any, place: View) -> Matrices:
-    """Value and derivative matrices from the solve grid to the picture's rows and columns."""
-    rows = splines.spline(place.y / pitch + (shape[0] - 1) / 2, shape[0])
-    return *rows, *splines.spline(place.x / pitch + (shape[1] - 1) / 2, shape[1])
+def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrices:
+    """Return value and derivative matrices from the solve grid to the image's rows and columns."""
+    rows = interpolation.spline(place.y / pitch + (shape[0] - 1) / 2, shape[0])
+    return *rows, *interpolation.spline(place.x / pitch + (shape[1] - 1) / 2, shape[1])
 
 
 def _slopes(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor, unit: Unit) -> tuple[Array, Array]:
-    """Slopes (H, W) along x and y at the pixels, smoothed by the skin and turned with the unit's lights."""
+    """Return slopes (H, W) along x and y at the pixels, smoothed by the skin and rotated with the unit's lights."""
     ay, dy, ax, dx = matrices
     if sensor.skin:
-        by, bx = (splines.blur(n, sensor.skin / pitch) for n in displacement.shape)
+        by, bx = (interpolation.blur(n, sensor.skin / pitch) for n in displacement.shape)
         displacement = by @ displacement @ bx.T
-    return turned(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit.light_angle)
+    return rotated(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit.light_angle)
 
 
 def _halo(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor) -> tuple[Array, ...]:
-    """Slopes and depth of the dent blurred over the sensor's `halo` mm, at the picture's pixels."""
+    """Return slopes and depth of the dent blurred over the sensor's `halo` mm, at the pixels."""
     ay, dy, ax, dx = matrices
-    by, bx = (splines.blur(n, sensor.halo / pitch) for n in displacement.shape)
+    by, bx = (interpolation.blur(n, sensor.halo / pitch) for n in displacement.shape)
     soft = by @ displacement @ bx.T
     rows = ay @ soft
     return rows @ dx.T / pitch, dy @ soft @ ax.T / pitch, rows @ ax.T
 
 
 def _ink(
-    tangential: Array | None, halo: tuple[Array, ...], matrices: Matrices, place: View, ink: Markers,
+    tangential: Array | None, halo: tuple[Array, ...], matrices: Matrices, place: PictureView, ink: Markers,
     sensor: Sensor, unit: Unit,
 ) -> Array:  # fmt: skip
-    """Share of ink (H, W): the lattice at the places that the skin seen at the pixels has come from."""
+    """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the pixels."""
     ay, _, ax, _ = matrices
     x = place.x[None, :] + SPREAD * halo[0]
     y = place.y[:, None] + SPREAD * halo[1]
@@ -192,15 +193,31 @@ def _ink(
         y = y - ay @ tangential[..., 1] @ ax.T
     soft = 1.5 * jnp.abs(place.x[1] - place.x[0])
     half = float(np.hypot(*sensor.field)) / 2
-    return markers.coverage(ink, x, y, unit.marker_phase, unit.marker_size, soft, half)
+    return ink_coverage(ink, x, y, unit.marker_phase, unit.marker_size, soft, half)
+
+
+def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: float) -> Array:
+    """Return the share of ink (H, W), 0..1, at places with *undeformed* coordinates `x`, `y` (H, W) mm.
+
+    Spots lie on a lattice and differ a little in size, as printed spots do. `phase` (2,) is in lattice steps, `size` a
+    factor on the radius, `soft` mm the width of a spot's rim, `half` mm half the field's diagonal (for the lens).
+    """
+    grow = 1.0 - markers.bend * (1.0 - (x**2 + y**2) / half**2) if markers.bend else 1.0
+    column, row = x * grow / markers.pitch - phase[0], y * grow / markers.pitch - phase[1]
+    i, j = jnp.floor(column + 0.5), jnp.floor(row + 0.5)
+    dx, dy = (column - i) * (markers.pitch / markers.aspect), (row - j) * markers.pitch
+    scatter = 0.754877 * i + 0.569840 * j  # no visible order (plastic number), and cheaper than a sine
+    radius = markers.radius * size * (0.88 + 0.24 * (scatter - jnp.floor(scatter)))
+    distance = jnp.sqrt(dx**2 + dy**2 + 1e-12)
+    return jnp.clip((radius - distance) / soft + 0.5, 0.0, 1.0)
 
 
 def _noise(bits: Array) -> Array:
-    """Noise of zero mean and unit variance from the lowest ten bits of each word: ten coin tosses."""
+    """Return noise of zero mean and unit variance from the lowest ten bits of each word: ten coin tosses."""
     return (jax.lax.population_count(bits & jnp.uint32(1023)).astype(jnp.float32) - 5) / np.sqrt(2.5)
 
 
-def field(
+def measure_field(
     displacement: Array,
     tangential: Array,
     pressure: Array,
@@ -212,19 +229,19 @@ def field(
     gel: Gel | None = None,
     key: Array | None = None,
 ) -> Array:
-    """What a field sensor measures, f32 (points, points, 6): displacement x, y, z in mm, force x, y, z in N.
+    """Return the measurement of a field sensor, f32 (points, points, 6): displacement x, y, z mm, force x, y, z N.
 
-    Inputs on the solve grid: `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h, w) kPa, `traction`
-    (h, w, 2) kPa, `pitch` mm. A point reports the mean displacement and the whole force of its cell, so but for noise
-    the forces add up to the load. `key` draws noise of standard deviation `noise` mm in a displacement; forces are
-    computed of displacements, so theirs is what a cube of `gel` under a cell needs for it. Raises UserError for maps of
-    different sizes.
+    Inputs on the solve grid are `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h, w) kPa, `traction`
+    (h, w, 2) kPa and `pitch` mm. A point reports the mean displacement and the total force of its cell, so without
+    noise the forces sum to the load. `key` draws noise of `noise` mm in a displacement. The sensor computes forces from
+    displacements, so their noise is the force that moves a cube of `gel` under a cell by it. Raises UserError for maps
+    of different sizes.
     """
     shape = displacement.shape
     if not shape == pressure.shape == tangential.shape[:2] == traction.shape[:2]:
         raise UserError(f"displacement {shape}, pressure {pressure.shape} and the tangential maps must have one size")
     maps = jnp.concatenate([tangential, displacement[..., None], traction, pressure[..., None]], -1)
-    rows, columns = (jnp.asarray(splines.average(n, points)) for n in shape)
+    rows, columns = (jnp.asarray(interpolation.average(n, points)) for n in shape)
     means = jnp.einsum("ih,hwc,jw->ijc", rows, maps, columns)
     cell = shape[0] * shape[1] / points**2 * pitch**2  # mm^2
     exact = means * _each(1.0, cell * KPA_MM2)
@@ -235,5 +252,5 @@ def field(
 
 
 def _each(displacement: Any, force: Any) -> Array:
-    """A value for the displacements and one for the forces of a field, (1, 1, 6)."""
+    """Return one value for the displacements and one for the forces of a field, (1, 1, 6)."""
     return jnp.repeat(jnp.stack([jnp.asarray(displacement), jnp.asarray(force)]), 3)[None, None]

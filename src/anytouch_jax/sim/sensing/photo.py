@@ -22,7 +22,7 @@ EXTENT = (30.0, 40.0)  # mm across the picture
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """A camera and a lamp: the eye (3,) mm above the place, unit axes (3, 3) right, down, ahead, the picture's extent
     in mm at the place, the unit vector (3,) to the lamp."""
 
@@ -65,7 +65,7 @@ def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int
     return _develop(planes, rng)
 
 
-def _draw_view(rng: np.random.Generator) -> View:
+def _draw_view(rng: np.random.Generator) -> CameraView:
     extent, turn = rng.uniform(*EXTENT), rng.uniform(-math.pi, math.pi)
     tilt, roll = math.radians(rng.uniform(0, 38)), rng.uniform(-math.pi, math.pi)
     away = rng.uniform(1.8, 3.0) * extent
@@ -76,7 +76,7 @@ def _draw_view(rng: np.random.Generator) -> View:
     flat = math.cos(lamp_height)
     light = np.asarray([flat * math.cos(lamp_turn), flat * math.sin(lamp_turn), math.sin(lamp_height)])
     # Image rows go down and y goes down: seen from above, (right, down, ahead) has the hand of (x, y, -z).
-    return View(-away * ahead, np.stack([right, np.cross(right, ahead), ahead]), extent, light)
+    return CameraView(-away * ahead, np.stack([right, np.cross(right, ahead), ahead]), extent, light)
 
 
 def _remap(picture: Image, column: Image, row: Image) -> Image:
@@ -91,7 +91,7 @@ def _dot(a: Planes, b: Any) -> Image:
     return a[0] * np.float32(b[0]) + a[1] * np.float32(b[1]) + a[2] * np.float32(b[2])
 
 
-def _trace(shape: Shape, place: Any, view: View, size: int) -> tuple[Image, Image, Image, Planes]:
+def _trace(shape: Shape, place: Any, view: CameraView, size: int) -> tuple[Image, Image, Image, Planes]:
     """Where the ray of each pixel meets the bare form: x, y mm in the object's frame, z mm, and the unit rays."""
     axis = ((np.arange(size) + 0.5) / size - 0.5).astype(np.float32)
     focal = float(np.linalg.norm(view.eye)) / view.extent

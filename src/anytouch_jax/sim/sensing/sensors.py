@@ -183,7 +183,7 @@ SENSORS: dict[str, Sensor] = {
 }
 
 
-def get(name: str) -> Sensor:
+def find_sensor(name: str) -> Sensor:
     """The sensor called `name`; raises UserError that lists the known ones."""
     if name not in SENSORS:
         raise UserError(f"there is no simulated sensor {name!r}; known are {', '.join(SENSORS)}")
@@ -197,7 +197,7 @@ def look(sensor: Sensor) -> Look:
     Raises UserError for a sensor without pictures, or when the package with the real ones is missing.
     """
     if sensor.kind != "image" or sensor.look is None:
-        raise UserError(f"{sensor.name} has no pictures; it measures a field: use optics.field")
+        raise UserError(f"{sensor.name} has no pictures; it measures a field: use optics.measure_field")
     height, width = (round(120 * side / min(sensor.field)) for side in sensor.field)
     if isinstance(sensor.look, str):
         frame = calibration.read_background(sensor.look).astype(np.float32) / 255

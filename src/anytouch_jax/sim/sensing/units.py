@@ -1,8 +1,7 @@
-"""One unit of a sensor: what differs between two devices of the same family, as arrays that vmap over recordings.
+"""Sensor units: the differences between two devices of one family, as arrays that vmap over recordings.
 
-`rotation` and `offset` move the *object*: `from_gel` turns places on the gel into places of the object's frame, before
-contact. `mirror`, `zoom` and `window` move the *picture*: they choose
-which part of the gel the camera shows and from which side, and only the renderer knows them.
+`rotation` and `offset` move the *object* before contact (`gel_to_object`). `mirror`, `zoom` and `window` move the
+*image*: they choose the visible part of the gel and its side. Only the renderer uses them.
 """
 
 from __future__ import annotations
@@ -19,35 +18,27 @@ from anytouch_jax.sim.contact.mechanics import Gel
 from anytouch_jax.sim.sensing.sensors import Sensor
 
 Tree = TypeVar("Tree")
-Leaf = Any  # numpy as drawn, jax under vmap and jit
+Leaf = Any  # numpy, or jax under vmap and jit
 
 
 class Unit(NamedTuple):
-    """Arrays f32 of one unit (or, stacked, of several); the identity unit leaves a sensor as its record says.
+    """Arrays f32 of one unit, or of several units stacked."""
 
-    `tint` (3,) factor on the image; `gain` (3,) factor on the colour change; `light_angle` rad by which the lights
-    are turned; `uneven` (5, 3) relative brightness on u, v, u^2, uv, v^2; `thickness`, `modulus` factors of the gel;
-    `marked` 1 with markers, 0 without; `marker_phase` (2,) of a lattice step; `marker_size` factor; `zoom` (<= 1)
-    share of the field that is shown, `window` (2,) its middle, mm (x, y); `mirror` (2,) +-1 along x and y;
-    `rotation` rad and `offset` (2,) mm of the object; `noise` standard deviation of a pixel, 0..255, or of a
-    field's displacement, mm.
-    """
-
-    tint: Leaf
-    gain: Leaf
-    light_angle: Leaf
-    uneven: Leaf
-    thickness: Leaf
-    modulus: Leaf
-    marked: Leaf
-    marker_phase: Leaf
-    marker_size: Leaf
-    zoom: Leaf
-    window: Leaf
-    mirror: Leaf
-    rotation: Leaf
-    offset: Leaf
-    noise: Leaf
+    tint: Leaf  # (3,) factor on the image
+    gain: Leaf  # (3,) factor on the colour change
+    light_angle: Leaf  # rad by which the lights are rotated
+    uneven: Leaf  # (5, 3) relative brightness on u, v, u^2, uv, v^2
+    thickness: Leaf  # factor on the gel's thickness
+    modulus: Leaf  # factor on the gel's modulus
+    marked: Leaf  # 1 with markers, 0 without
+    marker_phase: Leaf  # (2,) of a lattice step
+    marker_size: Leaf  # factor on the markers' radius
+    zoom: Leaf  # share of the field in the image, at most 1
+    window: Leaf  # (2,) mm (x, y), middle of that part
+    mirror: Leaf  # (2,) +-1 along x and y
+    rotation: Leaf  # rad of the object
+    offset: Leaf  # (2,) mm of the object
+    noise: Leaf  # standard deviation of a pixel (0 to 255), or of a field's displacement in mm
 
 
 def _unit(**values: object) -> Unit:
@@ -55,7 +46,7 @@ def _unit(**values: object) -> Unit:
 
 
 def identity_unit(sensor: Sensor) -> Unit:
-    """The unit that the sensor's record describes: no markers, no noise, the whole field, nothing moved."""
+    """Return the nominal unit of a sensor: no markers, no noise, the whole field, nothing moved."""
     return _unit(
         tint=np.ones(3), gain=np.ones(3), light_angle=0, uneven=np.zeros((5, 3)), thickness=1, modulus=1,
         marked=0, marker_phase=np.zeros(2), marker_size=1, zoom=1, window=np.zeros(2), mirror=np.ones(2),
@@ -63,13 +54,13 @@ def identity_unit(sensor: Sensor) -> Unit:
     )  # fmt: skip
 
 
-THINNEST = 0.7  # of the nominal gel: more than four standard deviations below, see `draw_unit`
+THINNEST = 0.7  # of the nominal thickness: more than four standard deviations below it, see `draw_unit`
 
 
 def draw_unit(sensor: Sensor, rng: np.random.Generator) -> Unit:
-    """A unit of `sensor` drawn from `rng`; the same generator state gives the same unit.
+    """Return a unit of `sensor` drawn from `rng`.
 
-    The number of draws does not depend on the sensor, so one stream can serve several.
+    The number of draws does not depend on the sensor, so several sensors can share a stream.
     """
     share = sensor.markers.share if sensor.markers else 0.0
     zoom = rng.uniform(0.8, 1.0)
@@ -93,23 +84,23 @@ def draw_unit(sensor: Sensor, rng: np.random.Generator) -> Unit:
     )
 
 
-def turned(x: jax.Array, y: jax.Array, angle: Any) -> tuple[jax.Array, jax.Array]:
-    """Vectors turned by `angle` rad, from x towards y."""
+def rotated(x: jax.Array, y: jax.Array, angle: Any) -> tuple[jax.Array, jax.Array]:
+    """Return vectors rotated by `angle` rad, from x towards y."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     return c * x - s * y, s * x + c * y
 
 
-def from_gel(unit: Unit, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where on the nominally mounted object the gel's places `x`, `y` (mm) lie: moved and turned back."""
-    return turned(x - unit.offset[0], y - unit.offset[1], -unit.rotation)
+def gel_to_object(unit: Unit, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the places mm on the nominally mounted object under the gel's places `x`, `y` mm."""
+    return rotated(x - unit.offset[0], y - unit.offset[1], -unit.rotation)
 
 
-def gel_of(sensor: Sensor, unit: Unit) -> Gel:
-    """The gel of a sensor's unit."""
+def unit_gel(sensor: Sensor, unit: Unit) -> Gel:
+    """Return the gel of a sensor unit."""
     gel = sensor.gel
     return replace(gel, modulus=gel.modulus * unit.modulus, thickness=gel.thickness * unit.thickness)
 
 
-def stack(several: Sequence[Tree]) -> Tree:
-    """Several units, or records that hold one, as one, with a leading axis for vmap."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *several)
+def stack_trees(trees: Sequence[Tree]) -> Tree:
+    """Stack units, or records with units, along a new leading axis for vmap."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

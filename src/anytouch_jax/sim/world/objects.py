@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.world.letters import STROKES
 from anytouch_jax.sim.world.materials import MATERIALS, Material, hardness_class
-from anytouch_jax.sim.world.shapes import PRIMITIVES, TEXTURES, Shape
+from anytouch_jax.sim.world.primitives import PRIMITIVES, STROKES
+from anytouch_jax.sim.world.shapes import Shape
+from anytouch_jax.sim.world.textures import TEXTURES
 
 # Sizes in mm (see `Shape`): contacts of 0.2 to 1.2 mm fill a good part of a field of 12 to 19 mm.
 SIZES: dict[str, tuple[float, float]] = {
@@ -127,11 +128,11 @@ def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
         chosen = min(left, key=lambda c: 3 * used[c[:2]] + used[c[1:]] + sum(used[kind] for kind in c))
         left.remove(chosen)
         used.update([chosen[:2], chosen[1:], *chosen])
-        objects.append(draw(*chosen, seed=int(rng.integers(2**31))))
+        objects.append(draw_object(*chosen, seed=int(rng.integers(2**31))))
     return tuple(objects)
 
 
-def draw(primitive: str, texture: str, material: str, seed: int) -> Object:
+def draw_object(primitive: str, texture: str, material: str, seed: int) -> Object:
     """One object of this kind with sizes, phases and colour from `seed`.
 
     Raises UserError on a name that is not in PRIMITIVES, TEXTURES or MATERIALS.

@@ -6,19 +6,11 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.world.letters import STROKES
-from anytouch_jax.sim.world.primitives import PRIMITIVES, floor
-from anytouch_jax.sim.world.textures import GRAINS, TEXTURES, Array, namespace, warped
-
-__all__ = [
-    "GRAINS", "PRIMITIVES", "TEXTURES", "Shape",
-    "base", "floor", "height", "layers", "relief", "sample", "unroll",
-]  # fmt: skip
+from anytouch_jax.sim.world.primitives import PRIMITIVES, STROKES, floor
+from anytouch_jax.sim.world.textures import GRAINS, TEXTURES, Array, namespace, warp
 
 
 @dataclass(frozen=True)
@@ -94,7 +86,7 @@ def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
     if shape.texture in ("bark", "sand"):
         s, t = u, v  # random already
     else:
-        s, t = warped(u, v, shape.texture_pitch, shape.irregularity, shape.seed)
+        s, t = warp(u, v, shape.texture_pitch, shape.irregularity, shape.seed)
     texture = TEXTURES[shape.texture](s, t, shape.texture_pitch, shape.seed)
     return texture, GRAINS[shape.grain](u, v, shape.grain_pitch, shape.seed + 100)
 
@@ -134,40 +126,3 @@ def relief(shape: Shape, pixels: int, pitch: float) -> np.ndarray:
     axis = ((np.arange(pixels) - (pixels - 1) / 2) * pitch).astype(np.float32)
     x, y = np.meshgrid(axis, axis)
     return np.asarray(height(shape, x, y), np.float32)
-
-
-def _cubic_weights(f: Array) -> tuple[Array, Array, Array, Array]:
-    """Catmull-Rom weights of the four neighbours at the fraction `f`; exactly 0, 1, 0, 0 at 0."""
-    return (
-        ((-0.5 * f + 1.0) * f - 0.5) * f,
-        (1.5 * f - 2.5) * f * f + 1.0,
-        ((-1.5 * f + 2.0) * f + 0.5) * f,
-        (0.5 * f - 0.5) * f * f,
-    )
-
-
-def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Heights of a centred `raster` (H, W) of `pitch` mm a pixel at `x`, `y` mm, any equal shape; same shape out.
-
-    Cubic (Catmull-Rom): the raster's own values at its pixels, continuous slopes between them. Outside of the
-    raster, and at NaN: the lowest value on its border. For jit and vmap; a point costs sixteen reads.
-    """
-    rows, columns = raster.shape
-    place = (jnp.asarray(y) / pitch + (rows - 1) / 2, jnp.asarray(x) / pitch + (columns - 1) / 2)
-    index, weights, inside = [], [], jnp.ones(place[0].shape, bool)
-    for at, count in zip(place, (rows, columns), strict=True):
-        slack = 1e-3  # rounding of a place on the border must not throw it out
-        inside = inside & (at >= -slack) & (at <= count - 1 + slack)
-        at = jnp.clip(jnp.nan_to_num(at), 0, count - 1)
-        first = jnp.floor(at)
-        weights.append(_cubic_weights((at - first).astype(raster.dtype)))
-        index.append([jnp.clip(first.astype(jnp.int32) + i, 0, count - 1) for i in (-1, 0, 1, 2)])
-    flat = jnp.asarray(raster).reshape(-1)
-    total = jnp.zeros(inside.shape, raster.dtype)
-    for row, across in zip(index[0], weights[0], strict=True):
-        line = jnp.zeros_like(total)
-        for column, along in zip(index[1], weights[1], strict=True):
-            line = line + along * flat.at[row * columns + column].get(mode="promise_in_bounds")
-        total = total + across * line
-    border = jnp.concatenate([raster[0], raster[-1], raster[:, 0], raster[:, -1]])
-    return jnp.where(inside, total, jnp.min(border))

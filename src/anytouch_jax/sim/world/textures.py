@@ -58,7 +58,7 @@ def normal_cdf(n: Array) -> Array:
     return 0.5 + 0.5 * namespace(n).tanh(0.7978845608 * (n + 0.044715 * n * n * n))
 
 
-def warped(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Array, Array]:
+def warp(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Array, Array]:
     """Push the places about by `amount` pitches (RMS) over some five pitches, as no made pattern is quite regular."""
     if amount == 0:
         return u, v
@@ -85,18 +85,18 @@ def _larger(a: Array, b: Array, soft: float) -> Array:
     return 0.5 * (a + b + namespace(a).sqrt((a - b) ** 2 + soft * soft))
 
 
-def smooth(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _smooth(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """No texture: 1 everywhere."""
     return 0.0 * (u + v) + 1.0
 
 
-def ridges(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _ridges(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Rounded parallel ridges, one a pitch."""
     s, _ = _shift(u, v, pitch, seed)
     return 0.5 + 0.5 / math.tanh(1.3) * namespace(u).tanh(1.3 * namespace(u).cos(2 * math.pi * s)) + 0.0 * v
 
 
-def grid(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _grid(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Two crossing families of raised lines, as on a waffle."""
     s, t = _shift(u, v, pitch, seed)
     xp, width = namespace(u), 0.45
@@ -104,7 +104,7 @@ def grid(u: Array, v: Array, pitch: float, seed: int) -> Array:
     return 1 - (1 - line_s) * (1 - line_t)
 
 
-def dots(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _dots(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Round bumps on a hexagonal lattice, a pitch apart."""
     s, t = _shift(u, v, pitch, seed)
     xp, tall, radius = namespace(u), math.sqrt(3.0), 0.42
@@ -116,7 +116,7 @@ def dots(u: Array, v: Array, pitch: float, seed: int) -> Array:
     return total
 
 
-def weave(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _weave(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Plain weave: strands a pitch apart that pass over and under each other."""
     s, t = _shift(u, v, pitch, seed)
     xp = namespace(u)
@@ -128,7 +128,7 @@ def weave(u: Array, v: Array, pitch: float, seed: int) -> Array:
     return xp.clip((_larger(warp, weft, 0.1) + 1.36) / 1.87, 0, 1)
 
 
-def knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Stockinette: columns of stitches, each a V of two slanted loops, a pitch wide."""
     s, t = _shift(u, v, pitch, seed)
     xp, row, lean = namespace(u), 0.75, 0.5  # rows are 0.75 pitches high, legs lean 0.5 radians
@@ -144,7 +144,7 @@ def knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
     return xp.clip((total - 0.06) / 0.9, 0, 1)
 
 
-def bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Bark-like: plates along v, parted by winding furrows.
 
     RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and v; all three are measured.
@@ -155,51 +155,51 @@ def bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
     return furrow * (0.65 + 0.35 * normal_cdf(plate))
 
 
-def sand(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _sand(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Sand-like: heights uniform in 0 to 1 (RMS 12**-0.5), autocorrelation 1/e at `SAND_LENGTH` pitches."""
     length = SAND_LENGTH * pitch / _FALL
     return normal_cdf(gaussian_field(u, v, (length, length), seed + 5))
 
 
 TEXTURES: dict[str, Texture] = {
-    "smooth": smooth,
-    "weave": weave,
-    "knit": knit,
-    "ridges": ridges,
-    "grid": grid,
-    "dots": dots,
-    "bark": bark,
-    "sand": sand,
+    "smooth": _smooth,
+    "weave": _weave,
+    "knit": _knit,
+    "ridges": _ridges,
+    "grid": _grid,
+    "dots": _dots,
+    "bark": _bark,
+    "sand": _sand,
 }
 
 
-def streaks(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _streaks(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Fine lines along v, as wood's fibres or brushed metal."""
     return normal_cdf(gaussian_field(u, v, (0.4 * pitch, 6 * pitch), seed + 6, terms=20))
 
 
-def pores(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _pores(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """A level surface with scattered small pits, as cork or foam."""
     n = gaussian_field(u, v, (0.5 * pitch, 0.5 * pitch), seed + 7, terms=24)
     return 1 - normal_cdf(2.5 * (n - 0.9))
 
 
-def pebbles(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _pebbles(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Small cushions between fine creases, as leather."""
     n = gaussian_field(u, v, (0.6 * pitch, 0.6 * pitch), seed + 8, terms=24)
     return 1 - namespace(n).exp(-((n / 0.5) ** 2))
 
 
-def grit(u: Array, v: Array, pitch: float, seed: int) -> Array:
+def _grit(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """An even fine roughness, as stone."""
     return normal_cdf(gaussian_field(u, v, (0.4 * pitch, 0.4 * pitch), seed + 9, terms=24))
 
 
 GRAINS: dict[str, Texture] = {
-    "none": smooth,
-    "streaks": streaks,
-    "pores": pores,
-    "pebbles": pebbles,
-    "grit": grit,
-    "threads": weave,
+    "none": _smooth,
+    "streaks": _streaks,
+    "pores": _pores,
+    "pebbles": _pebbles,
+    "grit": _grit,
+    "threads": _weave,
 }

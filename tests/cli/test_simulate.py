@@ -1,0 +1,72 @@
+"""`anytouch data simulate`: mistakes, messages, and a small data set."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from blank_recorder import BlankRecorder
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.sim import dataset
+
+SMALL = ["--objects", "6", "--frames", "2", "--size", "32"]
+
+
+@pytest.fixture(autouse=True)
+def _no_physics(monkeypatch, compiled_once):
+    monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--sensors", "nose"], "no simulated sensor 'nose'"),
+        (["--depth", "-1", "1"], "depth is a range of mm"),
+        (["--threads", "0"], "threads must be at least 1"),
+        (["--sensors", "tac3d", "--fields", "pressure"], "no sensor has a camera"),
+        (["--size", "8"], "size is 16 to 4096"),
+        (["--size", "20000"], "size is 16 to 4096"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(mistake, tmp_path, words, told):
+    assert told in mistake("simulate", "--out", tmp_path / "x", *words)
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("place", ["file", "file/below"])
+def test_a_file_is_no_folder(mistake, tmp_path, place):
+    (tmp_path / "file").write_text("")
+    assert "is a file" in mistake("simulate", "--out", tmp_path / place, "--touches", "1")
+
+
+def test_the_command_makes_a_data_set(anytouch, tmp_path):
+    out = tmp_path / "scenes"
+    said = anytouch("simulate", "--out", out, "--touches", 2, "--sensors", "digit", *SMALL)
+    assert said.status == 0, said
+    few, compiling, *_ = said.err.splitlines()
+    assert "val and test" in few and "compiling" in compiling and "2 touches by digit" in said.err
+    assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
+
+
+def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(anytouch, tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset, "GROUP", 1)
+    words = ["--sensors", "digit", "--vision", "0", "--held-out", "0", *SMALL]
+    said = anytouch("simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
+    assert said.status == 0, said
+    assert [line for line in said.err.splitlines() if " of 25 touches" in line] == [
+        f"{done} of 25 touches" for done in (3, 5, 8, 10, 13, 15, 18, 20, 23, 25)
+    ]
+    again = anytouch("simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
+    assert again.status == 0 and len(again.err.splitlines()) == 1  # nothing is left to do, nothing is compiled
+
+
+def test_frames_that_did_not_converge_are_counted(anytouch, tmp_path, monkeypatch):
+    class Rough(BlankRecorder):
+        def take(self, recording):
+            take = super().take(recording)
+            return take._replace(labels=take.labels | {"converged": np.array([1.0, 0.0])})
+
+    monkeypatch.setattr(dataset, "Recorder", Rough)
+    words = ["--touches", 3, "--sensors", "digit", "--fidelity", "exact", *SMALL]
+    said = anytouch("simulate", "--out", tmp_path, *words)
+    assert said.status == 0 and "3 of 6 frames did not converge" in said.err

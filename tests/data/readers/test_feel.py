@@ -11,7 +11,7 @@ import pytest
 from reader_world import fill
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.readers.feel_files import strings_in_pickle
+from anytouch_jax.data.readers.feel import strings_in_pickle
 from anytouch_jax.errors import UserError
 
 PHASES = ("before", "during", "after")

@@ -9,8 +9,8 @@ import pytest
 from reader_world import fill
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.readers import READERS, IndexOptions, Notes, get_reader, index
-from anytouch_jax.data.readers.common import RowBuilder, hash_split, listing, numbered
+from anytouch_jax.data.readers import READERS, DatasetIndex, IndexOptions, index
+from anytouch_jax.data.readers.common import hash_split
 from anytouch_jax.errors import UserError
 
 
@@ -27,9 +27,9 @@ def test_every_reader_says_what_it_is():
     assert abs(total - 2_481_703) < 450_000  # the paper's table sums to 2.9 million, its text says 2,481,703
 
 
-def test_an_unknown_name_is_answered_with_the_nearest():
+def test_an_unknown_name_is_answered_with_the_nearest(tmp_path):
     with pytest.raises(UserError, match=r"no reader is called 'Touch-and-go'; did you mean touch_and_go"):
-        get_reader("Touch-and-go")
+        index("Touch-and-go", tmp_path)
 
 
 @pytest.mark.parametrize("bad", [{"val": -0.1}, {"val": 0.6, "test": 0.5}, {"test": 2}])
@@ -94,7 +94,7 @@ def test_no_frame_is_opened_or_stated(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "stat", lambda path, *a, **k: (seen.append(os.fspath(path)), real_stat(path, *a, **k))[1])
     scans = []
     monkeypatch.setattr(os, "scandir", lambda path: (scans.append(os.fspath(path)), real_scan(path))[1])
-    READERS["ycb_slide"].read(tmp_path, IndexOptions(), Notes())
+    READERS["ycb_slide"].read(DatasetIndex("ycb_slide", tmp_path))
     assert not [path for path in seen if str(path).endswith(".jpg")]
     assert len(scans) == len(set(scans)) == 1 + 2 + 2  # real, the objects, their frames: each once
 
@@ -115,19 +115,23 @@ def test_hash_splits_are_stable_disjoint_and_of_the_asked_share():
     assert {hash_split("x", f"o{k}", IndexOptions(0, 1)) for k in range(50)} == {"test"}
 
 
-def test_rows_refuse_columns_of_another_length_or_name():
-    rows = RowBuilder("object")
+def test_columns_have_a_value_for_every_row_and_a_list_for_every_path(tmp_path):
+    rows = DatasetIndex("x", tmp_path)
     with pytest.raises(ValueError, match="'frame_index' has 1 values for 2 rows"):
-        rows.add(["a", "b"], frame_index=[1])
-    with pytest.raises(KeyError, match="undeclared"):
-        RowBuilder().add(["a"], object="x")
+        DatasetIndex("x", tmp_path).add(["a", "b"], frame_index=[1])
+    rows.add(["a", "b"], sensor="digit", frame_index=[0, 1], unit=None)
+    rows.add(["c"], sensor="digit", object="mug")
+    columns = rows.columns()
+    assert columns["object"] == [None, None, "mug"] and columns["frame_index"] == [0, 1, None]
+    assert "unit" not in columns and columns["split"] == [None] * 3  # a required column stays, to be an error later
 
 
 def test_numbers_order_frames_and_folders_naturally(tmp_path):
     fill(tmp_path, ["f10/x.png", "f9/x.png", "2.png", "10.png", "1.png", "٣.png"])
-    folders, files = listing(tmp_path, Notes())
+    rows = DatasetIndex("x", tmp_path)
+    folders, files = rows.listing(".")
     assert folders == ["f9", "f10"]
-    assert [name for _, name in numbered(files, r"([0-9]+)\.png", Notes(), "")] == ["1.png", "2.png", "10.png"]
+    assert [name for _, name in rows.numbered(files, r"([0-9]+)\.png", "")] == ["1.png", "2.png", "10.png"]
 
 
 def test_objectfolder_has_two_sensors_and_its_own_splits(tmp_path, read):

@@ -49,7 +49,7 @@ def test_what_lies_beside_or_above_belongs_to_a_recording(tmp_path, read):
     )
     assert (two["background_path"], two["image_path"]) == ("mug/two/Background.png", "mug/photo.jpg")
     assert (ball["background_path"], ball["image_path"], ball["text"]) == ("background.png", None, None)
-    assert table.reasons == {"film (--export writes its frames as pictures)": 1}
+    assert table.reasons == {"video (--export writes its frames as pictures)": 1}
 
 
 def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
@@ -162,14 +162,14 @@ def _film(path, frames=5):
     writer.release()
 
 
-def test_films_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):
+def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):
     root = tmp_path / "mine"
     _film(root / "mug" / "one.avi")
     _film(root / "mug" / "two.avi")
     (root / "mug" / "broken.mp4").write_bytes(b"no film")
     fill(root, ["ball/0.png"])
     table = read("recordings", root, sensor="digit", val=0, test=0)
-    assert len(table.rows) == 1 and table.reasons == {"film (--export writes its frames as pictures)": 3}
+    assert len(table.rows) == 1 and table.reasons == {"video (--export writes its frames as pictures)": 3}
     encode, count = cv2.imencode, []
     monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1] if len(count) < 7 else 1 / 0)
     with pytest.raises(ZeroDivisionError):  # in the second film
@@ -180,7 +180,7 @@ def test_films_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, mo
     assert len(count) == 7 + 5 and len(table.clips(5)) == 2  # the first film is not written again
     assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
     assert decode(root / "mug" / "two" / "000004.png")[0, 0] == pytest.approx([10, 80, 200], abs=6)  # red first
-    assert table.reasons["film that cannot be read"] == 1
+    assert table.reasons["video that cannot be read"] == 1
 
 
 def test_mistakes(tmp_path, read):
@@ -188,7 +188,7 @@ def test_mistakes(tmp_path, read):
     with pytest.raises(UserError, match="sensor 'DIGIT': it is called digit"):
         read("recordings", sensor="DIGIT")
     for sensor in (None, "tac3d", "universal"):
-        with pytest.raises(UserError, match="say by --sensor what made these pictures: gelsight"):
+        with pytest.raises(UserError, match="--sensor: gelsight"):
             read("recordings", sensor=sensor)
     (tmp_path / "a" / "caption.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match=r"caption\.txt cannot be read as UTF-8 text"):
@@ -208,7 +208,7 @@ def test_arrays_count_where_there_is_nothing_else(tmp_path, read):
     assert {path: row["frame_index"] for path, row in table.rows.items()} == {
         "a/1.png": 1, "a/2.png": 2, "a/4.png": 4, "b/0.npy": 0
     }  # fmt: skip
-    assert table.reasons == {"array beside pictures": 2}
+    assert table.reasons == {"array next to pictures": 2}
 
 
 def test_what_is_no_recording(tmp_path, read):
@@ -216,7 +216,7 @@ def test_what_is_no_recording(tmp_path, read):
     fill(tmp_path, [f"{tmp_path.name}/0.png", "0.png"])
     table = read("recordings", sensor="digit", val=0, test=0)
     assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
-    assert table.reasons == {"folder called background or photo, of which one picture is wanted": 1}
+    assert table.reasons == {"folder called background or photo, where one picture is expected": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}
 
 

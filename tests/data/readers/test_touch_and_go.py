@@ -41,7 +41,7 @@ def test_lists_labels_photographs_and_backgrounds(tmp_path, read):
     assert table.reasons["frame in no list (no contact)"] == 30 - 11
     assert {row["sequence"] for row in table.rows.values()} == {f"{VIDEO}/14", f"{VIDEO}/24"}
     assert len(table.clips(3)) == 4 + 3  # six and five frames in a row
-    assert (table.report.paper, table.report.frames) == (250_000, 11)
+    assert (table.report.reader.paper, table.report.frames) == (250_000, 11)
     assert any("250,000" in line for line in table.report.lines())
 
 

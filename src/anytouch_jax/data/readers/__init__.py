@@ -1,17 +1,23 @@
-"""Readers: a public dataset on disk becomes a manifest. `READERS` names them all, `index` runs one."""
+"""Readers: a public dataset on disk becomes a manifest. `READERS` lists them, `index` runs one."""
 
 from __future__ import annotations
 
 import difflib
 import os
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet
+
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest
 from anytouch_jax.data.readers import (
-    before,
     cloth,
     feel,
     objectfolder,
@@ -27,89 +33,60 @@ from anytouch_jax.data.readers import (
     visgel,
     ycb_slide,
 )
-from anytouch_jax.data.readers.common import Columns, DatasetError, DatasetReader, IndexOptions, Notes
+from anytouch_jax.data.readers.common import Columns, DatasetError, DatasetIndex, DatasetReader, IndexOptions
 from anytouch_jax.errors import UserError
 
-__all__ = [
-    "READERS",
-    "Columns",
-    "DatasetError",
-    "DatasetReader",
-    "IndexOptions",
-    "IndexReport",
-    "Notes",
-    "get_reader",
-    "index",
-]
+__all__ = ["READERS", "DatasetError", "DatasetIndex", "DatasetReader", "IndexOptions", "IndexReport", "index"]
 
-READERS: dict[str, DatasetReader] = {
-    "touch_and_go": touch_and_go.READER,
-    "visgel": visgel.READER,
-    "cloth": cloth.READER,
-    "objectfolder_real": objectfolder_real.READER,
-    "tvl": tvl.READER,
-    "ssvtp": ssvtp.READER,
-    "ycb_slide": ycb_slide.READER,
-    "octopi": octopi.READER,
-    "tacquad": tacquad.READER,
-    "feel": feel.READER,
-    "objectfolder": objectfolder.READER,
-    "real_touch": real_touch.READER,
-    "taxim_presses": taxim_presses.READER,
-    "recordings": recordings.READER,
-}
+_MODULES = (touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel, objectfolder,
+            real_touch, taxim_presses, recordings)  # fmt: skip
+READERS: dict[str, DatasetReader] = {module.READER.name: module.READER for module in _MODULES}
+_INDEX_KEY = b"anytouch.index"  # in the schema of a Parquet file: the content hash with which `index` wrote it
+_OTHER_OUT = "name another file with --out, in a folder that contains the data"
+_FROM_FILES = ("path", "sequence", "frame_index", "stride")  # columns that come from the files, never from the user
 
 
 @dataclass(frozen=True)
 class IndexReport:
-    """What one run of `index` found: counts, what was skipped (reason -> count, example), and sentences to say."""
+    """Counts of one run of `index`, the skipped files (reason -> count, example), and sentences for the user."""
 
-    name: str
+    reader: DatasetReader
     out: Path
     rows: int
     sequences: int
     splits: dict[str, int]
     sensors: dict[str, int]
-    frames: int
-    paper: int | None
-    paper_note: str
     with_image: int
     with_text: int
     with_touch: int
-    license: str
-    citation: str
-    commercial: bool
     skipped: dict[str, tuple[int, str]]
     notes: list[str]
     content_hash: str
 
+    @property
+    def frames(self) -> int:
+        """Touch frames: rows that are neither background nor unused."""
+        return self.rows - self.splits.get("background", 0) - self.splits.get("unused", 0)
+
     def lines(self) -> list[str]:
-        """The report as lines of text."""
+        """Return the report as lines of text."""
+        reader = self.reader
         counts = ", ".join(f"{name} {count:,}" for name, count in self.splits.items())
-        share = f" ({self.paper_note})" if self.paper_note else ""
-        paper = f"{self.paper:,} in the paper{share}" if self.paper else "no count in the paper"
-        use = "commercial use allowed" if self.commercial else "not for commercial use unless its owner allows it"
+        share = f" ({reader.paper_note})" if reader.paper_note else ""
+        paper = f"{reader.paper:,} in the paper{share}" if reader.paper else "no count in the paper"
+        use = "commercial use allowed" if reader.commercial else "no commercial use unless its owner allows it"
         return [
             f"{self.out}: {self.rows:,} rows of {self.sequences:,} sequences ({counts})",
             "sensors: " + ", ".join(f"{name} {count:,}" for name, count in self.sensors.items()),
             f"touch frames {self.frames:,}; {paper}",
             f"with photograph {self.with_image:,}, with text {self.with_text:,}, in a touch pair {self.with_touch:,}",
-            f"licence: {self.license}; {use}",
-            f"to be cited: {self.citation}",
-            *(f"left out or noted, {reason}: {count:,} (first: {one})" for reason, (count, one) in
-              self.skipped.items()),
+            f"licence: {reader.license}; {use}",
+            f"to be cited: {reader.citation}",
+            *(f"left out or noted, {reason}: {count:,} (first: {example})"
+              for reason, (count, example) in self.skipped.items()),
             *(f"note: {sentence}" for sentence in self.notes),
             f"content hash {self.content_hash}",
         ]  # fmt: skip
-
-
-def get_reader(name: str) -> DatasetReader:
-    """The reader called `name`. Raises UserError with the nearest names."""
-    if name not in READERS:
-        near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
-        guess = f"; did you mean {near[0]}?" if near else ""
-        raise UserError(f"no reader is called {name!r}{guess} There are: {', '.join(READERS)}")
-    return READERS[name]
 
 
 def index(
@@ -122,62 +99,71 @@ def index(
 ) -> IndexReport:
     """Read the dataset `name` in the folder `root` and write its manifest to `out` (default: ROOT/<name>.parquet).
 
-    `out` lies in `root` or above it: a manifest's paths may not leave its folder. `keep`: an edited manifest there
-    keeps its columns and values (see before.py). Raises UserError for a folder that is not the dataset, an option the
-    reader does not heed, a manifest that cannot be written there, and an edited one that would be lost.
+    `out` must be in `root` or above it, because a manifest's paths may not leave its folder. With `keep` an edited
+    manifest at `out` keeps its columns and values. Raises UserError for a folder that is not the dataset, an option
+    that the reader does not use, a manifest that cannot be written, and an edited manifest that would be lost.
     """
-    one, options = get_reader(name), options or IndexOptions()
+    reader, options = _reader_of(name), options or IndexOptions()
     base = Path(root).expanduser().resolve()
     if not base.is_dir():
-        what = f"{base} is a file" if base.exists() else f"there is no folder {base}"
-        raise UserError(f"{what}; ROOT is the folder that holds the dataset {name}")
-    _refuse_unused(one, options)
+        problem = f"{base} is a file" if base.exists() else f"there is no folder {base}"
+        raise UserError(f"{problem}; ROOT is the folder that holds the dataset {name}")
+    for field in fields(IndexOptions):
+        if field.name not in reader.uses and getattr(options, field.name) != field.default:
+            uses = ", ".join(reader.uses) or "no option"
+            raise UserError(f"the reader {name} does not use the option {field.name}; it uses {uses}")
     if options.lists is not None:
         options = replace(options, lists=(lists := options.lists.expanduser()))
         if not lists.is_dir():
             raise UserError(f"there is no folder {lists}; --lists is the folder that holds the dataset's lists")
     target = _target(base, name, out)
-    notes = Notes()
-    columns = one.read(base, options, notes)
+    rows = DatasetIndex(name, base, options)
+    reader.read(rows)
+    columns = rows.columns()
     size = len(columns["path"])
     if not size:
-        reasons = "; ".join(f"{reason}: {count} (first: {where})" for reason, (count, where) in notes.skipped.items())
+        reasons = "; ".join(f"{reason}: {count} (first: {first})" for reason, (count, first) in rows.skipped.items())
         raise DatasetError(f"{base} has no frame of {name} that could be used. Left out: {reasons or 'nothing'}")
-    constant = {"dataset": one.name, "license": one.license, "commercial": one.commercial}
+    constant = {"dataset": reader.name, "license": reader.license, "commercial": reader.commercial}
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
     manifest = manifests.from_columns(_below(columns, base, target.parent), target)
-    manifest.clips(2)  # raises for a frame that is there twice
-    _refuse_links(manifest, base)
-    whole = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
-    manifest = before.carry(manifest, target, notes, keep=keep, groups=whole)
+    manifest.clips(2)  # raises for a repeated frame
+    _check_links(manifest, base)
+    groups = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
+    manifest = _carry_over(manifest, target, rows.notes, keep=keep, groups=groups)
+    marked = manifest.table.replace_schema_metadata({_INDEX_KEY: manifest.content_hash.encode()})
     try:
-        manifests.write(before.marked(manifest), target)
+        manifests.write(replace(manifest, table=marked), target)
     except OSError as error:
-        raise UserError(
-            f"the manifest {target} cannot be written: {error.strerror}; name another file with --out, in a folder "
-            "that contains the data"
-        ) from None
-    for _, sentence, _ in manifests.misspelt_sensors(manifest):
-        notes.log(sentence)
-    return _report(one, target, manifest, notes)
+        raise UserError(f"the manifest {target} cannot be written: {error.strerror}; {_OTHER_OUT}") from None
+    rows.notes += [sentence for _, sentence, _ in manifests.misspelt_sensors(manifest)]
+    return _report(reader, target, manifest, rows)
 
 
-def _refuse_links(manifest: manifests.Manifest, base: Path) -> None:
-    """Raise UserError for a folder that is a link out of ROOT: no row of it could ever be read."""
-    found = (path for name in PATHS for path in manifest.column(name).unique().drop_null().to_pylist())
-    for folder in dict.fromkeys(path.rpartition("/")[0] for path in found):
-        place = manifest.files[0].parent / folder
-        if not place.resolve().is_relative_to(manifest.files[0].parent.resolve()):
-            raise UserError(
-                f"{place} leads out of {base}, to {place.resolve()}; give the folder that really holds it as ROOT"
-            )
+def _reader_of(name: str) -> DatasetReader:
+    if name not in READERS:
+        near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
+        guess = f"; did you mean {near[0]}?" if near else ""
+        raise UserError(f"no reader is called {name!r}{guess} There are: {', '.join(READERS)}")
+    return READERS[name]
 
 
-def _refuse_unused(one: DatasetReader, options: IndexOptions) -> None:
-    for field in fields(IndexOptions):
-        if field.name not in one.uses and getattr(options, field.name) != field.default:
-            heeds = ", ".join(one.uses) or "no option"
-            raise UserError(f"the reader {one.name} does not use the option {field.name}; it uses {heeds}")
+def _report(reader: DatasetReader, target: Path, manifest: Manifest, rows: DatasetIndex) -> IndexReport:
+    splits = Counter(manifest.table["split"].to_pylist())
+    return IndexReport(
+        reader=reader,
+        out=target,
+        rows=len(manifest),
+        sequences=int(manifest.codes("sequence").max()) + 1,
+        splits={split: splits[split] for split in SPLITS if splits[split]},
+        sensors=dict(sorted(Counter(manifest.table["sensor"].to_pylist()).items())),
+        with_image=int(manifest.present("image_path").sum()),
+        with_text=int(manifest.present("text").sum()),
+        with_touch=int(manifest.present("touch").sum()),
+        skipped=dict(sorted(rows.skipped.items())),
+        notes=rows.notes,
+        content_hash=manifest.content_hash,
+    )
 
 
 def _target(base: Path, name: str, out: str | Path | None) -> Path:
@@ -187,48 +173,97 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
     if not base.is_relative_to(target.parent):
         raise UserError(
             f"the manifest {target} must lie in {base} or in a folder above it, because its paths may not leave its "
-            "folder; leave --out away, or move the data"
+            "folder; leave out --out, or move the data"
         )
     if name == "real_touch" and target == base / "manifest.csv":
         raise UserError(f"{target} is the pack's own manifest; name another file with --out")
     if target.exists() and not is_manifest(target):
-        raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
+        raise UserError(f"{target} exists and is no manifest; name another file with --out, or remove it")
     if not os.access(target.parent, os.W_OK):
-        raise UserError(
-            f"the manifest {target} cannot be written: {target.parent} is read-only; name another file with --out, in "
-            "a folder that contains the data"
-        )
+        raise UserError(f"the manifest {target} cannot be written: {target.parent} is read-only; {_OTHER_OUT}")
     return target
 
 
 def _below(columns: Columns, base: Path, folder: Path) -> Columns:
-    """Paths relative to `folder`, which is `base` or above it."""
+    """Return columns with paths relative to `folder`, which is `base` or above it."""
     prefix = base.relative_to(folder).as_posix()
     if prefix == ".":
         return columns
-    paths = {name: [one and f"{prefix}/{one}" for one in columns[name]] for name in PATHS if name in columns}
+    paths = {name: [path and f"{prefix}/{path}" for path in columns[name]] for name in PATHS if name in columns}
     return columns | paths
 
 
-def _report(one: DatasetReader, target: Path, manifest: manifests.Manifest, notes: Notes) -> IndexReport:
-    splits = Counter(manifest.table["split"].to_pylist())
-    return IndexReport(
-        name=one.name,
-        out=target,
-        rows=len(manifest),
-        sequences=int(manifest.codes("sequence").max()) + 1,
-        splits={split: splits[split] for split in SPLITS if splits[split]},
-        sensors=dict(sorted(Counter(manifest.table["sensor"].to_pylist()).items())),
-        frames=len(manifest) - splits["background"] - splits["unused"],
-        paper=one.paper,
-        paper_note=one.paper_note,
-        with_image=int(manifest.present("image_path").sum()),
-        with_text=int(manifest.present("text").sum()),
-        with_touch=int(manifest.present("touch").sum()),
-        license=one.license,
-        citation=one.citation,
-        commercial=one.commercial,
-        skipped=dict(sorted(notes.skipped.items())),
-        notes=notes.said,
-        content_hash=manifest.content_hash,
-    )
+def _check_links(manifest: Manifest, base: Path) -> None:
+    """Raise UserError for a folder that is a link out of ROOT, because none of its rows could be read."""
+    root = manifest.files[0].parent
+    paths = (path for name in PATHS for path in manifest.column(name).unique().drop_null().to_pylist())
+    for folder in dict.fromkeys(path.rpartition("/")[0] for path in paths):
+        place = (root / folder).resolve()
+        if not place.is_relative_to(root.resolve()):
+            raise UserError(f"{root / folder} leads out of {base}, to {place}; give the folder that really holds it")
+
+
+# Edited manifests ----------------------------------------------------------------------------------------------------
+
+
+def _carry_over(new: Manifest, target: Path, notes: list[str], *, keep: bool, groups: Collection[str]) -> Manifest:
+    """Return the manifest to write over `target`: `new`, with the values of `target` by `path` if `keep`.
+
+    A row that still exists keeps every value except those of _FROM_FILES. Empty cells and new rows get the reader's
+    values, but a new row gets the split of its group (columns `groups`) if the kept rows of it agree. Without `keep`,
+    raises UserError for an edited `target`: it has a column that `new` lacks, or another value in a row of one path.
+    """
+    if not target.exists():
+        return new
+    old = manifests.read(target)
+    if not keep and _is_as_written(old, target):
+        return new
+    at = pc.index_in(new.column("path").combine_chunks(), value_set=old.column("path").combine_chunks())
+    merged, edits = new, []
+    for name in (column for column in old.table.column_names if column not in _FROM_FILES):
+        before, is_new = old.column(name).take(at), name not in new.table.column_names
+        differs = np.asarray(pc.is_valid(before)) if is_new else _differ(before, new.column(name))
+        if differs.any():
+            edits.append(name if is_new else f"other values of {name} ({differs.sum()} rows)")
+            merged = replace_column(merged, name, before if is_new else _first_of(before, new.column(name)))
+    if edits and not keep:
+        raise UserError(
+            f"{target} has {', '.join(edits)}, which index does not write: give another --out, pass --keep to carry "
+            "them over by path, or remove it"
+        )
+    if edits:
+        notes.append(f"kept from {target.name} by path: {', '.join(edits)}")
+    return _with_splits_of_groups(merged, np.asarray(pc.is_valid(at)), groups) if keep else merged
+
+
+def _is_as_written(old: Manifest, target: Path) -> bool:
+    """Whether nobody edited a Parquet file since `index` wrote it."""
+    if target.suffix.lower() != ".parquet":
+        return False
+    return (pa.parquet.read_schema(target).metadata or {}).get(_INDEX_KEY) == old.content_hash.encode()
+
+
+def _differ(before: pa.ChunkedArray, new: pa.ChunkedArray) -> np.ndarray:
+    """Return where `before` has another value than `new`, bool (rows,): 1 in a CSV may be "1" elsewhere."""
+    same = pc.equal(before.cast(pa.string()), new.cast(pa.string()))
+    return np.asarray(pc.and_(pc.is_valid(before), pc.invert(pc.fill_null(same, False))))
+
+
+def _first_of(before: pa.ChunkedArray, new: pa.ChunkedArray) -> pa.ChunkedArray:
+    if before.type != new.type:
+        before, new = before.cast(pa.string()), new.cast(pa.string())
+    return pc.coalesce(before, new)
+
+
+def _with_splits_of_groups(merged: Manifest, is_old: np.ndarray, groups: Collection[str]) -> Manifest:
+    """Give new rows of a group the one split of its old rows, so that no group comes to be in two splits."""
+    split = np.array(merged.column("split").to_pylist(), object)
+    is_open = ~is_old
+    for group in groups:
+        codes = merged.codes(group)
+        for code in np.unique(codes[is_open & (codes >= 0)]):
+            in_group = codes == code
+            if len(splits := set(split[in_group & is_old])) == 1:
+                split[in_group & is_open] = splits.pop()
+                is_open = is_open & ~in_group
+    return replace_column(merged, "split", split.tolist())

@@ -1,6 +1,6 @@
-"""What the readers share: folders listed once, frames by number, rows in columns, splits by hash, skips counted.
+"""Helpers of the dataset readers: folder listings, frame numbers, contact lists, hash splits, counts of skipped files.
 
-No reader opens or stats a frame: a folder is listed once and a frame is known by its name.
+No reader opens or stats a frame. Each folder is listed once, and frames are known by their names.
 """
 
 from __future__ import annotations
@@ -10,12 +10,13 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from anytouch_jax.data.images import natural
+from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.errors import UserError
 
 Columns = dict[str, list[Any]]
@@ -24,18 +25,17 @@ SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
 
 
 class DatasetError(UserError):
-    """A folder that is not the dataset it is said to be, or a broken list in it; the message names the file."""
+    """A folder that is not the expected dataset, or a broken list in it; the message names the file."""
 
 
 @dataclass(frozen=True)
 class IndexOptions:
-    """What a reader may be told; each reader says in `uses` which of these it heeds.
+    """Options of the readers; each reader names those that it uses.
 
-    `val`, `test`: shares of the groups (objects, else recordings) that go to these splits where a dataset has no
-    split of its own. `lists`: a folder with list files, looked into before ROOT. `task`: which lists of Touch and Go
-    decide the split. `fold`: which `split_<k>.npy` of Feel. `export`: let a reader write pictures into ROOT where the
-    dataset comes as arrays or films. `sensor`: what made one's own recordings. `split_by`: what of these is held
-    out whole. `labels`: a table of labels for these, by object or sequence.
+    `val`, `test`: shares of the groups (objects, else recordings) for these splits, in datasets without splits.
+    `lists`: a folder with list files, searched before ROOT. `task`: the lists of Touch and Go that decide the split.
+    `fold`: the `split_<k>.npy` of Feel. `export`: write pictures into ROOT for datasets of arrays or videos. `sensor`,
+    `split_by`, `labels`: for recordings, their sensor, what is held out, and a table of labels by object or sequence.
     """
 
     val: float = 0.05
@@ -53,34 +53,16 @@ class IndexOptions:
             raise UserError(f"val {self.val} and test {self.test} are shares: both at least 0, together at most 1")
 
 
-@dataclass
-class Notes:
-    """What was left out and why (`skipped`: reason -> count and one example), and things to say aloud."""
-
-    skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
-    said: list[str] = field(default_factory=list)
-
-    def skip(self, reason: str, example: str, count: int = 1) -> None:
-        """Count `count` things left out for `reason`; the first `example` is kept."""
-        if count:
-            before, first = self.skipped.get(reason, (0, example))
-            self.skipped[reason] = before + count, first
-
-    def log(self, sentence: str) -> None:
-        """Keep a sentence for the report."""
-        self.said.append(sentence)
-
-
 @dataclass(frozen=True)
 class DatasetReader:
-    """One public dataset: how to read it, and what is known of it.
+    """A dataset: how to read it, and facts about it.
 
-    `read(root, options, notes) -> columns` has paths relative to `root` (absolute). `commercial` is False where no
-    licence is stated. `paper` is the count of contact frames in the paper's dataset table, None where it has none.
+    `read` adds the rows of a `DatasetIndex`. `commercial` is False if no licence is stated. `paper` is the number of
+    contact frames in the paper's dataset table, None if it is not there.
     """
 
     name: str
-    read: Callable[[Path, IndexOptions, Notes], Columns]
+    read: Callable[[DatasetIndex], None]
     sensor: str
     license: str
     commercial: bool
@@ -92,106 +74,163 @@ class DatasetReader:
     paper_note: str = ""
 
 
-class RowBuilder:
-    """Columns that grow by whole recordings."""
+class DatasetIndex:
+    """The manifest rows of a dataset while its folder is read, and what was left out.
 
-    def __init__(self, *names: str) -> None:
-        fixed = ("path", "sensor", "sequence", "frame_index", "split")
-        self._columns: Columns = {name: [] for name in (*fixed, *names)}
+    `root` is absolute; all paths of rows are relative to it. `table` maps a column to a value for each row, `skipped` a
+    reason to (count, first example), and `notes` are sentences for the user.
+    """
+
+    def __init__(self, name: str, root: Path, options: IndexOptions | None = None) -> None:
+        self.name, self.root, self.options = name, root, options or IndexOptions()
+        self.skipped: dict[str, tuple[int, str]] = {}
+        self.notes: list[str] = []
+        self.contact: dict[str, list[str]] | None = None  # the authors' list of contact frames: path -> its cells
+        self._contact_rows = 0
+        self.table: Columns = {name: [] for name in REQUIRED}
+
+    def skip(self, reason: str, example: str, count: int = 1) -> None:
+        """Count `count` things left out for `reason`; the first `example` is reported."""
+        if count:
+            before, first = self.skipped.get(reason, (0, example))
+            self.skipped[reason] = before + count, first
+
+    # Folders and files -----------------------------------------------------------------------------------------------
+
+    def find_folder(self, *choices: str, inside: Sequence[str] = ()) -> Path:
+        """Return the first of the folders `choices` under the root that exists and holds one of `inside` (if any).
+
+        Raises DatasetError, which names the expected folders.
+        """
+        for choice in choices:
+            folder = self.root / choice
+            if folder.is_dir() and (not inside or any((folder / name).is_dir() for name in inside)):
+                return folder
+        expected = " or ".join(f"a folder {name!r}" for name in inside or [c for c in choices if c != "."])
+        places = ", ".join(str(self.root / choice) for choice in choices) if inside else str(self.root)
+        raise DatasetError(f"expected {expected} in {places}; is ROOT the folder that holds it?")
+
+    def find_file(self, names: Collection[str], *folders: Path) -> Path | None:
+        """Return the first file called one of `names` in `options.lists` or `folders` (default: the root)."""
+        places = [folder for folder in (self.options.lists, *(folders or (self.root,))) if folder is not None]
+        files = (folder / name for folder in places for name in names)
+        return next((file for file in files if file.is_file()), None)
+
+    def prefix(self, folder: Path) -> str:
+        """Return the path of a folder relative to the root with a slash, "" for the root itself."""
+        return "" if folder == self.root else f"{folder.relative_to(self.root).as_posix()}/"
+
+    def listing(self, folder: str | Path, *, count: bool = True) -> tuple[list[str], list[str]]:
+        """Return the names of the folders (2 before 10) and files in `folder`; links and system files are skipped."""
+        folders: list[str] = []
+        files: list[str] = []
+        try:
+            entries = list(os.scandir(self.root / folder))
+        except OSError as error:
+            raise DatasetError(f"{self.root / folder} cannot be listed: {error.strerror}") from None
+        for entry in entries:
+            name, reason = entry.name, None
+            if name.startswith(".") or name in SYSTEM_FILES:
+                reason = "hidden or system file"
+            elif not _is_text(name):
+                reason = "name that is not UTF-8"
+            elif entry.is_symlink():
+                reason = "symbolic link (a manifest's paths may not leave its folder)"
+            else:
+                (folders if entry.is_dir(follow_symlinks=False) else files).append(name)
+            if reason and count:
+                self.skip(reason, entry.path if _is_text(name) else repr(entry.path))
+        return sorted(folders, key=natural), sorted(files)
+
+    def walk(self, base: Path, inside: str = "", *, count: bool = True) -> Iterator[tuple[str, list[str], list[str]]]:
+        """Yield (folder relative to `base`, its folders, its files) of `base` and all folders below, in order."""
+        folders, files = self.listing(base / inside, count=count)
+        yield inside, folders, files
+        for folder in folders:
+            yield from self.walk(base, f"{inside}/{folder}" if inside else folder, count=count)
+
+    def numbered(self, files: Sequence[str], pattern: str, where: str, *, count: bool = True) -> Frames:
+        """Return the files whose whole name matches `pattern`, with the number in its first group, by number.
+
+        Other files, and a second file of one number, are skipped.
+        """
+        match = re.compile(pattern, re.IGNORECASE).fullmatch
+        frames: dict[int, str] = {}
+        for name in files:
+            parts = match(name)
+            if not parts or len(parts[1]) > 18:  # a manifest holds numbers of 64 bits
+                self.skip("file that is not a frame by its name", f"{where}/{name}", int(count))
+            elif int(parts[1]) in frames:
+                self.skip("second file of one frame number", f"{where}/{name}", int(count))
+            else:
+                frames[int(parts[1])] = name
+        return sorted(frames.items())
+
+    # Rows ------------------------------------------------------------------------------------------------------------
+
+    def split_of(self, group: str) -> str:
+        """Return the hash split of a group (an object or a recording) of this dataset."""
+        return hash_split(self.name, group, self.options)
+
+    def read_contact_list(self, names: Collection[str], marker: str) -> None:
+        """Read the authors' list of contact frames, if one of the CSV files `names` is there.
+
+        The keys of `contact` are the paths behind the last folder called `marker`.
+        """
+        path = self.find_file(names)
+        if path is not None:
+            rows = ((row[0].replace("\\", "/"), row) for row in read_csv(path))
+            self.contact = {name.rpartition(f"{marker}/")[2]: row for name, row in rows}
 
     def add(self, paths: Sequence[str], **cells: Any) -> None:
-        """Append one row a path; a cell is a list (one value a row) or one value for all rows; None is null."""
-        columns = self._columns
-        unknown = cells.keys() - columns.keys()
-        if unknown:
-            raise KeyError(f"undeclared columns {sorted(unknown)}")
-        columns["path"].extend(paths)
-        for name, column in columns.items():
-            if name != "path":
-                value = cells.get(name)
-                column.extend(value if isinstance(value, list) else [value] * len(paths))
-                if len(column) != len(columns["path"]):
-                    raise ValueError(f"column {name!r} has {len(column)} values for {len(columns['path'])} rows")
+        """Add a row for each path; a cell is a list (a value for each row) or one value for all rows (None: null)."""
+        before, size = len(self.table["path"]), len(paths)
+        for name, value in {"path": list(paths), **cells}.items():
+            values = value if isinstance(value, list) else [value] * size
+            if len(values) != size:
+                raise ValueError(f"column {name!r} has {len(values)} values for {size} rows")
+            self.table.setdefault(name, [None] * before).extend(values)
+        for column in self.table.values():
+            column.extend([None] * (before + size - len(column)))
+
+    def add_recording(self, frames: Frames, folder: str, *, split: str, key: str = "", **cells: Any) -> None:
+        """Add the frames of a recording; `key`/name is the key of a frame in the contact list.
+
+        With a contact list the frames in it have contact, and all other frames get the split `unused`.
+        """
+        names = [name for _, name in frames]
+        cells["split"] = split
+        if self.contact is not None:
+            is_contact = [f"{key}/{name}" in self.contact for name in names]
+            self._contact_rows += sum(is_contact)
+            cells |= {"label.contact": [int(touched) for touched in is_contact]}
+            cells |= {"split": [split if touched else "unused" for touched in is_contact]}
+        self.add(
+            [f"{folder}/{name}".lstrip("/") for name in names], frame_index=[number for number, _ in frames], **cells
+        )
 
     def columns(self) -> Columns:
-        """Everything added, without optional columns that are null on every row."""
-        return {
-            name: column
-            for name, column in self._columns.items()
-            if name in ("path", "sensor", "sequence", "frame_index", "split")
-            or any(value is not None for value in column)
-        }
+        """Return all columns, without optional ones that are null on every row; report unmatched contact frames."""
+        if self.contact is not None:
+            missing = len(self.contact) - self._contact_rows
+            self.skip("listed contact frame that is not on disk", "see the contact list", missing)
+        has_value = {name: any(value is not None for value in column) for name, column in self.table.items()}
+        return {name: column for name, column in self.table.items() if name in REQUIRED or has_value[name]}
 
 
-def listing(folder: Path, notes: Notes) -> tuple[list[str], list[str]]:
-    """Names of the folders (2 before 10) and of the files in `folder`; links and system files are counted."""
-    folders: list[str] = []
-    files: list[str] = []
-    try:
-        entries = list(os.scandir(folder))
-    except OSError as error:
-        raise DatasetError(f"{folder} cannot be listed: {error.strerror}") from None
-    for entry in entries:
-        name = entry.name
-        if name.startswith(".") or name in SYSTEM_FILES:
-            notes.skip("hidden or system file", entry.path)
-        elif not _is_text(name):
-            notes.skip("name that is not UTF-8", repr(entry.path))
-        elif entry.is_symlink():
-            notes.skip("symbolic link (a manifest's paths may not leave its folder)", entry.path)
-        else:
-            (folders if entry.is_dir(follow_symlinks=False) else files).append(name)
-    return sorted(folders, key=natural), sorted(files)
+def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
+    """Return the split of a group: the first 8 bytes of SHA-256(dataset/group) as a share of their range.
 
-
-def walk(base: Path, notes: Notes, inside: str = "") -> Iterator[tuple[str, list[str], list[str]]]:
-    """(folder relative to `base`, its folders, its files) of `base` and everything below, in natural order."""
-    folders, files = listing(base / inside, notes)
-    yield inside, folders, files
-    for folder in folders:
-        yield from walk(base, notes, f"{inside}/{folder}" if inside else folder)
-
-
-def numbered(files: Sequence[str], pattern: str, notes: Notes, where: str) -> Frames:
-    """The files whose whole name matches `pattern`, with the number its first group holds, by number.
-
-    Other files, and a second file of one number, are counted in `notes`.
+    Below `val` it is val, below `val + test` test, else train. A group is never in two splits, and adding or removing
+    other groups moves none.
     """
-    match = re.compile(pattern, re.IGNORECASE).fullmatch
-    frames: dict[int, str] = {}
-    for name in files:
-        found = match(name)
-        if not found or len(found[1]) > 18:  # a manifest holds numbers of 64 bits
-            notes.skip("file that is not a frame by its name", f"{where}/{name}")
-        elif int(found[1]) in frames:
-            notes.skip("second file of one frame number", f"{where}/{name}")
-        else:
-            frames[int(found[1])] = name
-    return sorted(frames.items())
-
-
-def find_folder(root: Path, *choices: str, inside: Sequence[str] = ()) -> Path:
-    """The first of the folders `choices` under `root` that exists ("." is `root` itself).
-
-    A choice counts only if it holds one of `inside`, where given. Raises DatasetError that says what was looked for.
-    """
-    for choice in choices:
-        folder = root / choice
-        if folder.is_dir() and (not inside or any((folder / name).is_dir() for name in inside)):
-            return folder
-    one = " or ".join(f"a folder {name!r}" for name in inside or [c for c in choices if c != "."])
-    places = ", ".join(str(root / choice) for choice in choices) if inside else str(root)
-    raise DatasetError(f"expected {one} in {places}; is ROOT the folder that holds it?")
-
-
-def find_file(names: Collection[str], *folders: Path | None) -> Path | None:
-    """The first file called one of `names` in `folders`."""
-    files = (folder / name for folder in folders if folder is not None for name in names)
-    return next((file for file in files if file.is_file()), None)
+    digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
+    share = int.from_bytes(digest[:8], "big") / 2**64
+    return "val" if share < options.val else "test" if share < options.val + options.test else "train"
 
 
 def read_csv(path: Path) -> list[list[str]]:
-    """The rows of a CSV file (UTF-8, with or without BOM), blank lines left out. Raises DatasetError."""
+    """Return the rows of a CSV file (UTF-8, with or without BOM) without blank lines. Raises DatasetError."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             return [[cell.strip() for cell in row] for row in csv.reader(file) if any(cell.strip() for cell in row)]
@@ -199,76 +238,26 @@ def read_csv(path: Path) -> list[list[str]]:
         raise DatasetError(f"{path} cannot be read as a CSV list: {error}") from None
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file with a header, as dicts. Raises DatasetError."""
+def read_table(path: Path, column: str | None = None) -> list[dict[str, str]]:
+    """Return the rows of a CSV file with a header as dicts. Raises DatasetError, also if `column` is missing."""
     rows = read_csv(path)
-    return [dict(zip(rows[0], row, strict=False)) for row in rows[1:]]
+    table = [dict(zip(rows[0], row, strict=False)) for row in rows[1:]]
+    for row in table:
+        if column is not None and column not in row:
+            raise DatasetError(f"{path}: expected a column {column!r}, found {', '.join(row)}")
+    return table
 
 
 def read_json(path: Path, values: type = object) -> dict[str, Any]:
-    """The object (names with `values` of a kind) that a JSON file holds. Raises DatasetError."""
+    """Return the object in a JSON file, whose values are of one type. Raises DatasetError."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path} cannot be read as JSON: {error}") from None
-    if not isinstance(found, dict) or not all(isinstance(value, values) for value in found.values()):
+    if not isinstance(content, dict) or not all(isinstance(value, values) for value in content.values()):
         kind = "" if values is object else f" with a {values.__name__} for every name"
         raise DatasetError(f"{path}: expected a JSON object{kind}")
-    return found
-
-
-def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
-    """The split of a group: the first 8 bytes of SHA-256(dataset / group) as a share of their range.
-
-    Below `val` it is val, below `val + test` test, else train: one group is never in two splits, and adding or
-    losing other groups moves none.
-    """
-    digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
-    share = int.from_bytes(digest[:8], "big") / 2**64
-    return "val" if share < options.val else "test" if share < options.val + options.test else "train"
-
-
-def contact_list(root: Path, options: IndexOptions, names: Collection[str], marker: str) -> dict[str, list[str]] | None:
-    """The authors' list of contact frames, where one of the CSV files `names` is there: path -> its cells.
-
-    Paths are taken from behind the last folder called `marker` on, where they have one.
-    """
-    path = find_file(names, options.lists, root)
-    if path is None:
-        return None
-    rows = ((row[0].replace("\\", "/"), row) for row in read_csv(path))
-    return {name.rpartition(f"{marker}/")[2]: row for name, row in rows}
-
-
-def add_recording(
-    rows: RowBuilder,
-    frames: Frames,
-    folder: str,
-    *,
-    split: str,
-    listed: Mapping[str, Sequence[str]] | None = None,
-    key: str = "",
-    **cells: Any,
-) -> int:
-    """Add the frames of one recording; the count of those in the contact list (0 without one).
-
-    With `listed` (keys `key`/name) a frame in it is contact, and every other one gets split `unused`.
-    """
-    names = [name for _, name in frames]
-    if listed is not None:
-        contact = [f"{key}/{name}" in listed for name in names]
-        cells |= {"label.contact": [int(one) for one in contact]}
-        cells |= {"split": [split if one else "unused" for one in contact]}
-    else:
-        cells["split"] = split
-    rows.add([f"{folder}/{name}" for name in names], frame_index=[number for number, _ in frames], **cells)
-    return sum(cells["label.contact"]) if listed is not None else 0
-
-
-def miss_listed(notes: Notes, listed: Mapping[str, Sequence[str]] | None, found: int) -> None:
-    """Count the listed contact frames that are not on disk."""
-    if listed is not None:
-        notes.skip("listed contact frame that is not on disk", "see the contact list", len(listed) - found)
+    return content
 
 
 def _is_text(name: str) -> bool:

@@ -1,90 +1,89 @@
-"""Feel, "The Feeling of Success" (Calandra et al., CoRL 2017): grasps with two GelSight fingers, failed or held.
+"""Feel, "The Feeling of Success" (Calandra et al., CoRL 2017): grasps with two GelSight fingers that failed or held.
 
-Seen in AnyTouch's code: `<object>/touch_{before,during,after}/<n>_{A,B}.png`, `vision_{...}/<n>.png`, `feel.csv`
-without header (object, n, success), `split_<k>.npy` (a pickled dict of train and test object lists); and how these
-folders are made from the original `calandra_corl2017_*.h5`. No licence of the data is stated.
+Layout in AnyTouch's code: `<object>/touch_{before,during,after}/<n>_{A,B}.png`, `vision_{...}/<n>.png`, `feel.csv`
+without header (object, n, success), `split_<k>.npy` (a pickled dict of train and test object lists). The original
+files are `calandra_corl2017_*.h5`. No licence of the data is stated.
 
-* The split of a `during` frame is its object's; `before` (open fingers) is background and the background of the
-  others; `after` shows the outcome and is `unused`. Every frame is a sequence of its own: no clip spans the phases.
-* `grasp_group` is the grasp: both fingers (`unit` A and B) have it. They press opposite sides, not one place, so it is
-  no `touch`: nothing is matched by it.
-* A pickled split file is never unpickled as code: `split_<k>.npy` is read by a reader that knows lists and strings
-  only; `split_<k>.json` with the same content is read too. Without either: by hash of the object.
-* Only original files: say `export` and they are written as PNG first (needs `pip install h5py`).
+* The split of a `during` frame is its object's. `before` (open fingers) is background, and the background of the
+  others. `after` shows the outcome and is `unused`. Every frame is a sequence: no clip spans the phases.
+* `grasp_group` is the grasp, the same for both fingers (`unit` A and B). They press opposite sides and not one place,
+  so it is no `touch`, and nothing is matched by it.
+* The split is that of `split_<k>.npy`, which is never unpickled, or of `split_<k>.json` with the same content. Without
+  either it is by hash of the object.
+* From the original files, `export` first writes the pictures as PNG (needs `pip install h5py`).
 """
 
 from __future__ import annotations
 
+import csv
+import io
+import pickletools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from anytouch_jax.data.readers.common import (
-    Columns,
-    DatasetError,
-    DatasetReader,
-    IndexOptions,
-    Notes,
-    RowBuilder,
-    find_file,
-    hash_split,
-    listing,
-    read_csv,
-    read_json,
-)
-from anytouch_jax.data.readers.feel_files import export_grasps, strings_in_pickle
+import cv2
+import numpy as np
+
+from anytouch_jax.data.images import natural
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_csv, read_json
+from anytouch_jax.files import atomic_write
 
 PHASES = ("before", "during", "after")
+PARTS = ("train", "val", "test")
+PICTURES = {
+    **{f"kinectA_rgb_{phase}": (f"vision_{phase}", "") for phase in PHASES},
+    **{f"gelsight{finger}_{phase}": (f"touch_{phase}", f"_{finger}") for phase in PHASES for finger in "AB"},
+}
 
 
-def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
-    """Every picture of every grasp in feel.csv. Raises DatasetError without it."""
+def read(index: DatasetIndex) -> None:
+    """Add every picture of every grasp in feel.csv. Raises DatasetError if it is missing."""
+    root = index.root
     base = next((root / name for name in ("feel", ".") if (root / name / "feel.csv").is_file()), root)
     if not (base / "feel.csv").is_file():
-        original = [name for name in listing(root, notes)[1] if name.endswith(".h5")]
+        original = [name for name in index.listing(root)[1] if name.endswith(".h5")]
         if not original:
             raise DatasetError(f"expected feel.csv and <object>/touch_during/0_A.png under {root}; is ROOT the folder "
                                "that holds 'feel.csv'?")  # fmt: skip
-        if not options.export:
+        if not index.options.export:
             raise DatasetError(f"{root} has {len(original)} original .h5 files and no feel.csv; add --export to write "
                                "the pictures beside them (needs pip install h5py)")  # fmt: skip
-        notes.log(f"{export_grasps(root, original)} grasps written from {len(original)} .h5 files")
-    splits = _splits(base, options, notes)
-    prefix = "" if base == root else f"{base.relative_to(root).as_posix()}/"
-    rows = RowBuilder(
-        "object", "unit", "grasp_group", "image_path", "background_path", "label.success", "label.contact"
-    )
-    there: dict[str, set[str]] = {}
-    table = base / "feel.csv"
+        index.notes.append(f"{export_grasps(root, original)} grasps written from {len(original)} .h5 files")
+    splits = _published_splits(index, base)
+    prefix, table = index.prefix(base), base / "feel.csv"
+    files: dict[str, set[str]] = {}
     for line, row in enumerate(read_csv(table), 1):
         if len(row) != 3 or not row[1].isdecimal() or row[2] not in ("0", "1"):
             raise DatasetError(f"{table}, line {line}: expected object,number,0 or 1, found {','.join(row)}")
         name, number, success = row
-        if name not in there:
-            there[name] = _files(base / name, notes)
+        if name not in files:
+            files[name] = _files(index, base / name)
         if splits is not None and name not in splits:
-            notes.skip(f"grasp of an object that is in no list of split {options.fold} (split unused)", name)
-        split = hash_split("feel", name, options) if splits is None else splits.get(name, "unused")
-        _grasp(rows, notes, prefix, name, int(number), int(success), split, there[name])
-    return rows.columns()
+            index.skip(f"grasp of an object that is in no list of split {index.options.fold} (split unused)", name)
+        split = index.split_of(name) if splits is None else splits.get(name, "unused")
+        _add_grasp(index, f"{prefix}{name}", name, int(number), int(success), split, files[name])
 
 
-def _files(folder: Path, notes: Notes) -> set[str]:
+def _files(index: DatasetIndex, folder: Path) -> set[str]:
     if not folder.is_dir():
         return set()
-    return {f"{sub}/{file}" for sub in listing(folder, notes)[0] for file in listing(folder / sub, notes)[1]}
+    return {f"{sub}/{file}" for sub in index.listing(folder)[0] for file in index.listing(folder / sub)[1]}
 
 
-def _grasp(rows: RowBuilder, notes: Notes, prefix: str, name: str, number: int, success: int, split: str,
-           there: set[str]) -> None:  # fmt: skip
+def _add_grasp(
+    index: DatasetIndex, folder: str, name: str, number: int, success: int, split: str, files: set[str]
+) -> None:
     grasp = f"{name}/{number}"
     for finger in "AB":
         before = f"touch_before/{number}_{finger}.png"
         for phase, part in zip(PHASES, ("background", split, "unused"), strict=True):
             file, photo = f"touch_{phase}/{number}_{finger}.png", f"vision_{phase}/{number}.png"
-            if file not in there:
-                notes.skip("picture of feel.csv that is not on disk", f"{prefix}{name}/{file}")
+            if file not in files:
+                index.skip("picture of feel.csv that is not on disk", f"{folder}/{file}")
                 continue
-            rows.add(
-                [f"{prefix}{name}/{file}"],
+            index.add(
+                [f"{folder}/{file}"],
                 sensor="gelsight",
                 unit=finger,
                 sequence=f"{grasp}/{phase}/{finger}",
@@ -92,35 +91,126 @@ def _grasp(rows: RowBuilder, notes: Notes, prefix: str, name: str, number: int, 
                 split=part,
                 object=name,
                 grasp_group=grasp if phase == "during" else None,
-                image_path=f"{prefix}{name}/{photo}" if photo in there else None,
-                background_path=f"{prefix}{name}/{before}" if before in there else None,
+                image_path=f"{folder}/{photo}" if photo in files else None,
+                background_path=f"{folder}/{before}" if before in files else None,
                 **{"label.success": success if phase == "during" else None,
                    "label.contact": 0 if phase == "before" else None},
             )  # fmt: skip
 
 
-def _splits(base: Path, options: IndexOptions, notes: Notes) -> dict[str, str] | None:
-    """object -> split, from split_<fold>.json or .npy; None without a file."""
-    path = find_file([f"split_{options.fold}.json", f"split_{options.fold}.npy"], options.lists, base)
-    if path is None and options.fold:
-        raise DatasetError(f"there is no split_{options.fold}.npy or .json for --fold {options.fold} under {base}")
+def _published_splits(index: DatasetIndex, base: Path) -> dict[str, str] | None:
+    """Return object -> split from split_<fold>.json or .npy, None without a file."""
+    fold = index.options.fold
+    path = index.find_file([f"split_{fold}.json", f"split_{fold}.npy"], base)
+    if path is None and fold:
+        raise DatasetError(f"there is no split_{fold}.npy or .json for --fold {fold} under {base}")
     if path is None:
-        notes.log(f"no split_{options.fold}.npy or .json: split by hash of the object")
+        index.notes.append(f"no split_{fold}.npy or .json: split by hash of the object")
         return None
     table = read_json(path) if path.suffix == ".json" else strings_in_pickle(path)
-    lists = table.values() if isinstance(table, dict) else ()
-    if not isinstance(table, dict) or not {"train", "test"} <= table.keys() or not all(map(_is_list, lists)):
+    if not {"train", "test"} <= table.keys() or not all(isinstance(names, list) for names in table.values()):
         raise DatasetError(f"{path}: expected the lists 'train' and 'test' of object names")
     splits: dict[str, str] = {}
-    for part in ("train", "val", "test"):
-        for name in table.get(part, []):
-            if splits.setdefault(str(name), part) != part:
-                raise DatasetError(f"{path}: the object {name} is in {splits[str(name)]} and in {part}")
+    for part in PARTS:
+        for name in map(str, table.get(part, [])):
+            if splits.setdefault(name, part) != part:
+                raise DatasetError(f"{path}: the object {name} is in {splits[name]} and in {part}")
     return splits
 
 
-def _is_list(one: object) -> bool:
-    return hasattr(one, "__len__") and not isinstance(one, str | bytes | dict)
+def strings_in_pickle(path: Path) -> dict[str, list[str]]:
+    """Return the lists of names under 'train', 'val', 'test' in a .npy file that holds a pickled dict of lists.
+
+    The pickle is scanned and never run: names are taken in order, each for the last of the three keys before it.
+    Raises DatasetError for anything else in the lists, which a scan could misread.
+    """
+    lists: dict[str, list[str]] = {}
+    memo: dict[int, str] = {}
+    last, current = "", ""
+    try:
+        with path.open("rb") as file:
+            is_old = np.lib.format.read_magic(file) == (1, 0)
+            (np.lib.format.read_array_header_1_0 if is_old else np.lib.format.read_array_header_2_0)(file)
+            ops = list(pickletools.genops(file.read()))
+    except (OSError, ValueError, IndexError) as error:
+        raise DatasetError(f"{path} is not a .npy file with a pickled dict: {error}") from None
+    for op, argument, _ in ops:
+        value: Any = argument
+        if op.name == "MEMOIZE":
+            memo[len(memo)] = last
+        elif op.name in ("BINPUT", "LONG_BINPUT"):
+            memo[value] = last
+        elif current and op.name in ("GLOBAL", "STACK_GLOBAL", "REDUCE"):
+            raise DatasetError(f"{path} holds more than lists of names; save it as {path.with_suffix('.json').name}")
+        word = memo.get(value, "") if op.name in ("BINGET", "LONG_BINGET") else value if "UNICODE" in op.name else None
+        last = word if isinstance(word, str) else ""
+        if word in PARTS:
+            current = word
+            lists[current] = []
+        elif word and current:
+            lists[current].append(word)
+    return lists
+
+
+def export_grasps(root: Path, names: Sequence[str]) -> int:
+    """Write the grasps of the HDF5 files `names` in `root` as PNG, and feel.csv last; return the number of grasps.
+
+    Raises DatasetError if h5py is not installed or a file cannot be read.
+    """
+    try:
+        import h5py  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:
+        raise DatasetError("the original files of Feel are HDF5; run pip install h5py") from None
+    lines: list[list[Any]] = []
+    numbers: dict[str, int] = {}
+    for name in sorted(names, key=natural):
+        try:
+            with h5py.File(root / name, "r") as file:
+                for grasp in _grasps(file):
+                    obj = _object_name(_value(grasp, "object_name"))
+                    number = numbers[obj] = numbers.get(obj, -1) + 1
+                    _write_grasp(root / obj, number, grasp)
+                    lines.append([obj, number, int(np.ravel(_value(grasp, "is_gripping"))[0])])
+        except (OSError, KeyError, ValueError) as error:
+            raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    atomic_write(root / "feel.csv", text.getvalue())
+    return len(lines)
+
+
+def _grasps(group: Any) -> Iterator[Any]:
+    """Yield every group with the pictures of a grasp, at any depth."""
+    if "gelsightA_during" in group:
+        yield group
+        return
+    for key in sorted(group, key=natural):
+        if hasattr(group[key], "keys"):
+            yield from _grasps(group[key])
+
+
+def _value(group: Any, key: str) -> Any:
+    """Return a small value, stored as a dataset or as an attribute."""
+    return group[key][()] if key in group else group.attrs[key]
+
+
+def _object_name(value: Any) -> str:
+    value = value.item() if isinstance(value, np.generic | np.ndarray) and np.size(value) == 1 else value
+    if isinstance(value, np.ndarray):
+        value = value.astype(np.uint8).tobytes()
+    text = value.decode() if isinstance(value, bytes) else str(value)
+    name = text.rstrip("\0").strip().replace("/", "_").replace("\\", "_")
+    if name.strip(".") == "":
+        raise ValueError(f"a grasp has the object name {text!r}")
+    return name
+
+
+def _write_grasp(folder: Path, number: int, grasp: Any) -> None:
+    for key, (sub, ending) in PICTURES.items():
+        if key in grasp:
+            pixels = cv2.cvtColor(np.asarray(grasp[key][()]), cv2.COLOR_RGB2BGR)
+            data = cv2.imencode(".png", pixels)[1].tobytes()
+            atomic_write(folder / sub / f"{number}{ending}.png", data, sync=False)
 
 
 READER = DatasetReader(

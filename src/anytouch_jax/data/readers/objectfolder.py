@@ -1,51 +1,38 @@
-"""ObjectFolder 1.0 and 2.0 (Gao et al., CoRL 2021, CVPR 2022): touches of neural objects, rendered.
+"""ObjectFolder 1.0 and 2.0 (Gao et al., CoRL 2021, CVPR 2022): rendered touches of neural objects.
 
-Seen in AnyTouch's code: pictures `obj1.0/<id>/<n>.png` (by TACTO) and `obj2.0/touch/<id>/<n>.png` (by Taxim), with
-`obj2.0/label.json` (id -> material number) and `obj2.0/split.json` (train, test: lists of [id, n]) for both; ids up to
+Layout in AnyTouch's code: pictures `obj1.0/<id>/<n>.png` (by TACTO) and `obj2.0/touch/<id>/<n>.png` (by Taxim), with
+`obj2.0/label.json` (id -> material number) and `obj2.0/split.json` (train, test: lists of [id, n]) for both. Ids up to
 100 are 1.0, and 2.0 leaves them out. The material numbers have no names. ObjectFolder is CC BY 4.0 (its repository).
 
-Sensors are `tacto` and `taxim`, never trained on in the paper. The split is the benchmark's own and by picture, so an
-object is in train and test; every picture is a sequence of its own. Pictures in no list are `unused`.
+The sensors are `tacto` and `taxim`, never trained on in the paper. The split is the benchmark's and by picture, so an
+object is in train and test. Every picture is a sequence. Pictures in no list are `unused`.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from anytouch_jax.data.readers.common import (
-    Columns,
-    DatasetError,
-    DatasetReader,
-    IndexOptions,
-    Notes,
-    RowBuilder,
-    find_file,
-    listing,
-    numbered,
-    read_json,
-)
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_json
 
 LAST_OF_1 = 100
 PLACES = ("obj1.0", "obj2.0/touch", "touch", ".")
 
 
-def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
-    """Every picture of both parts that are there. Raises DatasetError without pictures, label.json or split.json."""
-    places = [place for place in PLACES if _ids(root / place)]
+def read(index: DatasetIndex) -> None:
+    """Add every picture of both parts. Raises DatasetError without pictures, label.json or split.json."""
+    places = [place for place in PLACES if _ids(index, place)]
     if not places:
-        raise DatasetError(f"expected obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png under {root}; is ROOT the "
+        raise DatasetError(f"expected obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png under {index.root}; is ROOT the "
                            "folder that holds 'obj1.0' and 'obj2.0'?")  # fmt: skip
-    labels, splits = _lists(root, options)
-    rows = RowBuilder("object", "dataset", "label.material")
+    labels, splits = _lists(index)
     for place in places:
         prefix = "" if place == "." else f"{place}/"
-        for name in _ids(root / place):
+        for name in _ids(index, place):
             first = int(name) <= LAST_OF_1
             if (place.endswith("touch") and first) or (place == "obj1.0" and not first):
-                notes.skip(f"id that does not belong to {place} (1.0 ends at {LAST_OF_1})", f"{prefix}{name}")
+                index.skip(f"id that does not belong to {place} (1.0 ends at {LAST_OF_1})", f"{prefix}{name}")
                 continue
-            frames = numbered(listing(root / place / name, notes)[1], r"(\d+)\.(?:png|jpe?g)", notes, f"{prefix}{name}")
-            rows.add(
+            files = index.listing(f"{place}/{name}")[1]
+            frames = index.numbered(files, r"(\d+)\.(?:png|jpe?g)", f"{prefix}{name}")
+            index.add(
                 [f"{prefix}{name}/{file}" for _, file in frames],
                 sensor="tacto" if first else "taxim",
                 dataset="objectfolder1" if first else "objectfolder2",
@@ -55,37 +42,37 @@ def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
                 object=name,
                 **{"label.material": labels.get(int(name))},
             )
-            notes.skip("id without a label (kept without)", f"{prefix}{name}", int(name) not in labels)
-    notes.skip("picture of split.json that is not on disk", str(next(iter(splits), "")), len(splits))
-    return rows.columns()
+            index.skip("id without a label (kept without)", f"{prefix}{name}", int(name) not in labels)
+    index.skip("picture of split.json that is not on disk", str(next(iter(splits), "")), len(splits))
 
 
-def _ids(folder: Path) -> list[str]:
-    return [name for name in listing(folder, Notes())[0] if name.isdecimal()] if folder.is_dir() else []
+def _ids(index: DatasetIndex, place: str) -> list[str]:
+    if not (index.root / place).is_dir():
+        return []
+    return [name for name in index.listing(place, count=False)[0] if name.isdecimal()]
 
 
-def _lists(root: Path, options: IndexOptions) -> tuple[dict[int, int], dict[tuple[int, int], str]]:
-    """id -> material number, and (id, n) -> split."""
-    found = []
-    for name in ("label.json", "split.json"):
-        path = find_file([name], options.lists, root / "obj2.0", root)
+def _lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple[int, int], str]]:
+    """Return id -> material number, and (id, n) -> split."""
+    folders = (index.root / "obj2.0", index.root)
+    paths = {name: index.find_file([name], *folders) for name in ("label.json", "split.json")}
+    for name, path in paths.items():
         if path is None:
-            raise DatasetError(f"expected {name} in {root / 'obj2.0'} or {root} (or say where with --lists)")
-        found.append((path, read_json(path)))
-    (label_path, label), (split_path, split) = found
+            raise DatasetError(f"expected {name} in {folders[0]} or {folders[1]}, or in the folder of --lists")
+    label, split = (read_json(path) for path in paths.values() if path is not None)
     splits: dict[tuple[int, int], str] = {}
     try:
         labels = {int(name): int(value) for name, value in label.items()}
         for part in ("train", "val", "test"):
             for name, number in split.get(part, []):
-                if splits.setdefault((int(name), int(number)), part) != part:
-                    raise DatasetError(f"{split_path}: [{name}, {number}] is in {splits[int(name), int(number)]} "
-                                       f"and in {part}")  # fmt: skip
+                key = int(name), int(number)
+                if splits.setdefault(key, part) != part:
+                    raise DatasetError(f"{paths['split.json']}: {list(key)} is in {splits[key]} and in {part}")
     except (AttributeError, TypeError, ValueError) as error:
         if isinstance(error, DatasetError):
             raise
-        raise DatasetError(f"{label_path} or {split_path} is not as expected (id -> number; train, test: lists of "
-                           f"[id, number]): {error}") from None  # fmt: skip
+        raise DatasetError(f"{' or '.join(map(str, paths.values()))} is not as expected (id -> number; train, test: "
+                           f"lists of [id, number]): {error}") from None  # fmt: skip
     return labels, splits
 
 

@@ -1,15 +1,15 @@
-"""Recordings of one's own: a folder of pictures is a recording, in ROOT or at any depth below it.
+"""Recordings of your own: a folder of pictures is a recording, in ROOT or at any depth below it.
 
-    mine/mug/pour_1/000.png ...         the object is the first folder; the recording is the folder itself
+    mine/mug/pour_1/000.png ...         the object is the first folder, the recording is the folder
     mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its name
     mine/mug/background.png             the untouched gel of every recording in or below this folder
-    mine/mug/photo.jpg                  a photograph of what is touched, likewise
-    mine/mug/caption.txt                words for what is felt, likewise
+    mine/mug/photo.jpg                  a photograph of the touched object, for the same recordings
+    mine/mug/caption.txt                a caption, for the same recordings
 
-Frames are taken in natural order (2 before 10). Their numbers are those at the end of their names where these count
-frames (some neighbours are one apart), so that a frame left out is a gap; else they are counted. Where numbers repeat
-behind different stems (left_0.png, right_0.png: two fingers), each stem is a sequence and a unit of its own. Whole
-objects, or recordings where there are none, are held out; with `--split-by recording` some recordings of each object.
+Frames are in natural order (2 before 10). Their numbers are those at the end of their names if these count frames, so
+that a missing frame is a gap; otherwise they are counted. If numbers repeat behind different stems (left_0.png,
+right_0.png: two fingers), each stem is a sequence and a unit. Whole objects, or recordings without objects, are held
+out; with `--split-by recording` some recordings of each object are.
 """
 
 from __future__ import annotations
@@ -19,60 +19,74 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+import pyarrow as pa
+
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling
-from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES, frame_numbers, frame_sort_key, split_series
-from anytouch_jax.data.readers import films, label_table
+from anytouch_jax.data.images import (
+    BACKGROUND,
+    PHOTO,
+    SUFFIXES,
+    ImageError,
+    count_frames,
+    frame_numbers,
+    frame_sort_key,
+    frames_from_video,
+    split_series,
+)
+from anytouch_jax.data.manifest.schema import typed_label
 from anytouch_jax.data.readers.common import (
     Columns,
     DatasetError,
+    DatasetIndex,
     DatasetReader,
     Frames,
     IndexOptions,
-    Notes,
-    RowBuilder,
-    add_recording,
-    walk,
+    read_csv,
 )
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_folder
 
 CAPTION = "caption.txt"
-MANIFESTS = (".csv", ".parquet")  # such as an earlier index
+MANIFESTS = (".csv", ".parquet")  # of an earlier index
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
+LABEL_KEYS = ("object", "sequence")
+PLAIN_COLUMNS = ("unit", "touch", "text")  # columns of a label table that do not become label.<name>
 
 
-def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
-    """Every folder of pictures. Raises UserError without a sensor."""
+def read(index: DatasetIndex) -> None:
+    """Add every folder of pictures. Raises UserError without a sensor."""
+    root, options = index.root, index.options
     known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
     if options.sensor is None or options.sensor in (*FIELD_SENSORS, UNIVERSAL):
-        raise UserError(f"say by --sensor what made these pictures: {', '.join(known)}, or the name of a new sensor")
+        raise UserError(f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new name")
     check_spelling(options.sensor)
-    found: list[tuple[str, dict[str, Frames]]] = []
-    beside: dict[str, dict[str, Any]] = {}  # what a folder and those above it hold for their recordings
     if options.export:
-        films.write_video_frames(root, notes)
-    for folder, folders, files in walk(root, notes):
-        beside[folder] = beside.get(folder.rpartition("/")[0], {}) | _beside(root, folder, files)
+        _export_videos(index)
+    recordings: list[tuple[str, dict[str, Frames]]] = []
+    shared: dict[str, dict[str, Any]] = {}  # folder -> cells from the files in it and in the folders above
+    for folder, folders, files in index.walk(root):
+        shared[folder] = shared.get(folder.rpartition("/")[0], {}) | _shared_cells(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
-            notes.skip(f"folder called {BACKGROUND} or {PHOTO}, of which one picture is wanted", folder)
+            index.skip(f"folder called {BACKGROUND} or {PHOTO}, where one picture is expected", folder)
             continue
-        files = [name for name in files if not _is_cut(name, folders)]
-        if fingers := _frames(files, notes, folder):
-            found.append((folder, fingers))
-    rows = RowBuilder("object", "unit", "background_path", "image_path", "text", "dataset")
-    splits = _splits([folder for folder, _ in found], options, notes)
-    for folder, fingers in found:
+        # A video with a folder of its name has been exported.
+        files = [name for name in files if not (_is_video(name) and Path(name).stem in folders)]
+        if fingers := _fingers(index, files, folder):
+            recordings.append((folder, fingers))
+    splits = _splits(index, [folder for folder, _ in recordings])
+    for folder, fingers in recordings:
         for unit, frames in fingers.items():
             sequence = f"{folder}/{unit}".strip("/") or "."
-            add_recording(rows, frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
-                          unit=unit or None, object=_object(folder) or None, dataset=root.name,
-                          **beside[folder])  # fmt: skip
-    columns = rows.columns()
-    columns["path"] = [path.lstrip("/") for path in columns["path"]]
+            index.add_recording(frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
+                                unit=unit or None, object=_object(folder) or None, dataset=root.name,
+                                **shared[folder])  # fmt: skip
     if options.labels is not None:
-        columns = label_table.join(columns, options.labels.expanduser(), notes)
+        index.table = join_labels(index.columns(), options.labels.expanduser(), index)
     for split in ("val", "test"):
-        if columns["path"] and split not in columns["split"] and getattr(options, split):
-            notes.log(f"there are too few objects or recordings for split {split}")
-    return columns
+        if recordings and split not in splits.values() and getattr(options, split):
+            index.notes.append(f"there are too few objects or recordings for split {split}")
 
 
 def _object(folder: str) -> str:
@@ -80,11 +94,10 @@ def _object(folder: str) -> str:
 
 
 def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]:
-    """The split of every group: sorted by SHA-256 of its name, the first round(val n) are val, the last round(test n)
-    test, the others train.
+    """Return the split of every group, by rank: sorted by SHA-256, the first are val, the last test, the others train.
 
-    A share above 0 gets at least one group, and a share left for train too; where groups are too few, train goes first,
-    then test. A group that is added or lost moves no other but at the two cuts, one at each.
+    The counts are the rounded shares. A share above 0 gets at least one group, and train too if it has a share; with
+    too few groups train comes first, then test. Adding or removing a group moves at most one other at each cut.
     """
     order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
     most = max(0, len(order) - (options.val + options.test < 1))
@@ -96,59 +109,155 @@ def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]
     return dict(zip(order, parts, strict=True))
 
 
-def _splits(folders: list[str], options: IndexOptions, notes: Notes) -> dict[str, str]:
-    """The split of every recording: that of its object, or, by recording, a part of each object's."""
+def _splits(index: DatasetIndex, folders: list[str]) -> dict[str, str]:
+    """Return the split of every recording: that of its object, or a part of each object's recordings."""
+    options = index.options
     objects: dict[str, list[str]] = {}
     for folder in folders:
         objects.setdefault(_object(folder), []).append(folder)
     if options.split_by == "recording":
         return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
     if len(objects) > 1 and options.val + options.test > 0:
-        notes.log("whole objects are held out; for a classifier of objects: --split-by recording")
+        index.notes.append("whole objects are held out; for a classifier of objects: --split-by recording")
     split = ranked_split(objects, options)
     return {folder: split[_object(folder)] for folder in folders}
 
 
-def _beside(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
-    """Background, photograph and caption that lie in a folder. Raises DatasetError for a caption that is no text."""
-    found: dict[str, Any] = {}
+def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
+    """Return the background, photograph and caption in a folder. Raises DatasetError for a caption that is no text."""
+    cells: dict[str, Any] = {}
     for name in files:
         path = f"{folder}/{name}".lstrip("/")
         stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
         if name.lower() == CAPTION:
             try:
-                found["text"] = " ".join((root / path).read_text(encoding="utf-8-sig").split()) or None
+                cells["text"] = " ".join((root / path).read_text(encoding="utf-8-sig").split()) or None
             except (OSError, UnicodeDecodeError) as error:
                 raise DatasetError(f"{root / path} cannot be read as UTF-8 text: {error}") from None
         elif suffix in SUFFIXES and stem in (BACKGROUND, PHOTO):
-            found["background_path" if stem == BACKGROUND else "image_path"] = path
-    return found
+            cells["background_path" if stem == BACKGROUND else "image_path"] = path
+    return cells
 
 
-def _is_cut(name: str, folders: list[str]) -> bool:
-    """Whether it is a film whose frames lie in a folder of its name."""
-    return Path(name).suffix.lower() in films.SUFFIXES and Path(name).stem in folders
-
-
-def _frames(files: list[str], notes: Notes, folder: str) -> dict[str, Frames]:
-    """The pictures of a folder in order with their numbers, by finger; arrays count where there is nothing else."""
+def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Frames]:
+    """Return the pictures of a folder in order with their numbers, by finger; arrays only if there is nothing else."""
     names = []
     for name in sorted(files, key=frame_sort_key):
-        stem, suffix = Path(name).stem.lower(), Path(name).suffix.lower()
+        path, stem, suffix = f"{folder}/{name}".lstrip("/"), Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
-        elif suffix in films.SUFFIXES:
-            notes.skip("film (--export writes its frames as pictures)", f"{folder}/{name}".lstrip("/"))
+        elif _is_video(name):
+            index.skip("video (--export writes its frames as pictures)", path)
         elif suffix not in (*SUFFIXES, *MANIFESTS) and name.lower() != CAPTION:
-            notes.skip("file that is no picture", f"{folder}/{name}".lstrip("/"))
-    pictures = [name for name in names if Path(name).suffix.lower() != ".npy"]
-    if pictures and len(pictures) < len(names):
-        arrays = [name for name in names if name not in pictures]
-        notes.skip("array beside pictures", f"{folder}/{arrays[0]}", len(arrays))
-        names = pictures
+            index.skip("file that is no picture", path)
+    arrays = [name for name in names if Path(name).suffix.lower() == ".npy"]
+    if arrays and len(arrays) < len(names):
+        index.skip("array next to pictures", f"{folder}/{arrays[0]}", len(arrays))
+        names = [name for name in names if name not in arrays]
     if not names:
         return {}
     return {unit: list(zip(frame_numbers(one), one, strict=True)) for unit, one in split_series(names).items()}
+
+
+# Videos --------------------------------------------------------------------------------------------------------------
+
+
+def _is_video(name: str) -> bool:
+    return Path(name).suffix.lower() in VIDEOS
+
+
+def _export_videos(index: DatasetIndex) -> None:
+    """Write the frames of every video as 000000.png, ... into a folder of its name, unless that exists.
+
+    A video that cannot be read is skipped. Raises UserError if nothing can be written.
+    """
+    for folder, folders, files in list(index.walk(index.root, count=False)):  # before any folder is made
+        existing = set(folders)
+        for name in files:
+            video = index.root / folder / name
+            if not _is_video(name) or video.stem in existing:
+                continue
+            existing.add(video.stem)
+            try:
+                _write_frames(index, video)
+            except ImageError:
+                index.skip("video that cannot be read", str(video))
+            except OSError as error:
+                raise UserError(f"the frames of {video} cannot be written beside it: {error.strerror}") from None
+
+
+def _write_frames(index: DatasetIndex, video: Path) -> None:
+    count = 0
+    with atomic_folder(video.with_suffix("")) as target:
+        for frame in frames_from_video(video):
+            data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
+            (target / f"{count:06d}.png").write_bytes(data)
+            count += 1
+    if 0.98 * (declared := count_frames(video)) > count + 2:  # some containers only estimate it
+        index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
+
+
+# Labels --------------------------------------------------------------------------------------------------------------
+
+
+def join_labels(columns: Columns, path: Path, index: DatasetIndex) -> Columns:
+    """Return `columns` with those of the CSV table `path`, joined by object or sequence; sequence goes first.
+
+    Lines without a recording, and recordings without a line, are skipped. Raises DatasetError for a table that is
+    missing, has no key, or has a column or a key twice.
+    """
+    names, lines = _read_labels(path)
+    size = len(columns["path"])
+    objects = columns.get("object", [None] * size)
+    labels: dict[str, list[Any]] = {name: [None] * size for name in names if name not in LABEL_KEYS}
+    used = set()
+    unlabelled: dict[str, None] = {}
+    for row, (obj, sequence) in enumerate(zip(objects, columns["sequence"], strict=True)):
+        keys = [key for key in ((obj, None), (None, sequence), (obj, sequence)) if any(key) and key in lines]
+        used.update(keys)
+        for key in keys:
+            for name, cell in lines[key].items():
+                labels[name][row] = cell or labels[name][row]
+        if not keys:
+            unlabelled[sequence] = None
+    for key in lines:
+        if key not in used:
+            index.skip(f"key of {path.name} that no recording has", ", ".join(part for part in key if part))
+    for sequence in unlabelled:
+        index.skip(f"recording without a line in {path.name}", sequence)
+    joined = dict(columns)
+    for name, cells in labels.items():
+        if not any(cells):
+            continue
+        if name in PLAIN_COLUMNS:
+            old = columns.get(name, [None] * size)
+            joined[name] = [new or before for new, before in zip(cells, old, strict=True)]
+        else:
+            full = name if name.startswith("label.") else f"label.{name}"
+            joined[full] = typed_label(pa.chunked_array([pa.array(cells, pa.string())])).to_pylist()
+    return joined
+
+
+def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | None], dict[str, str]]]:
+    """Return the columns of the table, and (object, sequence) -> the other cells; an empty key cell is None."""
+    rows = read_csv(path)
+    names = rows[0] if rows else []
+    if not set(LABEL_KEYS) & set(names):
+        raise DatasetError(
+            f"{path} has no column object or sequence, by which labels are joined; it has {', '.join(names)}"
+        )
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise DatasetError(f"{path} has the column {repeated[0]!r} twice")
+    lines: dict[tuple[str | None, str | None], dict[str, str]] = {}
+    for number, row in enumerate(rows[1:]):
+        cells = dict(zip(names, row, strict=False))
+        key = (cells.pop("object", None) or None, cells.pop("sequence", None) or None)
+        if not any(key):
+            raise DatasetError(f"{path}, row {number}: there is neither an object nor a sequence")
+        if key in lines:
+            raise DatasetError(f"{path}, row {number}: {', '.join(part for part in key if part)} is there twice")
+        lines[key] = {name: cell for name, cell in cells.items() if name}
+    return [name for name in names if name], lines
 
 
 READER = DatasetReader(
@@ -159,6 +268,6 @@ READER = DatasetReader(
     commercial=False,
     about="folders of pictures, a recording each",
     url="",
-    citation="nothing, unless their owner says so",
+    citation="nothing, unless their owner asks for it",
     uses=("val", "test", "split_by", "sensor", "labels", "export"),
 )

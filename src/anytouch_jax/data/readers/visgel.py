@@ -1,70 +1,47 @@
 """VisGel (Li et al., CVPR 2019): a robot pokes 195 objects with a GelSight while a camera watches.
 
-Seen in others' code: `images/touch/<...>/frame%04d.jpg`, the photograph of the same moment under the same path in
-`images/vision/` (AnyTouch); `data_seen/` and `data_unseen/` with two levels of folders as downloaded, `frame0000.jpg`
-the touch-free reference (T3). Assumed: the same `touch` / `vision` pair within `data_seen` and `data_unseen`.
-No licence is stated.
+Layout in others' code: `images/touch/<...>/frame%04d.jpg`, with the photograph of the same moment under the same path
+in `images/vision/` (AnyTouch); `data_seen/` and `data_unseen/` with two levels of folders as downloaded, where
+`frame0000.jpg` is the touch-free reference (T3). Assumed: the same `touch` / `vision` pair within `data_seen` and
+`data_unseen`. No licence is stated.
 
-`data_unseen` is the dataset's own test part. A recording is the group of the hash split otherwise. The authors' list
-`contact_visgel.csv` (from TacQuad's download) marks the contact frames where it is there.
+`data_unseen` is the dataset's own test part. Otherwise a recording is the group of the hash split. The authors' list
+`contact_visgel.csv` (from TacQuad's download) marks the contact frames.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from anytouch_jax.data.readers.common import (
-    Columns,
-    DatasetError,
-    DatasetReader,
-    IndexOptions,
-    Notes,
-    RowBuilder,
-    add_recording,
-    contact_list,
-    hash_split,
-    listing,
-    miss_listed,
-    numbered,
-    walk,
-)
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 
 PLACES = ("images/touch", "touch", "data_seen/touch", "data_unseen/touch", "images/data_seen/touch",
           "images/data_unseen/touch")  # fmt: skip
 
 
-def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
-    """Every recording under `touch` with its photographs under `vision`. Raises DatasetError when there is none."""
-    bases = [root / place for place in PLACES if (root / place).is_dir()]
+def read(index: DatasetIndex) -> None:
+    """Add every recording under `touch` with its photographs under `vision`. Raises DatasetError if there is none."""
+    bases = [index.root / place for place in PLACES if (index.root / place).is_dir()]
     if not bases:
-        raise DatasetError(
-            f"expected images/touch/<recording>/frame0000.jpg under {root}; is ROOT the folder that holds 'images'?"
-        )
-    listed = contact_list(root, options, ("contact_visgel.csv", "images/contact_visgel.csv"), "touch")
-    rows = RowBuilder("image_path", "background_path", "label.contact")
-    found = 0
+        raise DatasetError(f"expected images/touch/<recording>/frame0000.jpg under {index.root}; is ROOT the folder "
+                           "that holds 'images'?")  # fmt: skip
+    index.read_contact_list(("contact_visgel.csv", "images/contact_visgel.csv"), "touch")
     for base in bases:
-        place = base.relative_to(root).as_posix()
-        for inside, folders, files in walk(base, notes):
+        place = base.relative_to(index.root).as_posix()
+        for inside, folders, files in index.walk(base):
             if files and not folders:
-                found += _recording(rows, notes, root, place, inside, files, listed, options)
+                _add_recording(index, place, inside, files)
             elif files:
-                notes.skip("file that is not a frame by its name", f"{base / inside}/{files[0]}", len(files))
-    miss_listed(notes, listed, found)
-    return rows.columns()
+                index.skip("file that is not a frame by its name", f"{base / inside}/{files[0]}", len(files))
 
 
-def _recording(rows: RowBuilder, notes: Notes, root: Path, place: str, inside: str, files: list[str],
-               listed: dict[str, list[str]] | None, options: IndexOptions) -> int:  # fmt: skip
-    folder = f"{place}/{inside}"
-    frames = numbered(files, r"frame(\d+)\.jpe?g", notes, folder)
-    vision = f"{place.removesuffix('touch')}vision/{inside}"
-    photos = set(listing(root / vision, notes)[1]) if (root / vision).is_dir() else set()
-    notes.skip("photograph missing (kept without)", vision, sum(name not in photos for _, name in frames))
-    split = "test" if "data_unseen" in place else hash_split("visgel", inside, options)
-    return add_recording(
-        rows, frames, folder,
-        split=split, listed=listed, key=inside, sensor="gelsight", sequence=folder,
+def _add_recording(index: DatasetIndex, place: str, inside: str, files: list[str]) -> None:
+    folder, vision = f"{place}/{inside}", f"{place.removesuffix('touch')}vision/{inside}"
+    frames = index.numbered(files, r"frame(\d+)\.jpe?g", folder)
+    photos = set(index.listing(vision)[1]) if (index.root / vision).is_dir() else set()
+    index.skip("photograph missing (kept without)", vision, sum(name not in photos for _, name in frames))
+    index.add_recording(
+        frames, folder,
+        split="test" if "data_unseen" in place else index.split_of(inside),
+        key=inside, sensor="gelsight", sequence=folder,
         image_path=[f"{vision}/{name}" if name in photos else None for _, name in frames],
         background_path=f"{folder}/{frames[0][1]}" if frames and frames[0][0] == 0 else None,
     )  # fmt: skip

@@ -1,52 +1,36 @@
-"""YCB-Slide (Suresh et al., CoRL 2022): a DIGIT slid over ten YCB objects, five times 60 s at 30 Hz each.
+"""YCB-Slide (Suresh et al., CoRL 2022): a DIGIT slides over ten YCB objects, five times 60 s at 30 Hz each.
 
-Seen: the dataset's read-me: `real/<object>/dataset_{0..4}/frames/frame_%07d.jpg`; its licence is MIT. The webcam
+Layout (the dataset's read-me): `real/<object>/dataset_{0..4}/frames/frame_%07d.jpg`. The licence is MIT. The webcam
 pictures are left out, as in the paper, and so is the simulated part.
 
-Neighbouring frames differ too little: a clip takes every third, as AnyTouch does, so every row has stride 3 and keeps
-its own number. The object is the group of the hash split (with ten objects a share may stay empty).
+Neighbouring frames differ too little. A clip takes every third, as in AnyTouch, so every row has stride 3 and keeps
+its number. The object is the group of the hash split. With ten objects a share may stay empty.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from anytouch_jax.data.readers.common import (
-    Columns,
-    DatasetError,
-    DatasetReader,
-    IndexOptions,
-    Notes,
-    RowBuilder,
-    add_recording,
-    hash_split,
-    listing,
-    numbered,
-)
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 
 STRIDE = 3
 
 
-def read(root: Path, options: IndexOptions, notes: Notes) -> Columns:
-    """Every recording of every object. Raises DatasetError when there is none."""
-    place = next((p for p in ("real", "dataset/real") if (root / p).is_dir()), ".")
-    prefix = "" if place == "." else f"{place}/"
-    rows = RowBuilder("object", "stride")
-    recordings = 0
-    for obj in listing(root / place, notes)[0]:
-        for name in listing(root / place / obj, notes)[0]:
-            frames = f"{obj}/{name}/frames"
-            if not name.startswith("dataset_") or not (root / place / frames).is_dir():
-                notes.skip("folder that is no dataset_<k>/frames", f"{prefix}{obj}/{name}")
+def read(index: DatasetIndex) -> None:
+    """Add every recording of every object. Raises DatasetError if there is none."""
+    base = next((index.root / place for place in ("real", "dataset/real") if (index.root / place).is_dir()), index.root)
+    prefix, recordings = index.prefix(base), 0
+    for obj in index.listing(base)[0]:
+        for name in index.listing(base / obj)[0]:
+            folder = f"{obj}/{name}/frames"
+            if not name.startswith("dataset_") or not (base / folder).is_dir():
+                index.skip("folder that is no dataset_<k>/frames", f"{prefix}{obj}/{name}")
                 continue
             recordings += 1
-            found = numbered(listing(root / place / frames, notes)[1], r"frame_(\d+)\.jpe?g", notes, frames)
-            add_recording(rows, found, f"{prefix}{frames}", split=hash_split("ycb_slide", obj, options),
-                          sensor="digit", sequence=f"{obj}/{name}", object=obj, stride=STRIDE)  # fmt: skip
+            frames = index.numbered(index.listing(base / folder)[1], r"frame_(\d+)\.jpe?g", folder)
+            index.add_recording(frames, f"{prefix}{folder}", split=index.split_of(obj), sensor="digit",
+                                sequence=f"{obj}/{name}", object=obj, stride=STRIDE)  # fmt: skip
     if not recordings:
-        raise DatasetError(f"expected real/<object>/dataset_0/frames/frame_0000000.jpg under {root}; is ROOT the "
+        raise DatasetError(f"expected real/<object>/dataset_0/frames/frame_0000000.jpg under {index.root}; is ROOT the "
                            "folder that holds 'real'?")  # fmt: skip
-    return rows.columns()
 
 
 READER = DatasetReader(

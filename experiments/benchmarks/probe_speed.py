@@ -26,9 +26,9 @@ from sklearn.linear_model import LogisticRegression
 
 from anytouch_jax.evaluate import logistic
 from anytouch_jax.evaluate.array_probes import linear_probe
-from experiments.tables import asked
+from experiments.tables import env
 
-ROWS, OTHERS = asked.number("ROWS", 100_000), 10_000
+ROWS, OTHERS = env.number("ROWS", 100_000), 10_000
 WIDTH, CLASSES = 384, 20
 
 rng = np.random.default_rng(0)
@@ -51,7 +51,7 @@ print(
 )
 
 # %%
-if asked.switch("SKLEARN"):
+if env.switch("SKLEARN"):
     x = (features[train] - features[train].mean(0)) / features[train].std(0)
     ours = next(logistic.path(x, labels[train], CLASSES, [penalty])).loss
     start, spent = time.perf_counter(), time.process_time()

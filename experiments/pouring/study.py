@@ -23,7 +23,7 @@
 # untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only), `anytouch`.
 # `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is finished is
 # not done again. QUICK=1 is a trial of minutes; TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS (a thousand of
-# 84 pixels take 9 GB at the most), TUNE (steps of fine-tuning), MODES, NAME (of the page and its folder) and OUT in
+# 84 pixels take 9 GB at the most), TUNE (steps of fine-tuning), MODES, NAME (of the page) and OUT in
 # the environment change the size and the place.
 
 # %%
@@ -51,21 +51,21 @@ from experiments.pouring import table
 from experiments.pouring import trials as pouring
 from experiments.pouring import tuning as pouring_tuning
 from experiments.pouring.physics import VERSION, Task
-from experiments.tables import asked, page, plan
-from experiments.tables.results import noted
+from experiments.records import read_records, write_record
+from experiments.tables import env, page, plan
 from experiments.tables.work import Work
 
 enable_compilation_cache()
 
-QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
-RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
-SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
-MODES = asked.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", table.MODES)
-TRIALS, DEMOS = asked.number("TRIALS", 10 if QUICK else 60), asked.number("DEMOS", 12 if QUICK else 1000)
-TUNE = asked.number("TUNE", 20 if QUICK else max(400, DEMOS))
-OUT = asked.path("OUT", "experiments/results")
-NAME = asked.path("NAME", "pouring-quick" if QUICK else "pouring").name
-FOLDER, PAGE = OUT / NAME, OUT / f"{NAME}.md"
+QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+RUNS, STUDY = env.runs(), env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
+SEEDS = env.numbers("SEEDS", "0" if QUICK else "0,1,2")
+MODES = env.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", table.MODES)
+TRIALS, DEMOS = env.number("TRIALS", 10 if QUICK else 60), env.number("DEMOS", 12 if QUICK else 1000)
+TUNE = env.number("TUNE", 20 if QUICK else max(400, DEMOS))
+OUT = env.path("OUT", "experiments/results")
+NAME = env.path("NAME", "pouring-quick" if QUICK else "pouring").name
+RESULTS, PAGE = OUT / f"{NAME}.jsonl", OUT / f"{NAME}.md"
 TASK = Task()
 
 if unknown := set(RUNS) - set(table.PAPER):
@@ -119,8 +119,8 @@ SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS, "version": VERSION, "poli
 SETTINGS |= {name: value for name, value in LEARNING.items() if not name.startswith("tune")}
 
 
-def path_of_row(name: str, mode: str, seed: int) -> Path:
-    return FOLDER / f"{name}-{mode}-{seed}.json"
+def key_of_row(name: str, mode: str, seed: int) -> str:
+    return f"{name}-{mode}-{seed}"
 
 
 def settings_of(mode: str) -> dict[str, Any]:
@@ -128,13 +128,10 @@ def settings_of(mode: str) -> dict[str, Any]:
     return SETTINGS | (tuning if mode == "fine-tuned" else {})
 
 
-def finished(path: Path, settings: dict[str, Any], source: str) -> bool:
-    """Whether a row is there with these settings; one of another encoder or size is done again."""
-    found = noted(path)
-    return bool(found.get("settings") == settings and found.get("source") == source)
-
-
-FOLDER.mkdir(parents=True, exist_ok=True)
+def finished(key: str, settings: dict[str, Any], source: str) -> bool:
+    """Return whether a row has a record of these settings and this encoder."""
+    record = read_records(RESULTS).get(key, {})
+    return bool(record.get("settings") == settings and record.get("source") == source)
 
 
 def do_seed(seed: int) -> None:
@@ -150,8 +147,9 @@ def do_seed(seed: int) -> None:
         return shown[side]
 
     def write(name: str, mode: str, trials: pouring.Trials, source: str, since: float, **about: float) -> None:
-        path, about["seconds"] = path_of_row(name, mode, seed), round(time.time() - since, 1)
-        atomic_write(path, table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about))
+        about["seconds"] = round(time.time() - since, 1)
+        record = table.record(name, mode, seed, trials, TASK, source, settings_of(mode), about)
+        write_record(RESULTS, key_of_row(name, mode, seed), record)
         mean = pouring.error(trials.poured, TASK.target).mean
         print(f"seed {seed}, {name}, {mode}: {mean:.1f} g, {about['seconds']:.0f} s", flush=True)
 
@@ -162,7 +160,7 @@ def do_seed(seed: int) -> None:
         "expert": lambda: pouring.Expert(TASK),
     }
     for name, make in bounds.items():
-        if not finished(path_of_row(name, "bound", seed), SETTINGS, name):
+        if not finished(key_of_row(name, "bound", seed), SETTINGS, name):
             since = time.time()
             write(name, "bound", pouring.run(TASK, setups, keys, make()), name, since)
     for name in table.PAPER:
@@ -172,7 +170,7 @@ def do_seed(seed: int) -> None:
                 print(f"no run is given for row {name}: it is left out")
             continue
         source = source_of(name, seed, encoder)
-        left = [m for m in MODES if not finished(path_of_row(name, m, seed), settings_of(m), source)]
+        left = [m for m in MODES if not finished(key_of_row(name, m, seed), settings_of(m), source)]
         todo = sorted(left, key=("frozen", "fine-tuned").index)  # fine-tuning goes on from the frozen policy
         if not todo:
             continue
@@ -216,11 +214,11 @@ if not TABLE or not (figures / "pouring.gif").exists():
 # ## The table
 
 # %%
-rows = table.read_rows(FOLDER)
+rows = table.read_rows(RESULTS)
 runs = {run for row in rows for run in row.runs}
 seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
 fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
-picture = f"{FOLDER.name}.png"
+picture = f"{NAME}.png"
 table.draw(figures / picture, rows)
 settings = max((row.settings for row in rows), key=len)
 told = json.loads(settings)
@@ -242,7 +240,7 @@ flow and the load, {VERSION} now):
 ![frames](figures/pouring_frames.png)
 ![film](figures/pouring.gif)
 
-Made by `SEEDS={",".join(seeds)} make pouring`, from the JSON in `{FOLDER.name}/`.{other}
+Made by `SEEDS={",".join(seeds)} make pouring`, from `{NAME}.jsonl`.{other}
 """
 atomic_write(PAGE, text)
 print(text)

@@ -1,4 +1,4 @@
-"""The pouring table in the paper's form, made from the JSON of its rows alone (Sec. Q3, table "real-world pouring")."""
+"""The pouring table in the form of the paper's Table 4, made from the records of its rows alone."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown, seed_interval, verdict
 from experiments.pouring.physics import Task
 from experiments.pouring.trials import Error, Trials, error
+from experiments.records import read_records
 
 Array = npt.NDArray[Any]
 MODES = ("fine-tuned", "frozen")
@@ -77,33 +78,32 @@ def record(
     source: str,
     settings: Mapping[str, Any],
     about: Mapping[str, Any],
-) -> str:
-    """The JSON of a row's trials with one seed; `about`: what else is known of it (seconds, the loss of learning)."""
+) -> dict[str, Any]:
+    """Return the record of a row's trials with one seed; `about` adds seconds and the loss of learning."""
     found = error(trials.poured, task.target)
     values = {
         "row": name, "mode": mode, "seed": seed, "target": task.target, "source": source, "settings": dict(settings),
         "poured": [round(float(x), 3) for x in trials.poured], "steps": [int(x) for x in trials.steps],
         "mean_error": round(found.mean, 3), "limit": task.limit,
     }  # fmt: skip
-    return json.dumps(values | dict(about), indent=2) + "\n"
+    return values | dict(about)
 
 
-def read_rows(folder: Path) -> list[Row]:
-    """The rows of a folder of JSON files. Raises UserError for one that cannot be read, other settings, or none."""
+def read_rows(path: Path) -> list[Row]:
+    """Return the rows of a file of results. Raises UserError for a record that is no row, other settings, or no row."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for path in sorted(folder.glob("*.json")):
+    for key, one in read_records(path).items():
         try:
-            one = json.loads(path.read_text(encoding="utf-8"))
             found.setdefault((one["row"], one["mode"]), []).append(one)
-        except (ValueError, KeyError, TypeError) as bad:
-            raise UserError(f"{path} is not the result of a pouring row ({bad}); remove it and run again") from None
+        except KeyError as missing:
+            raise UserError(f"{path}: the record {key} of a pouring row has no {missing}. Remove its line.") from None
     if not found:
-        raise UserError(f"no result of a pouring row in {folder}; run experiments/pouring.py")
+        raise UserError(f"{path} has no result. Run python -m experiments.pouring.study.")
     for tuned in (False, True):
         common = {json.dumps(one, sort_keys=True) for one in _settings(found, tuned)}
         if len(common) > 1:
             raise UserError(
-                f"rows of {folder} were run with different settings ({'; '.join(sorted(common))}); remove the old"
+                f"rows of {path} were run with different settings ({'; '.join(sorted(common))}); remove the old"
             )
     return [_row(name, mode, parts) for (name, mode), parts in found.items()]
 

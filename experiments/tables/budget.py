@@ -1,12 +1,12 @@
-"""What the matrix costs, and how it is cut.
+"""Costs of the matrix of experiments, and its parts of equal cost.
 
-Rates are medians of the 83 trainings and 96 runs of `results/matrix/`, most made two at a time on two slow CPU cores
-with a load of 2 to 8; alone on a quiet machine a training takes about two thirds. At preset tiny with 112 pixels: stage
+Rates are medians of 83 trainings and 96 runs, most made two at a time on two slow CPU cores with a load of 2 to 8.
+Alone on a quiet machine a training takes about two thirds. At preset tiny with 112 pixels: stage
 1 1.15 s a step of 64; stage 2 4.7 s a step of 32, of which the touch to align 1.2 s, photographs 0.3 s, text 0.2 s and
 the three touches of a match 3.0 s; in proportion to the tokens for smaller pictures, to the weights for smaller towers
 (but seven tenths of stage 1, its decoder and pixels, are the same for all); 100 simulated frames a second and 10 s for
 the program of a sensor; about 25 s to start and end a training; a run's scores 6 to 350 s (220 s for those of real
-touch are reckoned: its recordings are tested in ten folds). `matrix.py --plan` prints the sum for any size; eight
+touch are reckoned: its recordings are tested in ten folds). `--plan` prints the sum for any size; eight
 chunks, each of which makes its data again, stay below 75 minutes. Two processes side by side (`--jobs 2`) do 1.35
 times as much an hour.
 """
@@ -103,7 +103,7 @@ def chunk(leaves: Sequence[Leaf], number: int, of: int) -> list[Leaf]:
 
 
 def lines(leaves: Sequence[Leaf], done: Iterable[str] = ()) -> list[str]:
-    """The plan for people: each run with its minutes, what it shares, and the sum. `done`: files that are there."""
+    """Return the plan as text: each run with its minutes and shared trainings, and the sum. `done` are keys of runs."""
     there, seen = set(done), set[str]()
     found, seconds = [], costs(leaves)
     for leaf, one in zip(leaves, seconds, strict=True):
@@ -111,9 +111,9 @@ def lines(leaves: Sequence[Leaf], done: Iterable[str] = ()) -> list[str]:
         shared = sum(key in seen for key in keys)
         seen |= set(keys)
         share = f"{len(keys) - shared} to train, {shared} shared" if keys else "nothing to train"
-        mark = "done" if leaf.file in there else f"{one / 60:5.1f} min"
+        mark = "done" if leaf.key in there else f"{one / 60:5.1f} min"
         found.append(f"{leaf.question:11} {leaf.name:32} seed {leaf.seed}  {mark:>9}  {share}")
-    left = sum(one for leaf, one in zip(leaves, seconds, strict=True) if leaf.file not in there)
+    left = sum(one for leaf, one in zip(leaves, seconds, strict=True) if leaf.key not in there)
     found.append(
         f"{len(leaves)} runs, {len(seen)} trainings, {sum(seconds) / 60:.0f} min; {left / 60:.0f} min are left"
     )

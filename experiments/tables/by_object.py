@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, statistics
 from anytouch_jax.evaluate.statistics import markdown
 
@@ -37,11 +38,11 @@ def probed(
 
 
 def gathered(several: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, Right]:
-    """Rows of each object, and what each set of features got right of them, seed by seed. Raises SystemExit when the
+    """Rows of each object, and what each set of features got right of them, seed by seed. Raises UserError when the
     seeds were not scored on the same rows."""
     counts = [one["objects"] for one in several]
     if any(count != counts[0] for count in counts):
-        raise SystemExit("the files of these seeds are of different data: make them anew, without TABLE=1")
+        raise UserError("the records of these seeds are of different data: run this page without TABLE=1")
     right = {name: [np.array(one["right"][name]) for one in several] for name in several[0]["right"]}
     return np.array(list(counts[0].values())), right
 

@@ -41,7 +41,7 @@ path = page.picture(runs)
 # ## What order and change are worth, model by model
 
 # %%
-for name in ("anytouch", "static_only", "no_flips", "frame_differences", "force_heads"):
+for name in ("anytouch", "static_only", "no_flips"):
     for number, task in enumerate(("slip", "force", "twist", "slide")):
         found = {view: spread(runs, "dynamics", name, dynamic(view)[number]) for view in VIEWS}
         if all(found.values()):

@@ -6,7 +6,6 @@ there is nothing else to do.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -14,10 +13,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_write
+from experiments.records import read_records, write_record
 from experiments.tables import budget, plan
 from experiments.tables.plan import Leaf, Scenes, Size, Training
-from experiments.tables.results import differences, noted, simulated
+from experiments.tables.results import differences, simulated
 
 Log = Callable[[str], None]
 PAUSE = 5.0  # s until what others work on is looked at again
@@ -43,7 +42,7 @@ class Work(Protocol):
 
 
 class Outcome(NamedTuple):
-    """Files of the runs: finished in this call, found finished, left for want of time, and {file: what went wrong}."""
+    """Keys of the runs: finished in this call, found finished, left for want of time, and {key: what went wrong}."""
 
     made: list[str]
     found: list[str]
@@ -52,11 +51,11 @@ class Outcome(NamedTuple):
 
 
 def is_done(leaf: Leaf, out: Path) -> bool:
-    """Whether `out` has the JSON of just this run."""
-    return bool(noted(out / leaf.file).get("identity") == leaf.identity)
+    """Return whether the file of results `out` has a record of this very run."""
+    return bool(read_records(out).get(leaf.key, {}).get("identity") == leaf.identity)
 
 
-def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
+def check_results(leaves: Sequence[Leaf], out: Path) -> None:
     """Raise UserError where `out` holds results of one of these questions of another simulator or of other settings.
 
     They would stand in one table, and a part of what is there would be written over.
@@ -65,9 +64,8 @@ def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
         return
     size, questions = leaves[0].size, {leaf.question for leaf in leaves}
     ours = {"simulator": plan.simulator(), "settings": plan.settings(size), "size": size.name}
-    for path in sorted(out.glob("*.json")):
-        theirs = noted(path)
-        if theirs.get("question") not in questions:  # or broken: it is made again
+    for theirs in read_records(out).values():
+        if theirs.get("question") not in questions:
             continue
         if simulated(theirs) != ours["simulator"]:
             what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
@@ -77,7 +75,7 @@ def check_folder(leaves: Sequence[Leaf], out: Path) -> None:
             continue
         raise UserError(
             f"{out} holds results of {theirs['question']} of {what}: give a new folder, for example "
-            f"make experiments OUT=runs/study, or move {theirs['question']}-*.json away to make them anew"
+            f"make experiments OUT=runs/study, or remove the lines of {theirs['question']} to run them again"
         )
 
 
@@ -91,7 +89,7 @@ def execute(
     clock: Callable[[], float] = time.monotonic,
     pause: Callable[[float], None] = time.sleep,
 ) -> Outcome:
-    """Do the runs in order, a JSON each; stop before one that would not fit in `minutes`.
+    """Do the runs in order, a record each; stop before one that would not fit in `minutes`.
 
     How long things take is estimated by `budget`, corrected by what they took in this call. A run that fails is told
     and left out; the others go on. Raises UserError when not even the first run fits.
@@ -103,36 +101,36 @@ def execute(
         later: list[Leaf] = []  # another process works on these, or on what they need
         for leaf in waiting:
             if is_done(leaf, out):
-                result.found.append(leaf.file)
+                result.found.append(leaf.key)
                 continue
             expected, spent = budget.cost(leaf, work.ready(leaf)), clock() - start
             seconds = expected * (max(1.0, (spent - waited) / planned) if planned else 1.0)
             if minutes is not None and spent + seconds > 60 * minutes:
                 if not (result.made or result.failed or told):
                     raise UserError(
-                        f"{leaf.file} takes about {expected / 60:.0f} minutes with what it needs, and MINUTES is "
+                        f"{leaf.key} takes about {expected / 60:.0f} minutes with what it needs, and MINUTES is "
                         f"{minutes:g}; give more"
                     )
-                rest = [one.file for one in leaves if one.file not in result.failed and not is_done(one, out)]
+                rest = [one.key for one in leaves if one.key not in result.failed and not is_done(one, out)]
                 log(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
                 return result._replace(left=rest)
 
             def begin(leaf: Leaf = leaf, seconds: float = seconds) -> None:
-                if leaf.file not in told:
-                    log(f"{leaf.file}: about {seconds / 60:.1f} min")
-                    told.add(leaf.file)
+                if leaf.key not in told:
+                    log(f"{leaf.key}: about {seconds / 60:.1f} min")
+                    told.add(leaf.key)
 
-            with work.claim(leaf.file) as mine:
+            with work.claim(leaf.key) as mine:
                 try:
                     done = mine and (is_done(leaf, out) or _one(leaf, work, out, begin))
                 except (UserError, RuntimeError, MemoryError) as error:  # XLA's are RuntimeErrors
                     what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-                    log(f"{leaf.file} failed: {what}")
-                    result.failed[leaf.file] = what
+                    log(f"{leaf.key} failed: {what}")
+                    result.failed[leaf.key] = what
                     done = None
             planned += expected - (0.0 if done else budget.cost(leaf, work.ready(leaf)))
             if done:
-                result.made.append(leaf.file)
+                result.made.append(leaf.key)
             elif done is not None:
                 later.append(leaf)
         if len(later) == len(waiting):
@@ -166,6 +164,5 @@ def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
     begin()
     about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
     about |= {"identity": leaf.identity, "simulator": plan.simulator(), "scoring": plan.scoring(leaf.question)}
-    out.mkdir(parents=True, exist_ok=True)
-    atomic_write(out / leaf.file, json.dumps(about | work.score(leaf), indent=1, allow_nan=False) + "\n")
+    write_record(out, leaf.key, about | work.score(leaf))
     return True

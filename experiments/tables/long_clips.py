@@ -16,36 +16,35 @@
 #
 #     make long-clips RUN=runs/stage2 DATA=data/scenes/manifest.parquet
 #
-# `OUT=` is where the page, its picture and the folder `long_clips/` (a JSON file for each length) go, `ROWS=` how many
-# moments of a task at most. A length whose file is there, of this encoder and these data, is not done again. `QUICK=1`
-# is a trial of a minute or two, and `TABLE=1` makes the page anew from the files alone.
+# `OUT=` is the folder of the page, its picture and `long_clips.jsonl`, which has a line for each length. `ROWS=` is the
+# largest number of moments of a task. A length that was measured with the same encoder and data is not measured again.
+# `QUICK=1` is a trial of a minute or two. `TABLE=1` makes the page from `long_clips.jsonl` alone.
 
 # %%
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, plots, tasks
 from anytouch_jax.evaluate.statistics import markdown
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
-from experiments.tables import asked, page
-from experiments.tables.results import noted
+from experiments.records import read_records, write_record
+from experiments.tables import env, page
 
-RUN, DATA = asked.path("RUN", "runs/stage2"), asked.path("DATA", "data/scenes/manifest.parquet")
-QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
-OUT, NAME = asked.path("OUT", "experiments/results"), "long_clips-quick" if QUICK else "long_clips"
-ROWS = asked.number("ROWS", 100 if QUICK else 1500)
+RUN, DATA = env.path("RUN", "runs/stage2"), env.path("DATA", "data/scenes/manifest.parquet")
+QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+OUT, NAME = env.path("OUT", "experiments/results"), "long_clips-quick" if QUICK else "long_clips"
+ROWS = env.number("ROWS", 100 if QUICK else 1500)
 ROUNDS, BATCH = (3, 8) if QUICK else (9, 32)
 LOOKS = [(1, "mean"), (3, "mean"), *((frames, join) for frames in (5, 7) for join in ("mean", "sum", "concat"))]
 LONGEST = max(frames for frames, _ in LOOKS)
@@ -115,28 +114,21 @@ def milliseconds(encoder: Encoder) -> list[float]:
 # ## Look by look
 
 # %%
-FOLDER = OUT / NAME
-FOLDER.mkdir(parents=True, exist_ok=True)
+RESULTS = OUT / f"{NAME}.jsonl"
 SETTINGS: dict[str, Any] = {"version": 2, "rows": ROWS, "rounds": ROUNDS, "batch": BATCH}
 if not TABLE:
     SETTINGS |= {"encoder": encoder.mark, "manifest": table.content_hash}
 
 
-def finished(path: Path) -> dict[str, Any] | None:
-    """What was measured with these settings, if it was; with TABLE=1 whatever was measured."""
-    found = noted(path)
-    return found if found and (TABLE or found.get("settings") == SETTINGS) else None
-
-
-def make(name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    path = FOLDER / f"{name}.json"
-    found = finished(path)
-    if found is None and TABLE:
-        raise SystemExit(f"there is no {path}: run this page without TABLE=1")
-    if found is None:
-        found = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": SETTINGS} | measure()
-        atomic_write(path, json.dumps(found, indent=1) + "\n")
-    return found
+def make(key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the record of a length, measured first unless it was measured with these settings."""
+    record = read_records(RESULTS).get(key)
+    if TABLE and record is None:
+        raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
+    if record is None or not (TABLE or record["settings"] == SETTINGS):
+        record = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": SETTINGS} | measure()
+        write_record(RESULTS, key, record)
+    return record
 
 
 def seen(frames: int, join: Any) -> dict[str, Any]:

@@ -9,19 +9,19 @@
 # %% [markdown]
 # # A new sensor in minutes
 #
-# You have twenty frames of a sensor that AnyTouch never saw. Universal tokens serve it as they are (Sec. 3.5 of the
-# paper). Does it help to fit tokens of its own, with everything else frozen, and do labels of these frames help more?
+# You have twenty labelled frames of a sensor that AnyTouch was not trained on. Universal tokens serve it untrained
+# (Sec. 3.5 of the paper). Does it help to fit new tokens to these frames, with everything else frozen?
 #
-#     anytouch adapt --run runs/stage1 --data mine.csv --sensor my_gel --frames 18 --out runs/my_gel
+#     anytouch adapt --run runs/stage2 --data mine.csv --sensor my_gel --labels label.material --out runs/my_gel
 #     make experiments ONLY=new_sensor
 #
-# DuraGel is left out of training. 0, 4, 18 and 100 of its frames are given, with or without labels; the dashed line
-# is a model that was trained on it.
+# DuraGel is left out of training. The probes get 0, 4, 18 and 100 labelled frames of it. The dashed line is a model
+# that was trained on it.
 
 # %%
 from __future__ import annotations
 
-from experiments.tables import adaptation, page
+from experiments.tables import page, scores
 from experiments.tables.results import Column, spread
 
 runs = page.runs("new_sensor")
@@ -39,8 +39,8 @@ path = page.picture(runs)
 # A share of a gap means something only where there is one: accuracy with nothing of the sensor, and trained on it.
 
 # %%
-for name, view in (("left_out", "universal, 0 unlabelled"), ("seen", "seen")):
-    for task in adaptation.TASKS:
+for name, view in (("left_out", scores.NOTHING), ("seen", "seen")):
+    for task in scores.STATIC:
         found = spread(runs, "new_sensor", name, Column(task, view, task))
         print(f"{name:9} {task:10} {'not run' if found is None else f'{found[0]:.1f} %'}")
 

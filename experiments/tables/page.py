@@ -1,7 +1,7 @@
 """What the notebooks share: where the results are, how a picture and a text are shown, in Jupyter or in a terminal, and
 the scores of a checkpoint of one's own.
 
-`RESULTS=` and `FIGURES=` in the environment say where JSON files are read and pictures are written, `RUN=` which run is
+`RESULTS=` and `FIGURES=` in the environment say where results are read and pictures are written, `RUN=` which run is
 scored beside them, and `DATA=` on what: a folder of simulated data sets as the matrix makes them, or, for real touch, a
 manifest.
 """
@@ -21,7 +21,7 @@ from experiments.tables.results import Run, differences, read
 from experiments.tables.work import Work
 
 ROOT = Path(__file__).resolve().parents[2]
-DEFAULT = ROOT / "experiments" / "results" / "matrix"
+DEFAULT = ROOT / "experiments" / "results" / "matrix.jsonl"
 # The run whose row a checkpoint stands beside, and the size whose rows and refits it is scored with.
 BESIDE = {"q1": "+".join(plan.SENSORS), "q2": "matched", "new_sensor": "left_out"}
 SIZE = plan.FULL
@@ -29,12 +29,12 @@ SIZE = plan.FULL
 
 def runs(question: str) -> list[Run]:
     """The runs of a question; tells what to do where there are none."""
-    folder = Path(os.environ.get("RESULTS") or DEFAULT)
-    found = [run for run in read(folder) if run.question == question] if folder.is_dir() else []
+    results = Path(os.environ.get("RESULTS") or DEFAULT)
+    found = [run for run in read(results) if run.question == question]
     if not found:
-        text(f"**{folder} holds no result of `{question}`: `make experiments ONLY={question}` makes them.**")
+        text(f"**{results} holds no result of `{question}`: `make experiments ONLY={question}` makes them.**")
     if wrong := differences([run.about for run in found]):
-        text(f"**The results of `{question}` in {folder} differ in what they must share ({wrong}): none is shown.**")
+        text(f"**The results of `{question}` in {results} differ in what they must share ({wrong}): none is shown.**")
         return []
     return found
 

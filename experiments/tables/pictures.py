@@ -1,4 +1,4 @@
-"""The pictures of the results, drawn from the JSON files alone."""
+"""The pictures of the results, drawn from the records alone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.evaluate import plots
-from experiments.tables import adaptation, paper, questions, real
+from experiments.tables import paper, questions, real, scores
 from experiments.tables.results import Column, Run, change, spread, values
 from experiments.tables.tables import commonest, title
 
@@ -168,11 +168,11 @@ def dynamics(runs: Sequence[Run], path: Path) -> Path:
 
 def new_sensor(runs: Sequence[Run], path: Path) -> Path:
     """Accuracy on a sensor left out against how many frames of it there are."""
-    figure, axes = _panels(1, len(adaptation.TASKS), 3.4, 3.2)
-    counts = (0, *adaptation.FRAMES)
-    for axis, task in zip(axes, adaptation.TASKS, strict=True):
-        zero = spread(runs, "new_sensor", "left_out", Column(task, "universal, 0 unlabelled", task))
-        for number, kind in enumerate(("fitted, {} unlabelled", "universal, {} labelled", "fitted, {} labelled")):
+    figure, axes = _panels(1, len(scores.STATIC), 3.4, 3.2)
+    counts = (0, *scores.FRAMES)
+    for axis, task in zip(axes, scores.STATIC, strict=True):
+        zero = spread(runs, "new_sensor", "left_out", Column(task, scores.NOTHING, task))
+        for number, kind in enumerate(("universal, {} labelled", "fitted, {} labelled")):
             later = [spread(runs, "new_sensor", "left_out", Column(task, kind.format(n), task)) for n in counts[1:]]
             _line(axis, [zero, *later], kind.replace(" {}", ""), f"C{number}", bars=False)
         goal = spread(runs, "new_sensor", "seen", Column(task, "seen", task))

@@ -67,7 +67,7 @@ class Size:
     rate1: float = 1e-3
     rate2: float = 1e-3
     temperature: float = 0.2
-    match_head: Literal["mlp", "linear", "cosine", "none"] = "cosine"
+    match_head: Literal["mlp", "cosine", "none"] = "cosine"
     match_weight: float = 4.0
     match_keep: float = 0.5
     negatives: Literal["any", "same_sensor"] = "same_sensor"
@@ -140,9 +140,9 @@ class Leaf:
     tower: bool = False
 
     @property
-    def file(self) -> str:
-        """The name of its JSON file."""
-        return f"{self.question}-{self.name}-{self.seed}.json"
+    def key(self) -> str:
+        """The name of its record in the file of results."""
+        return f"{self.question}-{self.name}-{self.seed}"
 
     @property
     def trainings(self) -> tuple[Training, ...]:
@@ -290,8 +290,6 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
         for name in ("unitouch", "no_matching"):
             yield "restricted", name, own(name, sensors=RESTRICTED, aligned=False), False
         yield "dynamics", "no_flips", own("anytouch", data={"flip": 0.0}), False
-        for name in ("frame_differences", "force_heads"):
-            yield "dynamics", name, own(name), False
         paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0, negatives="any")  # the paper's
         yield "q2", "matched_mlp", training(paired, "anytouch", seed), False
 

@@ -18,7 +18,7 @@
 #     make train-stage1 DATA=../shared/real_touch/manifest.csv STEPS=1500
 #     make train-stage2 DATA=../shared/real_touch/manifest.csv STEPS=200 BATCH=32
 #
-# Then `.venv/bin/python experiments/real_touch.py` prints the tables and writes `experiments/results/real_touch.md`
+# Then `python -m experiments.tables.real_touch` prints the tables and writes `experiments/results/real_touch.md`
 # and `.json`. DATA=, STAGE1=, STAGE2=, OUT= and LABELLED_STEPS= in the environment change what it reads and writes.
 
 # %%
@@ -48,11 +48,11 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.train.loop import fit
 from anytouch_jax.weights import checkpoint
-from experiments.tables import asked
+from experiments.tables import env
 
-DATA, OUT = asked.path("DATA", "../shared/real_touch/manifest.csv"), asked.path("OUT", "experiments/results")
-STAGE1, STAGE2 = asked.path("STAGE1", "runs/stage1"), asked.path("STAGE2", "runs/stage2")
-LABELLED, LABELLED_STEPS = asked.path("LABELLED", "runs/labelled"), asked.number("LABELLED_STEPS", 600)
+DATA, OUT = env.path("DATA", "../shared/real_touch/manifest.csv"), env.path("OUT", "experiments/results")
+STAGE1, STAGE2 = env.path("STAGE1", "runs/stage1"), env.path("STAGE2", "runs/stage2")
+LABELLED, LABELLED_STEPS = env.path("LABELLED", "runs/labelled"), env.number("LABELLED_STEPS", 600)
 
 manifest = manifests.read(DATA)
 params, text, about = checkpoint.load_params(STAGE1)

@@ -1,4 +1,4 @@
-"""`experiments/results/README.md`, rendered from the JSON files of the runs alone, and its pictures."""
+"""`experiments/results/README.md`, rendered from `matrix.jsonl` alone, and its pictures."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Any
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown
 from anytouch_jax.files import atomic_write
-from experiments.tables import pictures, questions, real_table
+from experiments.tables import pictures, questions
 from experiments.tables.plan import LABELS
 from experiments.tables.questions import Part
 from experiments.tables.results import CLAIM, NOT_NOTED, Run, comparable, differences, drawn, read, simulated
 from experiments.tables.tables import by_chance, tally
 
-_INTRO = f"""Made by `make experiments` from the JSON files in `matrix/` alone; `make experiments RENDER=1` makes it
-again from them without running anything. Every number is the mean over seeds of training, with its 95 % interval over
+_INTRO = f"""Made by `make experiments` from `matrix.jsonl` alone. `make experiments RENDER=1` makes it
+again without running anything. Every number is the mean over seeds of training, with its 95 % interval over
 seeds (Student's t; of two seeds the two numbers themselves, and with one seed the interval of the run itself, over
 test objects). Accuracies are in %, by a linear probe of frozen features on objects never touched in training. Protocol
 `honest`: the penalty is chosen without the test set.
 
 An interval over seeds is one of trainings for these test objects, which are the same for every seed: it does not say
-how other objects would come out (the JSON files hold no numbers by object, so these cannot be drawn anew here).
+how other objects would come out (the records hold no numbers by object, so these cannot be drawn anew here).
 
 A sign is that of the difference of two rows, seed by seed. It *agrees* when the interval leaves zero out on the paper's
 side, is *undecided* when zero lies within, and is not claimed below {CLAIM} seeds. The data are simulated, the network
 is preset tiny made smaller still, trained from scratch for minutes, and cross-sensor matching is contrast with all
-other touches of the batch instead of the paper's pairs (`Size` in `study/plan.py` says why): compared is the direction
+other touches of the batch instead of the paper's pairs (`Size` in `tables/plan.py` says why): compared is the direction
 of an effect, never the paper's absolute numbers, which stand beside ours as printed there. Columns: *seen* is a data
 set trained on (as TAG); *seen sensor, other data* one never trained on (as Feel), whose objects are held out from the
 probe (their kinds may have been met in pre-training); *unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0).
@@ -41,7 +41,7 @@ CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not ag
 def parts(runs: Sequence[Run]) -> dict[str, Part]:
     """The sections, by question. Without runs, or where they differ in what they must share, there is no table."""
     found, kept = {}, comparable(runs)
-    for name, make in (*questions.OF.items(), ("real", real_table.real)):
+    for name, make in questions.OF.items():
         wrong = differences([run.about for run in runs if run.question == name])
         found[name] = make(kept)
         if not any(run.question == name for run in runs):
@@ -123,7 +123,7 @@ def provenance(runs: Sequence[Run]) -> str:
     if again := drawn(runs):
         notes += " The same scenes gave tables of other content (another kind of processor, by the machines above): "
         notes += f"{again}."
-    head = ("question", "runs", "trainings", "training, min", "scores, min", "files")
+    head = ("question", "runs", "trainings", "training, min", "scores, min", "names")
     return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"
 
 
@@ -134,13 +134,13 @@ def check_page(out: Path) -> None:
         raise UserError(f"{page} is not a page of these results; give another folder with --out")
 
 
-def write(folder: Path, out: Path) -> Path:
-    """Render the JSON files in `folder` to `out`/README.md and `out`/figures; gives back the page.
+def write(results: Path, out: Path) -> Path:
+    """Render a file of results to `out`/README.md and `out`/figures and return the page.
 
     Raises UserError where `out`/README.md is another page.
     """
     check_page(out)
-    runs, page = read(folder), out / "README.md"
+    runs, page = read(results), out / "README.md"
     figures = pictures.draw_all(comparable(runs), out / "figures")
     out.mkdir(parents=True, exist_ok=True)
     atomic_write(page, whole(runs, figures, out))

@@ -1,4 +1,4 @@
-"""Reading the JSON files of the runs, and what paired seeds say of a sign."""
+"""Runs of the matrix as tables read them, and what paired seeds say of a sign."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import CLAIM, verdict
 from anytouch_jax.evaluate.statistics import seed_interval as interval
+from experiments.records import read_records
 from experiments.tables.plan import LABELS
 
 NO_SIGN = "no sign in the paper"
@@ -22,7 +23,7 @@ Seeds = dict[int, float]
 
 @dataclass(frozen=True)
 class Run:
-    """One JSON file."""
+    """One record of the matrix."""
 
     question: str
     name: str
@@ -63,16 +64,18 @@ class Change(NamedTuple):
     seeds: int = 0
 
 
-def read(folder: Path) -> list[Run]:
-    """The runs of a folder, in the order of their files. Raises UserError for a file that is none."""
-    found = []
-    for path in sorted(folder.glob("*.json")):
+def read(path: Path) -> list[Run]:
+    """Return the runs of a file of results, in the order of their keys.
+
+    Raises UserError for a record that is no run of the matrix.
+    """
+    runs = []
+    for key, about in read_records(path).items():
         try:
-            about = json.loads(path.read_text(encoding="utf-8"))
-            found.append(Run(about["question"], about["name"], int(about["seed"]), about))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{path} is no result of a run ({error!r}); remove it, and make it again") from None
-    return found
+            runs.append(Run(about["question"], about["name"], int(about["seed"]), about))
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path}: {key} is no run of the matrix ({error!r}). Remove its line.") from None
+    return runs
 
 
 def noted(path: Path) -> dict[str, Any]:

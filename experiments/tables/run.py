@@ -1,7 +1,7 @@
-"""The matrix of experiments: `make experiments [QUICK=1] [MINUTES=75]`, or `.venv/bin/python experiments/matrix.py`.
+"""The matrix of experiments: `make experiments [QUICK=1] [MINUTES=75]`, or `python -m experiments.tables.run`.
 
-Runs what is not done yet, one JSON file a run, and renders `experiments/results/README.md` from all of them. What is
-run stands in `study/plan.py`, what it costs in `study/budget.py`; `--plan` prints both. The same command again goes on,
+Runs what is not done yet, one line of `matrix.jsonl` a run, and renders `experiments/results/README.md` from all lines.
+What is run stands in `plan.py`, what it costs in `budget.py`; `--plan` prints both. The same command again goes on,
 and the same command in another terminal helps: what one works on the other leaves to it. `--jobs` does just that, each
 process on its own share of the cores.
 The results of a question are of one version of the simulator and of one size: those of another go to a new folder,
@@ -24,7 +24,7 @@ import jax
 
 from anytouch_jax.errors import UserError
 from experiments.tables import budget, plan, report
-from experiments.tables.execute import check_folder, execute, is_done
+from experiments.tables.execute import check_results, execute, is_done
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plan", action="store_true", help="print every run with its minutes and stop")
-    parser.add_argument("--render", action="store_true", help="only render the tables from the JSON files")
+    parser.add_argument("--render", action="store_true", help="only render the tables from matrix.jsonl")
     parser.add_argument("--quick", action="store_true", help="toy sizes: does it work?")
     parser.add_argument("--minutes", type=float, help="stop before a run that would not fit")
     parser.add_argument("--chunk", help="i/n: only part i of n, of about equal cost")
@@ -40,7 +40,7 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", help="only these questions")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=0,1")
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
-    about = "folder of README.md and matrix/ (default: experiments/results; with --quick or --set beside the data)"
+    about = "folder of README.md and matrix.jsonl (default: experiments/results; with --quick or --set beside the data)"
     parser.add_argument("--out", type=Path, help=about)
     parser.add_argument("--real", type=Path, help="manifest of real touch (default: ../shared/real_touch/manifest.csv)")
     return parser.parse_args(argv)
@@ -85,13 +85,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _print(chosen)
         if asked.render:
             return _render(chosen)
-        check_folder(chosen.leaves, chosen.out / "matrix")
+        check_results(chosen.leaves, chosen.out / "matrix.jsonl")
         report.check_page(chosen.out)
         _check_objects(chosen)
         return _execute(chosen, asked.minutes) if asked.jobs == 1 else _side_by_side(words, asked.jobs)
     except UserError as error:
-        print(f"matrix: {error}", file=sys.stderr)
-        return 1
+        print(error, file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("interrupted; the same command goes on", file=sys.stderr)
         return 130
@@ -162,7 +162,7 @@ def choose(asked: argparse.Namespace) -> Chosen:
 
 
 def _print(chosen: Chosen) -> int:
-    done = {one.file for one in chosen.leaves if is_done(one, chosen.out / "matrix")}
+    done = {one.key for one in chosen.leaves if is_done(one, chosen.out / "matrix.jsonl")}
     print("\n".join(budget.lines(chosen.leaves, done)))
     return 0
 
@@ -175,7 +175,7 @@ def _check_objects(chosen: Chosen) -> None:
 
 
 def _render(chosen: Chosen) -> int:
-    print(report.write(chosen.out / "matrix", chosen.out))
+    print(report.write(chosen.out / "matrix.jsonl", chosen.out))
     return 0
 
 
@@ -188,7 +188,7 @@ def _execute(chosen: Chosen, minutes: float | None) -> int:
     if not there:
         print(f"there is no {chosen.real}: the question `real` is not run")
     work = Work(chosen.folder, real=chosen.real if there else None)
-    result = execute(chosen.leaves, work, chosen.out / "matrix", minutes=minutes)
+    result = execute(chosen.leaves, work, chosen.out / "matrix.jsonl", minutes=minutes)
     made, found, left = (len(part) for part in result[:3])
     print(f"{made} runs made, {found} were there, {left} left, {len(result.failed)} failed")
     for name, error in result.failed.items():

@@ -6,26 +6,28 @@ A view says of which data and how: `seen` (the sensors trained on), `seen, other
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
 from anytouch_jax.evaluate.contacts import contact_vector
-from anytouch_jax.evaluate.feature_cache import background_difference
+from anytouch_jax.evaluate.feature_cache import background_difference, encoder_digest
 from anytouch_jax.evaluate.probing import run_tasks
 from anytouch_jax.evaluate.tasks import Task
-from experiments.tables import adaptation, cuts, plan, real
-from experiments.tables.plan import Leaf
-
-if TYPE_CHECKING:
-    from experiments.tables.work import Work
+from anytouch_jax.files import atomic_write
+from experiments.tables import cuts, plan, real
+from experiments.tables.plan import Leaf, Training
 
 Row = dict[str, Any]
 STATIC = ("material", "roughness", "hardness")
@@ -37,12 +39,24 @@ SHOWN = ("gelsight", "digit", "gelsight_mini")  # of the t-SNE, as the paper sho
 TOUCHES = 30
 
 
-def score(leaf: Leaf, work: Work) -> dict[str, Any]:
+class Places(Protocol):
+    """Where data sets and runs are on disk (`work.Work`)."""
+
+    folder: Path
+
+    def run_of(self, one: Training) -> Path:
+        """Return the run folder of a training."""
+
+    def manifest(self, name: str) -> Path:
+        """Return the file of a manifest by its name in a plan."""
+
+
+def score(leaf: Leaf, work: Places) -> dict[str, Any]:
     """The results of a run: `rows`, `data` (names of the manifests read), and what else the question wants."""
     return _OF[leaf.question](leaf, work)
 
 
-def encoder_of(leaf: Leaf, work: Work) -> Encoder:
+def encoder_of(leaf: Leaf, work: Places) -> Encoder:
     """The encoder of a run: trained, the image tower of a trained model, or untrained."""
     if leaf.model is None:
         return random_encoder(untrained(leaf), leaf.seed)
@@ -60,7 +74,7 @@ def quiet(_: str) -> None:
 
 
 def _probes(
-    leaf: Leaf, work: Work, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
+    leaf: Leaf, work: Places, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
     """Rows of `run_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
@@ -70,7 +84,7 @@ def _probes(
     return [{"view": view} | one for one in run_tasks(encoder, table, tasks, **shared)]
 
 
-def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
+def _four_columns(leaf: Leaf, work: Places, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
     """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0).
 
     Of each the material and the form of the indenter; of the first also `tasks`.
@@ -89,11 +103,11 @@ def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[s
     return rows
 
 
-def _q1(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _q1(leaf: Leaf, work: Places) -> dict[str, Any]:
     return {"rows": _four_columns(leaf, work, plan.SENSORS[:1]), "data": ["own", "other"]}
 
 
-def _q3(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _q3(leaf: Leaf, work: Places) -> dict[str, Any]:
     rows = _four_columns(leaf, work, plan.SENSORS, STATIC) + _dynamic(leaf, work, ("clips",))
     return {"rows": rows + (_read(leaf, work) if leaf.name in READ else []), "data": ["own", "other"]}
 
@@ -107,7 +121,7 @@ WAYS: Mapping[str, dict[str, Any]] = {
 }
 
 
-def _read(leaf: Leaf, work: Work) -> list[Row]:
+def _read(leaf: Leaf, work: Places) -> list[Row]:
     """The static tasks and the form by other heads and poolings than the tables': views `read: <way>`."""
     sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
     encoder, labels = encoder_of(leaf, work), (*STATIC, FORM)
@@ -118,11 +132,11 @@ def _read(leaf: Leaf, work: Work) -> list[Row]:
     ]
 
 
-def _ablations(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _ablations(leaf: Leaf, work: Places) -> dict[str, Any]:
     return {"rows": _four_columns(leaf, work, plan.SENSORS), "data": ["own", "other"]}
 
 
-def _restricted(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _restricted(leaf: Leaf, work: Places) -> dict[str, Any]:
     return {"rows": _four_columns(leaf, work, plan.RESTRICTED, STATIC), "data": ["own", "other"]}
 
 
@@ -134,7 +148,7 @@ _VIEWS: Mapping[str, dict[str, Any]] = {
 }
 
 
-def _dynamic(leaf: Leaf, work: Work, views: Sequence[str]) -> list[Row]:
+def _dynamic(leaf: Leaf, work: Places, views: Sequence[str]) -> list[Row]:
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
     sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
     return [
@@ -144,14 +158,14 @@ def _dynamic(leaf: Leaf, work: Work, views: Sequence[str]) -> list[Row]:
     ]
 
 
-def _dynamics(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _dynamics(leaf: Leaf, work: Places) -> dict[str, Any]:
     """Dynamic tasks under every view, and what the same training makes of static ones."""
     sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
     static = _probes(leaf, work, f"own/{cuts.WHOLE}", STATIC, "static", encoder_of(leaf, work), **sensors)
     return {"rows": _dynamic(leaf, work, tuple(_VIEWS)) + static, "data": ["own"]}
 
 
-def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
     """The space of the test touches by the sensors trained on: numbers, and the t-SNE of some touches."""
     table = manifests.read(work.folder / "own" / cuts.STATIC)
     sensors = text_column(table, "sensor")
@@ -211,7 +225,7 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
     ]
 
 
-def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _grasp(leaf: Leaf, work: Places) -> dict[str, Any]:
     """Held or slipped, from the frame in which the press is done and from the last frame."""
     encoder, found = encoder_of(leaf, work), []
     options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocols": BOTH}
@@ -221,20 +235,73 @@ def _grasp(leaf: Leaf, work: Work) -> dict[str, Any]:
     return {"rows": found, "data": ["own", "own/grasp"]}
 
 
-def _new_sensor(leaf: Leaf, work: Work) -> dict[str, Any]:
-    read = ["own/static", f"own/{plan.UNSEEN}"]
-    if leaf.name != "seen":
-        read += [
-            f"own/{Path(adaptation.labelled(work.folder / 'own', count)).stem}" for count in (0, *adaptation.FRAMES)
-        ]
-    return {"rows": adaptation.rows(leaf, work, _probes), "data": read}
+FRAMES = (4, 18, 100)  # labelled frames of the new sensor
+NEW_SENSOR = "label.material"  # the label that tokens are fitted to
+NOTHING = "universal, 0 unlabelled"  # the view without any frame of the new sensor
 
 
-def _real(leaf: Leaf, work: Work) -> dict[str, Any]:
+def _new_sensor(leaf: Leaf, work: Places) -> dict[str, Any]:
+    """Probes of a sensor left out of training, with universal tokens and with tokens fitted to a few labelled frames.
+
+    The labelled frames also join the training rows of the probe. All views are tested on the same touches.
+    """
+    assert leaf.model is not None
+    run, own = work.run_of(leaf.model), work.folder / "own"
+    encoder, read = load_encoder(run), ["own/static", f"own/{plan.UNSEEN}"]
+    options = {"test_sensors": (plan.UNSEEN,), "max_rows": None, "protocols": BOTH}
+    if leaf.name == "seen":
+        rows = _probes(leaf, work, f"own/{cuts.STATIC}", STATIC, "seen", encoder, **options)
+        return {"rows": rows, "data": read}
+    rows = _probes(leaf, work, labelled(own, 0), STATIC, NOTHING, encoder, **options)
+    for count in FRAMES:
+        name = labelled(own, count)
+        fitted = load_encoder(adapted(work, run, work.folder / name, count))
+        for tokens, one in (("universal", encoder), ("fitted", fitted)):
+            rows += _probes(leaf, work, name, STATIC, f"{tokens}, {count} labelled", one, **options)
+    return {"rows": rows, "data": [*read, *(f"own/{Path(labelled(own, count)).stem}" for count in (0, *FRAMES))]}
+
+
+def adapted(work: Places, run: Path, data: Path, frames: int) -> Path:
+    """Return the run with tokens fitted to so many labelled frames of the new sensor (`anytouch adapt`).
+
+    It is stored with the trainings, and made again when the run's weights or the data change. Raises UserError when
+    `anytouch adapt` fails.
+    """
+    out = work.folder / "trained" / f"{run.name}-adapted{frames}"
+    note, of = out / "adapted.json", {"run": encoder_digest(load_encoder(run)), "data": cuts.content_hash(data)}
+    if not (note.exists() and json.loads(note.read_text(encoding="utf-8")) == of):
+        shutil.rmtree(out, ignore_errors=True)  # begun and not finished
+        table = manifests.read(data)
+        mine = (text_column(table, "sensor") == plan.UNSEEN) & (text_column(table, "split") == "train")
+        count = min(frames, int(mine.sum()))  # toy sizes have fewer
+        words = ["--run", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", count, "--labels", NEW_SENSOR]
+        if main([str(word) for word in ("adapt", *words, "--out", out)]):
+            raise UserError(f"anytouch adapt failed with {count} frames of {plan.UNSEEN}. Its message is above.")
+        atomic_write(note, json.dumps(of) + "\n")
+    return out
+
+
+def labelled(folder: Path, frames: int) -> str:
+    """Return a manifest whose training rows are those of the other sensors and so many of the new one.
+
+    It is written into `folder` first; its name is relative to the folder's parent.
+    """
+    path = folder / f"new{frames}.parquet"
+    if not path.exists():
+        table = manifests.read(folder / cuts.STATIC)
+        new, split = text_column(table, "sensor") == plan.UNSEEN, text_column(table, "split")
+        mine = np.flatnonzero(new & (split == "train"))
+        keep = ~new | (split == "test")
+        keep[np.random.default_rng(0).permutation(mine)[:frames]] = True
+        cuts.cut(table, np.flatnonzero(keep), path)
+    return f"{folder.name}/{path.name}"
+
+
+def _real(leaf: Leaf, work: Places) -> dict[str, Any]:
     return {"rows": real.rows(leaf, encoder_of(leaf, work), work.manifest(plan.REAL)), "data": [plan.REAL]}
 
 
-_OF: Mapping[str, Callable[[Leaf, Work], dict[str, Any]]] = {
+_OF: Mapping[str, Callable[[Leaf, Places], dict[str, Any]]] = {
     "q1": _q1, "q2": _q2, "q3": _q3, "ablations": _ablations, "restricted": _restricted, "dynamics": _dynamics,
     "grasp": _grasp, "new_sensor": _new_sensor, "real": _real,
 }  # fmt: skip

@@ -23,8 +23,7 @@ TITLES = {
     "no_universal": "w/o universal tokens", "masked": "+ masked modelling", "aligned": "+ alignment",
     "matched": "+ matching", "matched_mlp": "+ matching by the paper's head",
     "no_flips": "AnyTouch, touches never flipped",
-    "frame_differences": "AnyTouch, frame differences too", "force_heads": "AnyTouch, force heads too",
-    "left_out": "left out of training", "seen": "trained on",
+    "universal, 0 unlabelled": "universal, no frame", "left_out": "left out of training", "seen": "trained on",
 }  # fmt: skip
 
 

@@ -20,18 +20,17 @@
 #    tokens. Linear probes on its features, for labels that captions name (hardness, roughness, material) and for one
 #    that they do not (indenter).
 #
-# `.venv/bin/python experiments/teaching.py` does all of it, run by run, in an hour or more a seed: what is finished is
+# `python -m experiments.tables.teaching` does all of it, run by run, in an hour or more a seed: what is finished is
 # not done again. `TOUCHES=500 STEPS2=1000` is less than half the work, and less is learned;
 # `TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs
-# and results go: the page `teaching.md` and the folder `teaching/`, a JSON file for each grade and seed, from which
-# `TABLE=1` makes the page anew. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small
+# and results go: the page `teaching.md` and `teaching.jsonl`, a line for each grade and seed, from which `TABLE=1`
+# makes the page again. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small
 # convolutions (`--model.patch-encoder convolutional`), which find more in as many steps and take longer for them:
 # `teaching_convolutional.md`.
 
 # %%
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +40,7 @@ import numpy as np
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
@@ -49,16 +49,17 @@ from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
-from experiments.tables import asked
+from experiments.records import read_records, write_record
+from experiments.tables import env
 from experiments.tables.by_object import ahead, by_object, gathered, probe_table, probed
 
-WORK, OUT, TABLE = asked.path("WORK", "runs/teaching"), asked.path("OUT", "experiments/results"), asked.switch("TABLE")
-TOUCHES, STEPS1, STEPS2 = asked.number("TOUCHES", 1200), asked.number("STEPS1", 600), asked.number("STEPS2", 4000)
-MORE = asked.number("MORE", 2 * TOUCHES, least=0)
-OBJECTS = asked.number("OBJECTS", min(TOUCHES // 2, 500))
-SEEDS = asked.numbers("SEEDS", "0,1,2")
-GRADES = asked.names("GRADES", "fine,coarse", ("fine", "coarse"))
-CONVOLUTIONS = asked.switch("CONVOLUTIONS")
+WORK, OUT, TABLE = env.path("WORK", "runs/teaching"), env.path("OUT", "experiments/results"), env.switch("TABLE")
+TOUCHES, STEPS1, STEPS2 = env.number("TOUCHES", 1200), env.number("STEPS1", 600), env.number("STEPS2", 4000)
+MORE = env.number("MORE", 2 * TOUCHES, least=0)
+OBJECTS = env.number("OBJECTS", min(TOUCHES // 2, 500))
+SEEDS = env.numbers("SEEDS", "0,1,2")
+GRADES = env.names("GRADES", "fine,coarse", ("fine", "coarse"))
+CONVOLUTIONS = env.switch("CONVOLUTIONS")
 NAME = "teaching_convolutional" if CONVOLUTIONS else "teaching"
 SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
 STACK, DEPTH = {"width": 128, "heads": 4, "mlp": 512}, {"touch": 4, "image": 2, "text.stack": 2}
@@ -195,26 +196,27 @@ def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any
 # %%
 SETTINGS = {"touches": TOUCHES, "more": MORE, "objects": OBJECTS, "steps": [STEPS1, STEPS2], "grades": GRADES}
 SETTINGS |= {"simulator": VERSION}
+RESULTS = OUT / f"{NAME}.jsonl"
 
 
 def scored(grade: str, seed: int) -> dict[str, Any]:
-    """What the file of a grade and a seed says; it is made first where it is not there, or is of other encoders."""
-    file = OUT / NAME / f"{grade}-{seed}.json"
+    """Return the record of a grade and a seed. It is measured first if it is missing, or of other encoders."""
+    key = f"{grade}-{seed}"
+    found = read_records(RESULTS).get(key)
     if TABLE:
-        if not file.exists():
-            raise SystemExit(f"there is no {file}: run this page without TABLE=1")
-        return json.loads(file.read_text())
+        if found is None:
+            raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
+        return found
     encoders = {f"stage {stage}": load_encoder(run) for stage, run in zip((1, 2), prepare(seed), strict=True)}
     about: dict[str, Any] = {"settings": SETTINGS, "encoders": {name: one.mark for name, one in encoders.items()}}
-    if file.exists() and (found := json.loads(file.read_text())) | about == found:
+    if found is not None and found | about == found:
         return found
     config = encoders["stage 2"].config
     names = tuple("/".join(Path(one).parts[-2:]) for one in config.data.manifests)
     config = replace(config, data=replace(config.data, manifests=names))
     found = about | {"machine": machine.describe().sentence(), "config": asdict(config)}
     found |= {"retrieval": retrieve(encoders, grade, seed), "probes": probes(encoders, grade, seed)}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(file, json.dumps(found) + "\n")
+    write_record(RESULTS, key, found)
     return found
 
 
@@ -247,7 +249,7 @@ def retrieval_table(found: list[dict[str, Any]]) -> str:
 files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
 told = files[GRADES[0]][0]
 if any(one["settings"] != told["settings"] for found in files.values() for one in found):
-    raise SystemExit(f"the files of {NAME}/ were made by different settings: make them anew, without TABLE=1")
+    raise UserError(f"{RESULTS} has records made by different settings. Run this page without TABLE=1.")
 size = " ".join(f"{name.upper()}={told['settings'][name]}" for name in ("touches", "more", "objects"))
 size += " STEPS1={} STEPS2={}".format(*told["settings"]["steps"])
 size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
@@ -255,12 +257,16 @@ tower = told["config"]["model"]["touch"]
 network = f"preset tiny with a touch tower of {tower['width']} x {tower['depth']}"
 network += f" at {told['config']['model']['image_size']} pixels"
 network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
-lines = ["# Simulated scenes as teachers", "", f"Made by `{size} python experiments/teaching.py`, {network}.", ""]
+lines = [
+    "# Simulated scenes as teachers",
+    "",
+    f"Made by `{size} python -m experiments.tables.teaching`, {network}.",
+    "",
+]
 for grade, found in files.items():
     lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
     lines += [retrieval_table(found), ""]
     lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
     lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
-OUT.mkdir(parents=True, exist_ok=True)
 atomic_write(OUT / f"{NAME}.md", "\n".join(lines))
 print("\n".join(lines))

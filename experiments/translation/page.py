@@ -1,8 +1,7 @@
-"""The page of `translation.py`, made of the JSON files of its runs alone."""
+"""The page of the translation study, made from the records of its runs alone."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -12,8 +11,9 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown, seed_interval, verdict
-from experiments.tables.found import found_table
+from experiments.records import read_records
 from experiments.translation import training
+from experiments.translation.encoders import retrieval_table
 
 Task = tuple[str, str]
 Record = dict[str, Any]
@@ -25,12 +25,15 @@ _TITLES = {"gelsight_mini": "GelSight Mini", "digit": "DIGIT", "duragel": "DuraG
 _HEAD = tuple(f"{_TITLES[a]} -> {_TITLES[b]}" for a, b in TASKS)
 
 
-def page(folder: Path) -> str:
-    """The page of the runs in `folder`. Raises UserError where there are none, and as `one_table`."""
-    records = [json.loads(file.read_text()) for file in sorted(folder.glob("*-*.json"))]
+def page(results: Path) -> str:
+    """Return the page of a file of results.
+
+    Raises UserError without a run, and for runs that make no table together.
+    """
+    records = list(runs_of(results).values())
     if not records:
-        raise UserError(f"{folder} holds no results; run this page without TABLE=1")
-    one_table([record["settings"] for record in records], folder)
+        raise UserError(f"{results} has no run. Run this page without TABLE=1.")
+    one_table([record["settings"] for record in records], results)
     rows = Rows(records)
     lines = [
         "# One sensor's touch as another would feel it",
@@ -51,20 +54,30 @@ def page(folder: Path) -> str:
         "",
         markdown(("", *_HEAD), rows.in_units()),
         "",
-        f"Objects of the pairs that an encoder was trained on in its last stage: {_met(folder, rows.names)}.",
+        f"Objects of the pairs that an encoder was trained on in its last stage: {_met(results, rows.names)}.",
         "",
     ]
-    if again := found_table(folder):
+    if again := retrieval_table(results):
         title = "The same touch by another sensor and unit, objects never seen, found by the encoder itself:"
         lines += [title, "", again, ""]
     if not any(record["critic"] for record in records):
         lines += ["No critic judged the images.", ""]
     lines += ["Input, output, truth and difference, first seed, firm presses on objects never seen:", ""]
-    lines += [f"![{path.stem}]({folder.name}/{path.name})" for path in sorted(folder.glob("*.png"))]
+    lines += [f"![{path.stem.removeprefix(results.stem)[1:]}](figures/{path.name})" for path in pictures(results)]
     return "\n".join([*lines, ""])
 
 
-def one_table(several: Sequence[dict[str, Any]], folder: Path) -> None:
+def runs_of(results: Path) -> dict[str, Record]:
+    """Return the records of translations by key, without those of retrieval and of overlap."""
+    return {key: record for key, record in read_records(results).items() if "settings" in record}
+
+
+def pictures(results: Path) -> list[Path]:
+    """Return the pictures of the runs of a file of results."""
+    return sorted((results.parent / "figures").glob(f"{results.stem}-*.png"))
+
+
+def one_table(several: Sequence[dict[str, Any]], results: Path) -> None:
     """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
     (errors of pictures of another size are no rivals), two encoders of one name and seed."""
     kinds = ("touches", "size", "subtracts", "version", "steps1")
@@ -73,7 +86,7 @@ def one_table(several: Sequence[dict[str, Any]], folder: Path) -> None:
     made = {(one["from"], one["to"], one["pairs"], one.get("simulator")) for one in several}
     if len(ways) > 1 or len(known) > len({one[:2] for one in known}) or len(made) > len({one[:2] for one in made}):
         raise UserError(
-            f"{folder}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
+            f"{results}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
             f"make no table together ({sorted(map(str, ways | known | made))}): choose another OUT"
         )
 
@@ -99,9 +112,9 @@ def _about(records: Sequence[Record]) -> str:
     )
 
 
-def _met(folder: Path, names: Sequence[str]) -> str:
+def _met(results: Path, names: Sequence[str]) -> str:
     """How many objects of the pairs each encoder was trained on."""
-    known = json.loads((folder / "overlap.json").read_text())
+    known = read_records(results)["overlap"]
     counted = dict.fromkeys([*known, *(name.split(", ")[0] for name in names if PIXELS not in name)])
     return ", ".join(f"{name} {known.get(name, 'not counted')}" for name in counted)
 

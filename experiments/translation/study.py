@@ -26,14 +26,13 @@
 # (`translation_3000.md`). Each is compared with two plain references trained on the same pairs: copying the mean
 # training target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
-# What a run gives is one JSON in `experiments/results/translation/`: what is finished is not done again, and the table
-# is made of these files alone (`TABLE=1`: nothing but that). `WORK=` and `OUT=` in the environment are where data and
+# A run is one line of `experiments/results/translation.jsonl`. What is finished is not done again. The table is made
+# from this file alone, and `TABLE=1` does nothing else. `WORK=` and `OUT=` in the environment are where data and
 # results go; `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` (frozen, fine or both with a comma) change the size.
 
 # %%
 from __future__ import annotations
 
-import json
 import os
 import re
 import time
@@ -53,29 +52,31 @@ from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
-from experiments.tables import asked, page, plan, remaining
-from experiments.tables.found import find_again
+from experiments.records import read_records, write_record
+from experiments.tables import env, page, plan
 from experiments.tables.work import Work
+from experiments.translation import encoders as own_encoders
 from experiments.translation import page as translated
 from experiments.translation import pairs, training
+from experiments.translation.encoders import score_retrieval
 from experiments.translation.figures import picture_grid
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
-from experiments.translation.page import PIXELS, TASKS, one_table
+from experiments.translation.page import PIXELS, TASKS, one_table, runs_of
 
-QUICK, TABLE = asked.switch("QUICK"), asked.switch("TABLE")
+QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
 USUAL = plan.QUICK if QUICK else plan.FULL
-SIZE = replace(USUAL, steps1=asked.number("STEPS1", USUAL.steps1))
+SIZE = replace(USUAL, steps1=env.number("STEPS1", USUAL.steps1))
 LONGER = {} if SIZE == USUAL else {"steps1": SIZE.steps1}
 NAME = "_".join(["translation", *(["quick"] if QUICK else []), *map(str, LONGER.values())])
-WORK, OUT = asked.path("WORK", "runs/translation"), asked.path("OUT", "experiments/results")
-RUNS, STUDY = asked.runs(), asked.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
-TOUCHES, STEPS = asked.number("TOUCHES", 24 if QUICK else 400), asked.number("STEPS", 40 if QUICK else 600)
+WORK, OUT = env.path("WORK", "runs/translation"), env.path("OUT", "experiments/results")
+RUNS, STUDY = env.runs(), env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
+TOUCHES, STEPS = env.number("TOUCHES", 24 if QUICK else 400), env.number("STEPS", 40 if QUICK else 600)
 if RUNS and LONGER:
     raise UserError("STEPS1 is for the encoders that this page trains; leave it out with RUNS, whose encoders are done")
-SEEDS = asked.numbers("SEEDS", "0" if QUICK else "0,1,2")
-TUNE = asked.names("TUNE", "frozen", ("frozen", "fine"))
-RUN_FILES = OUT / NAME
+SEEDS = env.numbers("SEEDS", "0" if QUICK else "0,1,2")
+TUNE = env.names("TUNE", "frozen", ("frozen", "fine"))
+RESULTS = OUT / f"{NAME}.jsonl"
 enable_compilation_cache()
 
 # %% [markdown]
@@ -93,9 +94,9 @@ PAIRS = WORK / f"pairs-{TOUCHES}-{version(scenes.sensors)}"
 # %% [markdown]
 # ## What the encoders may be trained on
 #
-# The paper takes the coarse data of the same objects out of pre-training. `study/remaining.py` does so by name: it
+# The paper takes the coarse data of the same objects out of pre-training. `encoders.py` does so by name: it
 # keeps the rows whose object is in no split of the pairs. For encoders of your own `REMAINING="coarse.parquet ..."
-# make translation` writes `coarse_remaining.parquet` beside each and stops; train them on that.
+# make translation` writes `coarse_own_encoders.parquet` beside each and stops; train them on that.
 
 
 # %%
@@ -139,8 +140,8 @@ def settings(
     }  # fmt: skip
 
 
-def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Path) -> None:
-    """Train, score on objects never seen, and write the JSON of a run; the first seed also draws its pictures."""
+def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str) -> None:
+    """Train, score on held-out objects and write the record of a run. The first seed also draws its pictures."""
     (x, y), val, (test_x, test_y), shown = data
     begun = time.perf_counter()
     field = () if y.dtype == np.uint8 else y.shape[1:]
@@ -163,9 +164,9 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, file: Pat
         "critic": made.design.has_critic,
     }
     if about["fit"]["seed"] == SEEDS[0]:
-        picture_grid(file.with_suffix(".png"), made, test_x[shown], test_y[shown])
-    atomic_write(file, json.dumps(record, indent=2) + "\n")
-    print(f"{file.stem}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
+        picture_grid(OUT / "figures" / f"{NAME}-{key}.png", made, test_x[shown], test_y[shown])
+    write_record(RESULTS, key, record)
+    print(f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
 
 def of_sensors(table: manifests.Manifest, names: tuple[str, str]) -> str:
@@ -181,21 +182,16 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
         return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
     found: dict[str, dict[int, Encoder]] = {}
     for seed in SEEDS:
-        for name, one in remaining.encoders(Work(STUDY), SIZE, seed, table).items():
+        for name, one in own_encoders.encoders(Work(STUDY), SIZE, seed, table).items():
             found.setdefault(name, {})[seed] = one
     return found
-
-
-def _settings_of(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text())["settings"]
 
 
 # %% [markdown]
 # ## What an encoder knows beside pictures
 #
 # What a stage keeps of the picture it may lose for what touches have in common, so beside the errors stands how often
-# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`;
-# `study/found.py`).
+# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`).
 
 
 # %%
@@ -205,52 +201,52 @@ def all_runs() -> None:
     table = manifests.read(PAIRS / "manifest.parquet")
     if os.environ.get("REMAINING"):
         for word in os.environ["REMAINING"].split():
-            remaining.write_remaining(Path(word), table)
+            own_encoders.write_remaining(Path(word), table)
         raise SystemExit(0)
     known = encoders(table)
     if not (RUNS or QUICK):  # a trial has too few touches for galleries of 50
         fine = manifests.read(Work(STUDY).manifest("fine"))
         for name, seed in product(known, SEEDS):
             one = known[name][seed]
-            find_again(RUN_FILES, name, seed, one, mark(one), fine)
+            score_retrieval(RESULTS, name, seed, one, mark(one), fine)
     content = {task: of_sensors(table, task) for task in TASKS}
     plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
-    wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in remaining.NOT_TUNED]
+    wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in own_encoders.NOT_TUNED]
     plans = [*wanted, (PIXELS, "scratch")]
     every = {}
     for (task, seed), (name, tune) in product(product(TASKS, SEEDS), plans):
         encoder = known[name][seed] if name in known else None
         about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content[task])
         stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
-        every[RUN_FILES / f"{stem}.json"] = (about, encoder)
-    there = [file for file in RUN_FILES.glob("*-*.json") if file not in every]
-    one_table([*(about for about, _ in every.values()), *map(_settings_of, there)], RUN_FILES)
-    counts = RUN_FILES / "overlap.json"
-    before = json.loads(counts.read_text()) if counts.exists() else {}  # of encoders whose rows are there already
+        every[stem] = (about, encoder)
+    others = [record["settings"] for key, record in runs_of(RESULTS).items() if key not in every]
+    one_table([*(about for about, _ in every.values()), *others], RESULTS)
+    before = read_records(RESULTS).get("overlap", {})  # of encoders that have rows already
     met = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
-    atomic_write(counts, json.dumps(before | {name: " to ".join(found) for name, found in met.items()}) + "\n")
+    write_record(RESULTS, "overlap", before | {name: " to ".join(found) for name, found in met.items()})
     for source, target in TASKS:
-        mine = [(*one, file) for file, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
-        todo = [one for one in mine if not (one[2].exists() and _settings_of(one[2]) == one[0])]
+        mine = [(*one, key) for key, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
+        done = runs_of(RESULTS)
+        todo = [one for one in mine if done.get(one[2], {}).get("settings") != one[0]]
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
         data = [pairs.read_pairs(table, part, plain[0], subtract=plain[1]) for part in split]
         force = [table.value(int(row), "label.force") for row in split.test.source]
         shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
-        for about, encoder, file in todo:
-            one_run(about, encoder, (*data, shown), file)
+        for about, encoder, key in todo:
+            one_run(about, encoder, (*data, shown), key)
 
 
 if not TABLE:
     all_runs()
 
 # %% [markdown]
-# ## The table, from the JSON of the runs
+# ## The table, from the records of the runs
 
 # %%
-said = translated.page(RUN_FILES)
+said = translated.page(RESULTS)
 atomic_write(OUT / f"{NAME}.md", said)
 print(said)
-for picture in sorted(RUN_FILES.glob("*.png")):
+for picture in translated.pictures(RESULTS):
     page.show(picture)

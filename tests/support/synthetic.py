@@ -1,4 +1,4 @@
-"""JSON files as the runs write them, with numbers that are made up: what the tables and pictures read."""
+"""Records of the matrix with made-up numbers: what the tables and pictures read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.tables import adaptation, plan, real, scores
+from experiments.records import read_records, write_record
+from experiments.tables import plan, real, scores
 from experiments.tables.questions import FORM, FOUR, GRASP, SIX, SPACE, STATIC, VIEWS, dynamic
 from experiments.tables.results import Column
 
@@ -21,24 +22,28 @@ def level(question: str, name: str, seed: int, view: str, task: str) -> float:
     return 0.5
 
 
-def write(folder: Path, leaves: Sequence[plan.Leaf], mean: Mean = level) -> list[Path]:
-    """A file for each run."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return [write_one(folder, leaf, mean) for leaf in leaves]
+def write(results: Path, leaves: Sequence[plan.Leaf], mean: Mean = level) -> None:
+    """Write a record of each run."""
+    lines = [json.dumps({"key": leaf.key, **record_of(leaf, mean)}) for leaf in leaves]
+    results.parent.mkdir(parents=True, exist_ok=True)
+    results.write_text("".join(f"{line}\n" for line in sorted(lines)))
 
 
-def write_one(folder: Path, leaf: plan.Leaf, mean: Mean = level) -> Path:
+def change(results: Path, key: str, **values: Any) -> None:
+    """Change fields of a record; None removes one."""
+    record = read_records(results)[key] | values
+    write_record(results, key, {name: value for name, value in record.items() if value is not None})
+
+
+def record_of(leaf: plan.Leaf, mean: Mean = level) -> dict[str, Any]:
     rows = [row for view, task, metric in _columns(leaf) for row in _rows(leaf, view, task, metric, mean)]
-    about: dict[str, Any] = {
+    return {
         "question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity,
         "simulator": plan.simulator(), "settings": plan.settings(leaf.size), "scoring": plan.scoring(leaf.question),
         "size": leaf.size.name, "trained": [{"key": one.key, "seconds": 60.0} for one in leaf.trainings],
         "data": {"own": "0" * 64}, "version": "0", "source": "s", "machine": "a machine; load 1", "seconds": 30.0,
         "rows": rows, "points": _points(leaf.seed) if leaf.question == "q2" else [],
     }  # fmt: skip
-    path = folder / leaf.file
-    path.write_text(json.dumps(about))
-    return path
 
 
 def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
@@ -52,10 +57,10 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
         tasks = (*scores.STATIC, scores.FORM)
         found += [(f"read: {way}", task, "accuracy") for way in scores.WAYS for task in tasks]
     if leaf.question == "new_sensor":
-        views = ["seen"] if leaf.name == "seen" else ["universal, 0 unlabelled"]
-        for count in adaptation.FRAMES if leaf.name != "seen" else ():
-            views += [f"fitted, {count} unlabelled", f"universal, {count} labelled", f"fitted, {count} labelled"]
-        found = [(view, task, "accuracy") for view in views for task in adaptation.TASKS]
+        views = ["seen"] if leaf.name == "seen" else [scores.NOTHING]
+        for count in scores.FRAMES if leaf.name != "seen" else ():
+            views += [f"universal, {count} labelled", f"fitted, {count} labelled"]
+        found = [(view, task, "accuracy") for view in views for task in scores.STATIC]
     if leaf.question == "real":
         views = [
             real.OURS,

@@ -7,7 +7,7 @@ import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import text_column
-from experiments.tables import adaptation, cuts, plan
+from experiments.tables import cuts, plan, scores
 
 SENSORS = ("digit", "gelsight", plan.UNSEEN)
 FRAMES = 11
@@ -64,7 +64,7 @@ def test_a_grasp_is_held_or_slipped_and_seen_twice(folder):
 
 @pytest.mark.parametrize("frames", [0, 2])
 def test_labelled_frames_of_a_new_sensor_stand_in_train(folder, frames):
-    name = adaptation.labelled(folder, frames)
+    name = scores.labelled(folder, frames)
     assert name == f"{folder.name}/new{frames}.parquet"
     table = manifests.read(folder.parent / name)
     sensor, split = text_column(table, "sensor"), text_column(table, "split")

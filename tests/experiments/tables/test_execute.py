@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 
 import pytest
 
 from anytouch_jax.errors import UserError
+from experiments.records import read_records, write_record
 from experiments.tables import budget, plan
 from experiments.tables.execute import PAUSE, execute
 from experiments.tables.work import Work
@@ -17,6 +17,8 @@ LEAVES = [
     for leaf in plan.leaves(plan.FULL)
     if leaf.seed == 0 and leaf.question in ("q2", "ablations") and leaf.model and leaf.name != "matched_mlp"
 ]
+
+NAME = "matrix.jsonl"
 
 
 class Notes:
@@ -49,7 +51,7 @@ class Notes:
         if leaf.name == self.fail:
             raise UserError("no such column")
         self.time += self.slow * budget.of_scores(leaf)
-        self.calls.append(leaf.file)
+        self.calls.append(leaf.key)
         return {"rows": []}
 
     def _did(self, name, seconds):
@@ -64,29 +66,32 @@ class Notes:
 
 def run(work, out, **options):
     said: list[str] = []
-    result = execute(options.pop("leaves", LEAVES), work, out, log=said.append, clock=work.clock, **options)
+    result = execute(options.pop("leaves", LEAVES), work, out / NAME, log=said.append, clock=work.clock, **options)
     return result, said
 
 
-def test_each_training_is_made_once_and_every_run_leaves_a_file(tmp_path):
+def test_each_training_is_made_once_and_every_run_leaves_a_record(tmp_path):
     work = Notes()
     result, _ = run(work, tmp_path)
-    assert result.made == [leaf.file for leaf in LEAVES] == [name for name in work.calls if name.endswith(".json")]
+    assert (
+        result.made
+        == [leaf.key for leaf in LEAVES]
+        == [name for name in work.calls if name in {leaf.key for leaf in LEAVES}]
+    )
     keys = {one.key for leaf in LEAVES for one in leaf.trainings}
     assert sorted(set(work.calls) & keys) == sorted(keys) and work.calls[:4] == ["own", "fine", "coarse", "other"]
-    stored = json.loads((tmp_path / LEAVES[0].file).read_text())
+    stored = read_records(tmp_path / NAME)[LEAVES[0].key]
     assert stored["identity"] == LEAVES[0].identity and stored["seed"] == 0 and stored["question"] == LEAVES[0].question
 
 
-def test_a_finished_run_is_not_repeated_and_a_broken_file_is(tmp_path):
+def test_a_finished_run_is_not_repeated_and_one_of_other_settings_is(tmp_path):
     run(Notes(), tmp_path)
     work = Notes()
     result, said = run(work, tmp_path)
     assert not result.made and not work.calls and not said and len(result.found) == len(LEAVES)
-    (tmp_path / LEAVES[2].file).write_text('{"identity": "of other settings"}')
-    (tmp_path / LEAVES[3].file).write_text("{")
+    write_record(tmp_path / NAME, LEAVES[2].key, {"identity": "of other settings"})
     result, _ = run(Notes(), tmp_path)
-    assert result.made == [LEAVES[2].file, LEAVES[3].file]
+    assert result.made == [LEAVES[2].key]
 
 
 def test_a_half_done_run_is_gone_on_with(tmp_path):
@@ -94,10 +99,10 @@ def test_a_half_done_run_is_gone_on_with(tmp_path):
     work = Notes(stop_at=last)
     with pytest.raises(KeyboardInterrupt):
         run(work, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [LEAVES[0].file]
+    assert [*read_records(tmp_path / NAME)] == [LEAVES[0].key]
     first = list(work.calls)
     result, _ = run(work, tmp_path)
-    assert result.found == [LEAVES[0].file] and result.made == [leaf.file for leaf in LEAVES[1:]]
+    assert result.found == [LEAVES[0].key] and result.made == [leaf.key for leaf in LEAVES[1:]]
     assert work.calls[len(first)] == last  # nothing that was there is made again
 
 
@@ -110,8 +115,8 @@ def test_it_stops_before_a_run_that_does_not_fit_and_goes_on_later(tmp_path):
         files += result.made
         if not result.left:
             break
-        assert "left for the next call" in said[-1] and result.left == [leaf.file for leaf in LEAVES][len(files) :]
-    assert files == [leaf.file for leaf in LEAVES]
+        assert "left for the next call" in said[-1] and result.left == [leaf.key for leaf in LEAVES][len(files) :]
+    assert files == [leaf.key for leaf in LEAVES]
 
 
 def test_a_slow_machine_is_noticed(tmp_path):
@@ -126,7 +131,7 @@ def test_a_slow_machine_is_noticed(tmp_path):
 
 def test_waiting_for_others_is_no_slow_machine(tmp_path):
     by_itself, work, leaves = Notes(), Notes(), LEAVES[:2]
-    work.elsewhere = {leaves[1].file}
+    work.elsewhere = {leaves[1].key}
 
     def pause(seconds):  # the other process is lost after an hour, with nothing done
         work.time += 60 * 60
@@ -144,29 +149,29 @@ def test_a_budget_for_nothing_is_a_sentence(tmp_path):
 
 def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path):
     result, said = run(Notes(fail="no_text"), tmp_path)
-    assert list(result.failed.values()) == ["no such column"] and "no_text-0.json failed" in "\n".join(said)
-    assert len(result.made) == len(LEAVES) - 1 and not (tmp_path / "ablations-no_text-0.json").exists()
+    assert list(result.failed.values()) == ["no such column"] and "no_text-0 failed" in "\n".join(said)
+    assert len(result.made) == len(LEAVES) - 1 and "ablations-no_text-0" not in read_records(tmp_path / NAME)
 
 
 def test_what_another_process_works_on_is_left_to_it(tmp_path):
     work, training = Notes(), LEAVES[0].trainings[0]
     need = [leaf for leaf in LEAVES if training in leaf.trainings]
-    work.elsewhere = {"coarse", training.key, LEAVES[-1].file}
+    work.elsewhere = {"coarse", training.key, LEAVES[-1].key}
 
     def pause(seconds):  # meanwhile the other one finishes a thing
         assert seconds == PAUSE and work.elsewhere
         name = "coarse" if "coarse" in work.elsewhere else min(work.elsewhere)
         work.elsewhere.remove(name)
-        if name == LEAVES[-1].file:
-            (tmp_path / name).write_text(json.dumps({"identity": LEAVES[-1].identity}))
+        if name == LEAVES[-1].key:
+            write_record(tmp_path / NAME, name, {"identity": LEAVES[-1].identity})
         else:
             work.done.add(name)
 
     result, _ = run(work, tmp_path, pause=pause)
     assert 1 < len(need) < len(LEAVES) - 1 and LEAVES[-1] not in need
-    assert result.found == [LEAVES[-1].file] and sorted(result.made) == sorted(leaf.file for leaf in LEAVES[:-1])
-    assert not {"coarse", training.key, LEAVES[-1].file} & set(work.calls)
-    assert {leaf.file for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
+    assert result.found == [LEAVES[-1].key] and sorted(result.made) == sorted(leaf.key for leaf in LEAVES[:-1])
+    assert not {"coarse", training.key, LEAVES[-1].key} & set(work.calls)
+    assert {leaf.key for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
 
 
 def test_a_claim_is_one_process_alone_and_ends_with_it(tmp_path):

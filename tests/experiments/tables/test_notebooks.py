@@ -29,8 +29,8 @@ def visit(name, monkeypatch, results, figures):
 @pytest.fixture(scope="module")
 def made_up(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made_up")
-    synthetic.write(folder, plan.leaves(plan.FULL))
-    return folder
+    synthetic.write(folder / "matrix.jsonl", plan.leaves(plan.FULL))
+    return folder / "matrix.jsonl"
 
 
 @pytest.mark.parametrize(
@@ -45,15 +45,19 @@ def test_a_page_shows_its_picture_and_its_finding(name, made_up, tmp_path, monke
 
 
 def test_a_page_without_results_says_what_to_do(tmp_path, monkeypatch, capsys):
-    visit("ablations", monkeypatch, tmp_path, tmp_path)
+    visit("ablations", monkeypatch, tmp_path / "matrix.jsonl", tmp_path)
     assert "`make experiments ONLY=ablations` makes them" in capsys.readouterr().out
 
 
 def test_accuracies_alone_are_averaged(tmp_path, monkeypatch, capsys):
     leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "q3"]
-    synthetic.write(tmp_path, leaves, lambda question, name, seed, view, task: 0.9 * (task == "force") * (name == "t3"))
+    synthetic.write(
+        tmp_path / "matrix.jsonl",
+        leaves,
+        lambda question, name, seed, view, task: 0.9 * (task == "force") * (name == "t3"),
+    )
     monkeypatch.setattr("experiments.tables.pictures.draw_all", lambda runs, folder: [])
-    visit("q3_perception", monkeypatch, tmp_path, tmp_path)
+    visit("q3_perception", monkeypatch, tmp_path / "matrix.jsonl", tmp_path)
     found = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("T3-style ")]
     assert found == [["T3-style", "static", "+0.0"], ["T3-style", "dynamic", "+0.0"]]
 
@@ -72,21 +76,14 @@ def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, 
     monkeypatch.setattr(page, "SIZE", size)
     monkeypatch.setenv("RUN", str(tiny_run))
     monkeypatch.setenv("DATA", str(tmp_path / "data"))
-    synthetic.write(tmp_path / "made", plan.leaves(plan.FULL))
+    synthetic.write(tmp_path / "made.jsonl", plan.leaves(plan.FULL))
     monkeypatch.setattr("experiments.tables.pictures.draw_all", lambda runs, folder: [])
     for name, least in (("q2_space", 6), ("q1_sensors", 8), ("dynamics", 19)):
-        mine = visit(name, monkeypatch, tmp_path / "made", tmp_path)["mine"]
+        mine = visit(name, monkeypatch, tmp_path / "made.jsonl", tmp_path)["mine"]
         out = capsys.readouterr().out
         assert len(mine) >= least and all(f"| {row['view']} | {row['task']} |" in out for row in mine)
         assert f"{mine[0]['mean']:.3f}" in out and "| 0.500 |" in out  # theirs beside
     assert "is made, about" not in out  # the data sets of the first page serve the others
-
-
-def test_every_page_is_a_percent_script():
-    for name in PAGES:
-        text = (ROOT / "experiments" / "tables" / f"{name}.py").read_text()
-        assert text.startswith("# ---\n# jupyter:") and "# %% [markdown]\n# # " in text
-        assert "make experiments ONLY=" in text and "# ## Picture" in text and "# ## Finding" in text
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The page with its pictures, written from a folder of JSON files that holds nothing else."""
+"""The page with its pictures, written from its records alone."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ LEAVES = plan.leaves(plan.FULL)
 
 
 def test_the_page_and_its_pictures(tmp_path):
-    synthetic.write(tmp_path / "matrix", [leaf for leaf in LEAVES if leaf.seed < 2])
-    path = report.write(tmp_path / "matrix", tmp_path)
+    synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.seed < 2])
+    path = report.write(tmp_path / "matrix.jsonl", tmp_path)
     text = path.read_text()
     names = ("q1", "q2", "q3", "ablations", "dynamics", "new_sensor", "real")
     for name in names:
@@ -22,13 +22,13 @@ def test_the_page_and_its_pictures(tmp_path):
         picture = cv2.imread(str(tmp_path / "figures" / f"{name}.png"))
         assert picture.shape[1] > 500 and picture.std() > 20
     assert path.read_text() == report.text(
-        read(tmp_path / "matrix"), [tmp_path / "figures" / f"{n}.png" for n in names]
+        read(tmp_path / "matrix.jsonl"), [tmp_path / "figures" / f"{n}.png" for n in names]
     )
 
 
 def test_the_four_spaces_have_a_mark_for_every_touch_and_sensor(tmp_path):
-    synthetic.write(tmp_path, [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
-    runs = read(tmp_path)
+    synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
+    runs = read(tmp_path / "matrix.jsonl")
     path = pictures.q2(runs, tmp_path / "four.png")
     whole = cv2.imread(str(path)).shape[1]
     partly = pictures.q2([run for run in runs if run.name in ("masked", "matched")], tmp_path / "two.png")
@@ -40,19 +40,19 @@ def test_the_four_spaces_have_a_mark_for_every_touch_and_sensor(tmp_path):
 
 
 def test_the_four_spaces_are_of_one_seed(tmp_path):
-    synthetic.write(tmp_path, [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed != 0])
-    runs = [run for run in read(tmp_path) if (run.name, run.seed) != ("masked", 1)]
+    synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed != 0])
+    runs = [run for run in read(tmp_path / "matrix.jsonl") if (run.name, run.seed) != ("masked", 1)]
     chosen, told = pictures.q2(runs, tmp_path / "a.png"), pictures.q2(runs, tmp_path / "b.png", seed=2)
     assert chosen.read_bytes() == told.read_bytes()  # masked has no seed 1, so all are of seed 2
-    first = pictures.q2(read(tmp_path), tmp_path / "first.png")
-    assert first.read_bytes() == pictures.q2(read(tmp_path), tmp_path / "one.png", seed=1).read_bytes()
+    first = pictures.q2(read(tmp_path / "matrix.jsonl"), tmp_path / "first.png")
+    assert first.read_bytes() == pictures.q2(read(tmp_path / "matrix.jsonl"), tmp_path / "one.png", seed=1).read_bytes()
     apart = [run for run in runs if (run.name == "masked") == (run.seed == 2)]
     assert pictures.q2(apart, tmp_path / "c.png") is None
 
 
 def test_a_touch_without_points_in_one_space_is_left_out_of_it(tmp_path):
-    synthetic.write(tmp_path, [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
-    runs = read(tmp_path)
+    synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
+    runs = read(tmp_path / "matrix.jsonl")
     matched = next(run for run in runs if run.name == "matched")
     matched.about["points"] = [point for point in matched.about["points"] if point["touch"] != 3]
     assert pictures.q2(runs, tmp_path / "four.png") is not None

@@ -11,7 +11,7 @@ from touch_world import make_touches
 
 from anytouch_jax.data.manifest import manifest as manifests
 
-SCRIPT = EXPERIMENTS / "real_touch.py"
+SCRIPT = EXPERIMENTS / "tables" / "real_touch.py"
 
 
 @pytest.mark.slow

@@ -1,28 +1,21 @@
-"""What is said of signs, and the page that is rendered from JSON files alone."""
+"""What is said of signs, and the page that is rendered from records alone."""
 
 from __future__ import annotations
 
-import json
 import re
 
 import pytest
 import synthetic
-from places import EXPERIMENTS
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import seed_interval as interval
-from experiments.tables import plan, questions, report
+from experiments.tables import plan, questions, report, scores
 from experiments.tables.paper import TABLE6
 from experiments.tables.results import Column, change, comparable, read, spread, together, values
 
 LEAVES = plan.leaves(plan.FULL)
+NAME = "matrix.jsonl"
 THREE = {0: 50.0, 1: 52.0, 2: 54.0}
-
-
-def test_the_interval_is_students():
-    low, high = interval([1.0, 2.0, 3.0])  # sd 1, t(0.975, 2) = 4.3027
-    assert (low, high) == pytest.approx((2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), abs=1e-4)
-    assert interval([1.0]) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -75,8 +68,8 @@ def noisy(gain):
 @pytest.fixture
 def rendered(tmp_path):
     def render(gain, leaves=LEAVES):
-        synthetic.write(tmp_path, leaves, noisy(gain))
-        runs = read(tmp_path)
+        synthetic.write(tmp_path / NAME, leaves, noisy(gain))
+        runs = read(tmp_path / NAME)
         return report.text(runs), runs
 
     return render
@@ -87,14 +80,12 @@ def section(text, title):
 
 
 def test_another_page_is_not_written_over(tmp_path):
-    folder = tmp_path / "matrix"
-    folder.mkdir()
-    synthetic.write(folder, LEAVES[:1], noisy(lambda question, name: 0.0))
-    page = report.write(folder, tmp_path)
-    assert report.write(folder, tmp_path) == page and page.read_text().startswith("# The paper's questions")
+    synthetic.write(tmp_path / NAME, LEAVES[:1])
+    page = report.write(tmp_path / NAME, tmp_path)
+    assert report.write(tmp_path / NAME, tmp_path) == page
     page.write_text("# Mine")
-    with pytest.raises(UserError, match=r"README\.md is not a page of these results"):
-        report.write(folder, tmp_path)
+    with pytest.raises(UserError, match=r"README\.md"):
+        report.write(tmp_path / NAME, tmp_path)
     assert page.read_text() == "# Mine"
 
 
@@ -117,14 +108,6 @@ def test_ablations_that_help_do_not_agree_and_others_are_undecided(rendered):
     lines = section(text, "Ablations (Table 6)")
     assert "- w/o text against AnyTouch: **the sign does not agree**" in lines
     assert "| Ablations (Table 6) | 0 | 2 | 14 | 0 | 0 |" in text
-
-
-def test_views_of_one_model_are_shown_and_not_counted(rendered):
-    text, runs = rendered(lambda question, name: 0.0)
-    clips = [one for one in report.parts(runs)["dynamics"].statements if "clips against" in one.label]
-    assert {one.row.word for one in clips} == {"no sign in the paper"} and len(clips) == 2
-    assert "- AnyTouch, clips against stills: **no sign in the paper**. By column: slip " in text
-    assert "| Dynamics | 0 | 0 | 1 | 0 | 0 |" in text  # dynamic training against stills only
 
 
 def test_what_was_not_run_is_said(rendered):
@@ -186,79 +169,40 @@ def test_every_question_has_its_signs(rendered):
 )
 def test_runs_of_other_data_or_settings_stand_in_no_table(change, words, tmp_path, rendered):
     text, _ = rendered(lambda question, name: 0.05 * (name == "anytouch"))
-    path = tmp_path / "ablations-no_text-1.json"
-    whole = json.loads(path.read_text())
-    change = change | ({"settings": whole["settings"] | change["settings"]} if change.get("settings") else {})
-    path.write_text(json.dumps(whole | change))
-    after = report.text(read(tmp_path))
+    if change.get("settings"):
+        change = change | {"settings": plan.settings(plan.FULL) | change["settings"]}
+    synthetic.change(tmp_path / NAME, "ablations-no_text-1", **change)
+    after = report.text(read(tmp_path / NAME))
     lines = section(after, "Ablations (Table 6)")
     assert f"**No table: these runs differ in what they must share ({words}).**" in lines and "|" not in lines
     assert "| Ablations (Table 6) |" not in after
     assert section(after, "Dynamics") == section(text, "Dynamics")
 
 
-def test_questions_of_another_recipe_are_named(tmp_path, rendered):
-    text, _ = rendered(lambda question, name: 0.0)
-    assert "different recipes" not in text
-    for path in tmp_path.glob("q2-*.json"):
-        about = json.loads(path.read_text())
-        about["settings"] |= {"contact": 0.7}
-        path.write_text(json.dumps(about | {"simulator": 9}))
-    line = next(line for line in report.text(read(tmp_path)).splitlines() if "different recipes" in line)
-    assert "q2: simulator 9, contact 0.7" in line and f"simulator {plan.simulator()}, contact 0.6" in line
-
-
 def test_another_seed_may_have_been_simulated_on_another_processor(tmp_path):
     leaves = [leaf for leaf in LEAVES if leaf.question == "ablations"]
-    for path in synthetic.write(tmp_path, leaves):
-        about = json.loads(path.read_text())
-        if about["seed"] == 2:
-            path.write_text(json.dumps(about | {"data": {"own": "1" * 64}}))
-    runs = read(tmp_path)
+    synthetic.write(tmp_path / NAME, leaves)
+    for leaf in leaves:
+        if leaf.seed == 2:
+            synthetic.change(tmp_path / NAME, leaf.key, data={"own": "1" * 64})
+    runs = read(tmp_path / NAME)
     assert len(comparable(runs)) == len(leaves)
     assert "own 00000000 (seeds 0, 1), 11111111 (seeds 2)." in report.text(runs)
-
-
-def test_old_records_are_of_the_first_simulator_and_go_together(tmp_path):
-    for path in synthetic.write(tmp_path, LEAVES[:9]):
-        about = json.loads(path.read_text())
-        del about["simulator"], about["settings"]
-        path.write_text(json.dumps(about))
-    assert len(comparable(read(tmp_path))) == 9 and "Version of the simulator: 1." in report.text(read(tmp_path))
 
 
 def test_shares_of_the_gap(tmp_path):
     def mean(question, name, seed, view, task):
         if name == "seen":
             return 0.8
-        return {"universal, 0 unlabelled": 0.6, "fitted, 18 labelled": 0.7, "fitted, 100 labelled": 0.82}.get(view, 0.5)
+        return {scores.NOTHING: 0.6, "fitted, 18 labelled": 0.7, "fitted, 100 labelled": 0.82}.get(view, 0.5)
 
     leaves = [leaf for leaf in LEAVES if leaf.question == "new_sensor"]
-    synthetic.write(tmp_path, leaves, mean)
-    text, _, published = report.parts(read(tmp_path))["new_sensor"].text.partition("| published protocol")
+    synthetic.write(tmp_path / NAME, leaves, mean)
+    text, _, published = report.parts(read(tmp_path / NAME))["new_sensor"].text.partition("| published protocol")
     rows = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
     assert "70.0 (65.0 to 75.0) (50 %)" in rows["fitted, 18 labelled"] and "(110 %)" in rows["fitted, 100 labelled"]
-    assert "(0 %)" in rows["universal, 0 unlabelled"] and "80.0" in rows["trained on"]
+    assert "(0 %)" in rows["universal, no frame"] and "80.0" in rows["trained on"]
     assert "| fitted, 18 labelled | 1 | 70.0 | 70.0 | 70.0 |" in published
-
-
-def test_other_ways_to_read_features_stand_beside_the_tables(tmp_path):
-    def mean(question, name, seed, view, task):
-        return {"read: kNN": 0.2, "read: gradient": 0.3}.get(view, 0.6)
-
-    leaves = [leaf for leaf in LEAVES if leaf.question == "q3" and leaf.name in ("anytouch", "t3")]
-    files = synthetic.write(tmp_path, leaves, mean)
-    text = report.parts(read(tmp_path))["q3"].text
-    assert "AnyTouch, by head and pooling" in text and "T3-style, by head" not in text
-    assert "| kNN, class token and mean of patches | 3 | 20.0" in text and "| class token | 3 | 60.0" in text
-    for path in (
-        one for one in files if one.name != "q3-anytouch-0.json"
-    ):  # one seed was read in every way: the tables' own way is of that seed too
-        about = json.loads(path.read_text())
-        kept = [row for row in about["rows"] if not row["view"].startswith("read: ")]
-        path.write_text(json.dumps(about | {"rows": kept}))
-    text = report.parts(read(tmp_path))["q3"].text
-    assert "| linear, class token and mean of patches | 1 | " in text and "| gradient, class token and mean" in text
 
 
 def test_real_touch_is_above_only_when_every_interval_is(tmp_path):
@@ -267,31 +211,23 @@ def test_real_touch_is_above_only_when_every_interval_is(tmp_path):
     def mean(question, name, seed, view, task):
         return {"object": 0.08, "slip, objects left out": 0.04 + 0.01 * seed}[task] if " - " in view else 0.5
 
-    synthetic.write(tmp_path, leaves, mean)
-    words = {one.label: one.row.word for one in report.parts(read(tmp_path))["real"].statements}
+    synthetic.write(tmp_path / NAME, leaves, mean)
+    words = {one.label: one.row.word for one in report.parts(read(tmp_path / NAME))["real"].statements}
     assert words["object: above raw pixels"] == words["object: above an untrained encoder"] == "agrees"
     assert words["slip, objects left out: above raw pixels"] == "undecided"  # seed 0: 0.04 - 0.05 < 0
 
 
-def test_a_file_that_is_no_result_is_named(tmp_path):
-    (tmp_path / "q1-x-0.json").write_text('{"question": "q1"}')
-    with pytest.raises(UserError, match=r"q1-x-0\.json is no result of a run"):
-        read(tmp_path)
-
-
-def test_the_committed_page_is_what_its_sources_give():
-    out = EXPERIMENTS / "results"
-    figures = [out / "figures" / f"{name}.png" for name in (*report.parts([]),)]
-    again = report.whole(read(out / "matrix"), [path for path in figures if path.exists()], out)
-    assert (out / "README.md").read_text() == again, "render it again: make experiments RENDER=1"
+def test_a_record_that_is_no_run_is_named(tmp_path):
+    (tmp_path / NAME).write_text('{"key": "q1-x-0", "question": "q1"}\n')
+    with pytest.raises(UserError, match=r"matrix\.jsonl: q1-x-0"):
+        read(tmp_path / NAME)
 
 
 def test_toy_sizes_are_said_aloud(tmp_path):
-    synthetic.write(tmp_path, plan.leaves(plan.QUICK)[:3])
-    assert "toy sizes mean nothing" in report.text(read(tmp_path))
+    synthetic.write(tmp_path / NAME, plan.leaves(plan.QUICK)[:3])
+    assert "toy sizes mean nothing" in report.text(read(tmp_path / NAME))
 
 
-def test_an_empty_folder_renders(tmp_path):
-    (tmp_path / "matrix").mkdir()
-    text = report.write(tmp_path / "matrix", tmp_path).read_text()
-    assert "0 runs" in text and text.count("**Not run.**") == len(questions.OF) + 1
+def test_a_page_without_records_renders(tmp_path):
+    text = report.write(tmp_path / NAME, tmp_path).read_text()
+    assert "0 runs" in text and text.count("**Not run.**") == len(questions.OF)

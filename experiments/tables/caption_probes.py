@@ -1,0 +1,353 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Can what captions name be told of an object never touched?
+#
+# Captions name hardness, roughness and material. After both stages these three are told hardly better than by an
+# untrained encoder, while the form of the indenter, which no caption names, is told far better. Is it the training that
+# is short, or can the simulated touches not tell it? So here the same encoder is trained with the labels themselves,
+# which is more than any caption can say, on the scenes of `make experiments`: contact frames of four sensors, turned
+# over by chance, one linear head a label. What it tells of its own frames is what could be learned by heart; what it
+# tells of the test split, whose pairs of primitive and texture training never had, is what carries over. A small
+# convolutional network is trained in the same way: what it tells and the encoder does not is there in the touches.
+#
+# Then the sensor that is left out, in six touches of each object: linear probes of contact frames, shallow and deep
+# ones, read hardness, roughness, material and indenter from the frozen features of AnyTouch of Tables 2 to 4, of the
+# encoder trained with the labels, of an untrained one, and of the convolutional network, and from pixels less the
+# untouched gel.
+#
+# `python -m experiments.tables.caption_probes` takes some twenty minutes a seed on one core once `make experiments` has
+# trained the encoders. `STUDY=` is the folder of scenes and encoders, made if they are missing. `STEPS=` and `SEEDS=`
+# change the size, and `QUICK=1` is a trial. `TABLE=1` only rewrites the page `named.md` from `named.jsonl`. What is
+# finished is not done again. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small convolutions
+# (`--model.patch-encoder convolutional`): `named_convolutional.md`.
+
+# %%
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
+from anytouch_jax.evaluate.statistics import markdown, seed_interval
+from anytouch_jax.files import atomic_write
+from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.sim.dataset import VERSION
+from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.progress import silent
+from experiments.benchmarks import machine
+from experiments.records import read_records, write_record
+from experiments.tables import cuts, env, plan
+from experiments.tables.by_object import probe_table, probed
+from experiments.tables.work import Work
+
+QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+SIZE = plan.QUICK if QUICK else plan.FULL
+STUDY = env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
+CONVOLUTIONS = env.switch("CONVOLUTIONS")
+OUT, PLAIN = env.path("OUT", "experiments/results"), "named_quick" if QUICK else "named"
+NAME = PLAIN.replace("named", "named_convolutional") if CONVOLUTIONS else PLAIN
+RESULTS = OUT / f"{NAME}.jsonl"
+THERE = ",".join(sorted(read_records(RESULTS), key=int)) if TABLE else ""
+SEEDS = env.numbers("SEEDS", THERE or ("0" if QUICK else "0,1,2"))  # the table alone is of all that are there
+STEPS = env.number("STEPS", 5 if QUICK else 1200)
+NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)  # by captions
+LABELS = (*NAMED, *UNNAMED)
+NAMES = ("AnyTouch", "trained with labels", "untrained")  # encoders
+CONVOLUTIONAL = "convolutional, with labels"
+LEFT_OUT = plan.Scenes("left_out", (plan.UNSEEN,), 6 * SIZE.objects, "fine", 0, 0.25, first=10_000)  # same objects
+BATCH, RATE, WARMUP = 64, 1e-3, 100
+SETTINGS = {"size": SIZE.name, "steps": STEPS, "batch": BATCH, "rate": RATE, "simulator": VERSION}
+SETTINGS |= {"touches": LEFT_OUT.touches}
+enable_compilation_cache()
+
+# %% [markdown]
+# ## The touches
+
+
+# %%
+def frames(file: Path, splits: tuple[str, ...], encoder: Encoder) -> dict[str, np.ndarray]:
+    """Contact frames of a manifest: images u8 (n, h, w, 3) as the encoder gets them, sensor rows, splits, labels."""
+    table = manifests.read([file])
+    rows = contact_rows(table, splits)
+    batches = [
+        (np.asarray(batch.clip)[: len(ids), 0], np.asarray(batch.sensor)[: len(ids)])
+        for ids, batch in evaluation(table, rows, encoder.config, "still", frames=1, unknown="universal")
+    ]
+    image, sensor = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+    labels = {label: text_column(table, f"label.{label}")[rows] for label in LABELS}
+    return {"image": image, "sensor": sensor, "split": text_column(table, "split")[rows], **labels}
+
+
+def contact_rows(table: manifests.Manifest, splits: tuple[str, ...]) -> np.ndarray:
+    known = np.isin(text_column(table, "split"), splits)
+    return np.flatnonzero(known & (text_column(table, "label.contact") == "1"))
+
+
+def touches(work: Work, encoder: Encoder) -> dict[str, np.ndarray]:
+    """The frames that AnyTouch is trained on, and tested."""
+    files = [work.manifest(f"own/{name}") for name in plan.SENSORS] + [work.manifest(name) for name in plan.ALIGNED]
+    several = [frames(file, ("train", "test"), encoder) for file in files]
+    return {name: np.concatenate([one[name] for one in several]) for name in several[0]}
+
+
+# %% [markdown]
+# ## Training with the labels
+
+
+# %%
+def training(seed: int) -> plan.Training:
+    """AnyTouch of Tables 2 to 4, or the same with convolutions inside its patches."""
+    last = plan.training(SIZE, "anytouch", seed)
+    return by_convolutions_inside(last) if CONVOLUTIONS else last
+
+
+def by_convolutions_inside(one: plan.Training) -> plan.Training:
+    model = replace(one.config.model, patch_encoder="convolutional")
+    return plan.Training(replace(one.config, model=model), by_convolutions_inside(one.init) if one.init else None)
+
+
+class Pupil(NamedTuple):
+    """What is trained: f32 features (B, `width`) of images u8 (B, h, w, 3) and sensor rows (B,), by `params`."""
+
+    features: Callable[[Any, Any, Any], Any]
+    params: Any
+    width: int
+
+
+def of_encoder(encoder: Encoder) -> Pupil:
+    def features(params: Any, images: Any, sensor: Any) -> Any:
+        z = encoder.net.apply({"touch": params}, "encode", normalise_touch(images[:, None]), sensor)
+        return z.astype(jnp.float32)
+
+    return Pupil(features, encoder.params["touch"], encoder.config.model.embed)
+
+
+WIDTHS = (24, 48, 96, 160)
+FEATURES = 2 * WIDTHS[-1]
+
+
+class Convolutional(nnx.Module):
+    """Strided and plain convolutions with group norms; (B, H, W, 3) to the mean and the maximum over places of
+    what they find, (B, FEATURES)."""
+
+    def __init__(self, seed: int) -> None:
+        rngs, plan = nnx.Rngs(seed), [(3, WIDTHS[0], 5, 2)]
+        for before, width in pairwise(WIDTHS):
+            plan += [(before, width, 3, 2), (width, width, 3, 1)]
+        self.layers = nnx.List(
+            [nnx.Conv(a, b, (side, side), strides=step, use_bias=False, rngs=rngs) for a, b, side, step in plan]
+        )
+        self.norms = nnx.List([nnx.GroupNorm(width, num_groups=8, rngs=rngs) for _, width, _, _ in plan])
+
+    def __call__(self, x: Any) -> Any:
+        for layer, norm in zip(self.layers, self.norms, strict=True):
+            x = jax.nn.relu(norm(layer(x)))
+        return jnp.concatenate([x.mean((1, 2)), x.max((1, 2))], -1)
+
+
+def convolutional(seed: int) -> Pupil:
+    graph, params = nnx.split(Convolutional(seed))
+    return Pupil(lambda params, images, _: nnx.merge(graph, params)(normalise_touch(images)), params, FEATURES)
+
+
+def taught(
+    pupil: Pupil, data: dict[str, np.ndarray], seed: int, universal: int
+) -> tuple[Any, dict[str, dict[str, float]]]:
+    """Parameters trained with the labels of the train split; {label: {train, test, commonest}} shares told right."""
+    classes = {label: np.unique(data[label]) for label in LABELS}
+    numbers = {label: np.searchsorted(classes[label], data[label]) for label in LABELS}
+    train, test = (np.flatnonzero(data["split"] == part) for part in ("train", "test"))
+    heads = {label: jnp.zeros((pupil.width, len(names))) for label, names in classes.items()}
+    params: Any = {"features": pupil.params, "heads": heads}
+    warm = min(WARMUP, STEPS // 2)
+    optimiser = optax.adamw(optax.warmup_cosine_decay_schedule(0.0, RATE, warm, STEPS), weight_decay=0.1)
+
+    def logits(params: Any, images: Any, sensor: Any) -> Any:
+        z = pupil.features(params["features"], images, sensor)
+        return {label: z @ head for label, head in params["heads"].items()}
+
+    def loss(params: Any, images: Any, sensor: Any, wanted: Any) -> Any:
+        cross = optax.softmax_cross_entropy_with_integer_labels
+        return sum(cross(one, wanted[label]).mean() for label, one in logits(params, images, sensor).items())
+
+    @jax.jit
+    def step(params: Any, state: Any, *batch: Any) -> Any:
+        change, state = optimiser.update(jax.grad(loss)(params, *batch), state, params)
+        return optax.apply_updates(params, change), state
+
+    state = optimiser.init(params)
+    for number in range(STEPS):
+        rng = np.random.default_rng([seed, number])
+        rows, turned = rng.choice(train, BATCH), rng.integers(2, size=(BATCH, 2)) * 2 - 1
+        images = np.stack(
+            [data["image"][row][::down, ::across] for row, (down, across) in zip(rows, turned, strict=True)]
+        )
+        sensor = np.where(rng.random(BATCH) < 0.5, universal, data["sensor"][rows])
+        params, state = step(params, state, images, sensor.astype(np.int32), {k: v[rows] for k, v in numbers.items()})
+
+    log = jax.jit(logits)
+
+    def right(label: str, rows: np.ndarray) -> float:
+        told = [log(params, *some)[label].argmax(-1) for some in batched(data, rows)]
+        return float(np.mean(np.concatenate(told) == numbers[label][rows]))
+
+    some = np.random.default_rng(seed).choice(train, min(2000, len(train)), replace=False)
+    scores = {}
+    for label in LABELS:
+        commonest = np.bincount(numbers[label][train]).argmax()
+        scores[label] = {"train": right(label, some), "test": right(label, test)}
+        scores[label]["commonest"] = float(np.mean(numbers[label][test] == commonest))
+    return jax.tree.map(np.asarray, params["features"]), scores
+
+
+def batched(data: dict[str, np.ndarray], rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Images and sensor rows of some rows, some hundred at a time."""
+    parts = [rows[first : first + 256] for first in range(0, len(rows), 256)]
+    return [(data["image"][part], data["sensor"][part]) for part in parts]
+
+
+# %% [markdown]
+# ## The sensor left out
+
+
+# %%
+def probes(features: dict[str, np.ndarray], table: manifests.Manifest, rows: np.ndarray) -> dict[str, Any]:
+    """What linear probes of contact frames get right of each object never seen, by label."""
+    split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
+    labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in LABELS}
+    return probed(features, labels, groups, split)
+
+
+# %%
+def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Work, table: Any) -> dict[str, Any]:
+    """What AnyTouch, the encoder trained with the labels, an untrained one and pixels tell."""
+    last = training(seed)
+    anytouch = load_encoder(work.runs({"anytouch": last}, SIZE)["anytouch"])
+    params, scores = taught(of_encoder(fresh), data, seed, fresh.config.model.universal_row)
+    named = (anytouch, Encoder(fresh.config, {"touch": params}, "trained with labels"), fresh)
+    rows = contact_rows(table, cuts.SPLITS)
+    found = [embed_rows(one, table, rows, pooling="both", log=silent)[1] for one in named]
+    pixels = background_difference(table, rows)
+    features = dict(zip(NAMES, found, strict=True))
+    features["pixels"] = principal_components(pixels, text_column(table, "split")[rows] == "train")
+    return {
+        "settings": SETTINGS,
+        "anytouch": f"{last.key} (weights {anytouch.mark})",
+        "data": {name: cuts.content_hash(work.manifest(name)) for name in (*last.manifests, LEFT_OUT.name)},
+        "machine": machine.describe().sentence(),
+        "scores": scores,
+        "probes": probes(features, table, rows),
+    }
+
+
+def by_convolutions(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Work, table: Any) -> dict[str, Any]:
+    """What a convolutional network trained with the labels tells."""
+    pupil, rows = convolutional(seed), contact_rows(table, cuts.SPLITS)
+    params, scores = taught(pupil, data, seed, fresh.config.model.universal_row)
+    read, seen = jax.jit(pupil.features), frames(work.manifest(LEFT_OUT.name), cuts.SPLITS, fresh)
+    features = np.concatenate([np.asarray(read(params, *some)) for some in batched(seen, np.arange(len(rows)))])
+    return {"scores": scores, "probes": probes({CONVOLUTIONAL: features}, table, rows)}
+
+
+def one_seed(seed: int) -> dict[str, Any]:
+    """Return the record of a seed. What it lacks, or has of other settings, is measured first."""
+    found = read_records(RESULTS).get(str(seed), {})
+    if not TABLE and found.get("settings") != SETTINGS:
+        found = {}
+    if {"probes", CONVOLUTIONAL} <= set(found):
+        return found
+    if TABLE:
+        raise UserError(f"{RESULTS} has no whole record of seed {seed}. Run this page without TABLE=1.")
+    work = Work(STUDY)
+    first = training(seed).init
+    assert first is not None
+    work.make_sets(first.manifests, SIZE)
+    if not work.made(LEFT_OUT, SIZE):
+        work.make(LEFT_OUT, SIZE)
+    fresh = random_encoder(first.config, seed)
+    about = seed, fresh, touches(work, fresh), work, manifests.read([work.manifest(LEFT_OUT.name)])
+    if "probes" not in found:
+        found = by_encoders(*about)
+    there = read_records(OUT / f"{PLAIN}.jsonl").get(str(seed), {})  # the network depends on no encoder
+    same = all(there.get(kind) == found[kind] for kind in ("settings", "data"))
+    found[CONVOLUTIONAL] = there[CONVOLUTIONAL] if same and CONVOLUTIONAL in there else by_convolutions(*about)
+    write_record(RESULTS, str(seed), found)
+    return found
+
+
+runs = [one_seed(seed) for seed in SEEDS]
+
+# %% [markdown]
+# ## The table
+
+
+# %%
+def percent(values: list[float]) -> str:
+    low, high = seed_interval(values)
+    interval = "" if low is None or high is None else f" ({100 * low:.1f} to {100 * high:.1f})"
+    return f"{100 * np.mean(values):.1f} %{interval}"
+
+
+def row(label: str) -> tuple[str, ...]:
+    ways = [(run["scores"][label], run[CONVOLUTIONAL]["scores"][label]) for run in runs]
+    known = [percent([own["commonest"] for own, _ in ways])]
+    known += [percent([way[number][part] for way in ways]) for number in (0, 1) for part in ("train", "test")]
+    return (label, *known)
+
+
+def joined(run: dict[str, Any], label: str) -> dict[str, Any]:
+    """Both files' counts of a label, by object."""
+    one, other = run["probes"][label], run[CONVOLUTIONAL]["probes"][label]
+    return one | {"right": one["right"] | {CONVOLUTIONAL: other["right"][CONVOLUTIONAL]}}
+
+
+head = ("label", "commonest answer of train", "its own frames", "objects never touched")
+head += ("convolutional: its own frames", "convolutional: objects never touched")
+told = markdown(head, [row(label) for label in LABELS])
+probed_runs = [{label: joined(run, label) for label in LABELS} for run in runs]
+columns = (*NAMES, CONVOLUTIONAL, "pixels", "commonest")
+left_out = probe_table(probed_runs, columns, ("untrained", "pixels"), NAMED, UNNAMED)
+seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
+made = f"SEEDS={','.join(map(str, SEEDS))} python -m experiments.tables.caption_probes"
+made = f"CONVOLUTIONS=1 {made}" if CONVOLUTIONS else made
+inside = ", with small convolutions inside its patches" if CONVOLUTIONS else ""
+text = f"""# What captions name, of objects never touched
+
+The encoder of Tables 2 to 4{inside}, trained with the labels themselves ({runs[0]["settings"]["steps"]} steps of
+{BATCH} contact frames of four sensors), {seeds}; mean with its 95 % interval over seeds. The test split has pairs of
+primitive and texture that training never had. Captions name hardness, roughness and material; they do not name the
+indenter. Beside it a convolutional network with group norms, trained in the same way.
+
+{told}
+
+## {plan.UNSEEN}, left out of training: linear probes of contact frames (mean and spread over seeds)
+
+{runs[0]["settings"]["touches"]} touches of the same objects; none of those tested was touched in training, by any
+sensor. AnyTouch is that of Tables 2 to 4{inside}, of the same seeds; captions name the first three labels.
+
+{left_out}
+
+Made by `{made}` ({runs[0]["machine"]}), from `{NAME}.jsonl`.
+"""
+atomic_write(OUT / f"{NAME}.md", text)
+print(text)

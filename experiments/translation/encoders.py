@@ -1,0 +1,111 @@
+"""Encoders of the translation study: trained without the objects of its pairs, and their cross-sensor retrieval.
+
+The paper takes the coarse data of the objects that a translation is tested on out of pre-training (App. "Cross-sensor
+generation"). Here every row of such an object is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder
+from anytouch_jax.evaluate import retrieval
+from anytouch_jax.evaluate.contacts import deepest_rows
+from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.train.progress import silent
+from anytouch_jax.weights.tree import interpolate
+from experiments.records import read_records, write_record
+from experiments.tables import cuts, plan
+from experiments.tables.plan import Size, Training
+from experiments.tables.work import Work
+from experiments.translation import pairs
+
+LESS = "_remaining"
+SHARE = 0.5  # of the way from stage 1 to stage 2, of the encoder between them
+LAYER_DECAY = 0.1  # by the error of images of the third split, seed 0: 0.0347, with 0.3 0.0363, with 1 0.0365
+NOT_TUNED = (("stage1", "fine"),)  # it explains a frozen row
+
+
+def write_remaining(path: Path, taken: Manifest) -> Path:
+    """Write the manifest at `path` without the objects of `taken` next to it. Raises UserError when no row is left."""
+    whole = manifests.read(path)
+    kept = pairs.without_objects(whole, taken)
+    target = path.with_name(f"{path.stem}{LESS}{path.suffix}")
+    manifests.write(kept, target)
+    print(f"{target}: {len(kept)} of {len(whole)} rows are of objects that the pairs do not have")
+    return target
+
+
+def trainings(size: Size, seed: int) -> dict[str, Training]:
+    """Return AnyTouch, its stage 1, its stage 2 with layer decay, and T3-style, by name."""
+    whole, t3 = (plan.training(size, recipe, seed) for recipe in ("anytouch", "t3"))
+    assert whole.init is not None
+    kept = replace(whole.config, optim=replace(whole.config.optim, layer_decay=LAYER_DECAY))
+    found = {"anytouch": whole, "anytouch_layer_decay": Training(kept, whole.init), "stage1": whole.init, "t3": t3}
+    return {name: reduced(one) for name, one in found.items()}
+
+
+def reduced(one: Training) -> Training:
+    """Return the training, and those before it, on manifests without the objects of the pairs."""
+    names = tuple(
+        f"{name}{LESS}" if "/" in name else f"{name}/{Path(cuts.WHOLE).stem}{LESS}"
+        for name in one.config.data.manifests
+    )
+    config = replace(one.config, data=replace(one.config.data, manifests=names))
+    return Training(config, reduced(one.init) if one.init else None)
+
+
+def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]:
+    """Train what is not trained yet on the data sets of `work`, and return the run folders by name."""
+    wanted = trainings(size, seed)
+    names = sorted({name for one in wanted.values() for name in one.manifests})
+    work.make_sets(names, size)
+    for name in names:
+        write_remaining(work.manifest(name.removesuffix(LESS)), taken)
+    return work.runs(wanted, size)
+
+
+def encoders(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Encoder]:
+    """Return the encoders of `train`, and the weights half-way from AnyTouch's stage 1 to its stage 2."""
+    found = {name: load_encoder(run) for name, run in train(work, size, seed, taken).items()}
+    first, second = found["stage1"], found["anytouch"]
+    params = interpolate(first.params, second.params, SHARE)
+    return found | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}
+
+
+RETRIEVAL = "found_"  # how keys of retrieval records begin
+
+
+def score_retrieval(results: Path, name: str, seed: int, encoder: Encoder, source: str, table: Manifest) -> None:
+    """Write how often an encoder ranks the same touch by another sensor first, and among the first five of 50.
+
+    Nothing is done when `results` has a record of this encoder, named by `source`.
+    """
+    key = f"{RETRIEVAL}{name}_{seed}"
+    if read_records(results).get(key, {}).get("encoder") == source:
+        return
+    rows = deepest_rows(table, table.rows_of("test"))
+    features = {name: embed_rows(encoder, table, rows, log=silent)[1]}
+    scored = retrieval.cross_sensor_retrieval(table, features, rows, centre=(True,))
+    pooled = next(one.found for one in scored if one.query_sensor == retrieval.ALL)
+    assert pooled is not None
+    shares = {part: float(np.mean(getattr(pooled, part))) for part in ("top1", "top5")}
+    write_record(results, key, {"encoder": source, "queries": len(pooled.top1)} | shares)
+
+
+def retrieval_table(results: Path) -> str:
+    """Return the mean shares over seeds of every encoder that has a retrieval record, "" without any."""
+    records = {key: one for key, one in read_records(results).items() if key.startswith(RETRIEVAL)}
+    by_name: dict[str, list[dict[str, float]]] = {}
+    for key, one in records.items():
+        by_name.setdefault(key.removeprefix(RETRIEVAL).rsplit("_", 1)[0], []).append(one)
+    rows = [
+        (name, *(f"{100 * np.mean([one[part] for one in several]):.1f} %" for part in ("top1", "top5")))
+        for name, several in sorted(by_name.items())
+    ]
+    return markdown(("encoder", "first of 50", "among the first five"), rows) if rows else ""

@@ -1,0 +1,206 @@
+"""The command `make experiments`: sizes, the plan, mistakes, and (slow) the whole way at the smallest size."""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+import synthetic
+from places import ROOT
+
+from anytouch_jax.errors import UserError
+from experiments.records import read_records
+from experiments.tables import execute, plan, results, work
+from experiments.tables import run as matrix
+
+
+def test_the_plan_is_printed_with_what_is_done(tmp_path, capsys):
+    leaves = plan.leaves(plan.QUICK, real=False)
+    synthetic.write(tmp_path / "matrix.jsonl", leaves[:2])
+    words = ["--plan", "--quick", "--out", str(tmp_path), "--real", str(tmp_path / "none.csv")]
+    assert matrix.main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(leaves) + 1
+    assert [" done " in line for line in lines[:3]] == [True, True, False]
+    assert matrix.main([*words, "--only", "q1", "q2"]) == 0
+    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()[:-1]} == {"q1", "q2"}
+
+
+def test_chunks_of_the_command_are_all_of_it(tmp_path, capsys):
+    lines = []
+    for part in ("1/2", "2/2"):
+        assert matrix.main(["--plan", "--out", str(tmp_path), "--real", str(tmp_path / "no"), "--chunk", part]) == 0
+        lines += [line.split()[:4] for line in capsys.readouterr().out.splitlines()[:-1]]
+    whole = [[leaf.question, leaf.name, "seed", str(leaf.seed)] for leaf in plan.leaves(plan.FULL, real=False)]
+    assert lines == whole
+
+
+def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
+    leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "grasp"]
+    synthetic.write(tmp_path / "matrix.jsonl", leaves)
+    assert matrix.main(["--render", "--out", str(tmp_path), "--work", str(tmp_path / "never")]) == 0
+    text = (tmp_path / "README.md").read_text()
+    assert capsys.readouterr().out.strip() == str(tmp_path / "README.md") and not (tmp_path / "never").exists()
+    assert "| AnyTouch | 3 | 50.0 (50.0 to 50.0) | 50.0 (50.0 to 50.0) | 80.53 | 99.00 |" in text
+
+
+def test_sizes_can_be_changed():
+    size = matrix.size_of(False, ["steps1=7", "seeds=3,4", "rate1=0.01"])
+    assert (size.steps1, size.seeds, size.rate1, size.name) == (7, (3, 4), 0.01, "changed")
+    assert matrix.size_of(True, []) == plan.QUICK and matrix.size_of(False, []) == plan.FULL
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--set", "depth=3"], "--set depth=3: choose among own, "),
+        (["--set", "steps1=many"], "'many' is no number"),
+        (["--set", "own=0"], "--set own=0: 1 or more"),
+        (["--set", "match_head=foo"], "--set match_head=foo: choose among mlp, cosine, none"),
+        (["--set", "seeds=0,0,1"], "--set seeds=0,0,1: each seed once"),
+        (["--minutes", "-1"], "--minutes -1: above 0"),
+        (["--only", "q9"], "there is no question 'q9'; choose among q1"),
+        (["--only", "real", "--real", "no.csv"], "needs real touch, and there is no "),
+        (["--chunk", "3/2"], "--chunk 3/2: write it as 2/4"),
+        (["--chunk", "half"], "write it as 2/4"),
+    ],
+)
+def test_mistakes_are_one_sentence(words, sentence, capsys):
+    assert matrix.main(["--plan", *words]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and len(error.splitlines()) == 1
+
+
+def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, capsys):
+    for size in (plan.FULL, plan.QUICK):
+        work.check_objects(size)
+    for changes in (["own=150"], ["coarse=100", "objects=180"]):
+        words = ["--work", str(tmp_path / "work"), "--jobs", "2", "--minutes", "0.01", "--set", *changes]
+        assert matrix.main(words) == 2
+        error = capsys.readouterr().err
+        assert re.search(r"the object .* would be in \w+ of own and in \w+ of (fine|coarse): give both", error)
+        assert len(error.splitlines()) == 1 and not (tmp_path / "work").exists()
+        mended = int(re.search(r"--set objects=(\d+)", error).group(1))
+        work.check_objects(matrix.size_of(False, [*changes, f"objects={mended}"]))
+
+
+def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(tmp_path, capsys):
+    words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    words += ["--minutes", "0.01", "--jobs", "3"]
+    path, leaves = tmp_path / "matrix.jsonl", plan.leaves(plan.QUICK, real=False)
+    settings = plan.settings(plan.QUICK)
+    for change in ({"simulator": 1}, {"settings": settings | {"steps1": 999}}):
+        synthetic.write(path, leaves[:2])
+        synthetic.change(path, leaves[1].key, **change)
+        before = path.read_text()
+        assert matrix.main(words) == 2
+        error = capsys.readouterr().err
+        assert leaves[1].question in error and "OUT=" in error and len(error.splitlines()) == 1
+        assert path.read_text() == before and not (tmp_path / "work").exists()
+
+
+def test_results_of_a_question_that_is_not_run_may_be_of_another_simulator(tmp_path):
+    leaves, path = plan.leaves(plan.QUICK, real=False), tmp_path / "matrix.jsonl"
+    synthetic.write(path, leaves[:1])
+    synthetic.change(path, leaves[0].key, simulator=1)
+    execute.check_results([leaf for leaf in leaves if leaf.question != leaves[0].question], path)
+    with pytest.raises(UserError, match=leaves[0].question):
+        execute.check_results(leaves, path)
+
+
+def test_seeds_alone_make_no_other_size():
+    assert matrix.size_of(False, ["seeds=2"]).name == "full"
+    assert matrix.size_of(False, ["seeds=2", "steps1=7"]).name == "changed"
+
+
+def test_the_committed_results_are_of_one_simulator_and_can_be_shown():
+    runs = results.read(ROOT / "experiments" / "results" / "matrix.jsonl")
+    assert len({results.simulated(run.about) for run in runs}) == 1 and len(results.comparable(runs)) == len(runs)
+
+
+def test_processes_side_by_side_have_cores_of_their_own(tmp_path, monkeypatch):
+    started, shares = [], []
+
+    class Process:
+        def __init__(self, words):
+            started.append(words)
+            self.pid = len(started)
+
+        def wait(self):
+            return -9 if self.pid == 2 else 0
+
+    monkeypatch.setattr(matrix.subprocess, "Popen", Process)
+    monkeypatch.setattr(matrix, "cores", lambda: [3, 4, 5])
+    monkeypatch.setattr(matrix.os, "sched_setaffinity", lambda pid, cores: shares.append((pid, cores)), raising=False)
+    words = ["--quick", "--only", "q2", "--work", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    assert matrix.main(words) == 9  # one was killed
+    assert [one[-2:] for one in started] == [["--jobs", "1"]] * 2 and started[0][3 : 3 + len(words)] == words
+    assert shares == [(1, [3, 5]), (2, [4])]
+    assert matrix.main([*words, "--jobs", "4"]) == 0 and len(shares) == 2  # more than cores: they are shared
+
+
+@pytest.mark.parametrize("when", ["start", "wait"])
+def test_sigterm_is_passed_on(when, tmp_path, monkeypatch):
+    started, ended = [], []
+
+    class Process:
+        pid = 0
+
+        def __init__(self, words):
+            if when == "start" and started:
+                signal.raise_signal(signal.SIGTERM)
+            started.append(self)
+
+        def wait(self):
+            if when == "wait" and not ended:
+                signal.raise_signal(signal.SIGTERM)
+            return 130
+
+        def terminate(self):
+            ended.append(self)
+
+    monkeypatch.setattr(matrix.subprocess, "Popen", Process)
+    monkeypatch.setattr(matrix, "cores", lambda: [0])
+    before = signal.getsignal(signal.SIGTERM)
+    words = ["--quick", "--only", "q2", "--work", str(tmp_path), "--real", str(tmp_path / "no.csv")]
+    assert matrix.main([*words, "--jobs", "2"]) == 130 and len(set(ended)) == 2
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_changed_sizes_are_written_beside_the_data():
+    default = ROOT / "experiments" / "results"
+    assert matrix.choose(matrix.options([])).out == default
+    for words in (["--quick"], ["--set", "steps1=7"]):
+        found = matrix.choose(matrix.options([*words, "--work", "there"]))
+        assert found.out == Path("there") / "results" and found.folder == Path("there")
+    assert matrix.choose(matrix.options(["--set", "steps1=7", "--out", "here"])).out == Path("here")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
+    sizes = {"own": 24, "fine": 24, "coarse": 24, "other": 24, "objects": 24, "frames": 6, "steps1": 2, "steps2": 2}
+    words = ["--quick", "--set", *(f"{name}={number}" for name, number in sizes.items())]
+    words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
+    words += ["--real", str(tmp_path / "none.csv"), "--jobs", "1"]
+    assert matrix.main(words) == 0, capsys.readouterr().err
+    records = read_records(tmp_path / "out" / "matrix.jsonl")
+    ways = ("aligned", "contact", "masked", "matched", "matched_mlp", "pixels", "untrained")
+    assert [*records] == ["grasp-anytouch-0", *(f"q2-{way}-0" for way in ways)]
+    stored, grasp = records["q2-matched-0"], records["grasp-anytouch-0"]
+    assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"]["run"]["steps"] == 2
+    assert all(len(value) == 64 for value in stored["data"].values()) and stored["machine"] and stored["source"]
+    assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(stored["points"]) > 4
+    assert [row["view"] for row in grasp["rows"]] == ["during"] * 2 + ["after"] * 2  # by both protocols
+    assert grasp["data"].keys() >= {"own/grasp"}
+    assert all(len(row["values"]) == plan.QUICK.refits and row["groups"] > 1 for row in grasp["rows"])
+    assert records["q2-untrained-0"]["untrained"]["model"]["embed"] == 32
+    assert records["q2-pixels-0"]["untrained"] is None
+    trained = sorted((tmp_path / "work" / "trained").iterdir())
+    assert len(trained) == 4  # one stage 1, three stages 2
+    capsys.readouterr()
+    assert matrix.main(words) == 0  # all is there
+    assert "0 runs made, 8 were there, 0 left, 0 failed" in capsys.readouterr().out
+    assert "toy sizes mean nothing" in (tmp_path / "out" / "README.md").read_text()

@@ -1,0 +1,49 @@
+"""Files of results: a record replaces that of its key, writers do not lose each other's records."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+
+from anytouch_jax.errors import UserError
+from experiments.records import read_records, write_record
+
+
+def write_several(path, writer):
+    for number in range(10):
+        write_record(path, f"{writer}-{number}", {"value": number})
+
+
+def test_what_is_written_is_read_in_the_order_of_the_keys(tmp_path):
+    path = tmp_path / "new" / "study.jsonl"
+    assert read_records(path) == {}
+    for key, value in (("b", 1), ("a", [1.5, None]), ("b", 2)):
+        write_record(path, key, {"value": value})
+    assert [*read_records(path).items()] == [("a", {"value": [1.5, None]}), ("b", {"value": 2})]
+    assert len(path.read_text().splitlines()) == 2 and [*path.parent.iterdir()] == [path]
+
+
+def test_a_reader_may_change_what_it_read(tmp_path):
+    path = tmp_path / "study.jsonl"
+    write_record(path, "a", {"value": 1})
+    read_records(path)["b"] = {}
+    assert [*read_records(path)] == ["a"]
+
+
+def test_processes_lose_no_record(tmp_path):
+    path = tmp_path / "study.jsonl"
+    with ProcessPoolExecutor(3) as pool:
+        list(pool.map(write_several, [path] * 3, "abc"))
+    assert len(read_records(path)) == 30
+
+
+def test_a_broken_line_is_named_and_nan_is_refused(tmp_path):
+    path = tmp_path / "study.jsonl"
+    write_record(path, "a", {})
+    with pytest.raises(ValueError, match="Out of range"):
+        write_record(path, "b", {"value": math.nan})
+    path.write_text(path.read_text() + '{"key": "b", "va')
+    with pytest.raises(UserError, match=r"study\.jsonl, line 2"):
+        read_records(path)

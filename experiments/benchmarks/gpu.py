@@ -18,19 +18,19 @@ import jax
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
-from experiments.benchmarks import machine, speed, speed_report
+from experiments.benchmarks import machine, speed
 from experiments.benchmarks.variants import variants_of
 from experiments.benchmarks.workloads import Workload, workloads
 
 BATCHES = (8, 16, 32, 64, 128, 256, 512)
 
 
-def fastest(rows: list[speed.Row]) -> str:
+def fastest(rows: list[speed.SpeedRow]) -> str:
     """The variant that a user of an accelerator wants, among those that ran."""
     return min((row for row in rows if not row.note), key=lambda row: row.seconds).variant
 
 
-def sweep(work: Workload, rows: list[speed.Row], batches: tuple[int, ...], rounds: int) -> list[list[str]]:
+def sweep(work: Workload, rows: list[speed.SpeedRow], batches: tuple[int, ...], rounds: int) -> list[list[str]]:
     """Speed and memory of the fastest variant, and of the one with remat, for every batch that fits."""
     names = dict.fromkeys([fastest(rows), *(row.variant for row in rows if "remat" in row.variant and not row.note)])
     lines = []
@@ -59,19 +59,17 @@ def main() -> None:
         parser.error(f"{', '.join(sorted(unknown))}: choose among stage1, stage2, embed")
     here = machine.describe()
     print(here.sentence(), file=sys.stderr)
-    rows: list[speed.Row] = []
+    rows: list[speed.SpeedRow] = []
     swept: list[list[str]] = []
 
     def save() -> Path:
         """After every workload: a machine that is only lent may go away."""
         heads = ("workload", "variant", "batch", "samples/s", "of its peak", "GiB")
-        text = f"# Speed against error, preset {options.preset}\n\n{here.sentence()}\n\n{speed_report.NOTES}\n\n"
-        text += speed_report.to_markdown(rows)
+        text = f"# Speed against error, preset {options.preset}\n\n{here.sentence()}\n\n{speed.NOTES}\n\n"
+        text += speed.speed_table(rows)
         text += f"\n## Memory against batch size\n\n{statistics.markdown(heads, swept)}\n" if swept else ""
         numbers = {"machine": dataclasses.asdict(here), "preset": options.preset, "sweep": swept}
-        return speed_report.write(
-            options.out, "gpu", text, numbers | {"rows": [speed_report.as_dict(row) for row in rows]}
-        )
+        return speed.write_page(options.out, "gpu", text, numbers | {"rows": [speed.record_of(row) for row in rows]})
 
     def log(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
@@ -81,9 +79,9 @@ def main() -> None:
         try:
             found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, log=log)
         except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
-            found = [speed.Row(work.name, "none", work.samples, note=str(error).splitlines()[0])]
+            found = [speed.SpeedRow(work.name, "none", work.samples, note=str(error).splitlines()[0])]
         rows += found
-        print(speed_report.to_markdown(found), flush=True)
+        print(speed.speed_table(found), flush=True)
         save()
     for work in works:
         if work.trains and options.batches:

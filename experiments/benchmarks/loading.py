@@ -1,4 +1,4 @@
-"""How fast data come: the loader beside plain decoding and resizing, and the opening of a manifest of millions of rows.
+"""Benchmarks of the loader: plain decoding, batches by threads, and the opening of a manifest of millions of rows.
 
 Variants run in turns, so that a busy machine slows all of them alike; the figures are medians over the rounds.
 """
@@ -12,9 +12,10 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown
+from experiments.benchmarks.speed import interleaved
 
 SIZES = ((320, 240), (640, 480))
 PLAIN, PLAIN_LINEAR, NO_JITTER, ALL = (
@@ -40,10 +42,12 @@ _JITTER = {"brightness": 0, "contrast": 1, "saturation": 2, "hue": 3}
 _FRAMES = 200  # frames of a video in the large manifest
 
 
-class Speed(NamedTuple):
+@dataclass(frozen=True)
+class LoaderSpeed:
     """Images a second of one variant on pictures of `size`, and its share of plain decoding in the same round.
 
-    `cpu_share` compares processor time, which other programs on the machine disturb less than the clock.
+    `cpu_share` compares processor time, which other programs on the machine disturb less than the clock. `threads` of
+    the loader; `pixels` a side of its pictures.
     """
 
     size: tuple[int, int]
@@ -51,9 +55,12 @@ class Speed(NamedTuple):
     images_per_second: float
     share: float
     cpu_share: float
+    threads: int
+    pixels: int
 
 
-class Opened(NamedTuple):
+@dataclass(frozen=True)
+class Opened:
     """A manifest of `rows` opened by a fresh process: seconds to read it, to prepare the loader and to fill the first
     batch; the process's largest memory in MB after reading and after the first batch."""
 
@@ -66,33 +73,26 @@ class Opened(NamedTuple):
     peak_mb: float
 
 
-@dataclass(frozen=True)
-class Loading:
-    """What was measured, with `threads` loader threads and the model's pictures of `pixels` a side."""
+def loader_table(rows: Sequence[LoaderSpeed]) -> str:
+    """Return a table with a line a variant."""
+    heads = ("pictures", "what is done", "images/s", "share of decode + resize", "by processor time")
+    cells = [
+        (f"{x.size[0]} x {x.size[1]}", x.variant, f"{x.images_per_second:.0f}", f"{x.share:.0%}", f"{x.cpu_share:.0%}")
+        for x in rows
+    ]
+    about = f"{rows[0].threads} threads, pictures resized to {rows[0].pixels} x {rows[0].pixels}, JPEG"
+    return f"{about}\n\n{markdown(heads, cells)}\n"
 
-    threads: int
-    pixels: int
-    speeds: tuple[Speed, ...]
-    opened: tuple[Opened, ...]
 
-    def to_markdown(self) -> str:
-        """Two tables: throughput, and opening."""
-        speeds = [
-            (f"{w} x {h}", variant, f"{speed:.0f}", f"{share:.0%}", f"{cpu_share:.0%}")
-            for (w, h), variant, speed, share, cpu_share in self.speeds
-        ]
-        opened = [
-            (f"{x.rows:,}", str(x.stage), *(f"{seconds:.2f} s" for seconds in (x.read, x.prepare, x.first_batch)),
-             f"{x.read_mb:.0f} MB", f"{x.peak_mb:.0f} MB")
-            for x in self.opened
-        ]  # fmt: skip
-        heads = ("pictures", "what is done", "images/s", "share of decode + resize", "by processor time")
-        text = f"{self.threads} threads, pictures resized to {self.pixels} x {self.pixels}, JPEG\n\n"
-        text += markdown(heads, speeds) + "\n"
-        if opened:
-            names = ("rows", "stage", "read", "prepare", "first batch", "memory, read", "memory, largest")
-            text += "\n" + markdown(names, opened) + "\n"
-        return text
+def opened_table(rows: Sequence[Opened]) -> str:
+    """Return a table with a line a manifest and stage."""
+    heads = ("rows", "stage", "read", "prepare", "first batch", "memory, read", "memory, largest")
+    cells = [
+        (f"{x.rows:,}", str(x.stage), *(f"{seconds:.2f} s" for seconds in (x.read, x.prepare, x.first_batch)),
+         f"{x.read_mb:.0f} MB", f"{x.peak_mb:.0f} MB")
+        for x in rows
+    ]  # fmt: skip
+    return markdown(heads, cells) + "\n"
 
 
 def measure_loading(
@@ -106,7 +106,7 @@ def measure_loading(
     rows: int = 2_500_000,
     stages: Sequence[int] = (1, 2),
     log: Callable[[str], None] | None = None,
-) -> Loading:
+) -> list[LoaderSpeed | Opened]:
     """Measure in `folder`, which gets `pictures` files of every size and, if `rows`, a manifest of so many rows.
 
     Raises UserError for sizes that make no sense.
@@ -114,7 +114,7 @@ def measure_loading(
     if min(pictures, rounds, threads, pixels) < 1 or rows < 0 or pixels % 14:
         raise UserError("pictures, rounds, threads and pixels must be at least 1, and pixels a multiple of 14")
     root = Path(folder)
-    speeds: list[Speed] = []
+    speeds: list[LoaderSpeed] = []
     for size in sizes:
         if log:
             log(f"loading: {size[0]} x {size[1]}, {rounds} rounds of {pictures} pictures")
@@ -127,7 +127,7 @@ def measure_loading(
             if log:
                 log(f"loading: a manifest of {rows:,} rows, stage {stage}")
             opened.append(open_large(path, stage, threads))
-    return Loading(threads, pixels, tuple(speeds), tuple(opened))
+    return [*speeds, *opened]
 
 
 def write_pictures(folder: Path, size: tuple[int, int], count: int) -> Path:
@@ -151,7 +151,7 @@ def write_pictures(folder: Path, size: tuple[int, int], count: int) -> Path:
 # Throughput ---------------------------------------------------------------------------------------------------------
 
 
-def _speeds(path: Path, size: tuple[int, int], rounds: int, threads: int, pixels: int) -> list[Speed]:
+def _speeds(path: Path, size: tuple[int, int], rounds: int, threads: int, pixels: int) -> list[LoaderSpeed]:
     manifest = manifests.read(path)
     files = [manifest.file(row) for row in range(len(manifest))]
     variants: dict[str, Callable[[], None]] = {
@@ -172,7 +172,8 @@ def _speeds(path: Path, size: tuple[int, int], rounds: int, threads: int, pixels
     found = []
     for name, taken in seconds.items():
         wall, cpu = np.median(plain / np.array(taken), axis=0).tolist()
-        found.append(Speed(size, name, len(files) / float(np.median(taken, axis=0)[0]), wall, cpu))
+        rate = len(files) / float(np.median(taken, axis=0)[0])
+        found.append(LoaderSpeed(size, name, rate, wall, cpu, threads, pixels))
     return found
 
 
@@ -301,4 +302,110 @@ def open_here(path: str, stage: int, threads: int) -> None:
         times.append(time.perf_counter())
     read, prepare, batch = np.diff(times).round(3).tolist()
     found = Opened(len(manifest), stage, read, prepare, batch, round(read_mb), round(memory()))
-    sys.stdout.write(json.dumps(found._asdict()) + "\n")
+    sys.stdout.write(json.dumps(asdict(found)) + "\n")
+
+
+# Batches by threads --------------------------------------------------------------------------------------------------
+
+_SIDE = (320, 240)  # pixels of the made-up frames: width, height, those of a DIGIT
+_FEED_FRAMES = 12  # of a recording
+_BATCHES = 2  # of a measurement
+
+
+@dataclass(frozen=True)
+class Feed:
+    """A way to load: seconds a batch, frames a second, and ratio of time and difference of bytes to one thread."""
+
+    kind: str
+    threads: int
+    samples: int
+    seconds: float
+    seconds_iqr: float
+    frames_per_second: float
+    ratio: float
+    difference: int
+
+
+def measure_feeds(name: str, batch: int, *, rounds: int = 5) -> list[Feed]:
+    """A row for each number of threads, stills and clips. Raises UserError where the folder cannot be written."""
+    threads = sorted({1, 2, max(2, os.cpu_count() or 1)})
+    with TemporaryDirectory() as folder:
+        manifest = manifests.read([str(_recordings(Path(folder), max(4, batch // 4)))])
+        return [row for kind in ("clip", "still") for row in _feeds(manifest, name, kind, batch, rounds, threads)]
+
+
+def _recordings(folder: Path, recordings: int) -> Path:
+    """A manifest of recordings of smooth noise, as PNG files."""
+    rng, lines = np.random.default_rng(0), ["path,sensor,sequence,frame_index,split"]
+    try:
+        for sequence in range(recordings):
+            for frame in range(_FEED_FRAMES):
+                small = rng.integers(0, 256, (12, 16, 3), np.uint8)
+                name = f"{sequence:03d}_{frame:02d}.png"
+                if not cv2.imwrite(str(folder / name), cv2.resize(small, _SIDE, interpolation=cv2.INTER_CUBIC)):
+                    raise OSError(28, "the disk does not take it")
+                lines.append(f"{name},digit,{sequence},{frame},train")
+        (folder / "manifest.csv").write_text("\n".join(lines) + "\n")
+    except OSError as error:
+        raise UserError(f"cannot write frames to {folder}: {error.strerror}") from None
+    return folder / "manifest.csv"
+
+
+def _feeds(manifest: Any, name: str, kind: str, batch: int, rounds: int, threads: Sequence[int]) -> list[Feed]:
+    base = preset(name)
+
+    def config(count: int) -> Config:
+        share = 1.0 if kind == "clip" else 0.0
+        return replace(base, data=replace(base.data, threads=count, batch_size=batch, order="random", clip_share=share))
+
+    loaders = [Loader(manifest, config(count)) for count in threads]
+    first = [next(iter(_batches(loader, 1))) for loader in loaders]
+    times = interleaved([lambda loader=loader: _batches(loader, _BATCHES) for loader in loaders], rounds)  # type: ignore[misc]
+    base_times = times[0][:, 0]
+    rows = []
+    for count, seconds, one in zip(threads, (t[:, 0] / _BATCHES for t in times), first, strict=True):
+        low, middle, high = np.percentile(seconds, [25, 50, 75])
+        frames = one.clip.shape[0] * one.clip.shape[1]
+        rows.append(
+            Feed(
+                kind=kind,
+                threads=count,
+                samples=batch,
+                seconds=float(middle),
+                seconds_iqr=float(high - low),
+                frames_per_second=float(frames / middle),
+                ratio=float(np.median(seconds * _BATCHES / base_times)),
+                difference=int(np.max(np.abs(one.clip.astype(int) - first[0].clip.astype(int)))),
+            )
+        )
+    return rows
+
+
+def _batches(loader: Loader, count: int) -> list[Any]:
+    return [batch for _, batch, _ in loader.stream(0, count)]
+
+
+def feed_table(rows: Sequence[Feed]) -> str:
+    """A line a way to load."""
+    heads = (
+        "batches of",
+        "threads",
+        "batch",
+        "time / one thread",
+        "ms a batch (IQR)",
+        "frames/s",
+        "largest difference",
+    )
+    cells = [
+        [
+            f"{row.kind}s",
+            str(row.threads),
+            str(row.samples),
+            f"{row.ratio:.2f}",
+            f"{1e3 * row.seconds:.1f} ({1e3 * row.seconds_iqr:.1f})",
+            f"{row.frames_per_second:.0f}",
+            str(row.difference),
+        ]
+        for row in rows
+    ]
+    return markdown(heads, cells) + "\n"

@@ -1,29 +1,26 @@
-"""`anytouch bench`: one table of speed against error."""
+"""Benchmarks: one page of speed against error, with its numbers as JSON."""
 
 from __future__ import annotations
 
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from anytouch_jax.cli.output import check_folder
-from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import log
 from anytouch_jax.config import PresetName
-from anytouch_jax.config.parsing import COUNT, in_range
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import plots
+from experiments.benchmarks import compilation, loading, machine, simulator, speed, workloads
+from experiments.benchmarks.speed import NAN
 from experiments.command import run_script
 
-if TYPE_CHECKING:
-    from experiments.benchmarks.speed import Row
-
-_QUICK_ROUNDS, _QUICK_SAMPLES, _QUICK_PEAK = 2, 2, 512
-_NETWORK = ("stage1", "stage2", "embed")
-Section = tuple[str, str, list[Any]]  # title, Markdown, records
+Section = tuple[str, list[Any]]  # title, records
+QUICK_ROUNDS, QUICK_SAMPLES, QUICK_PEAK = 2, 2, 512
+QUICK_NOTE = "A quick run: two rounds on tiny batches, to see that everything works. Not for comparison."
+MEMORY_NOTE = " ".join((compilation.__doc__ or "").split("\n\n", 1)[1].split())
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class Bench:
 
     Example: python -m experiments.benchmarks.run stage1 embed --preset small --out runs/bench
 
-    Without WHAT everything is measured. Variants take turns in one process; quiet the machine first.
+    Without WHAT everything is measured. The variants take turns in one process. Quiet the machine first.
     """
 
     what: tuple[Literal["stage1", "stage2", "embed", "compile", "memory", "simulator", "loader"], ...]
@@ -42,186 +39,171 @@ class Bench:
     batch: int | None = None
     """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; 4 a device for memory)."""
     out: Path = Path("runs/bench")
-    """Folder for speed.md (speed_WHAT_PRESET.md where not everything at preset tiny), its numbers and figures/."""
+    """Folder of speed.md (speed_WHAT_PRESET.md for a part, or another preset), its numbers and figures/."""
     rounds: int = 9
-    """Rounds in which all variants take turns; figures are medians."""
+    """Rounds in which all variants take turns. Figures are medians."""
     quick: bool = False
-    """Two rounds of tiny batches: does it work?"""
+    """Two rounds of tiny batches, to see that everything works."""
+
+    @property
+    def stem(self) -> str:
+        """The name of the page: no measurement replaces one of something else."""
+        plain = not self.what and self.preset == "tiny"
+        return "_".join(("speed", *dict.fromkeys(self.what), *(() if plain else (self.preset,))))
+
+    @property
+    def turns(self) -> int:
+        return QUICK_ROUNDS if self.quick else self.rounds
+
+    @property
+    def samples(self) -> int | None:
+        return self.batch or (QUICK_SAMPLES if self.quick else None)
 
 
 def run(options: Bench) -> int:
-    """Measure what was asked for, write a page, its numbers and a figure a workload, and print the tables.
+    """Measure, and write the page, its numbers and a figure a workload after each section.
 
-    The page is speed.md, with WHAT and the preset in its name where only some or another preset was asked for: no
-    measurement is written over by one of something else. Raises UserError for a page that somebody wrote, and for a
-    quick run in the place of a measurement.
+    Raises UserError for numbers below 1, and for a page that this run may not replace.
     """
-    from experiments.benchmarks import machine
-
-    in_range("--", options, batch=COUNT, rounds=COUNT)
-    _refuse_unused(options)
-    page = options.out / f"{_stem(options)}.md"
-    check_folder(page)
-    if page.exists() and not page.with_suffix(".json").exists():
-        raise UserError(f"{page} was not made by bench, it has no numbers beside it: choose another --out")
-    if options.quick and page.exists() and not _made_quickly(page):
-        raise UserError(f"{page} holds a measurement, which a quick run would replace: choose another --out")
+    for name in ("rounds", "batch"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise UserError(f"--{name} must be 1 or more, not {value}.")
+    page = options.out / f"{options.stem}.md"
+    if page.exists() and (not page.with_suffix(".json").exists() or (options.quick and not _is_quick(page))):
+        raise UserError(f"{page} is another page or a measurement, which this run would replace. Choose another --out.")
     here = machine.describe()
     log(here.sentence())
-    wanted: list[str] = list(dict.fromkeys(options.what)) or list(_SECTIONS)
-    sections: list[Section] = []
-    for name in wanted:
-        for section in _SECTIONS[name](options, name):
-            sections.append(section)
-            path = _write(options, here, sections)  # after each: what was measured is not lost with what fails later
-            print(section[1])
-    log(f"{path}, its numbers in {path.stem}.json, and figures/ beside it")
+    numbers: dict[str, Any] = {"machine": speed.record_of(here), "preset": options.preset, "rounds": options.turns}
+    numbers |= {"quick": options.quick, "results": {}}
+    for name in dict.fromkeys(options.what) or SECTIONS:
+        for title, rows in SECTIONS[name](options, name):
+            if found := _figure(title, rows):
+                path, points, axes = found
+                plots.pareto(options.out / path, points, title=title, **axes)
+            numbers["results"][title] = [speed.record_of(row) for row in rows]
+            speed.write_page(options.out, options.stem, page_of(numbers), numbers)
+            print(section_of(title, rows))
+    log(f"{page}, its numbers in {page.stem}.json, and figures/")
     return 0
 
 
-def _refuse_unused(options: Bench) -> None:
-    asked: set[str] = {*(options.what or _SECTIONS)}
-    if asked == {"simulator"}:
-        refuse(options, ("preset", "batch"), "for the simulator alone, which has no network")
-    if asked <= {"compile", "memory"}:
-        refuse(options, ("rounds",), "for compilation and memory, which are measured once")
-    if options.quick:
-        refuse(options, ("rounds",), f"with --quick, which takes {_QUICK_ROUNDS}")
+def log(sentence: str) -> None:
+    """Print progress to standard error."""
+    print(sentence, file=sys.stderr, flush=True)
 
 
-def _stem(options: Bench) -> str:
-    plain = not options.what and options.preset == Bench.preset
-    return "_".join(("speed", *dict.fromkeys(options.what), *(() if plain else (options.preset,))))
-
-
-def _made_quickly(page: Path) -> bool:
-    """Whether the numbers beside a page are of a quick run, or none that can be read."""
+def _is_quick(page: Path) -> bool:
     try:
-        return bool(json.loads(page.with_suffix(".json").read_text(encoding="utf-8")).get("quick", True))
-    except (OSError, ValueError, AttributeError):
+        return bool(json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))["quick"])
+    except (OSError, ValueError, KeyError):
         return True
 
 
-def _write(options: Bench, here: Any, sections: list[Section]) -> Path:
-    from experiments.benchmarks import speed_report
+# The page -------------------------------------------------------------------------------------------------------------
 
-    quick = "A quick run: two rounds on tiny batches, to see that everything works. Not for comparison.\n\n"
-    text = f"# Speed against error\n\n{here.sentence()}\n\n{quick if options.quick else ''}{speed_report.NOTES}\n"
-    text += "".join(f"\n## {title}\n\n{body}" for title, body, _ in sections)
-    numbers = {
-        "machine": speed_report.as_dict(here),
-        "preset": options.preset,
-        "rounds": _rounds(options),
-        "quick": options.quick,
-        "results": {title: [speed_report.as_dict(row) for row in rows] for title, _, rows in sections},
-    }
-    return speed_report.write(options.out, _stem(options), text, numbers)
+TABLES: tuple[tuple[Any, Callable[[Any], str]], ...] = (
+    (speed.SpeedRow, speed.speed_table),
+    (compilation.Start, compilation.start_table),
+    (compilation.Layout, compilation.layout_table),
+    (simulator.FidelityRow, simulator.fidelity_table),
+    (simulator.Recorded, simulator.recording_table),
+    (loading.Feed, loading.feed_table),
+    (loading.LoaderSpeed, loading.loader_table),
+    (loading.Opened, loading.opened_table),
+)
 
 
-def _rounds(options: Bench) -> int:
-    return _QUICK_ROUNDS if options.quick else options.rounds
+def page_of(numbers: dict[str, Any]) -> str:
+    """Return the page of a run from its numbers alone."""
+    parts = ["# Speed against error\n", f"{machine.Machine(**numbers['machine']).sentence()}\n"]
+    parts += [*([f"{QUICK_NOTE}\n"] if numbers["quick"] else []), f"{speed.NOTES}\n"]
+    for title, rows in numbers["results"].items():
+        parts += [f"## {title}\n", section_of(title, [_record(row) for row in rows])]
+    return "\n".join(parts)
 
 
-def _batch(options: Bench) -> int | None:
-    return options.batch or (_QUICK_SAMPLES if options.quick else None)
+def section_of(title: str, rows: Sequence[Any]) -> str:
+    """Return a section of the page: a table for each kind of record, its figure, and how memory is measured."""
+    parts = [table([row for row in rows if type(row) is kind]) for kind, table in TABLES if kind in map(type, rows)]
+    if figure := _figure(title, rows):
+        parts.append(f"![{title}]({figure[0]})\n")
+    if any(isinstance(row, compilation.Layout) for row in rows):
+        parts.append(f"{MEMORY_NOTE}\n")
+    return "\n".join(parts)
 
 
-def _network(options: Bench, name: str) -> list[Section]:
-    from experiments.benchmarks import speed, speed_report
-    from experiments.benchmarks.workloads import workloads
-
-    found: list[Section] = []
-    for work in workloads(name, options.preset, _batch(options)):
-        rows = speed.measure(work, rounds=_rounds(options), peak_size=_QUICK_PEAK if options.quick else None, log=log)
-        body = speed_report.to_markdown(rows) + "\n" + _figure(options, rows)
-        found.append((f"{work.name}, preset {options.preset}", body, rows))
-    return found
+def _record(row: dict[str, Any]) -> Any:
+    """Return the record of which `row` is the JSON; null is NaN where that is the default."""
+    kind = next(kind for kind, _ in TABLES if {field.name for field in fields(kind)} <= row.keys())
+    usual = {field.name: field.default for field in fields(kind)}
+    return kind(**{name: usual[name] if row[name] is None and usual[name] is NAN else row[name] for name in usual})
 
 
-def _figure(options: Bench, rows: list[Row]) -> str:
-    """The Pareto plot of a workload, as a line of Markdown."""
-    from anytouch_jax.evaluate import plots
-    from experiments.benchmarks import speed_report
-
-    points = speed_report.points(rows)
+def _figure(title: str, rows: Sequence[Any]) -> tuple[str, dict[str, tuple[float, float]], dict[str, str]] | None:
+    """Return the file, the points and the axes of the Pareto plot of a section; None without points."""
+    if isinstance(rows[0], simulator.FidelityRow):
+        axes = {"x": "ms a frame", "y": "worst scene's rms error of the displacement, %"}
+        return "figures/speed_simulator.png", simulator.pareto_points(rows), axes
+    points = speed.pareto_points(rows) if isinstance(rows[0], speed.SpeedRow) else {}
     if not points:
-        return ""
+        return None
     what = "output" if rows[0].error_gradient is None else "gradient"
-    title = f"{rows[0].workload}, preset {options.preset}"
-    name = f"speed_{title.replace(', preset ', '_').replace(' ', '_')}.png"
-    y = f"relative error of the {what}, against float64"
-    plots.pareto(options.out / "figures" / name, points, x="time / float32 baseline", y=y, title=title)
-    return f"![{title}](figures/{name})\n"
+    axes = {"x": "time / float32 baseline", "y": f"relative error of the {what}, against float64"}
+    return f"figures/speed_{title.replace(', preset ', '_').replace(' ', '_')}.png", points, axes
 
 
-def _compile(options: Bench, _: str) -> list[Section]:
-    from experiments.benchmarks import startup
+# Sections -------------------------------------------------------------------------------------------------------------
 
+
+def _network(options: Bench, name: str) -> Iterator[Section]:
+    peak = QUICK_PEAK if options.quick else None
+    for work in workloads.workloads(name, options.preset, options.samples):
+        rows = speed.measure(work, rounds=options.turns, peak_size=peak, log=log)
+        yield f"{work.name}, preset {options.preset}", rows
+
+
+def _compile(options: Bench, _: str) -> Iterator[Section]:
     log("compile: fresh processes, without and with the cache")
-    steps = startup.STAGE1 if options.quick else startup.STEPS
-    found = startup.starts(options.preset, steps, _batch(options))
-    title = f"First step of a fresh process, preset {options.preset}"
-    return [(title, startup.to_markdown(found), list(found))]
+    steps = compilation.STAGE1 if options.quick else compilation.STEPS
+    starts = compilation.first_steps(options.preset, steps, options.samples)
+    yield f"First step of a fresh process, preset {options.preset}", starts
 
 
-def _memory(options: Bench, _: str) -> list[Section]:
-    from experiments.benchmarks import memory
-
-    found = []
-    for devices, fsdp in memory.MESHES[:3] if options.quick else memory.MESHES:
+def _memory(options: Bench, _: str) -> Iterator[Section]:
+    layouts = []
+    for devices, fsdp in compilation.MESHES[:3] if options.quick else compilation.MESHES:
         log(f"memory: {devices} devices, {fsdp} to a copy of the state")
-        found.append(memory.simulate(options.preset, devices, fsdp, _batch(options) or 4))
-    title = f"Memory and communication of a device, stage 1 on clips, preset {options.preset}"
-    note = "\n" + " ".join((memory.__doc__ or "").split()) + "\n"
-    return [(title, memory.to_markdown(found) + note, list(found))]
+        layouts.append(compilation.simulate(options.preset, devices, fsdp, options.samples or 4))
+    yield f"Memory and communication of a device, stage 1 on clips, preset {options.preset}", layouts
 
 
-def _simulator(options: Bench, _: str) -> list[Section]:
-    from anytouch_jax.evaluate import plots
-    from experiments.benchmarks import fidelity
-
+def _simulator(options: Bench, _: str) -> Iterator[Section]:
     log("simulator: contact and shear at every fidelity, against a converged float64 solution")
-    quick = options.quick
-    variants = [fidelity.Variant("exact", 28), fidelity.Variant("fast", 28)] if quick else fidelity.VARIANTS
-    scenes = {"sphere": fidelity.SCENES["sphere"]} if quick else fidelity.SCENES
-    reference = 56 if quick else 224
-    rows = fidelity.speed_against_error(variants, scenes, reference=reference, rounds=_rounds(options))
-    points = {
-        f"{row.fidelity} {row.grid}{'' if row.iterations is None else f', {row.iterations}'}": (
-            row.press_ms + row.shear_ms,
-            100 * max(row.rms.values()),
-        )
-        for row in rows
-    }
-    name = "speed_simulator.png"
-    y = "worst scene's rms error of the displacement, %"
-    plots.pareto(options.out / "figures" / name, points, x="ms a frame", y=y, title="contact and shear")
-    body = fidelity.to_markdown(rows) + f"\n![contact and shear](figures/{name})\n"
-    small: dict[str, Any] = {"sensors": ("digit",), "batch": 2, "frames": 2, "size": 32} if quick else {}
+    small: dict[str, Any] = {}
+    if options.quick:
+        variants = [simulator.SolverVariant("exact", 28), simulator.SolverVariant("fast", 28)]
+        small = {"variants": variants, "scenes": {"sphere": simulator.SCENES["sphere"]}, "reference": 56}
+    yield "Simulator", simulator.speed_against_error(**small, rounds=options.turns)
     log("simulator: whole recordings, when compiled")
-    recorded = fidelity.recording_speed(rounds=_rounds(options), **small)
-    shape = "two frames at 32" if quick else "ten frames at 224"
-    beside = f"Batches of recordings of {shape} pixels, default fidelity:\n\n{fidelity.recorded_markdown(recorded)}"
-    return [("Simulator", body, list(rows)), ("Simulator, whole recordings", beside, list(recorded))]
+    small = {"sensors": ("digit",), "batch": 2, "frames": 2, "size": 32} if options.quick else {}
+    shape = "two frames at 32" if options.quick else "ten frames at 224"
+    recorded = simulator.recording_speed(rounds=options.turns, **small)
+    yield f"Simulator, whole recordings of {shape} pixels, default fidelity", recorded
 
 
-def _loader(options: Bench, _: str) -> list[Section]:
-    from experiments.benchmarks import loading, speed_data
-
+def _loader(options: Bench, _: str) -> Iterator[Section]:
     log("loader: frames a second by threads")
-    rows = speed_data.measure(options.preset, _batch(options) or 64, rounds=_rounds(options))
-    toy = {"sizes": ((64, 48),), "pictures": 4, "rounds": 1, "pixels": 28, "rows": 2000}
-    small: dict[str, Any] = toy if options.quick else {}
+    feeds = loading.measure_feeds(options.preset, options.samples or 64, rounds=options.turns)
+    yield f"Loader, preset {options.preset}", feeds
+    toy: dict[str, Any] = {"sizes": ((64, 48),), "pictures": 4, "rounds": 1, "pixels": 28, "rows": 2000}
     with tempfile.TemporaryDirectory() as folder:
-        beside = loading.measure_loading(folder, log=log, **small)
-    return [
-        (f"Loader, preset {options.preset}", speed_data.to_markdown(rows), list(rows)),
-        ("Loader beside plain decoding, and a large manifest", beside.to_markdown(), [*beside.speeds, *beside.opened]),
-    ]
+        rows = loading.measure_loading(folder, log=log, **(toy if options.quick else {}))
+    yield "Loader compared with plain decoding, and a large manifest", rows
 
 
-_SECTIONS: dict[str, Callable[[Bench, str], list[Section]]] = {
-    **dict.fromkeys(_NETWORK, _network),
+SECTIONS: dict[str, Callable[[Bench, str], Iterator[Section]]] = {
+    **dict.fromkeys(("stage1", "stage2", "embed"), _network),
     "compile": _compile,
     "memory": _memory,
     "simulator": _simulator,
@@ -230,7 +212,7 @@ _SECTIONS: dict[str, Callable[[Bench, str], list[Section]]] = {
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line `args`; return the exit status."""
+    """Run the command line `args` and return the exit status."""
     return run_script(Bench, run, args)
 
 

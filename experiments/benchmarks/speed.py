@@ -1,4 +1,4 @@
-"""Speed against error: variants of a workload in turns in one process, beside a float64 reference (`anytouch bench`).
+"""Speed against error: variants of a workload in turns in one process, beside a float64 reference (`make bench`).
 
 A variant's time is a ratio to the float32 baseline *of the same round*, so that a busy machine slows both. Errors are
 those of the same parameters and the same batch computed in float64. Imports nothing but jax, flax, optax, numpy.
@@ -7,16 +7,21 @@ those of the same parameters and the same batch computed in float64. Imports not
 from __future__ import annotations
 
 import gc
+import json
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.statistics import markdown, plain
+from anytouch_jax.files import atomic_write
 from anytouch_jax.train.step import merge
 from experiments.benchmarks import machine
 from experiments.benchmarks.variants import BASELINE, Program, Variant, cold, compiled, traced_as, variants_of
@@ -30,10 +35,10 @@ _LATENCY_CALLS = 20  # calls a round of what is timed one sample at a time
 
 
 @dataclass(frozen=True)
-class Row:
+class SpeedRow:
     """The figures of a variant. Seconds and ratios are medians over rounds, `*_iqr` their interquartile ranges.
 
-    `operations`: useful ones a call (`flops`); `peak_share` of the matrix product of the variant's own type, and
+    `operations`: useful ones a call (`workloads`); `peak_share` of the matrix product of the variant's own type, and
     `float32_share` of the float32 one, in the same rounds. `error_*`: relative L2 against float64 (of the loss:
     relative). `peak_bytes`: arguments, results and temporaries of the compiled program. `copies`: copy instructions in
     it. `p50`, `p99`: seconds of single calls.
@@ -142,7 +147,7 @@ def measure(
     with_errors: bool = True,
     peak_size: int | None = None,
     log: Log = lambda _: None,
-) -> list[Row]:
+) -> list[SpeedRow]:
     """The rows of a workload, the baseline first. A variant that cannot be compiled or run here is a row with a note.
 
     Raises UserError when there is no round, or when the baseline itself fails.
@@ -239,12 +244,12 @@ def embed_calls(programs: Sequence[Program], touch: Tree) -> list[Callable[[], o
     return [partial(lambda p: np.asarray(p.call({"touch": touch}, *p.batch[:2])), program) for program in programs]
 
 
-def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wrong: Mapping[str, float]) -> Row:
+def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wrong: Mapping[str, float]) -> SpeedRow:
     mine, theirs = np.median(times, axis=1), np.median(base, axis=1)
     seconds, ratios = float(np.median(mine)), mine / theirs
     operations = program.work.operations
     rate = operations / seconds
-    return Row(
+    return SpeedRow(
         workload=program.work.name,
         variant=program.variant.name,
         samples=program.work.samples,
@@ -269,8 +274,8 @@ def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wr
     )
 
 
-def _empty(work: Workload, variant: Variant, note: str) -> Row:
-    return Row(work.name, variant.name, work.samples, note=note)
+def _empty(work: Workload, variant: Variant, note: str) -> SpeedRow:
+    return SpeedRow(work.name, variant.name, work.samples, note=note)
 
 
 def _iqr(values: Any) -> float:
@@ -278,9 +283,9 @@ def _iqr(values: Any) -> float:
     return float(high - low)
 
 
-def batch_sweep(variant: Variant, work: Workload, batches: Sequence[int], rounds: int = 5) -> list[Row]:
+def batch_sweep(variant: Variant, work: Workload, batches: Sequence[int], rounds: int = 5) -> list[SpeedRow]:
     """A row a batch size, for memory against batch; the sweep ends with the first size that does not fit."""
-    rows: list[Row] = []
+    rows: list[SpeedRow] = []
     for samples in batches:
         try:
             rows += measure(work.resized(samples), [variant], rounds=rounds, with_errors=False)
@@ -289,3 +294,108 @@ def batch_sweep(variant: Variant, work: Workload, batches: Sequence[int], rounds
             break
         gc.collect()
     return rows
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+_HEADS = (
+    "variant",
+    "samples",
+    "time / baseline (IQR)",
+    "ms",
+    "samples/s",
+    "GFLOP/s",
+    "of its peak",
+    "of float32 peak",
+    "error: output",
+    "loss",
+    "gradient",
+    "MiB",
+    "temporary MiB",
+    "copies",
+    "trace s",
+    "compile s",
+)
+
+NOTES = """A time is a median over rounds in which all rows of a table, and the matrix products of the peak, take turns;
+the ratio is to the first row of the same round, IQR its interquartile range. GFLOP/s counts useful operations only: the
+matrix products of the formula in `workloads.py`, not what is computed twice or for empty slots. "Of its peak" is
+the share of a large square product of the variant's own type in the same rounds. Errors are relative, L2 over all
+elements, against the same parameters and batch in float64. MiB: arguments, results and temporaries of the compiled
+program. Compile times are cold."""
+
+
+def speed_table(rows: Sequence[SpeedRow]) -> str:
+    """A table a workload, and one of latencies for what was timed one sample at a time."""
+    parts, names = [], list(dict.fromkeys(row.workload for row in rows))
+    for name in names:
+        members = [_cells(row) for row in rows if row.workload == name]
+        parts.append((f"### {name}\n\n" if len(names) > 1 else "") + markdown(_HEADS, members) + "\n")
+    single = [row for row in rows if row.samples == 1 and not row.note]
+    if single:
+        cells = [
+            [
+                r.workload,
+                r.variant,
+                f"{1e3 * r.p50:.2f}",
+                f"{1e3 * r.p99:.2f}",
+                str(r.calls),
+                format_error(r.error_output),
+            ]
+            for r in single
+        ]
+        heads = ("latency of one sample", "variant", "p50 ms", "p99 ms", "calls", "error")
+        parts.append(markdown(heads, cells) + "\n")
+    return "\n".join(parts)
+
+
+def _cells(row: SpeedRow) -> list[str]:
+    if row.note:
+        return [row.variant, str(row.samples), row.note, *[""] * (len(_HEADS) - 3)]
+    return [
+        row.variant,
+        str(row.samples),
+        f"{row.ratio:.2f} ({row.ratio_iqr:.2f})",
+        f"{1e3 * row.seconds:.1f}",
+        f"{row.samples_per_second:.4g}",
+        f"{row.gflops:.1f}",
+        f"{100 * row.peak_share:.0f} %",
+        f"{100 * row.float32_share:.0f} %",
+        *(format_error(value) for value in (row.error_output, row.error_loss, row.error_gradient)),
+        f"{row.peak_bytes / 2**20:.0f}",
+        f"{row.temp_bytes / 2**20:.0f}",
+        str(row.copies),
+        f"{row.trace_seconds:.1f}",
+        f"{row.compile_seconds:.1f}",
+    ]
+
+
+def format_error(value: float | None) -> str:
+    """A relative error for a table."""
+    return "" if value is None else f"{value:.1e}"
+
+
+def pareto_points(rows: Sequence[SpeedRow]) -> dict[str, tuple[float, float]]:
+    """(time ratio, error) of the rows that have both, for `plots.pareto`: of the gradient, or of the output."""
+    found = {}
+    for row in rows:
+        wrong = row.error_output if row.error_gradient is None else row.error_gradient
+        if wrong is not None and wrong > 0 and math.isfinite(row.ratio):
+            found[row.variant] = (row.ratio, wrong)
+    return found
+
+
+def record_of(row: Any) -> dict[str, Any]:
+    """A record as JSON takes it: a number that is not finite is null."""
+    values: dict[str, Any] = plain(row._asdict() if isinstance(row, tuple) else row)  # type: ignore[attr-defined]
+    if isinstance(row, SpeedRow):
+        values |= plain({"samples_per_second": row.samples_per_second, "gflops": row.gflops})
+    return values
+
+
+def write_page(folder: Path, name: str, text: str, numbers: Mapping[str, Any]) -> Path:
+    """Write `name`.md and `name`.json in a folder, each in one move. Raises OSError."""
+    for suffix, content in ((".json", json.dumps(numbers, indent=2, allow_nan=False) + "\n"), (".md", text)):
+        path = folder / f"{name}{suffix}"
+        atomic_write(path, content)
+    return path

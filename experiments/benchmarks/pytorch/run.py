@@ -26,7 +26,7 @@ import numpy as np
 from anytouch_jax.evaluate import plots, statistics
 from anytouch_jax.train.step import merge
 from anytouch_jax.weights import convert, load, safetensors
-from experiments.benchmarks import machine, speed, speed_report, variants
+from experiments.benchmarks import machine, speed, variants
 from experiments.benchmarks.pytorch.keys import renamed
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
 
@@ -147,9 +147,7 @@ def compare(
     with TemporaryDirectory() as name:
         folder, worker = Path(name), Worker(python)
         try:
-            safetensors.write_safetensors(
-                folder / "weights.safetensors", convert.to_release(params, work.config.model), {}
-            )
+            safetensors.write_safetensors(folder / "weights.safetensors", convert.to_release(params, work.config.model), {})
             batch_file(work, folder / "batch.safetensors")
             files = {"weights": str(folder / "weights.safetensors"), "batch": str(folder / "batch.safetensors")}
             about = worker.ask(do="setup", work=spec(work), **files)
@@ -232,7 +230,21 @@ def timed(
     return rows
 
 
-def to_markdown(work: Workload, found: dict[str, Any], preset: str) -> str:
+def page_of(numbers: dict[str, Any]) -> str:
+    """Return the page of a comparison from its numbers alone."""
+    preset = numbers["preset"]
+    parts = [f"# Ours against PyTorch\n\n{machine.Machine(**numbers['machine']).sentence()}\n"]
+    for name, found in numbers["results"].items():
+        parts += [section_of(name, found, preset), f"![{name}, preset {preset}]({_figure(name, preset)})\n"]
+    return "\n".join(parts)
+
+
+def _figure(name: str, preset: str) -> str:
+    return f"figures/torch_{name.replace(' ', '_')}_{preset}.png"
+
+
+def section_of(name: str, found: dict[str, Any], preset: str) -> str:
+    """Return the table of a workload."""
     heads = ("", "time / ours float32 (IQR)", "best / best", "ms", "samples/s", "GFLOP/s", "of float32 peak")
     heads += ("error: output", "loss", "gradient", "p99 ms")
     rows = [
@@ -244,15 +256,15 @@ def to_markdown(work: Workload, found: dict[str, Any], preset: str) -> str:
             f"{row['samples_per_second']:.4g}",
             f"{row['gflops']:.1f}",
             f"{100 * row['peak_share']:.0f} %",
-            *(speed_report.error(row.get(k)) for k in ("output", "loss", "gradient")),
+            *(speed.format_error(row.get(k)) for k in ("output", "loss", "gradient")),
             f"{1e3 * row['p99']:.1f}",
         ]
         for row in found["rows"]
     ]
     failed = "".join(f"\nPyTorch, {rival}: {note}\n" for rival, note in found["failed"].items())
-    about = found["about"]
+    about, first = found["about"], found["rows"][0]
     line = f"torch {about['torch']} ({about['threads']} threads), transformers {about['transformers']}"
-    title = f"## {work.name}, preset {preset}, batch {work.samples}"
+    title = f"## {name}, preset {preset}, batch {round(first['samples_per_second'] * first['seconds'])}"
     table = statistics.markdown(heads, rows)
     return f"{title}\n\n{table}\n{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
 
@@ -275,25 +287,22 @@ def main() -> None:
     here = machine.describe()
     if here.load > 0.3 * here.cores:
         print(f"load {here.load:.1f}: PyTorch's threads suffer more than ours from other work; wait", file=sys.stderr)
-    parts, numbers = [f"# Ours against PyTorch\n\n{here.sentence()}\n"], {}
+    numbers: dict[str, Any] = {"machine": dataclasses.asdict(here), "preset": options.preset, "rounds": options.rounds}
+    numbers["results"] = {}
     for what in options.what:
         for work in workloads(what, options.preset, options.batch):
             found = compare(work, options.torch, options.rounds, options.peak_size, tuple(options.rivals))
-            parts.append(to_markdown(work, found, options.preset))
-            print(parts[-1], flush=True)
-            numbers[work.name] = found
+            numbers["results"][work.name] = found
+            print(section_of(work.name, found, options.preset), flush=True)
+            wrong = {row["name"]: row.get("gradient", row["output"]) for row in found["rows"]}
             points = {
-                row["name"]: (row["ratio"], row.get("gradient", row["output"]))
-                for row in found["rows"]
-                if row.get("gradient", row["output"]) > 0
+                row["name"]: (row["ratio"], wrong[row["name"]]) for row in found["rows"] if wrong[row["name"]] > 0
             }
-            name = f"torch_{work.name.replace(' ', '_')}_{options.preset}.png"
             y = f"relative error of the {'gradient' if work.trains else 'output'}, against float64"
             title = f"{work.name}, preset {options.preset}"
-            plots.pareto(options.out / "figures" / name, points, x="time / ours in float32", y=y, title=title)
-            parts.append(f"![{title}](figures/{name})\n")
-    about = {"machine": dataclasses.asdict(here), "preset": options.preset, "rounds": options.rounds}
-    path = speed_report.write(options.out, f"torch_{options.preset}", "\n".join(parts), about | {"results": numbers})
+            figure = options.out / _figure(work.name, options.preset)
+            plots.pareto(figure, points, x="time / ours in float32", y=y, title=title)
+    path = speed.write_page(options.out, f"torch_{options.preset}", page_of(numbers), numbers)
     print(path, file=sys.stderr)
 
 

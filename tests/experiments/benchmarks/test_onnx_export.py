@@ -42,6 +42,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "frames", "same"), [(1.0, 3, True), (1.001, 1, False)])
 def test_what_differs_from_the_live_model_is_not_written(tmp_path, tiny_run, factor, frames, same):
     converter, out = tmp_path / "converter", tmp_path / "new" / "encoder.onnx"

@@ -17,12 +17,16 @@ from anytouch_jax import objectives
 from anytouch_jax.config import preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from experiments.benchmarks import flops, machine, speed, speed_report, variants
+from experiments.benchmarks import machine, speed, variants
 from experiments.benchmarks.workloads import (
     Workload,
     abstract_state,
+    align_flops,
+    encoder_flops,
+    image_flops,
     make_batch,
     normalised,
+    stage1_flops,
     step_of,
     values_of,
     workloads,
@@ -92,23 +96,23 @@ def test_the_formula_of_an_embedding_is_what_xla_counts():
 
 def test_operations_grow_with_depth_and_batch_as_the_products_do():
     config = preset("small")
-    one, two = flops.stage1(config, 1, 4), flops.stage1(config, 2, 4)
+    one, two = stage1_flops(config, 1, 4), stage1_flops(config, 2, 4)
     assert two == pytest.approx(2 * one)
     deep = replace(config, model=replace(config.model, touch=replace(config.model.touch, depth=12)))
-    encoder = flops.encoder(config.model, 1, 4, 64) - 2 * 2 * 64 * 3 * 588 * 384  # without the patches
-    assert flops.stage1(deep, 1, 4) - one == pytest.approx(encoder)
+    encoder = encoder_flops(config.model, 1, 4, 64) - 2 * 2 * 64 * 3 * 588 * 384  # without the patches
+    assert stage1_flops(deep, 1, 4) - one == pytest.approx(encoder)
 
 
 @pytest.mark.parametrize("name", ["tiny", "small", "base", "large"])
 def test_stage_1_encodes_about_a_quarter_of_the_sequence(name):
     config = preset(name)
     model, decoder_alone = config.model, replace(config.model, touch=replace(config.model.touch, depth=0))
-    all_seen = flops.encoder(model, 1, 4, model.patches)
-    rest = flops.stage1(replace(config, model=decoder_alone), 1, 4) - flops.encoder(
+    all_seen = encoder_flops(model, 1, 4, model.patches)
+    rest = stage1_flops(replace(config, model=decoder_alone), 1, 4) - encoder_flops(
         decoder_alone, 1, 4, model.patches // 4
     )
     limit = {"tiny": 0.32, "base": 0.28}.get(name, 0.27)  # six special tokens weigh more on a small grid
-    assert flops.stage1(config, 1, 4) - rest <= limit * all_seen
+    assert stage1_flops(config, 1, 4) - rest <= limit * all_seen
 
 
 def test_the_compiled_encoder_of_preset_large_costs_at_most_27_percent_of_the_unmasked_one():
@@ -129,9 +133,9 @@ def test_a_batch_without_vision_costs_nothing_for_the_image_tower():
     blind = batch._replace(image=batch.image[:0], image_row=batch.image_row[:0])
     terms = lambda p, b: objectives.stage2_terms(p, objectives.Stage2Batch(b, None), None, net=net, config=config)[0]  # noqa: E731
     costs = [counted(jax.grad(terms), net.abstract(), b) for b in (batch, blind)]
-    assert costs[0] - costs[1] >= flops.image_tower(config.model, 1)
+    assert costs[0] - costs[1] >= image_flops(config.model, 1)
     model = replace(config.model, image=None)
-    assert flops.align(replace(config, model=model), 4, 3, 0, 2, 77) == flops.align(config, 4, 3, 0, 2, 77)
+    assert align_flops(replace(config, model=model), 4, 3, 0, 2, 77) == align_flops(config, 4, 3, 0, 2, 77)
 
 
 def test_a_still_is_projected_as_one_frame():
@@ -234,6 +238,7 @@ def test_all_take_turns_and_each_round_begins_with_another():
 NOWHERE = {"dtype": "float7"}
 
 
+@pytest.mark.slow
 def test_a_variant_that_fails_when_it_is_run_is_a_row_with_a_note(monkeypatch):
     """As a GPU does that runs out of memory at the first call: the others are measured."""
     whole = speed.compiled
@@ -260,10 +265,10 @@ def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
     assert base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
     assert donated.peak_bytes > donated.temp_bytes > 0 and donated.ratio > 0 and donated.copies >= base.copies > 0
     assert absent.note and np.isnan(absent.ratio) and absent.variant == "seven bits"
-    text = speed_report.to_markdown(rows)
+    text = speed.speed_table(rows)
     assert absent.note.replace("|", "/") in text and "| donated | 4 |" in text
-    assert speed_report.as_dict(absent)["seconds"] is None
-    json.dumps([speed_report.as_dict(row) for row in rows], allow_nan=False)
+    assert speed.record_of(absent)["seconds"] is None
+    json.dumps([speed.record_of(row) for row in rows], allow_nan=False)
 
 
 def test_an_embedding_is_measured_from_pixels_on_the_host():
@@ -271,8 +276,8 @@ def test_an_embedding_is_measured_from_pixels_on_the_host():
     rows = speed.measure(one, FAST, rounds=2, peak_size=64)
     assert rows[0].calls == 40 and rows[0].p50 <= rows[0].p99 and rows[0].error_gradient is None
     assert rows[0].error_output < 1e-5 < rows[1].error_output
-    assert "latency of one sample" in speed_report.to_markdown(rows)
-    assert set(speed_report.points(rows)) == {"float32", "bfloat16"}
+    assert "latency of one sample" in speed.speed_table(rows)
+    assert set(speed.pareto_points(rows)) == {"float32", "bfloat16"}
 
 
 def test_the_peak_is_that_of_a_square_product():
@@ -281,14 +286,6 @@ def test_the_peak_is_that_of_a_square_product():
     (product,) = machine.matmul("bfloat16", 32)[0]()
     assert product.dtype == jnp.float32  # the one form of it that a CPU computes fast
     assert machine.describe().cores >= 1 and "jax" in machine.describe().sentence()
-
-
-def test_a_report_is_whole_or_not_there(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="file"):
-        speed_report.write(tmp_path / "file", "speed", "text", {})
-    path = speed_report.write(tmp_path / "new", "speed", "text", {"a": None})
-    assert path.read_text() == "text" and [p.name for p in sorted(path.parent.iterdir())] == ["speed.json", "speed.md"]
 
 
 # Many devices -------------------------------------------------------------------------------------------------------
@@ -337,6 +334,7 @@ print("OURS", *ours)
 """
 
 
+@pytest.mark.slow
 def test_the_accelerator_benchmark_needs_jax_flax_optax_and_numpy_alone(tmp_path):
     code = _BARE.format(out=str(tmp_path), root=str(ROOT), script=str(ROOT / "experiments" / "benchmarks" / "gpu.py"))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

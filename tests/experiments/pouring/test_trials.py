@@ -127,6 +127,7 @@ def toy(mass, step):
     return (np.stack([mass, np.sqrt(np.maximum(mass, 0)), mass**2 / 100, 0 * mass], -1) + noise).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_imitation_learns_a_toy_signal_and_beats_blind(late):
     z = np.stack([toy(mass, step) for step, mass in enumerate(late.mass)])[2:]
     head, loss = pouring_policy.imitate(
@@ -166,6 +167,7 @@ def test_dropout_leaves_out_its_share_while_a_policy_learns_and_nothing_when_it_
     np.testing.assert_allclose(found[found != 0], 1 / 0.7, rtol=1e-6)  # so the mean stays
 
 
+@pytest.mark.slow
 def test_dropout_keeps_features_from_being_learned_by_heart_and_told_policies_have_none(late, monkeypatch):
     rng = np.random.default_rng(0)
     runs = np.repeat(np.arange(10), 12)
@@ -182,6 +184,7 @@ def test_dropout_keeps_features_from_being_learned_by_heart_and_told_policies_ha
     assert met[0].dropout == 0 < FAST.dropout
 
 
+@pytest.mark.slow
 def test_the_load_alone_is_enough_to_pour_by():
     head = bounds.learn_loads(TASK, 0, 20, Learning())
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)

@@ -1,6 +1,7 @@
-"""Memory and communication of a step on 1 to 64 devices, read from the compiled program: no such devices are needed.
+"""Benchmarks of compilation: memory and communication on 1 to 64 devices, and the first step of a fresh process.
 
-A child process with that many simulated CPU devices compiles the very step that `train.loop.fit` would run, from
+No such devices are needed: memory and communication are read from the compiled program. A child process with that many
+simulated CPU devices compiles the very step that `train.loop.fit` would run, from
 shapes alone. What a compiler for real accelerators adds is not in it: it may overlap communication, merge small
 messages, and turn an all-reduce whose result is cut up at once into a reduce-scatter (half the bytes).
 """
@@ -13,8 +14,9 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,7 +24,14 @@ import jax
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown
-from anytouch_jax.train.mesh import batch_sharding, make_mesh, replicated, state_sharding
+from anytouch_jax.train.mesh import (
+    batch_sharding,
+    donated,
+    enable_compilation_cache,
+    make_mesh,
+    replicated,
+    state_sharding,
+)
 from experiments.benchmarks.workloads import Workload, abstract_state, make_batch, step_of, workloads
 
 MESHES = tuple((n, f) for n in (1, 2, 4, 8, 16, 32, 64) for f in dict.fromkeys((1, n)))
@@ -173,36 +182,36 @@ def _placed(tree: Any, sharding: Any) -> Any:
 def simulate(preset: str, devices: int, fsdp: int, batch_per_device: int) -> Layout:
     """`layout_of` stage 1 on clips, in a child process with so many simulated devices. Raises UserError."""
     question = json.dumps([preset, devices, fsdp, batch_per_device])
-    return Layout(**ask("memory", question, devices))
+    return Layout(**ask(answer_layout, question, devices))
 
 
-def ask(module: str, question: str, devices: int = 1, **environ: str) -> dict[str, Any]:
-    """Run `answer(question)` of a module of this folder in a fresh process, its last line the answer in JSON."""
+def ask(answer: Callable[[str], None], question: str, devices: int = 1) -> dict[str, Any]:
+    """Run `answer(question)` of this module in a fresh process and return the JSON of its last line."""
     clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
-    code = f"import sys; from experiments.benchmarks.{module} import answer; answer(sys.stdin.read())"
+    code = f"import sys; from {__name__} import {answer.__name__}; {answer.__name__}(sys.stdin.read())"
     paths = os.pathsep.join(one or os.getcwd() for one in sys.path)
     done = subprocess.run(
         [sys.executable, "-c", code],
         input=question,
-        env=clean | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)} | environ,
+        env=clean | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)},
         capture_output=True,
         text=True,
         check=False,
     )
     if done.returncode:
         said = done.stderr.strip().splitlines()
-        raise UserError(f"the child process of {module} failed: {said[-1] if said else done.returncode}")
+        raise UserError(f"the child process of {answer.__name__} failed: {said[-1] if said else done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def answer(question: str) -> None:
+def answer_layout(question: str) -> None:
     """What the child process does."""
     preset, devices, fsdp, batch = json.loads(question)
     work = workloads("stage1", preset, batch * devices)[0]
     sys.stdout.write(json.dumps(asdict(layout_of(work, devices, fsdp))) + "\n")
 
 
-def to_markdown(layouts: Sequence[Layout]) -> str:
+def layout_table(layouts: Sequence[Layout]) -> str:
     """A line a mesh; MiB a device, and a step."""
     heads = ("devices", "data x fsdp", "batch", "state MiB", "temporary MiB", "sent MiB a step", "collectives")
     mib = 2**20
@@ -217,5 +226,73 @@ def to_markdown(layouts: Sequence[Layout]) -> str:
             ", ".join(f"{x.counts[kind]} {kind} ({size / mib:.1f})" for kind, size in x.kinds.items()) or "none",
         ]
         for x in layouts
+    ]
+    return markdown(heads, rows) + "\n"
+
+
+# Start-up -------------------------------------------------------------------------------------------------------------
+
+# Programs of training: what to ask `workloads` for, its name there, the recipe (the release reconstructs in stage 2).
+STAGE1 = (("stage1", "stage1 clips", "paper"),)
+STEPS = (
+    *STAGE1,
+    ("stage2", "stage2 align", "paper"),
+    ("stage2", "stage2 match", "paper"),
+    ("stage2", "stage2 align", "release"),
+)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Seconds of a fresh process; `imports` counts from its start. `cached`: it finds its program in the cache."""
+
+    workload: str
+    recipe: str
+    preset: str
+    samples: int
+    cached: bool
+    imports: float
+    trace: float
+    compile: float
+
+    @property
+    def total(self) -> float:
+        return self.imports + self.trace + self.compile
+
+
+def first_steps(preset: str, steps: Sequence[tuple[str, str, str]] = STEPS, batch: int | None = None) -> list[Start]:
+    """Two fresh processes for each of `steps`: one fills a new cache, the next reads it."""
+    found = []
+    for step in steps:
+        with tempfile.TemporaryDirectory() as folder:
+            for cached in (False, True):
+                found.append(
+                    Start(**ask(answer_start, json.dumps([*step, preset, batch, cached, folder, time.time()])))
+                )
+    return found
+
+
+def answer_start(question: str) -> None:
+    """What the child process does."""
+    what, name, recipe, preset, batch, cached, folder, begun = json.loads(question)
+    enable_compilation_cache(folder)
+    work = next(work for work in workloads(what, preset, batch, recipe) if work.name == name)
+    args = abstract_state(work.config), make_batch(work), jax.eval_shape(lambda: jax.random.key(0))
+    imports, ready = time.time() - begun, time.perf_counter()
+    lowered = jax.jit(step_of(work.config), donate_argnums=donated()).lower(*args)
+    traced = time.perf_counter()
+    lowered.compile()
+    done = time.perf_counter()
+    start = Start(work.name, recipe, preset, work.samples, cached, imports, traced - ready, done - traced)
+    sys.stdout.write(json.dumps(asdict(start)) + "\n")
+
+
+def start_table(found: Sequence[Start]) -> str:
+    """A line a process."""
+    heads = ("workload", "recipe", "preset", "batch", "cache", "imports s", "trace s", "compile s", "sum s")
+    rows = [
+        [s.workload, s.recipe, s.preset, str(s.samples), "filled" if s.cached else "empty"]
+        + [f"{x:.2f}" for x in (s.imports, s.trace, s.compile, s.total)]
+        for s in found
     ]
     return markdown(heads, rows) + "\n"

@@ -147,7 +147,9 @@ def compare(
     with TemporaryDirectory() as name:
         folder, worker = Path(name), Worker(python)
         try:
-            safetensors.write_safetensors(folder / "weights.safetensors", convert.to_release(params, work.config.model), {})
+            safetensors.write_safetensors(
+                folder / "weights.safetensors", convert.to_release(params, work.config.model), {}
+            )
             batch_file(work, folder / "batch.safetensors")
             files = {"weights": str(folder / "weights.safetensors"), "batch": str(folder / "batch.safetensors")}
             about = worker.ask(do="setup", work=spec(work), **files)

@@ -215,9 +215,9 @@ def test_release_needs_whole_parameters():
     del params["decoder"]["norm"]
     params["touch"]["extra"] = np.zeros(1)
     params["touch"]["class_token"] = np.zeros(3)
-    with pytest.raises(UserError, match="norm/scale is missing") as caught:
+    with pytest.raises(UserError, match=r"missing keys \(2\): decoder/norm/scale") as caught:
         to_release(params, STAGE1)
-    assert "touch/extra is unknown" in str(caught.value)
+    assert "unknown keys (1): touch/extra" in str(caught.value)
     assert "touch/class_token has (3,) instead of (16,)" in str(caught.value)
     turned = dataclasses.replace(STAGE1, sensors=(UNIVERSAL, "digit"))
     with pytest.raises(UserError, match="last row"):

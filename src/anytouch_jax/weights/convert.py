@@ -83,13 +83,13 @@ def to_params(weights: Weights, model: ModelConfig, *, ignore: Collection[str] =
         parts = {key.split("/")[0] for key in weights}
         entries = [entry for entry in entries if entry.name.split("/")[0] in parts]
     head = _HEAD if layout == "probe" and weights.keys() >= _HEAD else frozenset()
-    left_out = {key for key in weights if key in ignore or key in head or _is_left_out(key, layout, model)}
+    first = {entry.key: entry for entry in entries}
     arrays = {
-        entry.key: _fit(weights[entry.key], entry, model)
-        for entry in {entry.key: entry for entry in entries}.values()
-        if entry.key in weights
+        key: _fit(array, first[key], model) if key in first else array
+        for key, array in weights.items()
+        if not (key in ignore or key in head or _is_left_out(key, layout, model))
     }
-    _account(layout, weights, arrays, _file_shapes(entries, shapes), left_out)
+    check_arrays(f"{layout} weights", arrays, _file_shapes(entries, shapes))
     flat: dict[str, Any] = {}
     for entry in entries:
         array = entry.conversion.read(_third(arrays[entry.key], entry.part))
@@ -122,7 +122,7 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
             f"the authors' files keep the universal tokens in the last row; here it is {model.sensors[-1]!r}"
         )
     shapes, entries = param_shapes(model), keymap.entries(model)
-    check_shapes("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
+    check_arrays("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
     arrays = {e.key: e.conversion.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
     for key, source in keymap.unused.items():
         theirs = arrays[source]
@@ -152,17 +152,21 @@ def release_names(model: ModelConfig, layout: str | None = None) -> dict[str, st
     return {entry.key: entry.name for entry in _keymap(model, layout).entries(model)}
 
 
-def check_shapes(title: str, flat: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
-    """Raise WeightsError that names the first parameters that are missing, unknown or of another shape."""
-    problems = [f"{name} is missing" for name in wanted if name not in flat]
-    problems += [f"{name} is unknown" for name in flat if name not in wanted]
-    problems += [
-        f"{name} has {tuple(flat[name].shape)} instead of {shape}"
-        for name, shape in wanted.items()
-        if name in flat and tuple(flat[name].shape) != tuple(shape)
-    ]
+def check_arrays(title: str, arrays: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
+    """Raise WeightsError unless the arrays have the wanted names and shapes; it counts and names the others."""
+    lists = {
+        "unknown keys": [key for key in arrays if key not in wanted],
+        "missing keys": [key for key in wanted if key not in arrays],
+        "other shapes": [
+            f"{key} has {tuple(arrays[key].shape)} instead of {shape}"
+            for key, shape in wanted.items()
+            if key in arrays and tuple(arrays[key].shape) != shape
+        ],
+    }
+    problems = [f"{name} ({len(rows)}): {_first(rows)}" for name, rows in lists.items() if rows]
     if problems:
-        raise WeightsError(f"the {title} do not fit this model: {_first(problems)}")
+        hint = _hint((*lists["unknown keys"], *lists["missing keys"]))
+        raise WeightsError(f"the {title} do not fit this model; {'; '.join(problems)}{hint}")
 
 
 def _is_left_out(key: str, layout: str, model: ModelConfig) -> bool:
@@ -209,24 +213,6 @@ def _file_shapes(entries: Sequence[Entry], shapes: Mapping[str, Shape]) -> dict[
         written = entry.conversion.write(np.broadcast_to(np.float32(0), shape)).shape
         theirs[entry.key] = written if entry.part is None else (3 * written[0], *written[1:])
     return theirs
-
-
-def _account(
-    layout: str, weights: Weights, arrays: Weights, wanted: Mapping[str, Shape], left_out: Collection[str]
-) -> None:
-    """Raise WeightsError unless the file has the wanted keys, in the wanted shapes, and no others."""
-    unknown = [key for key in weights if key not in wanted and key not in left_out]
-    missing = [key for key in wanted if key not in weights]
-    shapes = [
-        f"{key} has {tuple(weights[key].shape)} instead of {wanted[key]}"
-        for key, array in arrays.items()
-        if tuple(array.shape) != wanted[key]
-    ]
-    lists = {"unknown keys": unknown, "missing keys": missing, "other shapes": shapes}
-    problems = [f"{title} ({len(rows)}): {_first(rows)}" for title, rows in lists.items() if rows]
-    if problems:
-        hint = _hint((*unknown, *missing))
-        raise WeightsError(f"the {layout} weights do not fit this model; {'; '.join(problems)}{hint}")
 
 
 def _first(rows: Sequence[str]) -> str:

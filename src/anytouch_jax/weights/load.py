@@ -14,7 +14,7 @@ from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_j
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import checkpoint, compatible
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
-from anytouch_jax.weights.convert import check_shapes, detect_layout, detect_model, to_params
+from anytouch_jax.weights.convert import check_arrays, detect_layout, detect_model, to_params
 from anytouch_jax.weights.keymaps import Weights
 from anytouch_jax.weights.safetensors import (
     BACKGROUND_KEY,
@@ -239,7 +239,7 @@ def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
 def _replace(params: Params, parts: Params) -> Params:
     """Return `params` with whole parts replaced by others of the same names and shapes."""
     before = flatten({part: params[part] for part in parts if part in params})
-    check_shapes("weights", flatten(parts), {name: tuple(leaf.shape) for name, leaf in before.items()})
+    check_arrays("weights", flatten(parts), {name: tuple(leaf.shape) for name, leaf in before.items()})
     return {**params, **parts}
 
 

@@ -15,7 +15,7 @@ import reprlib
 import struct
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -63,12 +63,8 @@ class _Name:
     name: str
 
 
-@dataclass
-class _Object:
-    """An object whose class is not rebuilt (argparse.Namespace, torch.device): its name and its fields."""
-
-    name: str
-    fields: dict[str, Any] = field(default_factory=dict)
+class _Other:
+    """An object that is not rebuilt (argparse.Namespace, torch.device)."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +130,7 @@ class _Zip:
             raise WeightsError("a TorchScript program, not plain weights; save its state_dict() instead")
         order = self._read("byteorder") if f"{self.root}byteorder" in names else b"little"
         self.byteorder: Literal["<", ">"] = ">" if order.strip() == b"big" else "<"
-        self.content = _read_pickle(io.BytesIO(self._read("data.pkl")))
+        self.content = _Unpickler(io.BytesIO(self._read("data.pkl"))).load()
 
     def load(self, storage: _Storage) -> bytes:
         return self._read(f"data/{storage.key}")
@@ -152,42 +148,22 @@ class _Legacy:
     byteorder: Literal["<", ">"] = "<"
 
     def __init__(self, file: IO[bytes]) -> None:
-        if _read_pickle(file) != _LEGACY_MAGIC:
+        if _Unpickler(file).load() != _LEGACY_MAGIC:
             raise ValueError("no magic number of torch.save")
-        _read_pickle(file)  # protocol version
-        _read_pickle(file)  # sizes of C types on the machine that wrote it
-        self.content = _read_pickle(file)
-        keys = _read_pickle(file)
-        widths = {storage.key: storage.dtype.itemsize for storage in _storages(self.content)}
+        for _ in ("protocol version", "sizes of C types on the machine that wrote it"):
+            _Unpickler(file).load()
+        reader = _Unpickler(file)
+        self.content = reader.load()
+        keys = _Unpickler(file).load()
         self.data: dict[str, bytes] = {}
         for key in keys:
             (length,) = struct.unpack("<q", file.read(8))
-            if length < 0 or key not in widths:
+            if length < 0 or key not in reader.storages:
                 raise ValueError(f"storage {key!r} is of unknown type or length")
-            self.data[key] = file.read(length * widths[key])
+            self.data[key] = file.read(length * reader.storages[key].dtype.itemsize)
 
     def load(self, storage: _Storage) -> bytes:
         return self.data[storage.key]
-
-
-def _storages(content: Any) -> list[_Storage]:
-    """Return every storage that an unpickled object refers to."""
-    storages, todo, visited = [], [content], set()
-    while todo:
-        item = todo.pop()
-        if id(item) in visited:  # a pickle may refer to itself
-            continue
-        visited.add(id(item))
-        match item:
-            case _Tensor(storage=storage):
-                storages.append(storage)
-            case dict():
-                todo += item.values()
-            case list() | tuple():
-                todo += item
-            case _Object(fields=fields):
-                todo += fields.values()
-    return storages
 
 
 def _state(content: Any) -> dict[str, _Tensor]:
@@ -240,9 +216,9 @@ _BUILDERS: dict[str, Callable[..., Any]] = {
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_parameter": lambda data, *_: data,
     "torch.Size": lambda values=(): tuple(values),
-    "torch.device": lambda *args: _Object("torch.device", {"args": args}),
+    "torch.device": lambda *_: _Other(),
     "collections.OrderedDict": lambda pairs=(): {_key(key): value for key, value in pairs},
-    "argparse.Namespace": lambda: _Object("argparse.Namespace"),
+    "argparse.Namespace": _Other,
 }
 _INERT = {f"torch.{kind}" for kind in _STORAGES}
 _INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")}
@@ -250,9 +226,9 @@ _INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "
 _DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4
     FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING BINBYTES
     SHORT_BINBYTES BINBYTES8 EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET TUPLE TUPLE1 TUPLE2 TUPLE3 LIST APPEND APPENDS
-    PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL BINPERSID"""
+    PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID"""
 # Operations replaced in `_Unpickler`. Hashing a tuple that is nested 150,000 times would end the process.
-_GUARDED = "DICT SETITEM SETITEMS ADDITEMS FROZENSET REDUCE NEWOBJ BUILD GET BINGET LONG_BINGET INST"
+_GUARDED = "DICT SETITEM SETITEMS ADDITEMS REDUCE NEWOBJ BUILD INST"
 
 
 class _Dispatch(dict[int, Any]):
@@ -279,10 +255,21 @@ class _Unpickler(pickle._Unpickler):
     """
 
     stack: list[Any]
-    memo: dict[int, Any]
-    read: Callable[[int], bytes]
     readline: Callable[[], bytes]
     pop_mark: Callable[[], list[Any]]
+
+    def __init__(self, file: IO[bytes]) -> None:
+        super().__init__(file, encoding="latin1")
+        self.storages: dict[str, _Storage] = {}
+
+    def load(self) -> Any:
+        """Return the object pickled at the position of the file: plain containers, numbers, text and `_Tensor`."""
+        try:
+            return super().load()
+        except IndexError:
+            raise ValueError("the pickle uses a value that is not there") from None
+        except pickle.UnpicklingError as error:
+            raise (error.__context__ or error) from None
 
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module}.{name}"
@@ -296,7 +283,8 @@ class _Unpickler(pickle._Unpickler):
                 kind = name.removeprefix("torch.")
                 if kind not in _STORAGES:
                     raise ValueError(f"a storage of kind {name}")
-                return _Storage(key, kind, _size(length))
+                self.storages[key] = _Storage(key, kind, _size(length))
+                return self.storages[key]
         raise ValueError(f"the pickle refers to {reprlib.repr(pid)}")
 
     def load_inst(self) -> None:
@@ -311,29 +299,27 @@ class _Unpickler(pickle._Unpickler):
     load_newobj = load_reduce
 
     def load_build(self) -> None:
-        state, target = self.stack.pop(), self.stack[-1]
-        if isinstance(target, _Object) and isinstance(state, dict):
-            target.fields.update(state)
-        elif not isinstance(target, dict):  # the attributes of an OrderedDict (_metadata) are dropped
-            raise ValueError(f"the pickle sets the state of {type(target).__name__}")
+        self.stack.pop()  # the attributes of a Namespace, or of an OrderedDict (_metadata)
+        if not isinstance(self.stack[-1], _Other | dict):
+            raise ValueError(f"the pickle sets the state of {type(self.stack[-1]).__name__}")
 
-    def _set(self, target: Any, items: list[Any]) -> None:
-        if not isinstance(target, dict) or len(items) % 2:
+    def _fill(self, items: list[Any]) -> None:
+        """Set items of the dictionary on top of the stack."""
+        if not isinstance(self.stack[-1], dict) or len(items) % 2:
             raise ValueError("the pickle sets items of something that is no dictionary")
-        target.update(zip(map(_key, items[::2]), items[1::2], strict=True))
+        self.stack[-1].update(zip(map(_key, items[::2]), items[1::2], strict=True))
 
     def load_dict(self) -> None:
         items = self.pop_mark()
         self.stack.append({})
-        self._set(self.stack[-1], items)
+        self._fill(items)
 
     def load_setitem(self) -> None:
         value, key = self.stack.pop(), self.stack.pop()
-        self._set(self.stack[-1], [key, value])
+        self._fill([key, value])
 
     def load_setitems(self) -> None:
-        items = self.pop_mark()
-        self._set(self.stack[-1], items)
+        self._fill(self.pop_mark())
 
     def load_additems(self) -> None:
         items = self.pop_mark()
@@ -341,32 +327,8 @@ class _Unpickler(pickle._Unpickler):
             raise ValueError("the pickle adds to something that is no set")
         self.stack[-1].update(map(_key, items))
 
-    def load_frozenset(self) -> None:
-        items = self.pop_mark()
-        self.stack.append(frozenset(map(_key, items)))
-
-    def load_get(self) -> None:
-        self.stack.append(self.memo[int(self.readline()[:-1])])
-
-    def load_binget(self) -> None:
-        self.stack.append(self.memo[self.read(1)[0]])
-
-    def load_long_binget(self) -> None:
-        self.stack.append(self.memo[struct.unpack("<I", self.read(4))[0]])
-
     dispatch = _Dispatch((_code(name), pickle._Unpickler.dispatch[_code(name)]) for name in _DATA.split())
 
 
-for _name in _GUARDED.split():
-    _Unpickler.dispatch[_code(_name)] = getattr(_Unpickler, f"load_{_name.lower()}")
-
-
-def _read_pickle(file: IO[bytes]) -> Any:
-    """Return the object pickled at the position of `file`: plain containers, numbers, text, _Tensor, _Object and _Name.
-
-    Raises WeightsError that names the class or function if the pickle wants any other, ValueError for a damaged one.
-    """
-    try:
-        return _Unpickler(file, encoding="latin1").load()
-    except IndexError:
-        raise ValueError("the pickle uses a value that is not there") from None
+for _operation in _GUARDED.split():
+    _Unpickler.dispatch[_code(_operation)] = getattr(_Unpickler, f"load_{_operation.lower()}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -11,13 +11,13 @@ import numpy as np
 from anytouch_jax.errors import UserError
 
 
-def flatten(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
+def flatten(tree: Any) -> dict[str, Any]:
     """Return the leaves of a pytree by name: the keys, field names and indices of the path, joined with "/".
 
     Raises UserError if two leaves get the same name.
     """
     flat: dict[str, Any] = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)[0]:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         if name in flat:
             raise UserError(f"two arrays of the tree are called {name!r}; rename one of them")

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -70,21 +71,13 @@ def param_shapes(model: ModelConfig) -> dict[str, Shape]:
     return dict(_shapes(model))
 
 
-def _read_patch(weight: np.ndarray) -> np.ndarray:  # (D, colour, row, col) -> (P*P*3, D)
-    return weight.transpose(2, 3, 1, 0).reshape(-1, len(weight))
+def _write_patch(kernel: np.ndarray) -> np.ndarray:  # (..., P*P*3, D) -> (D, ..., colour, row, col)
+    side = math.isqrt(kernel.shape[-2] // 3)
+    return np.moveaxis(kernel.reshape(*kernel.shape[:-2], side, side, 3, -1), (-1, -2), (0, -3))
 
 
-def _write_patch(kernel: np.ndarray) -> np.ndarray:
-    side = math.isqrt(kernel.shape[0] // 3)
-    return kernel.reshape(side, side, 3, -1).transpose(3, 2, 0, 1)
-
-
-def _read_clip_patch(weight: np.ndarray) -> np.ndarray:  # (D, frame, colour, row, col) -> (frames, P*P*3, D), golden Q1
-    return np.stack([_read_patch(weight[:, frame]) for frame in range(weight.shape[1])])
-
-
-def _write_clip_patch(kernel: np.ndarray) -> np.ndarray:
-    return np.stack([_write_patch(frame) for frame in kernel], axis=1)
+def _read_patch(weight: np.ndarray) -> np.ndarray:  # golden Q1: (D, frame, colour, row, col) -> (frames, P*P*3, D)
+    return np.moveaxis(weight, (0, -3), (-1, -2)).reshape(*weight.shape[1:-3], -1, len(weight))
 
 
 SAME = Conversion(lambda x: x, lambda x: x)
@@ -92,7 +85,6 @@ LINEAR = Conversion(lambda x: x.T, lambda x: x.T)
 ROW = Conversion(lambda x: x[0], lambda x: x[None])
 TOKEN = Conversion(lambda x: x[0, 0], lambda x: x[None, None])
 PATCH = Conversion(_read_patch, _write_patch)
-CLIP_PATCH = Conversion(_read_clip_patch, _write_clip_patch)
 
 
 def linear(theirs: str, ours: str) -> list[Entry]:
@@ -136,6 +128,7 @@ def detect_text(weights: Weights, blocks: str, token: str, position: str) -> Tex
     return TextTower(detect_stack(weights, blocks, 64), vocab=len(weights[token]), length=len(weights[position]))
 
 
-def image_side(position: np.ndarray, patch: np.ndarray) -> int:
-    """Return the pixels on a side of the images, from a position table and a patch kernel."""
-    return round((len(position) - 1) ** 0.5) * int(patch.shape[-1])
+def image_sizes(weights: Weights, patch: str, position: str) -> dict[str, Any]:
+    """Return the image and patch sizes in pixels, from the keys of a patch kernel and a position table."""
+    side = int(weights[patch].shape[-1])
+    return {"image_size": round((len(weights[position]) - 1) ** 0.5) * side, "patch": side}

@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
-from anytouch_jax.weights.keymaps import (
-    CLIP_PATCH,
-    LINEAR,
-    ROW,
-    SAME,
-    TOKEN,
-    Entry,
-    KeyMap,
-    Weights,
-    detect_stack,
-    image_side,
-    linear,
-    norm,
-    stacked,
-)
-from anytouch_jax.weights.keymaps.hf_clip import DECODER, TOWERS, detect_text_tower, towers, vision
+from anytouch_jax.weights import keymaps
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, detect_stack, hf_clip, linear, norm
 
 _STAGE2 = "touch_mae_model."
 _CLIP_PATCH = "video_patch_embedding.weight"
 _PROBE_PATCH = "touch_model.embeddings.patch_embedding.weight"
+_MATCH_HEADS = {"mlp": "cross_sensor_mlp.up.weight", "linear": "cross_sensor_head.weight"}
 _DECODER_BLOCK = [
     *linear("attention.attention.query", "attention/query"),
     *linear("attention.attention.key", "attention/key"),
@@ -40,17 +28,17 @@ _DECODER_BLOCK = [
 
 def _touch(model: ModelConfig, prefix: str = "", patch: str = _CLIP_PATCH) -> Iterator[Entry]:
     yield Entry(f"{prefix}sensor_token", "touch/sensor_tokens", SAME)
-    yield Entry(f"{prefix}{patch}", "touch/patch/kernel", CLIP_PATCH)
-    yield from vision(f"{prefix}touch_model", "touch", model.touch.depth)
+    yield Entry(f"{prefix}{patch}", "touch/patch/kernel", keymaps.PATCH)
+    yield from hf_clip.vision(f"{prefix}touch_model", "touch", model.touch.depth)
     yield Entry(f"{prefix}touch_projection.weight", "touch/projection/kernel", LINEAR)
 
 
 def _decoder(model: ModelConfig, prefix: str = "") -> Iterator[Entry]:
-    yield Entry(f"{prefix}mask_token", "decoder/mask_token", TOKEN)
-    yield Entry(f"{prefix}decoder_pos_embed", "decoder/position", ROW)
+    yield Entry(f"{prefix}mask_token", "decoder/mask_token", keymaps.TOKEN)
+    yield Entry(f"{prefix}decoder_pos_embed", "decoder/position", keymaps.ROW)
     if model.decoder_sensor_tokens:
         yield Entry(f"{prefix}sensor_token_proj.weight", "decoder/sensor_projection/kernel", LINEAR)
-    yield from stacked(f"{prefix}touch_decoder_blocks", "decoder/blocks", model.decoder.depth, _DECODER_BLOCK)
+    yield from keymaps.stacked(f"{prefix}touch_decoder_blocks", "decoder/blocks", model.decoder.depth, _DECODER_BLOCK)
     yield from linear(f"{prefix}decoder_embed", "decoder/embed")
     yield from norm(f"{prefix}decoder_norm", "decoder/norm")
     yield from linear(f"{prefix}decoder_pred", "decoder/still_head")
@@ -58,7 +46,7 @@ def _decoder(model: ModelConfig, prefix: str = "") -> Iterator[Entry]:
 
 
 def _stage2(model: ModelConfig) -> list[Entry]:
-    entries = [*_touch(model, _STAGE2), *_decoder(model, _STAGE2), *towers(model, lora=bool(model.lora_rank))]
+    entries = [*_touch(model, _STAGE2), *_decoder(model, _STAGE2), *hf_clip.towers(model, lora=bool(model.lora_rank))]
     if model.match_head == "linear":
         entries += linear("cross_sensor_head", "matcher")
     elif model.match_head == "mlp":  # only in our files: the authors' head is linear
@@ -66,43 +54,32 @@ def _stage2(model: ModelConfig) -> list[Entry]:
     return entries
 
 
-def _sizes(weights: Weights, heads: int | None, prefix: str = "", patch_key: str = _CLIP_PATCH) -> dict[str, Any]:
-    """Return the settings of the touch encoder."""
-    patch, tokens = weights[f"{prefix}{patch_key}"], weights[f"{prefix}sensor_token"]
+def _detect(
+    weights: Weights, heads: int | None, decoder_heads: int | None, *, prefix: str = "", patch: str = _CLIP_PATCH
+) -> ModelConfig:
+    position = f"{prefix}touch_model.embeddings.position_embedding.weight"
+    tokens, blocks = weights[f"{prefix}sensor_token"], f"{prefix}touch_decoder_blocks"
     numbered = (*(f"sensor{row}" for row in range(len(tokens) - 1)), UNIVERSAL)
-    position = weights[f"{prefix}touch_model.embeddings.position_embedding.weight"]
-    return {
-        "image_size": image_side(position, patch),
-        "patch": patch.shape[-1],
-        "embed": weights[f"{prefix}touch_projection.weight"].shape[0],
-        "touch": detect_stack(weights, f"{prefix}touch_model", 64, heads),
-        "frames": patch.shape[1],
-        "sensors": SENSORS if len(tokens) == len(SENSORS) else numbered,
-        "sensor_tokens": tokens.shape[1],
-        "decoder_sensor_tokens": f"{prefix}sensor_token_proj.weight" in weights,
-    }
-
-
-def _detect_stage1(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
-    decoder = detect_stack(weights, "touch_decoder_blocks", 32, decoder_heads)
-    return ModelConfig(decoder=decoder, **_sizes(weights, heads))
-
-
-def _detect_stage2(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
-    ranks = [array.shape[0] for key, array in weights.items() if "lora_A" in key]
-    linear_head, mlp_head = (f"cross_sensor_{part}.weight" in weights for part in ("head", "mlp.up"))
+    sizes: dict[str, Any] = keymaps.image_sizes(weights, f"{prefix}{patch}", position)
+    if prefix:  # stage 2
+        ranks = [array.shape[0] for key, array in weights.items() if "lora_A" in key]
+        heads_of_match = [name for name, key in _MATCH_HEADS.items() if key in weights]
+        sizes |= {
+            "image": detect_stack(weights, "vision_model", 64, heads),
+            "text": hf_clip.detect_text_tower(weights),
+            "match_head": heads_of_match[0] if heads_of_match else "none",
+            "lora_rank": ranks[0] if ranks else 0,
+        }
     return ModelConfig(
-        decoder=detect_stack(weights, f"{_STAGE2}touch_decoder_blocks", 32, decoder_heads),
-        image=detect_stack(weights, "vision_model", 64, heads),
-        text=detect_text_tower(weights),
-        match_head="mlp" if mlp_head else "linear" if linear_head else "none",
-        lora_rank=ranks[0] if ranks else 0,
-        **_sizes(weights, heads, _STAGE2),
+        **sizes,
+        embed=weights[f"{prefix}touch_projection.weight"].shape[0],
+        touch=detect_stack(weights, f"{prefix}touch_model", 64, heads),
+        decoder=hf_clip.DECODER if patch == _PROBE_PATCH else detect_stack(weights, blocks, 32, decoder_heads),
+        frames=weights[f"{prefix}{patch}"].shape[1],
+        sensors=SENSORS if len(tokens) == len(SENSORS) else numbered,
+        sensor_tokens=tokens.shape[1],
+        decoder_sensor_tokens=f"{prefix}sensor_token_proj.weight" in weights,
     )
-
-
-def _detect_probe(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
-    return ModelConfig(decoder=DECODER, **_sizes(weights, heads, patch_key=_PROBE_PATCH))
 
 
 def _unused(prefix: str = "") -> dict[str, str]:
@@ -113,12 +90,12 @@ def _unused(prefix: str = "") -> dict[str, str]:
     }
 
 
-_TOWERS = TOWERS | {"matcher": r"cross_sensor_.*"}
+_TOWERS = hf_clip.TOWERS | {"matcher": r"cross_sensor_.*"}
 STAGE1 = KeyMap(
     "stage1",
     lambda weights: _CLIP_PATCH in weights,
     lambda model: [*_touch(model), *_decoder(model)],
-    _detect_stage1,
+    _detect,
     _unused(),
     _TOWERS,
 )
@@ -126,7 +103,7 @@ STAGE2 = KeyMap(
     "stage2",
     lambda weights: any(key.startswith(_STAGE2) for key in weights),
     _stage2,
-    _detect_stage2,
+    partial(_detect, prefix=_STAGE2),
     _unused(_STAGE2),
     _TOWERS,
 )
@@ -134,6 +111,6 @@ PROBE = KeyMap(
     "probe",
     lambda weights: _PROBE_PATCH in weights,
     lambda model: list(_touch(model, patch=_PROBE_PATCH)),
-    _detect_probe,
+    partial(_detect, patch=_PROBE_PATCH),
     towers=_TOWERS,
 )

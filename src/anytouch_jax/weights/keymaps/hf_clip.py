@@ -5,23 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from anytouch_jax.config import ModelConfig, Stack, TextTower
-from anytouch_jax.weights.keymaps import (
-    LINEAR,
-    PATCH,
-    PROJECTIONS,
-    SAME,
-    Entry,
-    KeyMap,
-    Weights,
-    detect_stack,
-    detect_text,
-    image_side,
-    linear,
-    norm,
-    stacked,
-)
+from anytouch_jax.weights import keymaps
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, linear, norm
 
-_ATTENTION = tuple(zip(("q_proj", "k_proj", "v_proj", "out_proj"), PROJECTIONS, strict=True))
+_ATTENTION = tuple(zip(("q_proj", "k_proj", "v_proj", "out_proj"), keymaps.PROJECTIONS, strict=True))
 _LORA_BLOCK = [
     Entry(f"self_attn.{theirs}.lora_{side.upper()}.default.weight", f"{ours}/{side}", LINEAR)
     for theirs, ours in _ATTENTION
@@ -46,22 +33,22 @@ def vision(prefix: str, ours: str, depth: int, *, lora: bool = False) -> Iterato
     yield Entry(f"{prefix}.embeddings.position_embedding.weight", f"{ours}/position", SAME)
     yield from norm(f"{prefix}.pre_layrnorm", f"{ours}/pre_norm")  # the library's spelling
     layers = f"{prefix}.encoder.base_model.model.layers" if lora else f"{prefix}.encoder.layers"
-    yield from stacked(layers, f"{ours}/blocks", depth, _block(".base_layer" if lora else ""))
+    yield from keymaps.stacked(layers, f"{ours}/blocks", depth, _block(".base_layer" if lora else ""))
     if lora:
-        yield from stacked(layers, "lora", depth, _LORA_BLOCK)
+        yield from keymaps.stacked(layers, "lora", depth, _LORA_BLOCK)
     yield from norm(f"{prefix}.post_layernorm", f"{ours}/post_norm")
 
 
 def towers(model: ModelConfig, *, lora: bool = False) -> Iterator[Entry]:
     """Yield the entries of the image and text towers that `model` has, and of the temperature."""
     if model.image:
-        yield Entry("vision_model.embeddings.patch_embedding.weight", "image/patch/kernel", PATCH)
+        yield Entry("vision_model.embeddings.patch_embedding.weight", "image/patch/kernel", keymaps.PATCH)
         yield from vision("vision_model", "image", model.image.depth, lora=lora)
         yield Entry("visual_projection.weight", "image/projection/kernel", LINEAR)
     if model.text:
         yield Entry("text_model.embeddings.token_embedding.weight", "text/token", SAME)
         yield Entry("text_model.embeddings.position_embedding.weight", "text/position", SAME)
-        yield from stacked("text_model.encoder.layers", "text/blocks", model.text.stack.depth, _block())
+        yield from keymaps.stacked("text_model.encoder.layers", "text/blocks", model.text.stack.depth, _block())
         yield from norm("text_model.final_layer_norm", "text/final_norm")
         yield Entry("text_projection.weight", "text/projection/kernel", LINEAR)
     if model.image or model.text:
@@ -71,16 +58,20 @@ def towers(model: ModelConfig, *, lora: bool = False) -> Iterator[Entry]:
 def detect_text_tower(weights: Weights) -> TextTower | None:
     """Return the sizes of the text tower; None if there is none."""
     table = "text_model.embeddings.{}_embedding.weight"
-    return detect_text(weights, "text_model", table.format("token"), table.format("position"))
+    return keymaps.detect_text(weights, "text_model", table.format("token"), table.format("position"))
 
 
 def _detect(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
-    patch = weights["vision_model.embeddings.patch_embedding.weight"]
-    position = weights["vision_model.embeddings.position_embedding.weight"]
-    stack = detect_stack(weights, "vision_model", 64, heads)
-    embed = weights["visual_projection.weight"].shape[0]
-    text = detect_text_tower(weights)
-    return ModelConfig(image_side(position, patch), patch.shape[-1], embed, stack, DECODER, image=stack, text=text)
+    inner = "vision_model.embeddings.{}_embedding.weight"
+    tower = keymaps.detect_stack(weights, "vision_model", 64, heads)
+    return ModelConfig(
+        **keymaps.image_sizes(weights, inner.format("patch"), inner.format("position")),
+        embed=weights["visual_projection.weight"].shape[0],
+        touch=tower,
+        decoder=DECODER,
+        image=tower,
+        text=detect_text_tower(weights),
+    )
 
 
 TOWERS = {

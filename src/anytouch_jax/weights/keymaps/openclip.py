@@ -5,21 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.weights.keymaps import (
-    LINEAR,
-    PATCH,
-    PROJECTIONS,
-    SAME,
-    Entry,
-    KeyMap,
-    Weights,
-    detect_stack,
-    detect_text,
-    image_side,
-    linear,
-    norm,
-    stacked,
-)
+from anytouch_jax.weights import keymaps
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, linear, norm
 from anytouch_jax.weights.keymaps.hf_clip import DECODER
 
 _BLOCK = [
@@ -29,7 +16,7 @@ _BLOCK = [
     *linear("mlp.c_fc", "mlp/up"),
     *linear("mlp.c_proj", "mlp/down"),
 ]
-for _part, _name in enumerate(PROJECTIONS[:3]):
+for _part, _name in enumerate(keymaps.PROJECTIONS[:3]):
     _BLOCK.append(Entry("attn.in_proj_weight", f"attention/{_name}/kernel", LINEAR, part=_part))
     _BLOCK.append(Entry("attn.in_proj_bias", f"attention/{_name}/bias", SAME, part=_part))
 
@@ -38,25 +25,30 @@ def _entries(model: ModelConfig) -> Iterator[Entry]:
     if model.image:
         yield Entry("visual.class_embedding", "image/class_token", SAME)
         yield Entry("visual.positional_embedding", "image/position", SAME)
-        yield Entry("visual.conv1.weight", "image/patch/kernel", PATCH)
+        yield Entry("visual.conv1.weight", "image/patch/kernel", keymaps.PATCH)
         yield from norm("visual.ln_pre", "image/pre_norm")
-        yield from stacked("visual.transformer.resblocks", "image/blocks", model.image.depth, _BLOCK)
+        yield from keymaps.stacked("visual.transformer.resblocks", "image/blocks", model.image.depth, _BLOCK)
         yield from norm("visual.ln_post", "image/post_norm")
         yield Entry("visual.proj", "image/projection/kernel", SAME)  # stored as (in, out), unlike a torch Linear
     if model.text:
         yield Entry("token_embedding.weight", "text/token", SAME)
         yield Entry("positional_embedding", "text/position", SAME)
-        yield from stacked("transformer.resblocks", "text/blocks", model.text.stack.depth, _BLOCK)
+        yield from keymaps.stacked("transformer.resblocks", "text/blocks", model.text.stack.depth, _BLOCK)
         yield from norm("ln_final", "text/final_norm")
         yield Entry("text_projection", "text/projection/kernel", SAME)
     yield Entry("logit_scale", "logit_scale", SAME)
 
 
 def _detect(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
-    patch, position = weights["visual.conv1.weight"], weights["visual.positional_embedding"]
-    stack, embed = detect_stack(weights, "visual", 64, heads), weights["visual.proj"].shape[1]
-    text = detect_text(weights, "transformer", "token_embedding.weight", "positional_embedding")
-    return ModelConfig(image_side(position, patch), patch.shape[-1], embed, stack, DECODER, image=stack, text=text)
+    tower = keymaps.detect_stack(weights, "visual", 64, heads)
+    return ModelConfig(
+        **keymaps.image_sizes(weights, "visual.conv1.weight", "visual.positional_embedding"),
+        embed=weights["visual.proj"].shape[1],
+        touch=tower,
+        decoder=DECODER,
+        image=tower,
+        text=keymaps.detect_text(weights, "transformer", "token_embedding.weight", "positional_embedding"),
+    )
 
 
 OPENCLIP = KeyMap(

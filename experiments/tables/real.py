@@ -14,7 +14,7 @@ import numpy as np
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, random_encoder
-from anytouch_jax.evaluate import statistics
+from anytouch_jax.evaluate import probe_results, statistics
 from anytouch_jax.evaluate.array_probes import leave_groups_out, linear_probe
 from anytouch_jax.evaluate.feature_cache import pixel_features
 from anytouch_jax.evaluate.probing import label_rows, pixel_components
@@ -22,7 +22,7 @@ from anytouch_jax.evaluate.tasks import TaskRows
 from experiments.tables.plan import Leaf
 
 Row = dict[str, Any]
-Fit = Callable[[np.ndarray, Any], statistics.ProbeResult]
+Fit = Callable[[np.ndarray, Any], probe_results.ProbeResult]
 FIRM: dict[str, Any] = {"where": ("label.contact_score", 7.0), "sensor": "gelsight_mini"}
 OURS, UNTRAINED, PIXELS = "trained", "untrained", "pixels"
 FOLDS = "object, every recording tested"  # in ten folds: the test split alone has fourteen
@@ -73,7 +73,7 @@ def _features(leaf: Leaf, encoder: Encoder, table: Manifest, task: TaskRows) -> 
     return found | {PIXELS: pixel_components(pixel_features(table), task)}
 
 
-def _fitted(features: dict[str, np.ndarray], fit: Fit) -> dict[str, statistics.ProbeResult]:
+def _fitted(features: dict[str, np.ndarray], fit: Fit) -> dict[str, probe_results.ProbeResult]:
     return {name: fit(x, "common" if name == PIXELS else "column") for name, x in features.items()}
 
 
@@ -100,7 +100,7 @@ def _compared(task: str, features: dict[str, np.ndarray], fit: Fit) -> list[Row]
             named = {"view": f"{name}, {part.name}", "test": part.n_test}
             found.append(shared | named | {"mean": part.accuracy, "low": part.low, "high": part.high})
     for name in (UNTRAINED, PIXELS):
-        mean, low, high = statistics.difference(by_name[OURS], by_name[name])
+        mean, low, high = probe_results.accuracy_difference(by_name[OURS], by_name[name])
         found.append(shared | {"view": f"{OURS} - {name}", "mean": mean, "low": low, "high": high})
     return found
 

@@ -24,6 +24,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, heads
 from anytouch_jax.evaluate.feature_cache import FeatureStore
 from anytouch_jax.evaluate.heads import load_head
+from anytouch_jax.evaluate.probe_results import task_table
 from anytouch_jax.evaluate.probing import (
     label_rows,
     pixel_components,
@@ -31,7 +32,6 @@ from anytouch_jax.evaluate.probing import (
     probe_label,
     probe_tasks,
     run_tasks,
-    task_table,
 )
 from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, find_benchmark, label_task, select
 

@@ -39,7 +39,8 @@ def run(options: Probe) -> int:
     if options.cache is not None:
         check_home(options.cache, "--cache")
     enable_compilation_cache()
-    from anytouch_jax.evaluate import probing, statistics
+    from anytouch_jax.evaluate import probing
+    from anytouch_jax.evaluate.probe_results import probe_table, task_table
 
     shared: dict[str, Any] = {name: getattr(options, name) for name in ("features", "seeds", "controls", "out")}
     sides = {name: _names(getattr(options, name)) for name in _SIDES} | {"max_rows": options.max_rows}
@@ -47,17 +48,17 @@ def run(options: Probe) -> int:
         raise UserError("give --benchmark, which has its own settings, or --tasks, not both")
     if options.benchmark:
         shared |= sides | {"cache": options.cache, "log": log}
-        table = probing.task_table(probing.probe_benchmark(options.run, options.data, options.benchmark, **shared))
+        table = task_table(probing.probe_benchmark(options.run, options.data, options.benchmark, **shared))
     elif options.tasks:
         names: tuple[str, ...] = ("protocol", "frames", "pooling", "join", "order", "cache")
         shared |= sides | {name: getattr(options, name) for name in names} | {"log": log}
         tasks = "all" if options.tasks == "all" else _names(options.tasks)
         heads = _names(options.heads)
-        table = probing.task_table(probing.probe_tasks(options.run, options.data, tasks, heads=heads, **shared))
+        table = task_table(probing.probe_tasks(options.run, options.data, tasks, heads=heads, **shared))
     else:
         names = ("group", "leave_out", "where", "sensor", "pooling", "protocol", "save")
         shared |= {name: getattr(options, name) for name in names} | {"frames": options.frames or 1, "log": log}
-        table = statistics.to_table(probing.probe_label(options.run, options.data, options.label, **shared))
+        table = probe_table(probing.probe_label(options.run, options.data, options.label, **shared))
     Console().print(Markdown(table)) if Console().is_terminal else print(table)
     return 0
 

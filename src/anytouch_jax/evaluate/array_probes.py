@@ -19,8 +19,9 @@ import numpy.typing as npt
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits, statistics
 from anytouch_jax.evaluate.heads import FittedHead, ProbeHead, Scaling
+from anytouch_jax.evaluate.probe_results import Outcome, ProbeResult, RegressionResult, subset_results
 from anytouch_jax.evaluate.splits import Split
-from anytouch_jax.evaluate.statistics import ProbeResult, Protocol, RegressionResult
+from anytouch_jax.evaluate.statistics import Protocol
 from anytouch_jax.evaluate.tasks import label_text
 
 Array = npt.NDArray[Any]
@@ -116,7 +117,7 @@ def _probe_classes(
     if model is not None and not model.finished:
         notes += ("the fit stopped at its limit of iterations",)
     result = _probe_result(name, protocol, data, rows, correct, selected, notes, subsets, refits)
-    outcome = statistics.Outcome(rows.test, correct, data.groups[rows.test], (model, data.names))
+    outcome = Outcome(rows.test, correct, data.groups[rows.test], (model, data.names))
     return dataclasses.replace(result, outcome=outcome)
 
 
@@ -231,9 +232,9 @@ def _probe_result(
         n_test=len(rows.test),
         test_groups=len(np.unique(groups)),
         classes=tuple(map(str, data.names[np.unique(data.y[rows.fit])])),
-        parts=statistics.parts_of(correct, groups, subsets or {}, rows.test),
+        parts=subset_results(correct, groups, subsets or {}, rows.test),
         notes=notes if low is not None else (*notes, "test has one group only: no interval"),
-        outcome=statistics.Outcome(rows.test, correct, groups),
+        outcome=Outcome(rows.test, correct, groups),
     )
 
 

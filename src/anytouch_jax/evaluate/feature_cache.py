@@ -154,11 +154,9 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
         raise UserError(f"{path} needs the arrays features (n, d) and rows (n,). It has {', '.join(arrays) or 'none'}.")
     values, rows = arrays["features"], arrays["rows"]
     numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
-    if values.ndim != 2 or not numeric or rows.shape != values.shape[:1]:
-        raise UserError(
-            f"{path} needs numbers features (n, d) and integers rows (n,), not {values.shape}, {rows.shape}."
-        )
-    if len(np.unique(rows)) < len(rows) or not len(rows) or rows.min() < 0 or rows.max() >= len(table):
+    if values.ndim != 2 or not numeric or not len(rows) or rows.shape != values.shape[:1]:
+        raise UserError(f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}.")
+    if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
         raise UserError(f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}.")
     paths = arrays.get("key/path")
     if paths is not None and (paths != text_column(table, "path")[rows]).any() and len(table.files) == 1:
@@ -199,13 +197,8 @@ def _derangement(frames: int, row: int) -> Array:
 
 
 def _content(table: Manifest, parameters: str, order: Order) -> dict[str, Any]:
-    return {
-        "version": VERSION,
-        "parameters": parameters,
-        "manifest": table.content_hash,
-        "pictures": image_digest(table),
-        "order": order,
-    }
+    about = {"parameters": parameters, "manifest": table.content_hash, "pictures": image_digest(table)}
+    return {"version": VERSION, "order": order, **about}
 
 
 def encoder_digest(encoder: Encoder) -> str:

@@ -23,41 +23,14 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import Encoder, Join, Pooling, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import feature_cache, logistic, splits, statistics
-from anytouch_jax.evaluate.array_probes import (
-    LabelledFeatures,
-    check_rows,
-    knn_probe,
-    leave_groups_out,
-    linear_probe,
-    majority_baseline,
-    select_option,
-    unlearned_note,
-)  # fmt: skip
+from anytouch_jax.evaluate import array_probes, feature_cache, heads, logistic, splits, statistics, tasks
+from anytouch_jax.evaluate.array_probes import LabelledFeatures
 from anytouch_jax.evaluate.feature_cache import FeatureStore, Order
-from anytouch_jax.evaluate.heads import (
-    GradientRecipe,
-    HeadName,
-    ProbeHead,
-    Scaling,
-    fit_head,
-    linear_head,
-    majority_class,
-    save_head,
-)  # fmt: skip
+from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, ProbeHead, Scaling
+from anytouch_jax.evaluate.probe_results import ProbeResult, probe_json
 from anytouch_jax.evaluate.splits import RowRoles, Split
-from anytouch_jax.evaluate.statistics import GroupSums, ProbeResult, Protocol
-from anytouch_jax.evaluate.tasks import (
-    TASKS,
-    Task,
-    TaskRows,
-    available_tasks,
-    described_subsets,
-    find_benchmark,
-    find_task,
-    label_task,
-    select,
-)  # fmt: skip
+from anytouch_jax.evaluate.statistics import GroupSums, Protocol
+from anytouch_jax.evaluate.tasks import Task, TaskRows
 from anytouch_jax.files import atomic_write
 
 Array = npt.NDArray[Any]
@@ -72,8 +45,12 @@ class _Source(NamedTuple):
 
     name: str
     store: FeatureStore
-    encoder: Encoder | None
+    encoder: Encoder | None = None
     scaling: Scaling = "column"
+
+    @property
+    def is_file(self) -> bool:
+        return self.encoder is None and self.name != RAW
 
 
 class _Sides(NamedTuple):
@@ -117,39 +94,44 @@ def probe_label(
 
     `group` is the column that no split cuts. `leave_out` tests every value of a column held out, instead of the splits.
     `where` keeps rows whose column exceeds a number. `save` writes the linear head of the only model, `out` the results
-    as JSON. Print the results with `statistics.to_table`. Raises UserError.
+    as JSON. Print the results with `probe_table`. Raises UserError.
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
-    table = manifests.read([str(path) for path in data])
+    table = _read(data)
     filters: dict[str, Any] = {"group": group, "leave_out": leave_out, "where": where, "sensor": sensor}
     rows, subsets = label_rows(table, label, **filters, frames=frames)
     log(f"{len(rows.rows)} of {len(table)} rows take part")
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
-    check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
+    array_probes.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
     results: list[Any] = []
-    for source in _sources(table, models, features, controls, frames, cache, pooling=pooling, join=join):
+    sources = _sources(table, models, features, controls, frames, cache, pooling=pooling, join=join)
+    for source in sources:
+        if source.is_file:  # a file that lacks rows is reported before the work
+            source.store.add(rows.rows, frames)
+    for source in sources:
         if source.encoder is not None:
-            for name in sorted(set(rows.sensors)):
-                source.encoder.sensor_row(name, log)  # warns of universal tokens
+            for sensor_name in sorted(set(rows.sensors)):
+                source.encoder.sensor_row(sensor_name, log)  # warns of universal tokens
         values = pixel_components(source.store, rows) if source.name == RAW else source.store.get(rows.rows, frames)
         found = probe_rows(
             values, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds, scaling=source.scaling,
             subsets=subsets,
         )  # fmt: skip
         if save is not None and source.encoder is not None and source.name != RANDOM:
-            model, names = found[0].outcome.fitted  # type: ignore[union-attr, misc]
+            assert found[0].outcome is not None and found[0].outcome.fitted is not None
+            model, names = found[0].outcome.fitted
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
-            save_head(save, linear_head(model, names, fingerprint=source.encoder.mark, **about))
+            heads.save_head(save, heads.linear_head(model, names, fingerprint=source.encoder.mark, **about))
             log(f"{save}: the linear head")
         results += found
         log(f"probed {source.name}")
     if leave_out is None:
-        results.append(majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
+        results.append(array_probes.majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
     if out is not None:
-        atomic_write(out, statistics.to_json(results))
+        atomic_write(out, probe_json(results))
     return results
 
 
@@ -158,10 +140,10 @@ def label_rows(
     where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
 ) -> tuple[TaskRows, dict[str, Array]]:  # fmt: skip
     """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named."""
-    task = label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
-    rows = select(table, task, frames)
+    task = tasks.label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
+    rows = tasks.select(table, task, frames)
     column, name = (task.label, "classes") if leave_out is None else (task.groups[0], f"{leave_out}s")
-    return rows, described_subsets(table, column, rows.rows[:, 0], name)
+    return rows, tasks.described_subsets(table, column, rows.rows[:, 0], name)
 
 
 def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
@@ -175,13 +157,13 @@ def probe_rows(
     seeds: int = 5, scaling: Scaling = "column", subsets: dict[str, Array] | None = None,
 ) -> list[ProbeResult]:  # fmt: skip
     """Return the linear and kNN results of features (n, d) on the rows of a task, or that of held-out groups."""
+    arrays, options = (features, rows.labels, rows.groups), dict[str, Any](subsets=subsets)
     if leave_out is not None:
         name = f"{name}: linear, {leave_out} left out"
-        return [leave_groups_out(features, rows.labels, rows.groups, scaling=scaling, subsets=subsets, name=name)]
-    arrays, shared = (features, rows.labels, rows.groups, rows.split), {"protocol": protocol, "seeds": seeds}
-    options: dict[str, Any] = shared | {"subsets": subsets}
-    linear = linear_probe(*arrays, scaling=scaling, name=f"{name}: linear", **options)
-    return [linear, knn_probe(*arrays, name=f"{name}: kNN", **options)]
+        return [array_probes.leave_groups_out(*arrays, name=name, scaling=scaling, **options)]
+    options |= {"protocol": protocol, "seeds": seeds}
+    linear = array_probes.linear_probe(*arrays, rows.split, name=f"{name}: linear", scaling=scaling, **options)
+    return [linear, array_probes.knn_probe(*arrays, rows.split, name=f"{name}: kNN", **options)]
 
 
 def probe_tasks(
@@ -197,33 +179,13 @@ def probe_tasks(
     `train_sensors` and its siblings name sensors and units (patterns) to fit on and to test on. `out` writes JSON.
     Tasks that cannot be probed are left out with their reason. Print the result with `task_table`. Raises UserError.
     """
-    table = manifests.read([str(path) for path in data])
-    every = tasks == "all" or list(tasks) == ["all"]
-    names = available_tasks(table) if every else tuple(tasks)
-    if not names:
-        raise UserError("The manifest has no label of any task. `anytouch probe label` takes any column.")
-    if order != "right" and all((frames or find_task(name).frames) == 1 for name in names):
-        raise UserError("--order has no effect on stills. Leave it out, or give --frames.")
-    if features and order != "right":
-        raise UserError("--order has no effect on --features, whose frames are encoded already. Leave one of them out.")
-    sides, plans, left_out = _Sides(train_sensors, test_sensors, train_units, test_units), list[_Plan](), {}
-    for name in names:
-        task = find_task(name)
-        try:
-            plans.append(_plan(table, task, frames, sides, max_rows))
-        except UserError as error:
-            left_out[name] = str(error).removeprefix(f"Task {name}: ")
-    if not plans:
-        raise UserError(" ".join(f"Task {name}: {reason}" for name, reason in left_out.items()))
-    if every:
-        left_out |= {name: "The manifest has no such label." for name in TASKS if name not in names}
-    for name, reason in left_out.items():
-        log(f"{name}: not probed ({reason})")
+    table, sides = _read(data), _Sides(train_sensors, test_sensors, train_units, test_units)
+    plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log)
+    if order != "right" and (features or all(plan.frames == 1 for plan in plans)):
+        raise UserError("--order has no effect on stills or on --features. Leave it out, or give --frames.")
     sources = _sources(table, models, features, controls, frames or 1, cache, pooling=pooling, join=join, order=order)
-    if join != "mean":
-        for encoder in (source.encoder for source in sources if source.encoder is not None):
-            if (frames or 1) <= encoder.config.model.frames:
-                raise UserError("--join has no effect without --frames longer than a clip of the model.")
+    if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
+        raise UserError("--join has no effect without --frames longer than a clip of the model.")
     protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else ("honest",)
     settings = _Settings(seeds, heads, protocols, GradientRecipe(), order)
     return _report(table, data, sources, plans, settings, sides, left_out, None, out, log)
@@ -238,8 +200,8 @@ def probe_benchmark(
 
     `out` writes JSON. Print the result with `task_table`. Raises UserError.
     """
-    setting = find_benchmark(benchmark)
-    table = manifests.read([str(path) for path in data])
+    setting = tasks.find_benchmark(benchmark)
+    table = _read(data)
     sides = _Sides(train_sensors, test_sensors, train_units, test_units)
     plans = [_plan(table, setting.task, None, sides, max_rows)]
     encoding: dict[str, Any] = {"pooling": setting.pooling, "universal": setting.universal}
@@ -267,11 +229,11 @@ def run_tasks(
     if encoder is None:
         source = _Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common")
     elif isinstance(encoder, FeatureStore):
-        source = _Source("features", encoder, None)
+        source = _Source("features", encoder)
     else:
         options: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
         source = _Source("encoder", feature_cache.encoder_features(encoder, table, folder=cache, **options), encoder)
-    plans = [_plan(table, find_task(name), frames, _Sides(**sides), max_rows) for name in names]
+    plans = [_plan(table, tasks.find_task(name), frames, _Sides(**sides), max_rows) for name in names]
     return _run_plans(source, plans, _Settings(seeds, head_names, protocols, recipe or GradientRecipe(), order))
 
 
@@ -289,7 +251,7 @@ def _sources(
         check_frames(encoder.config.model, frames)
         store = feature_cache.encoder_features(encoder, table, order=order, folder=cache, **encoding)
         sources.append(_Source(name, store, encoder))
-    sources += [_Source(str(path), feature_cache.file_features(Path(path), table), None) for path in features]
+    sources += [_Source(str(path), feature_cache.file_features(Path(path), table)) for path in features]
     if controls:
         sources.append(_Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common"))
     if not sources:
@@ -297,12 +259,38 @@ def _sources(
     return sources
 
 
+def _plan_tasks(
+    table: Manifest, names: Sequence[str], frames: int | None, sides: _Sides, max_rows: int | None, log: Log
+) -> tuple[list[_Plan], dict[str, str]]:
+    """Return the plans of the tasks that can be probed, and why the others cannot. Raises UserError if none can."""
+    plans, left_out = list[_Plan](), dict[str, str]()
+    if names == "all" or list(names) == ["all"]:
+        names = tasks.available_tasks(table)
+        left_out = {name: "The manifest has no such label." for name in tasks.TASKS if name not in names}
+    if not names:
+        raise UserError("The manifest has no label of any task. `anytouch probe label` takes any column.")
+    for task in map(tasks.find_task, names):
+        try:
+            plans.append(_plan(table, task, frames, sides, max_rows))
+        except UserError as error:
+            left_out[task.name] = str(error).removeprefix(f"Task {task.name}: ")
+    if not plans:
+        raise UserError(" ".join(f"Task {name}: {left_out[name]}" for name in names))
+    for name, reason in left_out.items():
+        log(f"{name}: not probed ({reason})")
+    return plans, left_out
+
+
+def _read(data: Paths) -> Manifest:
+    return manifests.read([str(path) for path in data])
+
+
 def _plan(table: Manifest, task: Task, frames: int | None, sides: _Sides, max_rows: int | None) -> _Plan:
     """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them. Raises UserError."""
     for name, count in (("max_rows", max_rows), ("frames", frames)):
         if count is not None and count < 1:
             raise UserError(f"{name} must be at least 1, not {count}.")
-    rows = select(table, task, frames)
+    rows = tasks.select(table, task, frames)
     rows = rows.take(np.flatnonzero(np.logical_or(*_side_masks(rows, sides))))
     used = np.flatnonzero(splits.split_scheme(_roles(task, rows, sides)[0])[1])
     rows = rows.take(splits.subsample(used, max_rows or len(used)))
@@ -311,7 +299,7 @@ def _plan(table: Manifest, task: Task, frames: int | None, sides: _Sides, max_ro
     notes = [*rows.notes, why]
     notes += [f"{name.replace('_', ' ')} {', '.join(some)}" for name, some in sides._asdict().items() if some]
     if scheme == "split" and not roles.measured:
-        notes += unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
+        notes += array_probes.unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
     return _Plan(task, rows, roles, names, frames or task.frames, [note for note in notes if note])
 
 
@@ -352,6 +340,8 @@ def _report(
     table: Manifest, data: Paths, sources: Sequence[_Source], plans: Sequence[_Plan], settings: _Settings,
     sides: _Sides, left_out: dict[str, str], paper: float | None, out: Path | None, log: Log,
 ) -> dict[str, Any]:  # fmt: skip
+    for source in (source for source in sources if source.is_file):
+        _add_rows(source, plans)  # a file that lacks rows is reported before the work
     results = []
     for source in sources:
         results += [{"features": source.name} | row for row in _run_plans(source, plans, settings)]
@@ -369,8 +359,7 @@ def _report(
 def _run_plans(source: _Source, plans: Sequence[_Plan], settings: _Settings) -> list[dict[str, Any]]:
     if settings.seeds < 1:
         raise UserError(f"seeds must be at least 1, not {settings.seeds}.")
-    for length in sorted({plan.frames for plan in plans}):  # one pass over the rows of all tasks
-        source.store.add(np.concatenate([p.rows.rows.ravel() for p in plans if p.frames == length]), length)
+    _add_rows(source, plans)
     results = []
     for plan in plans:
         x = source.store.get(plan.rows.rows, plan.frames)
@@ -395,6 +384,11 @@ def _run_plans(source: _Source, plans: Sequence[_Plan], settings: _Settings) -> 
     return results
 
 
+def _add_rows(source: _Source, plans: Sequence[_Plan]) -> None:
+    for length in sorted({plan.frames for plan in plans}):  # one pass over the rows of all tasks
+        source.store.add(np.concatenate([p.rows.rows.ravel() for p in plans if p.frames == length]), length)
+
+
 def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Protocol, seeds: int) -> dict[str, Any]:
     """Score a head on all splits of all seeds: a row of the result."""
     roles, chosen, sizes, unfinished = plan.roles, list[float](), list[int](), 0
@@ -409,7 +403,7 @@ def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Proto
             option, predicted, finished = _predict(data, cut, dataclasses.replace(head, seed=seed), protocol)
             unfinished += not finished
             fitted = roles.y[cut.fit]
-            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else majority_class(fitted)))
+            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else heads.majority_class(fitted)))
             predictions.append(predicted)
             chosen.append(option)
             sizes.append(len(cut.fit))
@@ -437,13 +431,13 @@ def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Proto
 
 def _predict(data: LabelledFeatures, cut: Split, head: ProbeHead, protocol: Protocol) -> tuple[float, Array, bool]:
     """Return the selected option, its predictions for the test rows, and whether its fit converged."""
-    selected = select_option(head, data, cut, protocol)
+    selected = array_probes.select_option(head, data, cut, protocol)
     fitted, index = selected.fitted, selected.place
     assert fitted is not None  # an honest cut has rows of val
     if head.name != "gradient" and len(cut.fit) > splits.SELECT_ROWS:
         start = fitted.models[index] if fitted.models else None
         head, index = dataclasses.replace(head, options=(selected.option,)), 0
-        fitted = fit_head(head, data.x[cut.fit], data.y[cut.fit], len(data.names), start=start)
+        fitted = heads.fit_head(head, data.x[cut.fit], data.y[cut.fit], len(data.names), start=start)
     finished = all(model.finished for model in fitted.models[index : index + 1])
     return selected.option, fitted.predict(data.x[cut.test])[index], finished
 
@@ -453,22 +447,3 @@ def _sums(roles: RowRoles, tested: Array, predicted: Array) -> GroupSums:
     if not roles.measured:
         return statistics.classification_sums(predicted == truth, groups)
     return statistics.regression_sums(predicted - truth, truth - roles.y.mean(), groups)
-
-
-def task_table(report: dict[str, Any]) -> str:
-    """Return the result of `probe_tasks` or `probe_benchmark` as Markdown, with notes below."""
-    head = ("features", "task", "head", "protocol", "score", "95 %", "chance", "train", "test (groups)")
-    rows, notes = [], dict[str, None]()
-    for row in report["results"]:
-        r2 = row["metric"] == "r2"
-        factor, digits = (1.0, 3) if r2 else (100.0, 1)
-        score = f"R2 {row['mean']:.3f}, {row['mae']:.3g} {row['unit']}" if r2 else f"{100 * row['mean']:.1f} %"
-        chance = f"{row['chance_mae']:.3g} {row['unit']}" if r2 else f"{100 * row['chance']:.1f} %"
-        low, high = row["low"], row["high"]
-        interval = "-" if low is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
-        names = (row["features"], row["task"], row["head"], row["protocol"])
-        rows.append((*names, score, interval, chance, str(row["train"]), f"{row['test']} ({row['groups']})"))
-        notes |= dict.fromkeys(f"- {row['task']}: {note}" for note in row["notes"])
-    if report["paper"] is not None:
-        notes[f"- the paper reports {100 * report['paper']:.2f} % for AnyTouch, its epoch chosen on test"] = None
-    return "\n\n".join([statistics.markdown(head, rows), *(["\n".join(notes)] if notes else [])]) + "\n"

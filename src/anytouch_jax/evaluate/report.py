@@ -21,7 +21,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, geometry, matching, retrieval, statistics
+from anytouch_jax.evaluate import array_probes, geometry, matching, probe_results, retrieval, statistics
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
 from anytouch_jax.evaluate.sections import (  # fmt: skip
@@ -309,7 +309,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
         features[PIXELS] = principal_components(study.pixels, study.split == "train")
     objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
     groups = np.where(objects == "", sequences, objects)
-    found: dict[str, list[statistics.Result]] = {}
+    found: dict[str, list[probe_results.Result]] = {}
     for label in (*LABELS, *QUANTITIES):
         name = f"label.{label}"
         if name not in table.table.column_names:
@@ -327,7 +327,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     return probes_section(found, notes, out), {"found": found, "notes": notes}
 
 
-def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> statistics.Result:
+def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> probe_results.Result:
     if measured:
         return array_probes.regression_probe(x, labels, groups, split, name=name)
     # Principal components keep their sizes: bringing each to unit spread would blow up the smallest.

@@ -19,7 +19,7 @@ from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.encoder import text_column
-from anytouch_jax.evaluate import matching, plots, retrieval, statistics
+from anytouch_jax.evaluate import matching, plots, probe_results, retrieval, statistics
 from anytouch_jax.evaluate.contacts import deepest_rows
 from anytouch_jax.evaluate.figures import reconstruction_panels, write_png
 from anytouch_jax.evaluate.geometry import Space
@@ -273,12 +273,12 @@ def _ahead(pooled: Mapping[Any, retrieval.Retrieval], names: Sequence[str], best
     }  # fmt: skip
 
 
-def probes_section(found: Mapping[str, Sequence[statistics.Result]], notes: Sequence[str], folder: Path) -> Section:
+def probes_section(found: Mapping[str, Sequence[probe_results.Result]], notes: Sequence[str], folder: Path) -> Section:
     """Probes {label: results of several features}: accuracy of classes, R2 of quantities, on objects never seen."""
     parts, panels = [], {}
     for label, several in found.items():
-        parts.append(f"### {label}\n\n{statistics.to_table(several).strip()}")
-        classified = [one for one in several if isinstance(one, statistics.ProbeResult)]
+        parts.append(f"### {label}\n\n{probe_results.probe_table(several).strip()}")
+        classified = [one for one in several if isinstance(one, probe_results.ProbeResult)]
         if classified:
             panels[label] = {one.probe: plots.Bar(one.accuracy, one.low, one.high, one.baseline) for one in classified}
     path = folder / "figures" / "probes.png"

@@ -3,105 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.errors import UserError
-
 Array = npt.NDArray[Any]
 Protocol = Literal["honest", "published"]
-
-
-@dataclass(frozen=True)
-class Part:
-    """Accuracy of a fit on a named part of its test rows; `low`, `high` as in `ProbeResult`."""
-
-    name: str
-    accuracy: float
-    low: float | None
-    high: float | None
-    n_test: int
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Test row by test row: number of the row, whether it was right, its group. What `difference` pairs.
-
-    `fitted`: the linear model that was tested, and the names (K,) that its class numbers count.
-    """
-
-    rows: Array
-    correct: Array
-    groups: Array
-    fitted: tuple[Any, Array] | None = None
-
-
-@dataclass(frozen=True)
-class ProbeResult:
-    """A classification probe. Shares are in 0..1.
-
-    `accuracy`, `balanced_accuracy`: of the model fitted on all of train, on the test rows; a test row of a class
-    that train lacks counts as an error. `low`, `high`: 95 % percentile interval of that accuracy when the test
-    *groups* (recordings), not the frames, are drawn anew with replacement: what other recordings of the same kind
-    would give for this fitted model. None with fewer than two test groups. `refit_mean`, `refit_std`: accuracy of
-    `seeds` models fitted on bootstraps of the train groups: what other training recordings would give (each sees
-    some 63 % of the recordings, so the mean lies a little below `accuracy`). `baseline`: accuracy of always naming
-    the commonest class of train. `protocol` honest: `penalty` (k for kNN) was chosen without the test set, on
-    `chosen_on`; published: on the test set, as the authors' released code does, so the accuracy is an upper estimate.
-    """
-
-    probe: str
-    protocol: Protocol
-    accuracy: float
-    balanced_accuracy: float
-    low: float | None
-    high: float | None
-    baseline: float
-    refit_mean: float | None
-    refit_std: float | None
-    seeds: int
-    penalty: float | None
-    chosen_on: str
-    n_train: int
-    n_test: int
-    test_groups: int
-    classes: tuple[str, ...]
-    parts: tuple[Part, ...] = ()
-    notes: tuple[str, ...] = ()
-    outcome: Outcome | None = field(default=None, repr=False, compare=False)
-
-
-@dataclass(frozen=True)
-class RegressionResult:
-    """A regression probe: `r2` (1 - squared error / variance of the test labels) and `mae` in units of the label.
-
-    `low`, `high` bound R2 as in `ProbeResult`; `baseline_mae` is that of always naming the mean of train.
-    """
-
-    probe: str
-    protocol: Protocol
-    r2: float
-    low: float | None
-    high: float | None
-    mae: float
-    mae_low: float | None
-    mae_high: float | None
-    baseline_mae: float
-    penalty: float
-    chosen_on: str
-    n_train: int
-    n_test: int
-    test_groups: int
-    notes: tuple[str, ...] = ()
-
-
-Result = ProbeResult | RegressionResult
 
 
 DRAWS = 10_000  # bootstraps of an interval: with a tenth of them its ends are 0.09 standard errors off, now 0.03
@@ -211,39 +121,6 @@ def verdict(low: float | None, high: float | None, seeds: int, *, wanted: float 
     return "agrees" if (low > 0) == (wanted > 0) else "disagrees"
 
 
-def difference(first: ProbeResult, second: ProbeResult) -> tuple[float, float | None, float | None]:
-    """Accuracy of `first` minus that of `second` with its 95 % interval over groups, paired by test row.
-
-    Two encoders err on the same hard recordings, so this is much narrower than two intervals side by side. Raises
-    UserError when the two were not tested on the same rows.
-    """
-    a, b = first.outcome, second.outcome
-    if a is None or b is None or not np.array_equal(a.rows, b.rows) or not np.array_equal(a.groups, b.groups):
-        raise UserError(
-            f"{first.probe!r} and {second.probe!r} were not tested on the same rows; give both the same table"
-        )
-    change = a.correct.astype(np.float64) - b.correct
-    return float(change.mean()), *mean_interval(change, a.groups)
-
-
-def parts_of(correct: Array, groups: Array, subsets: Mapping[str, Array], test: Array) -> tuple[Part, ...]:
-    """`correct` and `groups` of the test rows, cut by `subsets` (masks over all rows; `test` are the rows' numbers)."""
-    found = []
-    for name, mask in subsets.items():
-        chosen = np.asarray(mask, bool)[test]
-        if chosen.any():
-            low, high = mean_interval(correct[chosen], groups[chosen])
-            found.append(Part(name, float(correct[chosen].mean()), low, high, int(chosen.sum())))
-        else:
-            found.append(Part(name, float("nan"), None, None, 0))
-    return tuple(found)
-
-
-def to_json(results: Sequence[Result]) -> str:
-    """The results as a JSON list of objects, without outcomes; a number that does not exist is null."""
-    return json.dumps(plain(results), indent=2, allow_nan=False)
-
-
 def plain(value: Any) -> Any:
     """A value as JSON takes it: records as objects without what single rows did, what is not finite as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -257,56 +134,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def to_table(results: Sequence[Result]) -> str:
-    """The results as Markdown: one table of classification, one of regression, then the notes."""
-    blocks = []
-    classified = [one for one in results if isinstance(one, ProbeResult)]
-    regressed = [one for one in results if isinstance(one, RegressionResult)]
-    if classified:
-        head = ("probe", "protocol", "accuracy", "95 % over test groups", "balanced", "commonest class", "refits")
-        blocks.append(markdown((*head, "train", "test (groups)", "classes", "penalty or k"), _class_rows(classified)))
-    if regressed:
-        head = ("probe", "protocol", "R2", "95 % over test groups", "MAE", "MAE 95 %", "MAE of the mean")
-        blocks.append(markdown((*head, "train", "test (groups)", "penalty"), _regression_rows(regressed)))
-    notes = dict.fromkeys(f"- {one.probe} ({one.protocol}): {note}" for one in results for note in one.notes)
-    if notes:
-        blocks.append("\n".join(notes))
-    return "\n\n".join(blocks) + "\n"
-
-
-def _class_rows(results: Sequence[ProbeResult]) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    for one in results:
-        refits = "-" if one.refit_mean is None else f"{_share(one.refit_mean)} ± {100 * (one.refit_std or 0):.1f}"
-        chosen = "-" if one.penalty is None else f"{one.penalty:g} ({one.chosen_on})"
-        interval, size = _interval(one.low, one.high), f"{one.n_test} ({one.test_groups})"
-        shares = (_share(one.accuracy), interval, _share(one.balanced_accuracy), _share(one.baseline), refits)
-        rows.append((one.probe, one.protocol, *shares, str(one.n_train), size, str(len(one.classes)), chosen))
-        for part in one.parts:
-            cells = (_share(part.accuracy), _interval(part.low, part.high), "", "", "", "", str(part.n_test), "", "")
-            rows.append((f"{one.probe}: {part.name}", one.protocol, *cells))
-    return rows
-
-
-def _regression_rows(results: Sequence[RegressionResult]) -> list[tuple[str, ...]]:
-    return [
-        (
-            *(one.probe, one.protocol, f"{one.r2:.3f}", _interval(one.low, one.high, 1.0, 3)),
-            *(f"{one.mae:.4g}", _interval(one.mae_low, one.mae_high, 1.0, 3), f"{one.baseline_mae:.4g}"),
-            *(str(one.n_train), f"{one.n_test} ({one.test_groups})", f"{one.penalty:g} ({one.chosen_on})"),
-        )
-        for one in results
-    ]
-
-
-def _share(value: float) -> str:
-    return "-" if np.isnan(value) else f"{100 * value:.1f} %"
-
-
-def _interval(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
-    return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -91,35 +91,30 @@ class Benchmark:
     paper: float
 
 
-def _touch_and_go(name: str, label: str, test_list: str, paper: float) -> Benchmark:
-    task = Task(f"touch_and_go_{name}", label, groups=("recording",), which="all", test_list=test_list,
-                where=(("dataset", "touch_and_go"),))  # fmt: skip
-    return Benchmark(task, "class", GradientRecipe(batch=128, rate=2e-4, decay=0.05), False, paper)
-
-
-def _objectfolder(number: int, pooling: Pooling, batch: int, paper: float) -> Benchmark:
-    name = f"objectfolder{number}"
-    task = Task(f"{name}_material", "label.material", which="all", where=(("dataset", name),))
-    return Benchmark(task, pooling, GradientRecipe(batch=batch, rate=1e-3, decay=0.01), True, paper)
+def _benchmark(
+    name: str, dataset: str, label: str, paper: float, batch: int, rate: float, decay: float,
+    pooling: Pooling = "class", universal: bool = False, **task: Any,
+) -> Benchmark:  # fmt: skip
+    question = Task(name, label, which="all", where=(("dataset", dataset),), **task)
+    return Benchmark(question, pooling, GradientRecipe(batch=batch, rate=rate, decay=decay), universal, paper)
 
 
 # Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code, run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py
 # and downstream_dataset.py. A batch is of two devices together. Features are computed once, so training pictures are
 # not augmented: the release flips and jitters them, except for ObjectFolder 2.0.
+_TAG: dict[str, Any] = {"batch": 128, "rate": 2e-4, "decay": 0.05, "groups": ("recording",)}
+_OF: dict[str, Any] = {"label": "label.material", "rate": 1e-3, "decay": 0.01, "universal": True}
 BENCHMARKS = {
     benchmark.task.name: benchmark
     for benchmark in (
-        _touch_and_go("material", "label.material", "material", 0.8082),
-        _touch_and_go("roughness", "label.rough", "rough", 0.8674),
-        _touch_and_go("hardness", "label.hardness", "material", 0.9468),
-        Benchmark(
-            Task("feel_grasp", "label.success", which="all", fingers=True, where=(("dataset", "feel"),)),
-            "class", GradientRecipe(batch=256, rate=1e-3, decay=0.05), False, 0.8053,
-        ),
-        _objectfolder(1, "mean", 128, 0.4962),
-        _objectfolder(2, "class", 256, 0.7602),
+        _benchmark("touch_and_go_material", "touch_and_go", "label.material", 0.8082, test_list="material", **_TAG),
+        _benchmark("touch_and_go_roughness", "touch_and_go", "label.rough", 0.8674, test_list="rough", **_TAG),
+        _benchmark("touch_and_go_hardness", "touch_and_go", "label.hardness", 0.9468, test_list="material", **_TAG),
+        _benchmark("feel_grasp", "feel", "label.success", 0.8053, 256, 1e-3, 0.05, fingers=True),
+        _benchmark("objectfolder1_material", "objectfolder1", paper=0.4962, batch=128, pooling="mean", **_OF),
+        _benchmark("objectfolder2_material", "objectfolder2", paper=0.7602, batch=256, **_OF),
     )
-}  # fmt: skip
+}
 
 
 class TaskRows(NamedTuple):
@@ -253,17 +248,15 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     return TaskRows(rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes)
 
 
-def label_text(value: Any) -> str:
+def label_text(value: Any, source: str = "The label") -> str:
     """Return a class label as text, "" for None and NaN. Raises UserError for a measured quantity."""
-    if value is None:
+    if value is None or value != value:
         return ""
-    if isinstance(value, float | np.floating):
-        if np.isnan(value):
-            return ""
-        if not np.isfinite(value) or value != int(value):
-            raise UserError(f"The label holds {value:g}, a measured quantity, not a class. Probe it as a number.")
-        return str(int(value))
-    return str(value)
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if not np.isfinite(value) or value != int(value):
+        raise UserError(f"{source} holds {value:g}, a measured quantity, not a class. Probe it as a number.")
+    return str(int(value))
 
 
 def _has_values(table: Manifest, column: str) -> bool:
@@ -282,10 +275,8 @@ def _labels(table: Manifest, task: Task) -> Array:
         if task.above is None:
             return number
         return np.where(np.isfinite(number), np.where(number > task.above, "yes", "no"), "")
-    try:
-        texts = np.array([label_text(value) for value in table.column(task.label).to_pylist()], dtype=str)
-    except UserError as error:
-        raise UserError(f"Task {task.name}, column {task.label!r}: {error}") from None
+    values = table.column(task.label).to_pylist()
+    texts = np.array([label_text(value, f"Column {task.label!r}") for value in values], dtype=str)
     return np.where(np.isin(texts, task.classes), texts, "") if task.classes else texts
 
 

@@ -57,7 +57,7 @@ def touches(tmp_path_factory):
         (["--label", "object"], "class of test is in train"),
         (["--label", "force"], "a measured quantity"),
         (["--label", "split"], "on every row of train"),
-        (["--tasks", "material", "--order", "shuffled"], "--order has no effect on stills"),
+        (["--tasks", "hardness", "--order", "shuffled"], "--order has no effect on stills"),
     ],
 )
 def test_a_label_that_cannot_be_probed_is_told_before_the_work(anytouch, touches, monkeypatch, words, told):

@@ -26,7 +26,7 @@ def data(classes: int = 4):
 def scores(head: ProbeHead, classes: int, start=None) -> list[float]:
     x, y = data(classes)
     fitted = fit_head(head, x[FIT], y[FIT], classes, start=start)
-    return [heads.score(predicted, y[TEST], classes) for predicted in fitted.predict(x[TEST])]
+    return [heads.head_score(predicted, y[TEST], classes) for predicted in fitted.predict(x[TEST])]
 
 
 @pytest.mark.parametrize("name", ["linear", "knn", "gradient"])

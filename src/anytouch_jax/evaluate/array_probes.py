@@ -57,7 +57,7 @@ def select_option(head: ProbeHead, data: LabelledFeatures, split: Split, protoco
     fit = split.fit if head.name == "gradient" else splits.subsample(split.fit)
 
     def scores(fitted: FittedHead, rows: Array) -> list[float]:
-        return [heads.score(predicted, data.y[rows], classes) for predicted in fitted.predict(data.x[rows])]
+        return [heads.head_score(predicted, data.y[rows], classes) for predicted in fitted.predict(data.x[rows])]
 
     if protocol == "published" or len(split.val):
         chosen_on, rows = ("test", split.test) if protocol == "published" else ("val", split.val)

@@ -122,7 +122,7 @@ def fit_head(
     return FittedHead(options, lambda rows: [model(rows) for model in models], models)
 
 
-def score(predicted: Array, truth: Array, classes: int) -> float:
+def head_score(predicted: Array, truth: Array, classes: int) -> float:
     """Return the accuracy, or minus the mean squared error of numbers (0 classes)."""
     return float(np.mean(predicted == truth)) if classes else -float(np.mean((predicted - truth) ** 2))
 

@@ -451,7 +451,7 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     [
         ("sequence,text\ns0,a\ns0,b\n", {}, "row 1: sequence 's0' has another caption"),
         ("sequence,caption\ns0,a\n", {}, "no column 'text'; it has sequence, caption"),
-        ("sequence,touch,text\ns0,x,a\n", {}, "say which one is the key"),
+        ("sequence,touch,text\ns0,x,a\n", {}, "name the key column"),
         ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
         ("sequence,text\ns0,a\n", {"key": "tuoch"}, "no column 'tuoch'"),
         ("grip,text\ns0,a\n", {}, "has no column 'grip'"),

@@ -1,4 +1,4 @@
-"""Clips as windows over rows: which rows lie exactly one stride apart in one sequence, without a loop over rows."""
+"""Clips as windows over rows: rows exactly one stride apart in one sequence, found without a loop over rows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 _MOST = 1 << 61
-_BLOCK = 1 << 18  # rows at a time: what a block needs beside its windows fits into the cache
+_BLOCK = 1 << 18  # rows at a time, so that the intermediate arrays of a block fit into the cache
 
 
 def clip_windows(
@@ -15,56 +15,57 @@ def clip_windows(
     frame: np.ndarray,
     stride: np.ndarray,
     length: int,
-    repeated: Callable[[int, int], Exception] | None = None,
+    repeat_error: Callable[[int, int], Exception] | None = None,
     ends: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
+    """Return row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
 
-    They are i32, beyond 2^31 rows i64. `sequence` i64 (rows,) codes, `frame` i64 (rows,), `stride` i64 (rows,) (that of
-    t counts). A row whose window has a gap has no window, nor has one that is not in `ends`, bool (rows,). Raises
-    `repeated(first row, second row)` when a sequence holds a frame twice.
+    The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` are i64 (rows,); the stride of row t
+    counts. A row whose window has a gap, or that is not in `ends` bool (rows,), has no window. Raises
+    `repeat_error(first row, second row)` if a sequence repeats a frame.
     """
     if length < 1:
         raise ValueError(f"a clip has at least one frame, not {length}")
-    order, key, spread = _keys(sequence, frame)
-    twice = np.flatnonzero(key[1:] == key[:-1])
-    if twice.size and length > 1:
-        one, two = sorted(int(at if order is None else order[at]) for at in (twice[0], twice[0] + 1))
-        raise repeated(one, two) if repeated else ValueError(f"rows {one} and {two} are the same frame")
-    kind = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # millions of windows are held
+    order, key, spread = _sorted_keys(sequence, frame)
+    repeats = np.flatnonzero(key[1:] == key[:-1])
+    if repeats.size and length > 1:
+        first, second = sorted(int(at if order is None else order[at]) for at in (repeats[0], repeats[0] + 1))
+        raise repeat_error(first, second) if repeat_error else ValueError(f"rows {first}, {second}: the same frame")
+    dtype = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # there can be millions of windows
     if length > np.bincount(sequence, minlength=1).max():
-        return np.empty((0, length), kind)
-    found, count = np.empty((len(key), length), kind), 0
+        return np.empty((0, length), dtype)
+    windows, count = np.empty((len(key), length), dtype), 0
     for start in range(0, len(key), _BLOCK):
-        here = np.arange(start, min(start + _BLOCK, len(key)))
-        rows = here if order is None else order[here]
-        chosen = rows if ends is None else rows[ends[rows]]
-        places = _places(key, spread, here if ends is None else here[ends[rows]], stride[chosen], length)
-        found[count : count + len(places)] = places if order is None else order[places]
-        count += len(places)
-    found = found[:count]
-    return found if order is None else found[np.argsort(found[:, -1], kind="stable")]
+        last = np.arange(start, min(start + _BLOCK, len(key)))
+        rows = last if order is None else order[last]
+        if ends is not None:
+            last, rows = last[ends[rows]], rows[ends[rows]]
+        positions = _windows_ending_at(last, key, spread, stride[rows], length)
+        windows[count : count + len(positions)] = positions if order is None else order[positions]
+        count += len(positions)
+    windows = windows[:count]
+    return windows if order is None else windows[np.argsort(windows[:, -1], kind="stable")]
 
 
-def _places(key: np.ndarray, spread: int, here: np.ndarray, stride: np.ndarray, length: int) -> np.ndarray:
-    """Windows that end at the places `here` of `key`, as places i64 (windows, length)."""
-    found = np.empty((len(here), length), np.int64)
-    found[:, -1] = here
-    whole, last, stride = np.ones(len(here), bool), key[here], np.minimum(stride, spread)
+def _windows_ending_at(last: np.ndarray, key: np.ndarray, spread: int, stride: np.ndarray, length: int) -> np.ndarray:
+    """Return the whole windows that end at the positions `last` of `key`, as positions i64 (windows, length)."""
+    windows = np.empty((len(last), length), np.int64)
+    windows[:, -1] = last
+    is_whole, last_key, stride = np.ones(len(last), bool), key[last], np.minimum(stride, spread)
     for back in range(1, length):
-        wanted = last - back * stride
-        inside = last % spread >= back * stride  # else the number would be one of the sequence before
-        at = np.maximum(here - back * stride, 0)  # where it lies when no frame between is missing
-        astray = np.flatnonzero(inside & (key[at] != wanted))
-        at[astray] = np.minimum(np.searchsorted(key, wanted[astray]), len(key) - 1)
-        whole &= inside & (key[at] == wanted)
-        found[:, length - 1 - back] = at
-    return found[whole]
+        wanted = last_key - back * stride
+        same_sequence = last_key % spread >= back * stride  # else the key would be one of the sequence before
+        at = np.maximum(last - back * stride, 0)  # its position if no frame between is missing
+        elsewhere = np.flatnonzero(same_sequence & (key[at] != wanted))
+        at[elsewhere] = np.minimum(np.searchsorted(key, wanted[elsewhere]), len(key) - 1)
+        is_whole &= same_sequence & (key[at] == wanted)
+        windows[:, length - 1 - back] = at
+    return windows[is_whole]
 
 
-def _keys(sequence: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
-    """(order, key, spread): row ids i64 by sequence and frame (None: they are so already), and in that order one
-    number i64 for each row, sequence * spread + frame, where frames count from 0 and stay below `spread`."""
+def _sorted_keys(sequence: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
+    """Return (order, key, spread): row ids i64 sorted by sequence and frame (None: they are sorted already), and in
+    that order one i64 for each row, sequence * spread + frame, where frames count from 0 and are below `spread`."""
     if not len(frame):
         return None, np.arange(0), 1
     low, high, sequences = int(frame.min()), int(frame.max()), int(sequence.max()) + 1
@@ -73,7 +74,7 @@ def _keys(sequence: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray | None, n
         key = sequence * spread
         key += frame
         key -= low
-        if (key[1:] >= key[:-1]).all():  # as readers write them: nothing to sort
+        if (key[1:] >= key[:-1]).all():  # the order in which readers write
             return None, key, spread
         order = np.argsort(key, kind="stable")
         return order, key[order], spread

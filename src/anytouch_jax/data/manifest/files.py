@@ -1,4 +1,8 @@
-"""The distinct files that a manifest names."""
+"""Files of a manifest: their bytes, loose or in a shard, and the distinct files of all path columns.
+
+The path `touch/00000.zip/17` is file 17 of that shard. A shard is a ZIP file without compression, so a random file
+costs one read of its length. Shards of version 1 are Parquet files with their index next to them.
+"""
 
 from __future__ import annotations
 
@@ -20,54 +24,54 @@ import pyarrow.compute as pc
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.manifest.schema import PATHS
 
-MAX_BYTES = 1 << 29  # of one file: a picture of images.MAX_PIXELS with four channels of 16 bits
+MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four channels of 16 bits
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
 _PARQUET_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
-_OPEN = 64  # shards held open at once
-NPY_HEADER_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 fails at times in two threads
+_OPEN = 64  # open shards at once
+NPY_HEADER_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 can fail in two threads
 
 
 class ShardError(ValueError):
-    """A file that cannot be had from a shard."""
+    """A file that cannot be read from a shard."""
 
 
 def read_file(path: Path) -> bytes:
-    """The bytes of a file, loose or packed.
+    """Return the bytes of a file, loose or packed.
 
-    Raises OSError, or ValueError (ShardError for a shard) where the file is no regular file, is larger than
-    MAX_BYTES, lies in a shard that is damaged, or is not in it.
+    Raises OSError, or ValueError (ShardError for a shard) if it is no regular file, is larger than MAX_BYTES, is in a
+    damaged shard, or is missing in its shard.
     """
     place = split_shard_path(path)
     return _read_loose(path) if place is None else _shard(place[0]).read(place[1])
 
 
 def split_shard_path(path: Path) -> tuple[Path, int] | None:
-    """(shard, row) of a path into a shard; None for the path of a loose file."""
+    """Return (shard, row) of a path into a shard, None for a loose file."""
     if path.name.isascii() and path.name.isdecimal() and path.parent.suffix in (".zip", ".parquet"):
         return path.parent, int(path.name)
     return None
 
 
 def close_shards() -> None:
-    """Close all shards that are held open (after they were written anew)."""
+    """Close all open shards, after they were rewritten."""
     _shard.cache_clear()
     _cached_index.cache_clear()
 
 
 def _read_loose(path: Path) -> bytes:
-    # Without O_NONBLOCK the opening of a named pipe waits for ever.
+    # Without O_NONBLOCK, opening a named pipe waits forever.
     file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        about = os.fstat(file)
-        if stat.S_ISDIR(about.st_mode):
+        status = os.fstat(file)
+        if stat.S_ISDIR(status.st_mode):
             raise IsADirectoryError("it is a folder")
-        if not stat.S_ISREG(about.st_mode):
+        if not stat.S_ISREG(status.st_mode):
             raise ValueError("it is not a regular file")
-        if about.st_size > MAX_BYTES:
-            raise ValueError(f"it has {about.st_size} bytes, more than the limit of {MAX_BYTES}")
-        parts = [os.read(file, about.st_size + 1)]
-        if len(parts[0]) != about.st_size:  # it grew, or the read was interrupted
-            while part := os.read(file, about.st_size + 1):
+        if status.st_size > MAX_BYTES:
+            raise ValueError(f"it has {status.st_size} bytes, more than the limit of {MAX_BYTES}")
+        parts = [os.read(file, status.st_size + 1)]
+        if len(parts[0]) != status.st_size:  # it grew, or the read was interrupted
+            while part := os.read(file, status.st_size + 1):
                 parts.append(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
     finally:
@@ -138,21 +142,21 @@ def _parquet_index(path: Path) -> np.ndarray:
         raise ShardError(f"there is no {path}, the shard's index; copy it from where the data were packed") from None
     except (ValueError, EOFError, SyntaxError) as error:
         raise ShardError(f"{path}, the index of the shard, is damaged: {str(error).splitlines()[0]}") from None
-    if index.dtype != _PARQUET_INDEX or index.ndim != 1:
-        raise ShardError(f"{path} is not the index of a shard")
-    if (index["size"] > MAX_BYTES).any() or (index["offset"] < 0).any():
+    is_index = index.dtype == _PARQUET_INDEX and index.ndim == 1
+    if not is_index or (index["size"] > MAX_BYTES).any() or (index["offset"] < 0).any():
         raise ShardError(f"{path} is not the index of a shard")
     return index
 
 
-_cached_index = lru_cache(None)(read_shard_index)  # 20 bytes a file; parsing takes some 5 us a file
-_shard = lru_cache(_OPEN)(_Shard)  # the least recently used one is closed when its last reader is done with it
+_cached_index = lru_cache(None)(read_shard_index)  # 20 bytes a file; parsing takes about 5 us a file
+_shard = lru_cache(_OPEN)(_Shard)  # the least recently used one closes when its last reader is done
 
 
 class Files(NamedTuple):
-    """Distinct files i = 0 .. n - 1 of a manifest: `code[column]` i64 (rows,) which one a cell names, -1 for null.
+    """Distinct files i = 0 .. n - 1 of a manifest.
 
-    `row` i64 (n,) and `column` (n,) a cell that names the file: the first one, `path` before the other columns.
+    `code[column]` i64 (rows,) is the file of each cell, -1 for null. `row` i64 (n,) and `column` (n,) are the first
+    cell with the file, `path` before the other columns.
     """
 
     code: dict[str, np.ndarray]
@@ -164,7 +168,7 @@ class Files(NamedTuple):
 
 
 def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
-    """The files of the path columns `columns`, each one once (by its path as it is written, and its manifest)."""
+    """Return the files of the path columns `columns`, each once (by its written path and its manifest)."""
     columns = [name for name in columns if name in manifest.table.column_names]
     rows = len(manifest)
     cells = pa.chunked_array([chunk for name in columns for chunk in manifest.table[name].chunks], pa.string())

@@ -1,12 +1,12 @@
-"""The columns of a manifest: their types, and CSV or Parquet files read into a checked table."""
+"""The schema of a manifest: column types, and CSV or Parquet files read into a checked table."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -21,70 +21,88 @@ PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 
 _READERS = 2  # columns of a Parquet file that are read at once: more need more memory
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
+_TEXT_COLUMNS = (*REQUIRED, *PATHS, "dataset", "unit", "touch", "object", "text", "license")
 SCHEMA: dict[str, pa.DataType] = {
-    "path": _TEXT,
-    "sensor": _TEXT,
-    "sequence": _TEXT,
+    **dict.fromkeys(_TEXT_COLUMNS, _TEXT),
     "frame_index": _WHOLE,
-    "split": _TEXT,
-    "dataset": _TEXT,
-    "unit": _TEXT,
     "stride": _WHOLE,
-    "touch": _TEXT,
-    "object": _TEXT,
-    "image_path": _TEXT,
-    "image2_path": _TEXT,
-    "text": _TEXT,
-    "background_path": _TEXT,
-    "field_path": _TEXT,
-    "license": _TEXT,
     "commercial": _FLAG,
 }
+Cast = Callable[[pa.ChunkedArray], pa.ChunkedArray]
 
 
 class ManifestError(UserError):
     """A manifest that cannot be used; the message names the file, the column and the row (counted from 0)."""
 
 
-def load_table(path: Path) -> pa.Table:
-    """The table in `path` (.csv or .parquet), checked and typed by `typed`. Raises ManifestError."""
-    if path.is_dir():
-        raise ManifestError(f"{path} is a folder; give the .csv or .parquet file in it")
-    if not path.is_file():
-        raise ManifestError(f"there is no manifest {path}")
-    kind = path.suffix.lower()
-    if kind not in (".csv", ".parquet"):
-        raise ManifestError(f"{path}: a manifest ends in .csv or .parquet")
-    try:
-        return typed(_read_csv(path), str(path)) if kind == ".csv" else _load_parquet(path)
-    except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ManifestError(f"{path} cannot be read as a {kind[1:]} table: {reason}") from None
-
-
 def is_manifest(path: Path) -> bool:
-    """Whether the file in `path` has the columns of a manifest; its values are not looked at."""
+    """Return whether the file in `path` has the columns of a manifest; its values are not checked."""
     try:
-        if path.suffix.lower() == ".parquet":
-            names = pa.parquet.read_schema(path).names
-        else:
-            with path.open(encoding="utf-8-sig", newline="") as file:
-                names = next(csv.reader(file), [])
+        names = pa.parquet.read_schema(path).names if path.suffix.lower() == ".parquet" else _csv_names(path)
     except (pa.ArrowException, UnicodeDecodeError, csv.Error):
         return False
     return set(REQUIRED) <= set(names)
 
 
+def table_suffix(path: Path, name: str = "a manifest") -> str:
+    """Return ".csv" or ".parquet". Raises ManifestError for any other ending; `name` is for the message."""
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        raise ManifestError(f"{path}: {name} ends in .csv or .parquet")
+    return suffix
+
+
+def load_table(path: Path) -> pa.Table:
+    """Load the table in `path` (.csv or .parquet), checked and typed by `typed`. Raises ManifestError."""
+    if path.is_dir():
+        raise ManifestError(f"{path} is a folder; give the .csv or .parquet file in it")
+    if not path.is_file():
+        raise ManifestError(f"there is no manifest {path}")
+    if table_suffix(path) == ".parquet":
+        with reading(path):
+            return _load_parquet(path)
+    table = read_text_csv(path)
+    for position, name in enumerate(table.column_names):
+        if name.startswith("label."):
+            table = table.set_column(position, name, typed_label(table[name]))
+    return typed(table, str(path))
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn errors of reading a table into a ManifestError that names the file."""
+    try:
+        yield
+    except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        kind = path.suffix.lower()[1:]
+        raise ManifestError(f"{path} cannot be read as a {kind} table: {reason}") from None
+
+
+def read_text_csv(path: Path) -> pa.Table:
+    """Return a CSV file as a table of text columns, where an empty cell is null. Raises ManifestError."""
+    with reading(path):
+        types = dict.fromkeys(_csv_names(path), _TEXT)
+        convert = pa.csv.ConvertOptions(column_types=types, strings_can_be_null=True, null_values=[""])
+        parse = pa.csv.ParseOptions(newlines_in_values=True)
+        return pa.csv.read_csv(path, convert_options=convert, parse_options=parse)
+
+
+def _csv_names(path: Path) -> list[str]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        return next(csv.reader(file), [])
+
+
 def _load_parquet(path: Path) -> pa.Table:
-    """Column by column, so that a large table is never in the memory twice."""
+    """Load column by column, so that a large table is never in memory twice."""
     with pa.parquet.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
     _check_names(names, rows, str(path))
 
     def load(name: str) -> pa.ChunkedArray:
-        with pa.parquet.ParquetFile(path) as file:  # a file is not to be read by two threads
+        with pa.parquet.ParquetFile(path) as file:  # two threads cannot share a file
             column = file.read([name], use_threads=False)[name]
-        return _whole_chunk(_checked(name, column, str(path)))
+        return pa.table({"column": _checked(name, column, str(path))}).combine_chunks()["column"]
 
     with ThreadPoolExecutor(_READERS) as pool:
         columns = dict(zip(names, pool.map(load, names), strict=True))
@@ -92,64 +110,18 @@ def _load_parquet(path: Path) -> pa.Table:
     return pa.table(columns)
 
 
-def _whole_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    return pa.table({"one": column}).combine_chunks()["one"]
-
-
 def typed(table: pa.Table, where: str) -> pa.Table:
-    """`table` with the types of SCHEMA, blank text as null, and every value checked.
+    """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
-    Columns outside SCHEMA are carried through. `where` names the file in errors. Raises ManifestError when a
-    required column or value is missing, a type is wrong, a split is unknown, a stride is below 1, or no row is there.
+    Columns outside SCHEMA stay unchanged. `where` names the file in errors. Raises ManifestError for a missing column
+    or value, a wrong type, an unknown split, a stride below 1, and a table without rows.
     """
     _check_names(table.column_names, table.num_rows, where)
     return pa.table({name: _checked(name, table[name], where) for name in table.column_names}).combine_chunks()
 
 
-def _check_names(names: Sequence[str], rows: int, where: str) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ManifestError(f"{where}: column {twice[0]!r} is there twice")
-    missing = [name for name in REQUIRED if name not in names]
-    if len(names) == 1 and ";" in names[0]:
-        raise ManifestError(f"{where} has semicolons between its columns; save it with commas")
-    if missing:
-        raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {', '.join(names)}")
-    if not rows:
-        raise ManifestError(f"{where} has no rows")
-
-
-def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
-    """A column with its type, every value checked."""
-    column = _convert(name, column, where)
-    if name in REQUIRED:
-        _refuse(pc.is_null(column), where, name, lambda _: "is empty")
-    if name == "split":
-        unknown = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS)))
-        choices = ", ".join(SPLITS)
-        _refuse(unknown, where, name, lambda row: f"must be one of {choices}, is the unknown split {column[row]}")
-    if name == "stride":
-        column = pc.fill_null(column, 1)
-        _refuse(pc.less(column, 1), where, name, lambda row: f"must be at least 1, is {column[row]}")
-    return column
-
-
-def _read_csv(path: Path) -> pa.Table:
-    """A CSV file as text columns (an empty cell is null), `label.*` as numbers or truths where all cells are."""
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        names = next(csv.reader(file), [])
-    convert = pa.csv.ConvertOptions(
-        column_types=dict.fromkeys(names, _TEXT), strings_can_be_null=True, null_values=[""]
-    )
-    table = pa.csv.read_csv(path, convert_options=convert, parse_options=pa.csv.ParseOptions(newlines_in_values=True))
-    for position, name in enumerate(table.column_names):
-        if name.startswith("label."):
-            table = table.set_column(position, name, typed_label(table[name]))
-    return table
-
-
 def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """A column of text as numbers or truths where all of it are; 007 is a name, of which a number would lose the 0s."""
+    """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter."""
     column = pc.utf8_trim_whitespace(column)
     column = pc.if_else(pc.equal(column, ""), pa.scalar(None, _TEXT), column)
     if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py():
@@ -162,7 +134,40 @@ def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return column
 
 
-def _convert(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
+def _check_names(names: Sequence[str], rows: int, where: str) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ManifestError(f"{where}: column {repeated[0]!r} is there twice")
+    missing = [name for name in REQUIRED if name not in names]
+    if len(names) == 1 and ";" in names[0]:
+        raise ManifestError(f"{where} has semicolons between its columns; save it with commas")
+    if missing:
+        raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {', '.join(names)}")
+    if not rows:
+        raise ManifestError(f"{where} has no rows")
+
+
+def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
+    """Return a column with its type, every value checked."""
+
+    def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
+        row = pc.index(bad, True).as_py()
+        if row >= 0:
+            raise ManifestError(f"{where}, row {row}: column {name!r} {problem(row)}")
+
+    column = _converted(name, column, where)
+    if name in REQUIRED:
+        refuse(pc.is_null(column), lambda _: "is empty")
+    if name == "split":
+        unknown, choices = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS))), ", ".join(SPLITS)
+        refuse(unknown, lambda row: f"must be one of {choices}, is the unknown split {column[row]}")
+    if name == "stride":
+        column = pc.fill_null(column, 1)
+        refuse(pc.less(column, 1), lambda row: f"must be at least 1, is {column[row]}")
+    return column
+
+
+def _converted(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     wanted = SCHEMA.get(name)
@@ -176,65 +181,47 @@ def _convert(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
         if wanted != _TEXT:
             column = pc.utf8_trim_whitespace(column)
         blank = pc.or_(pc.equal(pc.binary_length(column), 0), pc.utf8_is_space(column))
-        if pc.any(blank).as_py():  # copying millions of strings takes longer than looking at them
+        if pc.any(blank).as_py():  # copying millions of strings takes longer than the check
             column = pc.if_else(blank, pa.scalar(None, _TEXT), column)
     if wanted == _TEXT:
         if not is_text:
             raise ManifestError(f"{where}: column {name!r} must be text, is {column.type}")
         return column
-    number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_boolean(column.type)
-    if not (is_text or number):
-        raise ManifestError(f"{where}: column {name!r} must be a {_plain(wanted)}, is {column.type}")
+    kind = "whole number" if wanted == _WHOLE else "0 or 1"
+    if not is_text and not any(
+        is_kind(column.type) for is_kind in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    ):
+        raise ManifestError(f"{where}: column {name!r} must be a {kind}, is {column.type}")
+    cast = _cast_whole if wanted == _WHOLE else _cast_flag
     try:
-        # A column of whole numbers with gaps is often stored as floats ("130.0"), so a plain cast is not enough.
-        return _whole(column) if wanted == _WHOLE else _flag(column, is_text)
+        return cast(column)
     except pa.ArrowInvalid:
-        parse = _parse_whole if wanted == _WHOLE else _parse_flag
-        row, value = _first_bad(column, parse)
-        what = _plain(wanted)
-        raise ManifestError(f"{where}, row {row}: column {name!r} must be a {what}, is {value!r}") from None
+        row = _first_invalid(column, cast)
+        value = column[row].as_py()
+        raise ManifestError(f"{where}, row {row}: column {name!r} must be a {kind}, is {value!r}") from None
 
 
-def _whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
+def _cast_whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
     try:
         return column.cast(_WHOLE)
-    except pa.ArrowInvalid:
+    except pa.ArrowInvalid:  # a column of whole numbers with gaps is often stored as floats ("130.0")
         return column.cast(pa.float64()).cast(_WHOLE)
 
 
-def _flag(column: pa.ChunkedArray, is_text: bool) -> pa.ChunkedArray:
-    if not is_text and not pa.types.is_boolean(column.type):
-        column = _whole(column).cast(_TEXT)  # a number other than 0 and 1 is a mistake, not "true"
-    return column.cast(pa.bool_())
+def _cast_flag(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    if pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
+        column = _cast_whole(column).cast(_TEXT)  # a number other than 0 and 1 is a mistake, not "true"
+    return column.cast(_FLAG)
 
 
-def _plain(kind: pa.DataType) -> str:
-    return "whole number" if kind == _WHOLE else "0 or 1"
-
-
-def _parse_whole(value: Any) -> None:
-    if "_" in str(value) or float(value) != int(float(value)) or abs(float(value)) >= 2**63:
-        raise ValueError
-
-
-def _parse_flag(value: Any) -> None:
-    if str(value).lower() not in ("0", "1", "true", "false"):
-        raise ValueError
-
-
-def _first_bad(column: pa.ChunkedArray, parse: Callable[[Any], None]) -> tuple[int, Any]:
-    """Row and value of the first entry that `parse` refuses; only walked when the fast cast has failed."""
-    for row, value in enumerate(column.to_pylist()):
-        if value is None:
-            continue
+def _first_invalid(column: pa.ChunkedArray, cast: Cast) -> int:
+    """Return the first row that `cast` refuses, by bisection."""
+    low, high = 0, len(column)
+    while high - low > 1:
+        middle = (low + high) // 2
         try:
-            parse(value)
-        except (ValueError, OverflowError):
-            return row, value
-    return 0, column[0].as_py()
-
-
-def _refuse(bad: pa.ChunkedArray, where: str, name: str, log: Callable[[int], str]) -> None:
-    row = pc.index(bad, True).as_py()
-    if row >= 0:
-        raise ManifestError(f"{where}, row {row}: column {name!r} {log(row)}")
+            cast(column.slice(low, middle - low))
+            low = middle
+        except pa.ArrowInvalid:
+            high = middle
+    return low

@@ -225,7 +225,9 @@ def load_policy(folder: Path | str) -> Touch:
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
         head = Head(arrays["mean"], arrays["basis"], layers)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{folder / POLICY} is no policy of `anytouch pour` ({error})") from None
+        raise UserError(f"{folder / POLICY} is no pouring policy ({error})") from None
     if mark != encoder.mark:
-        raise UserError(f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}; pour again")
+        raise UserError(
+            f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}. Learn the policy again."
+        )
     return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=votes)

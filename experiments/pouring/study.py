@@ -49,7 +49,6 @@ from experiments.pouring import bounds as pouring_bounds
 from experiments.pouring import policy as pouring_policy
 from experiments.pouring import table
 from experiments.pouring import trials as pouring
-from experiments.pouring import tuning as pouring_tuning
 from experiments.pouring.physics import VERSION, Task
 from experiments.records import read_records, write_record
 from experiments.tables import env, page, plan
@@ -178,7 +177,7 @@ def do_seed(seed: int) -> None:
         policy = pouring_policy.learn_frozen(encoder, demonstrations(side), learning, stills=stills)
         for mode in todo:
             if mode == "fine-tuned":
-                since, policy = time.time(), pouring_tuning.fine_tune(policy, demonstrations(side), learning)
+                since, policy = time.time(), pouring_policy.fine_tune(policy, demonstrations(side), learning)
             trials = pouring.run(TASK, setups, keys, policy, side=side, grasps=grasps(side))
             write(name, mode, trials, source, since, loss=round(policy.loss, 4))
 

@@ -221,8 +221,7 @@ def load(folder: str | Path) -> Generator:
         others = sorted(file.parent.name for file in path.parent.glob(f"*/{GENERATOR}"))
         there = f" (there are {', '.join(others)})" if others else ""
         raise UserError(
-            f"there is no generator in {folder}{there}; "
-            "train one: anytouch translate --fit --data M --run R --from A --to B"
+            f"there is no generator in {folder}{there}; train one with python -m experiments.translation.run --fit"
         )
     arrays, about = read_safetensors(path)
     try:

@@ -59,10 +59,9 @@ from experiments.translation import encoders as own_encoders
 from experiments.translation import page as translated
 from experiments.translation import pairs, training
 from experiments.translation.encoders import score_retrieval
-from experiments.translation.figures import picture_grid
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
-from experiments.translation.page import PIXELS, TASKS, one_table, runs_of
+from experiments.translation.page import PIXELS, TASKS, one_table, picture_grid, runs_of
 
 QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
 USUAL = plan.QUICK if QUICK else plan.FULL

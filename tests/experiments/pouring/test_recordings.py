@@ -18,7 +18,7 @@ from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights.compatible import serve_unseen
 from experiments.pouring import policy as pouring_policy
-from experiments.pouring import recordings, tuning
+from experiments.pouring import recordings
 from experiments.pouring import trials as pouring
 from experiments.pouring.physics import POUR, RETRACT, WAIT, Task
 from experiments.pouring.policy import Learning
@@ -101,7 +101,7 @@ def test_recordings_teach_what_the_demonstrations_teach(shown, manifest, encoder
 def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder, tmp_path, stills):
     found = recordings.read(manifest, SIDE)
     policy = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=stills, sensor=found.sensor)
-    policy = tuning.fine_tune(policy, found.part(False), FAST)
+    policy = pouring_policy.fine_tune(policy, found.part(False), FAST)
     recordings.save_policy(tmp_path, policy)
     again = recordings.load_policy(tmp_path)
     said = []
@@ -210,5 +210,5 @@ def test_files_that_do_not_belong_together(shown, encoder, tmp_path):
     whole = (tmp_path / "two" / "policy.npz").read_bytes()
     for damaged in (b"no", b"", whole[: len(whole) // 2]):
         (tmp_path / "two" / "policy.npz").write_bytes(damaged)
-        with pytest.raises(UserError, match="is no policy"):
+        with pytest.raises(UserError, match="no pouring policy"):
             recordings.load_policy(tmp_path / "two")

@@ -1,4 +1,4 @@
-"""`anytouch pour`: masses, mean errors beside both bounds, a film; mistakes in one sentence."""
+"""The pouring script: masses, mean errors of the policy and of both bounds, a film; mistakes in one sentence."""
 
 import json
 
@@ -11,7 +11,7 @@ from experiments.pouring import run as pour
 @pytest.mark.slow
 def test_a_run_pours(script, tiny_run, tmp_path):
     out = tmp_path / "deep" / "pour"
-    said = script(pour, "--run", tiny_run, "--trials", 2, "--demos", 2, "--steps", 20, "--out", out)
+    said = script(pour, "--model", tiny_run, "--trials", 2, "--demos", 2, "--steps", 20, "--out", out)
     assert said.status == 0, said.err
     lines = said.out.splitlines()
     masses = [float(line.split("|")[2]) for line in lines if line.startswith(("| 1 |", "| 2 |"))]
@@ -27,50 +27,42 @@ def test_a_run_pours(script, tiny_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("words", "named"),
     [
-        (["--run", "nowhere"], "nowhere"),
-        (["--run", "x", "--trials", "0"], "--trials must be at least 1"),
-        (["--run", "x", "--demos", "0"], "--demos must be at least 1"),
-        (["--run", "x", "--steps", "0"], "--steps must be at least 1"),
-        (["--run", "x", "--record", "y"], "--run does nothing with --record, which only writes demonstrations"),
-        (["--record", "y", "--trials", "3", "--stills"], "--trials, --stills do nothing with --record"),
-        (["--run", "x", "--recordings", "y", "--demos", "9"], "--demos does nothing with --recordings"),
-        (["--record", "y", "--demos", "1"], "--demos 1 is too few to record"),
-        (["--run", "x", "--size", "56"], "--size does nothing without --record"),
+        (["--model", "nowhere"], "nowhere"),
+        (["--model", "x", "--trials", "0"], "--trials"),
+        (["--model", "x", "--demos", "0"], "--demos"),
+        (["--model", "x", "--steps", "0"], "--steps"),
+        (["--record", "y", "--demos", "1"], "--demos"),
+        (["--recordings", "x.parquet"], "--model"),
     ],
 )
-def test_mistakes_are_one_sentence(script, words, sentence):
+def test_mistakes_are_one_sentence(script, words, named):
     said = script(pour, *words)
-    assert said.status == 2 and sentence in said.err and len(said.err.strip().splitlines()) == 1
+    assert said.status == 2 and named in said.err and len(said.err.strip().splitlines()) == 1
 
 
 def test_what_was_recorded_is_not_mixed_with_new_pictures(script, tmp_path):
     (tmp_path / "manifest.parquet").write_bytes(b"of an earlier recording")
     said = script(pour, "--record", tmp_path, "--demos", 2)
-    assert said.status == 2 and "is there already" in said.err and len(list(tmp_path.iterdir())) == 1
+    assert said.status == 2 and len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_policy_of_other_settings_is_not_written_over(script, tiny_run, tmp_path):
-    kept = '{"run": "%s", "target": 60.0, "demonstrations": 2, "seed": 0, "stills": false, "fine_tuned": %s}'
+    kept = '{"model": "%s", "target": 60.0, "demonstrations": 2, "seed": 0, "stills": false, "fine_tuned": %s}'
     (tmp_path / "pour.json").write_text(kept % (tiny_run, "true"))
-    said = script(pour, "--run", tiny_run, "--demos", 2, "--out", tmp_path)
-    assert said.status == 2 and "holds a policy of other settings (fine_tuned, markers)" in said.err
-    assert "choose another folder with --out" in said.err and len(list(tmp_path.iterdir())) == 1
-    said = script(pour, "--run", tiny_run, "--demos", 2, "--steps", 3, "--out", tmp_path)
-    assert said.status == 2 and "other settings (fine_tuned, markers, steps)" in said.err
-
-
-def test_without_a_run_one_is_asked_for(script):
-    said = script(pour, "--recordings", "x.parquet")
-    assert said.status == 2 and "give --run" in said.err and len(said.err.strip().splitlines()) == 1
+    said = script(pour, "--model", tiny_run, "--demos", 2, "--out", tmp_path)
+    assert said.status == 2 and "(fine_tuned, markers)" in said.err
+    assert "--out" in said.err and len(list(tmp_path.iterdir())) == 1
+    said = script(pour, "--model", tiny_run, "--demos", 2, "--steps", 3, "--out", tmp_path)
+    assert said.status == 2 and "(fine_tuned, markers, steps)" in said.err
 
 
 @pytest.mark.slow
 def test_demonstrations_are_recorded_and_learned_from(script, tiny_run, tmp_path):
     demos, out = tmp_path / "demos", tmp_path / "policy"
     assert script(pour, "--record", demos, "--demos", 4, "--size", 28).status == 0
-    said = script(pour, "--run", tiny_run, "--recordings", demos / "manifest.parquet", "--steps", 20, "--out", out)
+    said = script(pour, "--model", tiny_run, "--recordings", demos / "manifest.parquet", "--steps", 20, "--out", out)
     assert said.status == 0, said.err
     assert "3 runs of gelsight_mini to learn from, 1 of split test" in said.err
     assert {"touch", "blind"} <= json.loads((out / "pour.json").read_text()).keys()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import jax
@@ -14,10 +13,8 @@ from tiny_models import tiny_config
 
 from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import verdict
-from experiments.pouring import bounds, tuning
+from experiments.pouring import bounds
 from experiments.pouring import policy as pouring_policy
-from experiments.pouring import table as pouring_table
 from experiments.pouring import trials as pouring
 from experiments.pouring.physics import POUR, RETRACT, WAIT, Task
 from experiments.pouring.policy import Learning
@@ -267,7 +264,7 @@ def test_a_moment_astray_is_outvoted_and_two_are_not(encoder, monkeypatch):
 def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encoder):
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     before = jax.tree.map(np.array, encoder.params)
-    tuned = tuning.fine_tune(policy, shown, FAST)
+    tuned = pouring_policy.fine_tune(policy, shown, FAST)
     moved = jax.tree.map(lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()), tuned.encoder.params, before)
     assert max(jax.tree.leaves(moved)) > 1e-5
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, encoder.params), before)
@@ -278,7 +275,7 @@ def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encode
 def test_fine_tuning_that_goes_astray_is_told(shown, encoder):
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     with pytest.raises(UserError, match=r"went astray .*lower tune_rate"):
-        tuning.fine_tune(policy, shown, replace(FAST, tune_steps=12, tune_rate=1e30))
+        pouring_policy.fine_tune(policy, shown, replace(FAST, tune_steps=12, tune_rate=1e30))
 
 
 def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
@@ -286,12 +283,12 @@ def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
     wanted = np.asarray(pouring_policy.forward(policy.head, pouring_policy.input_table(z).reshape(8, -1)))
-    chains = tuning.draw(np.random.default_rng(0), shown.steps, 6, 3)
+    chains = pouring_policy.draw_chains(np.random.default_rng(0), shown.steps, 6, 3)
     where = np.stack([chains.numbers, np.broadcast_to(chains.runs[:, None], chains.numbers.shape)], -1)
     clips = pouring_policy.segments(encoder, shown.frames, where.reshape(-1, 2), 3).reshape(6, 6, 3, SIDE, SIDE, 3)
     params = {"encoder": encoder.params, "head": {"basis": policy.head.basis, "layers": policy.head.layers}}
     row = encoder.sensor_row(policy.sensor)
-    found = tuning.logits_of(params, clips, net=encoder.net, pooling="both", mean=policy.head.mean, sensor=row)
+    found = pouring_policy.logits_of(params, clips, net=encoder.net, pooling="both", mean=policy.head.mean, sensor=row)
     moment = chains.numbers[:, 3:] - pouring_policy.LIFTED
     runs = np.broadcast_to(chains.runs[:, None], moment.shape)
     expected = wanted.reshape(4, 2, 3)[moment, runs]
@@ -300,7 +297,7 @@ def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
 
 def test_every_moment_of_choice_is_as_likely_in_a_chain():
     steps = np.array([START + 1, START + 20])
-    chains = tuning.draw(np.random.default_rng(0), steps, 30_000, 3)
+    chains = pouring_policy.draw_chains(np.random.default_rng(0), steps, 30_000, 3)
     now, before = chains.numbers[:, 3:], chains.numbers[:, 2:-1]
     np.testing.assert_array_equal(np.maximum(now - pouring_policy.LAG, pouring_policy.LIFTED)[chains.inside],
                                   before[chains.inside])  # fmt: skip
@@ -341,91 +338,3 @@ def test_the_film_shows_every_page(shown, tmp_path):
         first = np.asarray(film.convert("RGB")).astype(int)
         film.seek(3)
         assert np.abs(np.asarray(film.convert("RGB")).astype(int) - first).mean() > 0.2
-
-
-# The table.
-
-
-def write(folder, name, mode, poured, seed=0, **settings):
-    steps = np.where(np.asarray(poured) == 100, TASK.limit, 9)
-    trials = pouring.Trials(np.asarray(poured), steps, *[np.zeros((1, 1))] * 5, None)
-    text = pouring_table.record(name, mode, seed, trials, TASK, "runs/x", {"trials": len(poured)} | settings, {})
-    (folder / f"{name}-{mode}-{seed}.json").write_text(text)
-
-
-def test_the_table_says_what_the_intervals_say(tmp_path):
-    rng = np.random.default_rng(0)
-    noise = rng.normal(0, 1, (3, 10))
-    for seed in range(3):
-        write(tmp_path, "anytouch", "frozen", 62 + noise[seed] / 4, seed)
-        write(tmp_path, "static", "frozen", 66 + noise[seed], seed)
-        write(tmp_path, "none", "frozen", 66 + noise[seed] + rng.normal(0, 0.5, 10), seed)
-        write(tmp_path, "t3", "frozen", 75 + noise[seed], seed)
-        write(tmp_path, "blind", "bound", 72 + noise[seed], seed)
-    rows = pouring_table.read_rows(tmp_path)
-    text = pouring_table.table(rows)
-    mean = np.abs(2 + noise / 4).mean()
-    assert f"| AnyTouch | yes | - | 1.56 | {mean:.1f} (" in text and ") | 8.22 |" in text
-    lines = [line for line in text.splitlines() if line.count("|") > 5]
-    signs = {tuple(c.strip() for c in line.split("|")[1:4]): line.split("|")[5].strip() for line in lines}
-    assert signs[("AnyTouch", "AnyTouch, static only", "frozen")] == "agrees"
-    assert signs[("AnyTouch, static only", "no tactile pre-training", "frozen")] == "undecided"
-    assert signs[("T3-style", "no tactile pre-training", "frozen")] == "disagrees"
-    assert signs[("AnyTouch", "blind: time and own actions", "frozen")] == "agrees"
-    assert "expert" not in text and "fine-tuned | 10" not in text
-    pouring_table.draw(tmp_path / "table.png", rows)
-    with Image.open(tmp_path / "table.png") as drawn:
-        assert drawn.size[0] > 500
-
-
-def test_differences_are_paired_run_by_run(tmp_path):
-    write(tmp_path, "anytouch", "frozen", [60, 70, 80])
-    write(tmp_path, "static", "frozen", [61, 71, 81])
-    write(tmp_path, "static", "frozen", [0, 0, 0], seed=1)
-    rows = {row.name: row for row in pouring_table.read_rows(tmp_path)}
-    found = pouring_table.difference(rows["anytouch"], rows["static"])
-    assert (found.mean, found.low, found.high) == (-1, None, None)  # one seed is shared: one learned policy each
-    assert verdict(found.low, found.high, len(found.each)) == "1 seed, no claim"
-    assert len(rows["static"].runs) == 6
-
-
-def test_a_sign_is_decided_over_seeds_not_over_runs(tmp_path):
-    for seed, worse in enumerate((0.1, 8.0, 16.0)):  # ten runs each would be sure of it; three policies are not
-        write(tmp_path, "anytouch", "frozen", np.full(10, 61.0), seed)
-        write(tmp_path, "static", "frozen", np.full(10, 61.0 + worse), seed)
-    rows = {row.name: row for row in pouring_table.read_rows(tmp_path)}
-    found = pouring_table.difference(rows["anytouch"], rows["static"])
-    assert found.low < 0 < found.high and verdict(found.low, found.high, 3, wanted=-1) == "undecided"
-    mean, low, high = rows["static"].error
-    assert (
-        mean == pytest.approx(9 + 1 / 30) and low < 0 and high - mean == pytest.approx(4.303 * 7.95 / 3**0.5, rel=1e-3)
-    )
-
-
-def test_runs_that_were_never_turned_back_are_told(tmp_path):
-    write(tmp_path, "static", "frozen", [100, 60, 100])
-    assert "2 never turned back" in pouring_table.table(pouring_table.read_rows(tmp_path))
-
-
-def test_a_broken_or_mixed_result_is_named(tmp_path):
-    with pytest.raises(UserError, match="no result"):
-        pouring_table.read_rows(tmp_path)
-    write(tmp_path, "static", "frozen", [60.0])
-    write(tmp_path, "static", "frozen", [60.0, 61.0], seed=1)
-    with pytest.raises(UserError, match="different settings"):
-        pouring_table.read_rows(tmp_path)
-    write(tmp_path, "static", "frozen", [60.0], seed=1)
-    write(tmp_path, "static", "fine-tuned", [60.0], tune_steps=9)
-    pouring_table.read_rows(tmp_path)
-    write(tmp_path, "anytouch", "frozen", [60.0], demonstrations=9)  # would be compared with static
-    with pytest.raises(UserError, match="different settings"):
-        pouring_table.read_rows(tmp_path)
-    (tmp_path / "anytouch-frozen-0.json").unlink()
-    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=10)  # nor with a static one tuned for 9 steps
-    with pytest.raises(UserError, match="different settings"):
-        pouring_table.read_rows(tmp_path)
-    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=9)
-    pouring_table.read_rows(tmp_path)
-    (tmp_path / "static-frozen-1.json").write_text(json.dumps({"row": "static"}))
-    with pytest.raises(UserError, match="static-frozen-1"):
-        pouring_table.read_rows(tmp_path)

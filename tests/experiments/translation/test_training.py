@@ -21,7 +21,6 @@ from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.weights.safetensors import write_safetensors
 from anytouch_jax.weights.tree import flatten
 from experiments.translation import training
-from experiments.translation.figures import picture_grid
 from experiments.translation.generator import (
     GENERATOR,
     Design,
@@ -35,6 +34,7 @@ from experiments.translation.generator import (
     save,
 )
 from experiments.translation.networks import STATES, Conv, Translation, UNet, doubled, halved, thumbnail_side
+from experiments.translation.page import picture_grid
 
 X, Y, FIELDS = arrays(24)
 ENCODER = random_encoder(tiny_config())

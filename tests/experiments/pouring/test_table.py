@@ -1,0 +1,101 @@
+"""The pouring table: its intervals are over seeds, its differences are paired by run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.statistics import verdict
+from experiments.pouring import table as pouring_table
+from experiments.pouring.physics import Task
+from experiments.pouring.trials import Trials
+from experiments.records import write_record
+
+TASK, RESULTS = Task(), "pouring.jsonl"
+
+
+def write(folder, name, mode, poured, seed=0, **settings):
+    steps = np.where(np.asarray(poured) == 100, TASK.limit, 9)
+    trials = Trials(np.asarray(poured), steps, *[np.zeros((1, 1))] * 5, None)
+    record = pouring_table.record(name, mode, seed, trials, TASK, "runs/x", {"trials": len(poured)} | settings, {})
+    write_record(folder / RESULTS, f"{name}-{mode}-{seed}", record)
+
+
+def test_the_table_says_what_the_intervals_say(tmp_path):
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0, 1, (3, 10))
+    for seed in range(3):
+        write(tmp_path, "anytouch", "frozen", 62 + noise[seed] / 4, seed)
+        write(tmp_path, "static", "frozen", 66 + noise[seed], seed)
+        write(tmp_path, "none", "frozen", 66 + noise[seed] + rng.normal(0, 0.5, 10), seed)
+        write(tmp_path, "t3", "frozen", 75 + noise[seed], seed)
+        write(tmp_path, "blind", "bound", 72 + noise[seed], seed)
+    rows = pouring_table.read_rows(tmp_path / RESULTS)
+    text = pouring_table.table(rows)
+    mean = np.abs(2 + noise / 4).mean()
+    assert f"| AnyTouch | yes | - | 1.56 | {mean:.1f} (" in text and ") | 8.22 |" in text
+    lines = [line for line in text.splitlines() if line.count("|") > 5]
+    signs = {tuple(c.strip() for c in line.split("|")[1:4]): line.split("|")[5].strip() for line in lines}
+    assert signs[("AnyTouch", "AnyTouch, static only", "frozen")] == "agrees"
+    assert signs[("AnyTouch, static only", "no tactile pre-training", "frozen")] == "undecided"
+    assert signs[("T3-style", "no tactile pre-training", "frozen")] == "disagrees"
+    assert signs[("AnyTouch", "blind: time and own actions", "frozen")] == "agrees"
+    assert "expert" not in text and "fine-tuned | 10" not in text
+    pouring_table.draw(tmp_path / "table.png", rows)
+    with Image.open(tmp_path / "table.png") as drawn:
+        assert drawn.size[0] > 500
+
+
+def test_differences_are_paired_run_by_run(tmp_path):
+    write(tmp_path, "anytouch", "frozen", [60, 70, 80])
+    write(tmp_path, "static", "frozen", [61, 71, 81])
+    write(tmp_path, "static", "frozen", [0, 0, 0], seed=1)
+    rows = {row.name: row for row in pouring_table.read_rows(tmp_path / RESULTS)}
+    found = pouring_table.difference(rows["anytouch"], rows["static"])
+    assert (found.mean, found.low, found.high) == (-1, None, None)  # one seed is shared: one learned policy each
+    assert verdict(found.low, found.high, len(found.each)) == "1 seed, no claim"
+    assert len(rows["static"].runs) == 6
+
+
+def test_a_sign_is_decided_over_seeds_not_over_runs(tmp_path):
+    for seed, worse in enumerate((0.1, 8.0, 16.0)):  # ten runs each would be sure of it; three policies are not
+        write(tmp_path, "anytouch", "frozen", np.full(10, 61.0), seed)
+        write(tmp_path, "static", "frozen", np.full(10, 61.0 + worse), seed)
+    rows = {row.name: row for row in pouring_table.read_rows(tmp_path / RESULTS)}
+    found = pouring_table.difference(rows["anytouch"], rows["static"])
+    assert found.low < 0 < found.high and verdict(found.low, found.high, 3, wanted=-1) == "undecided"
+    mean, low, high = rows["static"].error
+    assert (
+        mean == pytest.approx(9 + 1 / 30) and low < 0 and high - mean == pytest.approx(4.303 * 7.95 / 3**0.5, rel=1e-3)
+    )
+
+
+def test_runs_that_were_never_turned_back_are_told(tmp_path):
+    write(tmp_path, "static", "frozen", [100, 60, 100])
+    assert "2 never turned back" in pouring_table.table(pouring_table.read_rows(tmp_path / RESULTS))
+
+
+def test_a_broken_or_mixed_result_is_named(tmp_path):
+    with pytest.raises(UserError, match="no result"):
+        pouring_table.read_rows(tmp_path / RESULTS)
+    write(tmp_path, "static", "frozen", [60.0])
+    write(tmp_path, "static", "frozen", [60.0, 61.0], seed=1)
+    with pytest.raises(UserError, match="different settings"):
+        pouring_table.read_rows(tmp_path / RESULTS)
+    write(tmp_path, "static", "frozen", [60.0], seed=1)
+    write(tmp_path, "static", "fine-tuned", [60.0], tune_steps=9)
+    pouring_table.read_rows(tmp_path / RESULTS)
+    write(tmp_path, "anytouch", "frozen", [60.0], demonstrations=9)  # would be compared with static
+    with pytest.raises(UserError, match="different settings"):
+        pouring_table.read_rows(tmp_path / RESULTS)
+    write(tmp_path, "anytouch", "frozen", [60.0])
+    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=10)  # nor with a static one tuned for 9 steps
+    with pytest.raises(UserError, match="different settings"):
+        pouring_table.read_rows(tmp_path / RESULTS)
+    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=9)
+    pouring_table.read_rows(tmp_path / RESULTS)
+    write_record(tmp_path / RESULTS, "static-frozen-1", {"row": "static"})
+    with pytest.raises(UserError, match="static-frozen-1"):
+        pouring_table.read_rows(tmp_path / RESULTS)

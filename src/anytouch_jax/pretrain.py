@@ -16,7 +16,6 @@ from jax.sharding import Mesh
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
-from anytouch_jax.data import tokenizer as texts
 from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
@@ -170,20 +169,14 @@ def _choose_tokenizer(config: Config, run: Path, manifest: Any, clip: Any, resum
     """Return the config and the tokenizer of stage 2: the run's, the option's, CLIP's, or one trained on captions."""
     if config.model.text is None:
         return config, None
+    file = None
     if resumes and (run / TOKENIZER).exists():  # without a checkpoint it is left from a start that failed
-        tokenizer = texts.load_tokenizer(run / TOKENIZER)
-    elif config.data.tokenizer is not None:
-        tokenizer = texts.load_tokenizer(config.data.tokenizer)
-    elif config.towers == "pretrained":
-        clip = Path(clip)
-        tokenizer = texts.load_tokenizer((clip if clip.is_dir() else clip.parent) / TOKENIZER)
-    else:
-        rows = manifest.rows_of(config.data.split)
-        captions = pools.training_captions(manifest, rows, aligned_text=config.data.aligned_text)
-        if not captions:
-            return config, None
-        tokenizer = texts.train_tokenizer(captions, min(SCRATCH_VOCABULARY, config.model.text.vocab))
-    if config.towers == "pretrained":
+        file = run / TOKENIZER
+    elif config.data.tokenizer is None and config.towers == "pretrained":
+        file = (Path(clip) if Path(clip).is_dir() else Path(clip).parent) / TOKENIZER
+    rows, most = manifest.rows_of(config.data.split), min(SCRATCH_VOCABULARY, config.model.text.vocab)
+    tokenizer, _ = pools.choose_tokenizer(manifest, rows, config, file=file, vocabulary=most)
+    if tokenizer is None or config.towers == "pretrained":
         return config, tokenizer
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
     return replace(config, model=replace(config.model, text=text)), tokenizer

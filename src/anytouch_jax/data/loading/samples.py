@@ -10,18 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from anytouch_jax.config import Config
+from anytouch_jax.data import transforms
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.transforms import (
-    TOUCH,
-    VISION,
-    augmentation_rng,
-    subtract_background,
-    touch_evaluation,
-    touch_transform,
-    vision_evaluation,
-    vision_transform,
-)
 from anytouch_jax.errors import UserError
 
 TRIES = 20  # bad samples in a row before a slot gives up
@@ -60,23 +51,23 @@ class SampleReader:
         if data.background == "subtract":
             background = self._background(int(rows[-1]), load or self._decode_background)
         if epoch is None or plain:
-            return touch_evaluation(
-                frames if background is None else subtract_background(frames, background), size, out
+            return transforms.touch_evaluation(
+                frames if background is None else transforms.subtract_background(frames, background), size, out
             )
-        rng = augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), TOUCH)
+        rng = transforms.augmentation_rng(self.config.run.seed, epoch, int(rows[-1]), transforms.TOUCH)
         if background is None:
-            return touch_transform(frames, size, rng, data, out)
-        *augmented, background = touch_transform([*frames, background], size, rng, data)
-        return np.stack(subtract_background(augmented, background), out=out)
+            return transforms.touch_transform(frames, size, rng, data, out)
+        *augmented, background = transforms.touch_transform([*frames, background], size, rng, data)
+        return np.stack(transforms.subtract_background(augmented, background), out=out)
 
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """Return the photograph of a row, u8 (size, size, 3); `epoch` None means no augmentation."""
         size = self.config.model.image_size
         image = read_image(self.manifest, row, "image_path")
         if epoch is None:
-            return vision_evaluation(image, size)
-        rng = augmentation_rng(self.config.run.seed, epoch, int(row), VISION)
-        return vision_transform(image, size, rng, self.config.data.rotation)
+            return transforms.vision_evaluation(image, size)
+        rng = transforms.augmentation_rng(self.config.run.seed, epoch, int(row), transforms.VISION)
+        return transforms.vision_transform(image, size, rng, self.config.data.rotation)
 
     def caption(self, row: int) -> str:
         """Return the caption of a row."""
@@ -91,7 +82,7 @@ class SampleReader:
         """Return an image at the model's size, read-only, from the cache if it is there."""
         image = self._cache.get(file)
         if image is None:
-            image = touch_evaluation([decode(file)], self.config.model.image_size)[0]
+            image = transforms.touch_evaluation([decode(file)], self.config.model.image_size)[0]
             image.flags.writeable = False
             if (len(self._cache) + 1) * image.nbytes <= self.config.data.cache * 1_000_000:
                 self._cache[file] = image

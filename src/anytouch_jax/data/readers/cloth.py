@@ -60,10 +60,8 @@ def _labels(values: object, table: Path | None, cloth: str) -> dict[str, int]:
 READER = DatasetReader(
     name="cloth",
     read=read,
-    sensor="gelsight",
     license="not stated",
     commercial=False,
-    about="a robot squeezing clothes; eleven properties of each as labels",
     url="http://data.csail.mit.edu/active_clothing/Data_ICRA18.tar",
     citation="Yuan et al., Active Clothing Material Perception using Tactile Sensing and Deep Learning, ICRA 2018",
     uses=("val", "test", "lists"),

@@ -63,12 +63,10 @@ class DatasetReader:
 
     name: str
     read: Callable[[DatasetIndex], None]
-    sensor: str
     license: str
     commercial: bool
-    about: str
-    url: str
     citation: str
+    url: str = ""
     uses: tuple[str, ...] = ("val", "test")
     paper: int | None = None
     paper_note: str = ""
@@ -261,8 +259,4 @@ def read_json(path: Path, values: type = object) -> dict[str, Any]:
 
 
 def _is_text(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    return name.encode(errors="ignore").decode() == name

@@ -216,10 +216,8 @@ def _write_grasp(folder: Path, number: int, grasp: Any) -> None:
 READER = DatasetReader(
     name="feel",
     read=read,
-    sensor="gelsight",
     license="not stated",
     commercial=False,
-    about="9,269 grasps with two fingers; label success (a downstream task of the paper)",
     url="https://sites.google.com/view/the-feeling-of-success",
     citation="Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, CoRL 2017",
     uses=("val", "test", "lists", "fold", "export"),

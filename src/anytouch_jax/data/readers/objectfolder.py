@@ -79,10 +79,8 @@ def _lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple[int, int], s
 READER = DatasetReader(
     name="objectfolder",
     read=read,
-    sensor="tacto, taxim",
     license="CC-BY-4.0",
     commercial=True,
-    about="ObjectFolder 1.0 and 2.0: rendered touches of 1,000 objects; label material (downstream tasks of the paper)",
     url="https://github.com/rhgao/ObjectFolder",
     citation="Gao et al., ObjectFolder, CoRL 2021; ObjectFolder 2.0, CVPR 2022",
     uses=("lists",),

@@ -80,10 +80,8 @@ def _views(
 READER = DatasetReader(
     name="objectfolder_real",
     read=read,
-    sensor="gelslim",
     license="CC-BY-4.0",
     commercial=True,
-    about="a robot touching 100 household objects",
     url="https://objectfolder.stanford.edu/objectfolder-real-download",
     citation="Gao et al., The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, CVPR 2023",
     uses=("val", "test", "lists"),

@@ -62,10 +62,8 @@ def _published_splits(index: DatasetIndex, base: Path) -> dict[str, str]:
 READER = DatasetReader(
     name="octopi",
     read=read,
-    sensor="gelsight_mini",
     license="not stated",
     commercial=False,
-    about="PhysiCLeAR: presses and rubs of 74 objects",
     url="https://github.com/clear-nus/octopi",
     citation="Yu et al., Octopi: Object Property Reasoning with Large Tactile-Language Models, RSS 2024",
     uses=("val", "test", "lists"),

@@ -35,11 +35,8 @@ def read(index: DatasetIndex) -> None:
 READER = DatasetReader(
     name="real_touch",
     read=read,
-    sensor="gelsight_mini, gelslim, digit, 9dtact, allsight",
     license="by row",
     commercial=False,
-    about="a small pack of real frames: slip clips, ball presses, backgrounds",
-    url="",
     citation="the sources named in the pack's read-me",
     uses=(),
 )

@@ -24,27 +24,10 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling
-from anytouch_jax.data.images import (
-    BACKGROUND,
-    PHOTO,
-    SUFFIXES,
-    ImageError,
-    count_frames,
-    frame_numbers,
-    frame_sort_key,
-    frames_from_video,
-    split_series,
-)
+from anytouch_jax.data import images
+from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
 from anytouch_jax.data.manifest.schema import typed_label
-from anytouch_jax.data.readers.common import (
-    Columns,
-    DatasetError,
-    DatasetIndex,
-    DatasetReader,
-    Frames,
-    IndexOptions,
-    read_csv,
-)
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, Frames, IndexOptions, read_csv
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder
 
@@ -82,8 +65,8 @@ def read(index: DatasetIndex) -> None:
             index.add_recording(frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
                                 unit=unit or None, object=_object(folder) or None, dataset=root.name,
                                 **shared[folder])  # fmt: skip
-    if options.labels is not None:
-        index.table = join_labels(index.columns(), options.labels.expanduser(), index)
+    if options.labels is not None and recordings:
+        _join_labels(index, options.labels.expanduser())
     for split in ("val", "test"):
         if recordings and split not in splits.values() and getattr(options, split):
             index.notes.append(f"there are too few objects or recordings for split {split}")
@@ -142,7 +125,7 @@ def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
 def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Frames]:
     """Return the pictures of a folder in order with their numbers, by finger; arrays only if there is nothing else."""
     names = []
-    for name in sorted(files, key=frame_sort_key):
+    for name in sorted(files, key=images.frame_sort_key):
         path, stem, suffix = f"{folder}/{name}".lstrip("/"), Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
@@ -156,7 +139,9 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Fr
         names = [name for name in names if name not in arrays]
     if not names:
         return {}
-    return {unit: list(zip(frame_numbers(one), one, strict=True)) for unit, one in split_series(names).items()}
+    return {
+        unit: list(zip(images.frame_numbers(one), one, strict=True)) for unit, one in images.split_series(names).items()
+    }
 
 
 # Videos --------------------------------------------------------------------------------------------------------------
@@ -180,7 +165,7 @@ def _export_videos(index: DatasetIndex) -> None:
             existing.add(video.stem)
             try:
                 _write_frames(index, video)
-            except ImageError:
+            except images.ImageError:
                 index.skip("video that cannot be read", str(video))
             except OSError as error:
                 raise UserError(f"the frames of {video} cannot be written beside it: {error.strerror}") from None
@@ -189,53 +174,46 @@ def _export_videos(index: DatasetIndex) -> None:
 def _write_frames(index: DatasetIndex, video: Path) -> None:
     count = 0
     with atomic_folder(video.with_suffix("")) as target:
-        for frame in frames_from_video(video):
+        for frame in images.frames_from_video(video):
             data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
             (target / f"{count:06d}.png").write_bytes(data)
             count += 1
-    if 0.98 * (declared := count_frames(video)) > count + 2:  # some containers only estimate it
+    if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
         index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
 
 
 # Labels --------------------------------------------------------------------------------------------------------------
 
 
-def join_labels(columns: Columns, path: Path, index: DatasetIndex) -> Columns:
-    """Return `columns` with those of the CSV table `path`, joined by object or sequence; sequence goes first.
+def _join_labels(index: DatasetIndex, path: Path) -> None:
+    """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
 
     Lines without a recording, and recordings without a line, are skipped. Raises DatasetError for a table that is
     missing, has no key, or has a column or a key twice.
     """
     names, lines = _read_labels(path)
-    size = len(columns["path"])
-    objects = columns.get("object", [None] * size)
+    table, size = index.table, len(index.table["path"])
     labels: dict[str, list[Any]] = {name: [None] * size for name in names if name not in LABEL_KEYS}
-    used = set()
+    used: set[tuple[str | None, str | None]] = set()
     unlabelled: dict[str, None] = {}
-    for row, (obj, sequence) in enumerate(zip(objects, columns["sequence"], strict=True)):
+    for row, (obj, sequence) in enumerate(zip(table["object"], table["sequence"], strict=True)):
         keys = [key for key in ((obj, None), (None, sequence), (obj, sequence)) if any(key) and key in lines]
         used.update(keys)
-        for key in keys:
-            for name, cell in lines[key].items():
-                labels[name][row] = cell or labels[name][row]
+        for name, cell in (item for key in keys for item in lines[key].items()):
+            labels[name][row] = cell or labels[name][row]
         if not keys:
             unlabelled[sequence] = None
-    for key in lines:
-        if key not in used:
-            index.skip(f"key of {path.name} that no recording has", ", ".join(part for part in key if part))
+    for key in (key for key in lines if key not in used):
+        index.skip(f"key of {path.name} that no recording has", ", ".join(part for part in key if part))
     for sequence in unlabelled:
         index.skip(f"recording without a line in {path.name}", sequence)
-    joined = dict(columns)
-    for name, cells in labels.items():
-        if not any(cells):
-            continue
+    for name, cells in ((name, cells) for name, cells in labels.items() if any(cells)):
         if name in PLAIN_COLUMNS:
-            old = columns.get(name, [None] * size)
-            joined[name] = [new or before for new, before in zip(cells, old, strict=True)]
+            old = table.get(name, [None] * size)
+            table[name] = [new or before for new, before in zip(cells, old, strict=True)]
         else:
-            full = name if name.startswith("label.") else f"label.{name}"
-            joined[full] = typed_label(pa.chunked_array([pa.array(cells, pa.string())])).to_pylist()
-    return joined
+            column = typed_label(pa.chunked_array([pa.array(cells, pa.string())]))
+            table[f"label.{name.removeprefix('label.')}"] = column.to_pylist()
 
 
 def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | None], dict[str, str]]]:
@@ -263,11 +241,8 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
 READER = DatasetReader(
     name="recordings",
     read=read,
-    sensor="",
     license="as their owner says",
     commercial=False,
-    about="folders of pictures, a recording each",
-    url="",
     citation="nothing, unless their owner asks for it",
     uses=("val", "test", "split_by", "sensor", "labels", "export"),
 )

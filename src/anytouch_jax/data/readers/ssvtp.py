@@ -58,10 +58,8 @@ def _tables(index: DatasetIndex, base: Path) -> tuple[set[str], dict[str, str]]:
 READER = DatasetReader(
     name="ssvtp",
     read=read,
-    sensor="digit",
     license="not stated",
     commercial=False,
-    about="a DIGIT pressed on textiles, with photographs and short phrases; stills only",
     url="https://sites.google.com/berkeley.edu/ssvtp",
     citation="Kerr et al., Self-Supervised Visuo-Tactile Pretraining to Locate and Follow Garment Features, RSS 2023",
     paper=4_500,

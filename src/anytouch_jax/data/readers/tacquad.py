@@ -108,10 +108,8 @@ def _photos(index: DatasetIndex, folder: str, numbers: list[int]) -> list[str | 
 READER = DatasetReader(
     name="tacquad",
     read=read,
-    sensor="gelsight_mini, digit, duragel",
     license="not stated",
     commercial=False,
-    about="the same places touched with four sensors, with photographs; fine and coarse alignment",
     url="https://huggingface.co/datasets/xxuan01/TacQuad",
     citation="Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple Visuo-tactile "
     "Sensors, ICLR 2025",

@@ -73,10 +73,8 @@ def _save(path: Path, image: np.ndarray) -> None:
 READER = DatasetReader(
     name=FOLDER,
     read=read,
-    sensor="gelsight, gelsight_mini",
     license="MIT",
     commercial=True,
-    about="real ball presses of the Python package taxim (written as PNG into ROOT)",
     url="https://pypi.org/project/taxim",
     citation="Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L 2022",
     uses=("val", "test", "lists"),

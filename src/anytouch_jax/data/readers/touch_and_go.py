@@ -142,10 +142,8 @@ def _runs(numbers: list[int], together: Callable[[int, int], bool]) -> list[list
 READER = DatasetReader(
     name="touch_and_go",
     read=read,
-    sensor="gelsight",
     license="not stated",
     commercial=False,
-    about="touches of objects indoors and outdoors, with photographs; labels material, hardness, rough",
     url="https://touch-and-go.github.io",
     citation="Yang et al., Touch and Go: Learning from Human-Collected Vision and Touch, NeurIPS 2022",
     uses=("lists", "task"),

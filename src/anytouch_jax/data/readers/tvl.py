@@ -203,10 +203,8 @@ def _thumb(picture: np.ndarray) -> np.ndarray:
 READER = DatasetReader(
     name="tvl",
     read=read,
-    sensor="digit",
     license="not stated",
     commercial=False,
-    about="HCT: a hand-held DIGIT and a camera, with short phrases (SSVTP has a separate reader)",
     url="https://huggingface.co/datasets/mlfu7/Touch-Vision-Language-Dataset",
     citation="Fu et al., A Touch, Vision, and Language Dataset for Multimodal Alignment, ICML 2024",
     paper=39_000,

@@ -50,10 +50,8 @@ def _add_recording(index: DatasetIndex, place: str, inside: str, files: list[str
 READER = DatasetReader(
     name="visgel",
     read=read,
-    sensor="gelsight",
     license="not stated",
     commercial=False,
-    about="a robot poking 195 objects, with video of the scene",
     url="http://visgel.csail.mit.edu",
     citation="Li et al., Connecting Touch and Vision via Cross-Modal Prediction, CVPR 2019",
     uses=("val", "test", "lists"),

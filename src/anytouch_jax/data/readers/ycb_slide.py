@@ -36,10 +36,8 @@ def read(index: DatasetIndex) -> None:
 READER = DatasetReader(
     name="ycb_slide",
     read=read,
-    sensor="digit",
     license="MIT",
     commercial=True,
-    about="a DIGIT sliding over ten YCB objects",
     url="https://github.com/rpl-cmu/YCB-Slide",
     citation="Suresh et al., MidasTouch: Monte-Carlo inference over distributions across sliding touch, CoRL 2022",
     paper=183_000,

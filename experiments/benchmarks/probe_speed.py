@@ -13,7 +13,7 @@
 # the one chosen: d = 384, 20 classes, spreads of the directions from 1 to 100, as a network has. Beside it, with
 # SKLEARN=1, scikit-learn's fit for that one penalty: its time, and the loss of both.
 #
-# `.venv/bin/python experiments/probe_speed.py`; `ROWS=10000` is a trial of a second.
+# `python -m experiments.benchmarks.probe_speed`; `ROWS=10000` is a trial of a second.
 
 # %%
 from __future__ import annotations

@@ -211,7 +211,7 @@ record["slip"] = json.loads(probe_results.probe_json(slips))
 # %%
 head = (
     "# Real touch: what a tiny encoder learns from 210 clips\n\n"
-    f"Made by `experiments/real_touch.py` from `{STAGE1}` ({config.run.steps} steps) and `{STAGE2}`; manifest "
+    f"Made by `experiments/tables/real_touch.py` from `{STAGE1}` ({config.run.steps} steps) and `{STAGE2}`; manifest "
     f"{manifest.content_hash[:12]}. Every number is in `real_touch.json`.\n\n"
 )
 atomic_write(OUT / "real_touch.md", head + "\n".join(lines) + "\n")

@@ -98,7 +98,7 @@ def donated() -> tuple[int, ...]:
     """Which arguments of a step its compiled program may overwrite, for `jax.jit(donate_argnums=...)`: the state.
 
     On a CPU none: XLA copies a donated array that several of its kernels read before it is overwritten, which is every
-    parameter and moment, and the step takes longer (`anytouch bench stage1` has both).
+    parameter and moment, and the step takes longer (`python -m experiments.benchmarks.run stage1` has both).
     """
     return () if jax.default_backend() == "cpu" else (0,)
 

@@ -1,4 +1,4 @@
-"""The page `experiments/datasets.py`, from top to bottom."""
+"""The page `experiments/tables/datasets.py`, from top to bottom."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`experiments/long_clips.py` from top to bottom on a small world: every length is scored on the same moments."""
+"""`experiments/tables/long_clips.py` on a small world: every length is scored on the same moments."""
 
 from __future__ import annotations
 

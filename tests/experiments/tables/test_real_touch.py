@@ -1,4 +1,4 @@
-"""`experiments/real_touch.py` from top to bottom on a small world."""
+"""`experiments/tables/real_touch.py` from top to bottom on a small world."""
 
 from __future__ import annotations
 

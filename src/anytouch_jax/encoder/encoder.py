@@ -1,8 +1,12 @@
-"""Touch features from a trained encoder: of arrays, manifests, folders of frames and videos (`anytouch embed`)."""
+"""Encoders of touch, images and text, loaded from a run folder or a weights file.
+
+>>> encoder = load_encoder("runs/stage2")
+>>> touch = encoder.encode_touch(encoder.preprocess(frame), "digit")
+>>> encoder.similarity(touch, ["a soft sponge", "a hard metal edge"], probabilities=True)
+"""
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,112 +18,135 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
-from anytouch_jax.data.loading.evaluation import evaluation
-from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation
+from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
+from anytouch_jax.data.transforms import vision_evaluation
+from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
+from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
-from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.nn.lora import merge_lora
+from anytouch_jax.objectives import normalise_image, normalise_touch
+from anytouch_jax.ops import losses
 from anytouch_jax.weights import load
 
-Pooling = Literal["class", "mean", "both"]
-Join = Literal["mean", "sum", "concat"]
-Log = Callable[[str], None]
+Params = dict[str, Any]
 
 
-def _warn(sentence: str) -> None:
-    warnings.warn(sentence, stacklevel=4)
+@dataclass(frozen=True)
+class Parts:
+    """The parts of a model beyond its touch encoder: towers, decoder and heads, as the whole `model` names them.
+
+    The arrays stay on the host until a part is called. `tokenizer_file` is None without a tokenizer.json.
+    """
+
+    model: ModelConfig
+    params: Params = field(repr=False)
+    tokenizer_file: Path | None = None
+
+    @cached_property
+    def tokenizer(self) -> Tokenizer | None:
+        return None if self.tokenizer_file is None else load_tokenizer(self.tokenizer_file)
+
+    @cached_property
+    def compiled(self) -> dict[str, Callable[..., jax.Array]]:
+        """The parts that were called, by the method that calls them."""
+        return {}
 
 
 @dataclass(frozen=True)
 class Encoder:
-    """A touch encoder with its parameters. `source` says where they came from.
+    """A touch encoder with its parameters, and the image and text towers if the weights have them.
 
-    `seen`: the sensors that it was trained on, None where nothing tells. `universal_drawn`: whether training drew the
-    universal tokens; else the mean over the sensors seen stands in their place (`compatible.serve_unseen`).
+    `config` and `params` are those of the touch encoder alone, `source` is the path of the weights. `trained_sensors`
+    is None if the weights do not store them. If training never drew the universal tokens (`universal_drawn`), the mean
+    of the trained sensors' tokens is used instead.
     """
 
     config: Config
-    params: dict[str, Any] = field(repr=False)
+    params: Params = field(repr=False)
     source: str
-    seen: tuple[str, ...] | None = None
+    trained_sensors: tuple[str, ...] | None = None
     universal_drawn: bool = True
+    parts: Parts | None = field(default=None, repr=False)
 
     @cached_property
     def net(self) -> Net:
+        """The network of the touch encoder."""
         return build(self.config.model)
 
-    def sensor_row(self, name: str, log: Log = _warn) -> int:
-        """Row of a sensor's tokens. For one that training has not seen, or that the table does not have, these are the
-        universal ones, said aloud. Raises SpellingError for a known name that is spelled otherwise."""
+    def sensor_row(self, name: str, log: Log = warn) -> int:
+        """Return the row of a sensor's tokens, that of the universal tokens for a sensor outside training.
+
+        The universal tokens (Sec. 3.5) are logged. Raises SpellingError for a misspelled name.
+        """
         model, name = self.config.model, str(name)
-        drawn, known = self.universal_drawn or not self.seen, name in model.sensors
-        if known and (drawn if name == UNIVERSAL else self.seen is None or name in self.seen):
+        drawn, known = self.universal_drawn or not self.trained_sensors, name in model.sensors
+        if known and (drawn if name == UNIVERSAL else self.trained_sensors is None or name in self.trained_sensors):
             return model.sensors.index(name)
         check_spelling(name, model.sensors)
         why = f"is not in this model's table ({', '.join(model.sensors)})"
         if known:
-            why = f"was not drawn in training (that saw {', '.join(self.seen or ())})"
-        instead = "the universal tokens" if drawn else "the mean of the tokens that training saw (no universal ones)"
-        log(f"sensor {name!r} {why}: using {instead}")
+            why = f"was not in training, which had {', '.join(self.trained_sensors or ())}"
+        used = "the universal tokens" if drawn else "the mean of the trained sensors' tokens (no universal ones)"
+        log(f"sensor {name!r} {why}: using {used}")
         return model.sensors.index(name) if known else model.universal_row
 
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
-        """The same encoder with other arithmetic: "float32", "bfloat16", or "trained" for that of its training."""
+        """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its training."""
         if dtype == "trained":
             return self
-        return replace(self, config=replace(self.config, model=replace(self.config.model, dtype=dtype)))
+        parts = self.parts and replace(self.parts, model=replace(self.parts.model, dtype=dtype))
+        return replace(self, config=replace(self.config, model=replace(self.config.model, dtype=dtype)), parts=parts)
 
     @property
     def subtracts(self) -> bool:
-        """Whether it was trained on touches less the untouched gel (`data.background`), and wants those."""
+        """Whether it was trained on background-subtracted touches (`data.background`), and needs such frames."""
         return self.config.data.background == "subtract"
 
     @cached_property
-    def mark(self) -> str:
-        """A checksum of the parameters: a run that was trained anew is another encoder."""
+    def fingerprint(self) -> str:
+        """CRC-32 of the touch encoder's parameters, in hexadecimal."""
         return f"{zlib.crc32(b''.join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(self.params))):08x}"
 
-    def embed(
-        self, clips: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
+    def preprocess(self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None) -> np.ndarray:
+        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder needs it.
+
+        Raises UserError if the encoder needs a `background`, the picture of the untouched gel, and there is none. Use
+        `Preprocess` for a camera: it stores the background.
+        """
+        if self.subtracts and background is None:
+            raise UserError(f"{self.source} needs background-subtracted frames. Give the background, an untouched gel.")
+        return Preprocess(self, background)(frame)
+
+    def encode_touch(
+        self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
         join: Join = "mean",
     ) -> np.ndarray:  # fmt: skip
-        """Features (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or one (H, W, 3), at the model's size.
+        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3); not unit-norm.
 
-        `sensor` is a name for all, names (B,), or rows i32 (B,). T is 1 (a still), 3 (a clip) or more: segments joined
-        by `join`.
-        An encoder that `subtracts` wants them less the untouched gel: see `Sight`.
-        `pooling`: the class token's embedding (what alignment trains), the mean over patch tokens, or both (B, 2E).
-        Raises UserError for another shape or type.
+        H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments
+        of three are joined by `join`. `sensor` is one name, names (B,), or rows i32 (B,). `pooling`: the class token
+        (which alignment trains), the mean of the patch tokens, or both (B, 2E). Raises UserError for another shape or
+        type.
         """
-        clips = np.asarray(clips)
-        clips = clips[None, None] if clips.ndim == 3 else clips[:, None] if clips.ndim == 4 else clips
+        frames = np.asarray(frames)
+        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
         side = self.config.model.image_size
-        if clips.dtype != np.uint8 or clips.ndim != 5 or clips.shape[2:] != (side, side, 3):
+        if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
             raise UserError(
-                f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {clips.dtype} "
-                f"{clips.shape}; `see = Sight(encoder)`, then `see(frame)`, resizes a frame"
+                f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
+                f"{frames.shape}; resize each frame with encoder.preprocess(frame)"
             )
-        check_frames(self.config.model, clips.shape[1])
-        rows = np.full(len(clips), self.sensor_row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
-        if rows.dtype.kind in "UO":
-            rows = np.array([self.sensor_row(name) for name in rows.reshape(-1)], np.int32).reshape(rows.shape)
-        if rows.shape != (len(clips),) or rows.dtype.kind not in "iu":
-            raise UserError(
-                f"sensor rows must be one integer for each of the {len(clips)} touches, not {rows.dtype} {rows.shape}"
-            )
-        if rows.min(initial=0) < 0 or rows.max(initial=0) >= len(self.config.model.sensors):
-            raise UserError(f"sensor rows must be 0 to {len(self.config.model.sensors) - 1}")
-        count, run = len(clips), self._run(pooling, join)
-        if not count:  # the network has no shape for nothing: embed one and give none
-            clips, rows = np.zeros((1, *clips.shape[1:]), np.uint8), np.zeros(1, np.int32)
-        return np.asarray(run(self._placed, clips, rows.astype(np.int32)))[:count]
+        check_frames(self.config.model, frames.shape[1])
+        rows = sensor_rows(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
+        count, run = len(frames), self._run(pooling, join)
+        if not count:  # the network has no shape for nothing: embed one touch and return none
+            frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
+        return np.asarray(run(self._placed, frames, rows))[:count]
 
     def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
         key = (pooling, join)
@@ -128,64 +155,145 @@ class Encoder:
         return self._compiled[key]
 
     @cached_property
-    def _placed(self) -> dict[str, Any]:
-        """The parameters on the device, where they stay."""
+    def _placed(self) -> Params:
+        """The parameters on the device."""
         return jax.device_put(self.params)
 
     @cached_property
     def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
         return {}
 
+    def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
+        """Return embeddings f32 (B, E) of photographs, RGB (h, w, 3) of any size each; not unit-norm.
 
-class Preprocess:
-    """Frames of one sensor as an encoder was trained to see them: resized, and, where it `subtracts`, less `background`
-    (a frame), the picture of the untouched gel; the first frame serves where none is given. `rotate` and `flip` turn
-    both before (`data.transforms.orient_frame`)."""
+        Each is resized and cropped as in training. Raises UserError without an image tower, and for another shape.
+        """
 
-    def __init__(
-        self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
-    ) -> None:
-        self._encoder, self._turned = encoder, partial(orient_frame, rotate=rotate, flip=flip)
-        self._background = None
-        if background is not None:
-            self._background = self._turned(to_rgb(np.asarray(background), "the background"))
+        def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
+            return net.apply(params, "embed_image", normalise_image(pixels)).astype(jnp.float32)
 
-    def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
-        """A frame (h, w, 3), or another form of picture that `data.images.decode` reads (grey, RGBA, u16, floats of
-        0..1), as RGB u8 (size, size, 3). Raises ImageError for any other."""
-        frame = np.ascontiguousarray(self._turned(to_rgb(np.asarray(frame), "the frame")))
-        if self._encoder.subtracts:
-            self._background = frame if self._background is None else self._background
-            frame = subtract_background([frame], self._background)[0]
-        return touch_evaluation([frame], self._encoder.config.model.image_size)[0]
+        tower, size = self._part("encode_image", run, "image", "lora"), self.config.model.image_size
+        images = [images] if getattr(images, "ndim", 0) == 3 else images
+        pixels = (vision_evaluation(to_rgb(np.asarray(image), "the image"), size) for image in images)
+        return self._embeddings(tower, pixels, batch)
+
+    def encode_text(self, texts: str | Sequence[str], *, batch: int = 64) -> np.ndarray:
+        """Return embeddings f32 (L, E) of texts; not unit-norm.
+
+        Raises UserError without a text tower, or without a tokenizer.json in the folder of the weights.
+        """
+
+        def run(net: Net, params: Params, batch: tuple[jax.Array, jax.Array]) -> jax.Array:
+            return net.apply(params, "embed_text", *batch).astype(jnp.float32)
+
+        tower = self._part("encode_text", run, "text")
+        assert self.parts is not None and self.parts.model.text is not None
+        tokenizer, text = self.parts.tokenizer, self.parts.model.text
+        if tokenizer is None:
+            raise UserError(f"there is no tokenizer.json in the folder of {self.source}; copy the one of its training")
+        if tokenizer.vocab_size > text.vocab:
+            raise UserError(
+                f"{self.parts.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
+                f"{text.vocab}; copy the tokenizer of its training"
+            )
+        ids, mask = tokenizer.encode([texts] if isinstance(texts, str) else list(texts), text.length)
+        return self._embeddings(tower, zip(ids, mask, strict=True), batch)
+
+    def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
+        values = run_in_batches(tower, items, batch)
+        return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
+
+    def similarity(
+        self, touch: npt.ArrayLike, texts: str | Sequence[str] | np.ndarray, *, probabilities: bool = False
+    ) -> np.ndarray:
+        """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
+
+        With `probabilities`, return their softmax over the texts with the learned temperature: a zero-shot classifier.
+        Raises UserError without a text tower. With `objective.centre`, training subtracted the batch mean first.
+        """
+        z_touch = _unit(touch)
+        z_text = _unit(texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts))
+        if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
+            raise UserError(
+                f"touch must be features (B, {z_text.shape[-1]}) of encode_touch with pooling class, not {z_touch.shape}"
+            )
+        cosine = z_touch @ z_text.T
+        if not probabilities:
+            return np.asarray(np.clip(cosine, -1, 1))
+        scale = self._part("scale", lambda net, params: net.apply(params, "scale"), "logit_scale")
+        return np.asarray(jax.nn.softmax(scale() * cosine, axis=1))
+
+    def match(self, first: npt.ArrayLike, second: npt.ArrayLike) -> np.ndarray:
+        """Return matching logits f32 (B,) of two sets of touch features (B, E), pooling class (Eq. 5).
+
+        A positive logit predicts the same place. Raises UserError without a matching head.
+        """
+
+        def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
+            return net.apply(params, "match", losses.normalise(first), losses.normalise(second))
+
+        head = self._part("match", run, "matcher")
+        return np.asarray(head(np.asarray(first, np.float32), np.asarray(second, np.float32)))
+
+    def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
+        """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
+        parts = self.parts
+        if parts is None or name not in parts.params:
+            part = {"image": "image tower", "text": "text tower", "matcher": "matching head"}.get(name, "alignment")
+            raise UserError(f"{self.source} has no {part}, which {method} needs; give a stage-2 run that has one")
+        if method not in parts.compiled:
+            params = {key: parts.params[key] for key in (name, *more) if key in parts.params}
+            net = build(usable(parts.model))
+            parts.compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
+        return parts.compiled[method]
+
+
+def _unit(values: npt.ArrayLike) -> np.ndarray:
+    return np.asarray(losses.normalise(jnp.asarray(values, jnp.float32)))
 
 
 def check_frames(model: ModelConfig, frames: int) -> None:
-    """Raise UserError unless a touch may have so many frames: 1 (a still), or as many as the model's clips or more."""
+    """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of the model's clips."""
     if frames != 1 and frames < model.frames:
         raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
+
+
+def sensor_rows(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
+    """Return rows i32 (count,) of one sensor name, of names (count,), or of row numbers below `rows`.
+
+    `row` returns the row of a name. Raises UserError for another shape or type.
+    """
+    ids = np.full(count, row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
+    if ids.dtype.kind in "UO":
+        ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)
+    if ids.shape != (count,) or ids.dtype.kind not in "iu":
+        raise UserError(
+            f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}"
+        )
+    if ids.min(initial=0) < 0 or ids.max(initial=0) >= rows:
+        raise UserError(f"sensor rows must be 0 to {rows - 1}")
+    return ids.astype(np.int32)
 
 
 def touch_features(
     params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
 ) -> jax.Array:
-    """Features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,), to be traced: see `Encoder.embed`."""
+    """Return features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,): a traceable `encode_touch`."""
     for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
         if value not in get_args(kind):
             raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
     clips = normalise_touch(clips)
     if pooling == "class":
         return net.apply(params, "encode", clips, sensor, join).astype(jnp.float32)
-    parts = net.apply(params, "encode_both", clips, sensor, join)  # what is not read is not computed
-    return jnp.concatenate(parts if pooling == "both" else parts[1:], axis=-1).astype(jnp.float32)
+    both = net.apply(params, "encode_both", clips, sensor, join)  # an unused half is not computed
+    return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
 
 
 def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
-    """The encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
+    """Load the encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
 
-    Only the touch encoder is kept. A sensor that a run, or the authors' weights, was not trained on is served by the
-    universal tokens (Sec. 3.5), whether or not the table has its name. A bad sample stops what it embeds, whatever
-    training did with such. Raises UserError when there is no touch encoder, or weights that are not finite.
+    `step` chooses a checkpoint of a run, the latest by default. Image and text towers are loaded too, if there are
+    any. Raises UserError for weights without a touch encoder, or with values that are not finite.
     """
     path = Path(path)
     if path.is_file():
@@ -193,111 +301,60 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     loaded = load.load_model(path, step=step)
     if "touch" not in loaded.params:
         raise UserError(f"{path} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
-    touch = loaded.params["touch"]
-    if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(touch)):
+    if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(loaded.params["touch"])):
         raise UserError(f"{path} has weights that are not finite: its training diverged; take an earlier checkpoint")
-    config = _touch_only(loaded.config)
-    return Encoder(config, {"touch": touch}, str(path), loaded.trained_sensors, loaded.universal_drawn)
+    others = {name: part for name, part in loaded.params.items() if name != "touch"}
+    return Encoder(
+        _touch_only(loaded.config), {"touch": loaded.params["touch"]}, str(path), loaded.trained_sensors,
+        loaded.universal_drawn, Parts(loaded.config.model, others, _tokenizer_file(path)),
+    )  # fmt: skip
+
+
+def _tokenizer_file(path: Path) -> Path | None:
+    """Return the tokenizer.json of a run, of the run of a checkpoint, or of the folder of a file."""
+    is_checkpoint = path.is_dir() and not (path / "config.json").is_file()
+    folders = [path, path.parent, path.parent.parent] if is_checkpoint else [path if path.is_dir() else path.parent]
+    return next((folder / "tokenizer.json" for folder in folders if (folder / "tokenizer.json").is_file()), None)
 
 
 def _refuse_features(path: Path) -> None:
-    """Raise UserError for what `anytouch embed` wrote."""
+    """Raise UserError for a features file of `anytouch embed`."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            found = {"features", "rows"} <= set(file.files)
-    except Exception:  # weights of any kind: who reads them says what is wrong
+            is_features = {"features", "rows"} <= set(file.files)
+    except Exception:  # weights of any kind: their reader reports what is wrong
         return
-    if found:
-        raise UserError(f"{path} is a features file, no encoder: `anytouch probe` takes it as --features")
+    if is_features:
+        raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
 
 
 def random_encoder(config: Config, seed: int = 0) -> Encoder:
-    """An untrained encoder: the control of every probe."""
+    """Return an untrained encoder of the same form: the control of every probe."""
     config = _touch_only(config)
     return Encoder(config, {"touch": build(config.model).init(jax.random.key(seed))["touch"]}, f"random({seed})")
 
 
+def image_tower_encoder(path: str | Path) -> Encoder:
+    """Load the image tower of a stage-2 run (LoRA merged) or of CLIP weights as a touch encoder: no tactile training.
+
+    A still gives the tower's embedding of that image, a clip that of its mean frame (the rows CLIP of Tables 1 to 4).
+    There are no sensor tokens. Raises UserError without an image tower.
+    """
+    loaded = load.load_model(path)
+    model, params = loaded.config.model, loaded.params
+    if model.image is None or "image" not in params:
+        raise UserError(f"{path} has no image tower; give a stage-2 run with one, or CLIP weights")
+    tower = merge_lora(params, model.lora_alpha)["image"]
+    bare = replace(_bare(model), touch=model.image, sensor_tokens=0, patch_encoder="shared")
+    fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
+    touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
+    return Encoder(replace(loaded.config, model=bare), touch, f"{path} (image tower)")
+
+
+def _bare(model: ModelConfig) -> ModelConfig:
+    """Return a model without towers and heads."""
+    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0, force_head=False)
+
+
 def _touch_only(config: Config) -> Config:
-    bare = replace(usable(config.model), image=None, text=None, match_head="none", lora_rank=0, force_head=False)
-    return replace(config, model=bare, data=replace(config.data, on_bad_sample="error"))
-
-
-@dataclass(frozen=True)
-class Features:
-    """Features (n, d) f32 with the keys of their rows: manifest row numbers, or frame numbers of a video or folder.
-
-    `said`: more arrays (n, ...), what a head says of them.
-    """
-
-    values: np.ndarray
-    rows: np.ndarray
-    keys: dict[str, np.ndarray]
-    skipped: int = 0
-    said: dict[str, np.ndarray] = field(default_factory=dict)
-
-
-def embed_rows(
-    encoder: Encoder,
-    manifest: Manifest,
-    rows: np.ndarray,
-    frames: int = 1,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    *,
-    batch: int = 64,
-    on_bad_sample: Literal["error", "skip"] = "error",
-    log: Log = _warn,
-) -> tuple[np.ndarray, np.ndarray]:
-    """(row numbers, features) of manifest rows, each frame encoded once; `frames` is the length of a row's clip.
-
-    A sensor that the model does not know gets the universal tokens, said aloud. With `on_bad_sample` "skip" rows that
-    cannot be read are left out. Raises UserError.
-    """
-    if not len(rows):
-        raise UserError("no rows are left to embed; check the split and the filters")
-    for name in sorted(set(text_column(manifest, "sensor")[rows])):
-        encoder.sensor_row(name, log)
-    if on_bad_sample == "error":
-        check_backgrounds(encoder, manifest, rows)
-    data = replace(encoder.config.data, batch_size=min(batch, len(rows)), on_bad_sample=on_bad_sample)
-    config = replace(encoder.config, data=data)
-    kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
-    ids, values = [], []
-    for found, part in evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"):
-        ids.append(found)
-        values.append(encoder.embed(part.clip, part.sensor, pooling=pooling, join=join)[: len(found)])
-    if not ids:
-        raise UserError(f"none of the {len(rows)} rows can be read; `anytouch verify` says what is wrong with them")
-    return np.concatenate(ids), np.concatenate(values)
-
-
-def check_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray) -> None:
-    """Raise UserError where the encoder takes the untouched gel off and some of `rows` name no picture of it."""
-    bare = rows[~manifest.present("background_path")[rows]]
-    if encoder.subtracts and len(bare):
-        raise UserError(
-            f"{manifest.where(int(bare[0]))} and {len(bare) - 1} other rows have no background_path, which "
-            f"{encoder.source} takes off every touch; name one, or leave such rows out (embed: --on-bad-sample skip)"
-        )
-
-
-def text_column(manifest: Manifest, name: str) -> np.ndarray:
-    """A column of a manifest as strings, "" where it is null."""
-    return np.array(["" if value is None else str(value) for value in manifest.column(name).to_pylist()])
-
-
-def plain_column(manifest: Manifest, name: str) -> np.ndarray:
-    """A column of a manifest as an array without objects: numbers as they are, NaN where null; all else as text."""
-    kind = manifest.column(name).type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return text_column(manifest, name)
-    return np.asarray([np.nan if value is None else value for value in manifest.column(name).to_pylist()])
-
-
-def save_npz(path: str | Path, features: Features, about: dict[str, str]) -> None:
-    """Write features, row numbers, keys and a description as one `.npz`, whole or not at all. Raises OSError."""
-    described = {f"about/{k}": np.asarray(v) for k, v in about.items()}
-    keys = {f"key/{k}": v for k, v in features.keys.items()}
-    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows, **features.said, **keys, **described}
-    with atomic_path(path) as part, open(part, "wb") as file:
-        np.savez(file, **arrays)
+    return replace(config, model=_bare(config.model), data=replace(config.data, on_bad_sample="error"))

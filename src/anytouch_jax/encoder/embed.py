@@ -1,0 +1,196 @@
+"""Embedding of many touches in equal batches: arrays, manifest rows, frames of a folder or a video; features files."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pyarrow as pa
+
+from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_path
+
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder
+
+Pooling = Literal["class", "mean", "both"]
+Join = Literal["mean", "sum", "concat"]
+Log = Callable[[str], None]
+BATCH = 64
+
+
+def warn(sentence: str) -> None:
+    """Show a sentence as a Python warning."""
+    warnings.warn(sentence, stacklevel=4)
+
+
+def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH) -> np.ndarray:
+    """Return the results (n, ...) of `function` over n items, in batches of `size`.
+
+    Items are arrays, which are stacked, or tuples of arrays, which are stacked one by one. The last batch is filled up
+    with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
+    number. Without items the result is empty, of shape (0,). This is the only place that pads batches.
+    """
+    values: list[np.ndarray] = []
+    waiting: list[Any] = []
+
+    def flush() -> None:
+        count = len(waiting)
+        full = waiting + waiting[-1:] * (size - count if values else 0)
+        batch = tuple(map(np.stack, zip(*full, strict=True))) if isinstance(full[0], tuple) else np.stack(full)
+        values.append(np.asarray(function(batch))[:count])
+        waiting.clear()
+
+    for item in items:
+        waiting.append(item)
+        if len(waiting) == size:
+            flush()
+    if waiting:
+        flush()
+    return np.concatenate(values) if values else np.zeros(0, np.float32)
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features f32 (n, d), their `rows` i64 (n,) and further `keys` (n,).
+
+    Rows are those of a manifest, or frame numbers of a video or folder. `predictions`: arrays (n, ...) of a head.
+    `skipped` counts rows without features.
+    """
+
+    values: np.ndarray
+    rows: np.ndarray
+    keys: dict[str, np.ndarray]
+    skipped: int = 0
+    predictions: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def embed_rows(
+    encoder: Encoder,
+    manifest: Manifest,
+    rows: np.ndarray,
+    frames: int = 1,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    *,
+    batch: int = BATCH,
+    on_bad_sample: Literal["error", "skip"] = "error",
+    sensor_row: int | None = None,
+    edit: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    log: Log = warn,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (row numbers i64 (n,), features f32 (n, d)) of manifest rows, each frame encoded once.
+
+    A row's clip is the `frames` frames that end at it. A sensor that the model does not know gets the universal tokens,
+    which is logged; `sensor_row` serves all rows by one row of the table. `edit` changes clips u8 (B, T, H, W, 3) of
+    rows (B,) before they are encoded. With `on_bad_sample` "skip", rows that cannot be read are left out. Raises
+    UserError.
+    """
+    if not len(rows):
+        raise UserError("there are no rows to embed; check the split and the filters")
+    for name in sorted(set(text_column(manifest, "sensor")[rows])) if sensor_row is None else ():
+        encoder.sensor_row(name, log)
+    if on_bad_sample == "error":
+        check_backgrounds(encoder, manifest, rows)
+    data = replace(encoder.config.data, batch_size=min(batch, len(rows)), on_bad_sample=on_bad_sample)
+    config, ids = replace(encoder.config, data=data), []
+
+    def touches() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
+        for row_ids, part in evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"):
+            ids.append(row_ids)
+            clips = part.clip[: len(row_ids)]
+            clips = clips if edit is None else edit(clips, row_ids)
+            yield from zip(clips, part.sensor[: len(row_ids)], strict=True)
+
+    def encode(part: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        clips, sensor = part
+        sensor = sensor if sensor_row is None else np.full_like(sensor, sensor_row)
+        return encoder.encode_touch(clips, sensor, pooling=pooling, join=join)
+
+    values = run_in_batches(encode, touches(), data.batch_size)
+    if not ids:
+        raise UserError(f"none of the {len(rows)} rows can be read; check them with `anytouch data verify`")
+    return np.concatenate(ids), values
+
+
+def embed_frames(
+    encoder: Encoder,
+    frames: Iterable[tuple[int, str, np.ndarray | None]],
+    sensor_row: int,
+    preprocess: Callable[[np.ndarray], np.ndarray] | None = None,
+    *,
+    length: int = 1,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    batch: int = BATCH,
+) -> Features:
+    """Return features of every clip of `length` consecutive frames, keyed by the place of its last frame.
+
+    `frames` yields number, name ("" for a video) and pixels of each frame, None for an unreadable one. No clip spans a
+    gap in the numbers or an unreadable frame. `preprocess` is `encoder.preprocess` by default. Raises UserError if
+    there is no clip.
+    """
+    prepare = encoder.preprocess if preprocess is None else preprocess
+    names: list[str] = []
+    ends: list[int] = []
+
+    def clips() -> Iterator[np.ndarray]:
+        last, ring = None, list[np.ndarray]()
+        for number, name, frame in frames:
+            names.append(name)
+            ring = ring if last is None or number == last + 1 else []
+            ring = [] if frame is None else [*ring, prepare(frame)][-length:]
+            last = number
+            if len(ring) == length:
+                ends.append(len(names) - 1)
+                yield np.stack(ring)
+
+    def encode(clips: np.ndarray) -> np.ndarray:
+        return encoder.encode_touch(clips, np.full(len(clips), sensor_row), pooling=pooling, join=join)
+
+    values = run_in_batches(encode, clips(), batch)
+    if not ends:
+        raise UserError(f"{len(names)} frames are too few for clips of {length} readable frames")
+    index = np.array(ends)
+    keys = {"frame_index": index} | ({"path": np.array(names)[index]} if any(names) else {})
+    return Features(values, index, keys, max(0, len(names) - length + 1) - len(index))
+
+
+def check_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray) -> None:
+    """Raise UserError if the encoder needs background-subtracted frames and one of `rows` has no background_path."""
+    missing = rows[~manifest.present("background_path")[rows]]
+    if encoder.subtracts and len(missing):
+        raise UserError(
+            f"{manifest.where(int(missing[0]))} and {len(missing) - 1} other rows have no background_path, which "
+            f"{encoder.source} subtracts; add backgrounds, or pass --on-bad-sample skip to embed"
+        )
+
+
+def text_column(manifest: Manifest, name: str) -> np.ndarray:
+    """Return a column of a manifest as strings, "" for null."""
+    return np.array(["" if value is None else str(value) for value in manifest.column(name).to_pylist()])
+
+
+def plain_column(manifest: Manifest, name: str) -> np.ndarray:
+    """Return a column of a manifest as an array without objects: numbers with NaN for null, all others as text."""
+    kind = manifest.column(name).type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return text_column(manifest, name)
+    return np.asarray([np.nan if value is None else value for value in manifest.column(name).to_pylist()])
+
+
+def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> None:
+    """Write features, rows, keys and metadata as one `.npz`, whole or not at all. Raises OSError."""
+    described = {f"about/{name}": np.asarray(value) for name, value in metadata.items()}
+    keys = {f"key/{name}": values for name, values in features.keys.items()}
+    arrays: dict[str, Any] = {"features": features.values, "rows": features.rows}
+    arrays |= features.predictions | keys | described
+    with atomic_path(path) as part, open(part, "wb") as file:
+        np.savez(file, **arrays)

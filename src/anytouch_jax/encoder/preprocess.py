@@ -1,0 +1,47 @@
+"""Preprocessing of camera frames for an encoder: orientation, background subtraction, size."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.data.images import to_rgb
+from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation
+
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder
+
+
+class Preprocess:
+    """Frames of one sensor in the form that an encoder was trained on.
+
+    They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and resized. For an encoder
+    that `subtracts`, the `background` (a frame of the untouched gel) is subtracted first. Without a background the
+    first frame is taken as the background.
+
+    >>> preprocess = Preprocess(encoder, background=camera.read())
+    >>> features = encoder.encode_touch(preprocess(camera.read()), "digit")
+    """
+
+    def __init__(
+        self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
+    ) -> None:
+        self._subtracts, self._size = encoder.subtracts, encoder.config.model.image_size
+        self._orient = partial(orient_frame, rotate=rotate, flip=flip)
+        self._background = None
+        if background is not None:
+            self._background = self._orient(to_rgb(np.asarray(background), "the background"))
+
+    def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
+        """Return a frame as RGB u8 (size, size, 3).
+
+        `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
+        """
+        frame = np.ascontiguousarray(self._orient(to_rgb(np.asarray(frame), "the frame")))
+        if self._subtracts:
+            self._background = frame if self._background is None else self._background
+            frame = subtract_background([frame], self._background)[0]
+        return touch_evaluation([frame], self._size)[0]

@@ -18,7 +18,9 @@ from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
-from anytouch_jax.encoder.encoder import Encoder, Preprocess, embed_rows, load_encoder
+from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.encoder import Encoder, load_encoder
+from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy
 
@@ -130,7 +132,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     assert "first frame" not in capsys.readouterr().err
     said: list[str] = []
     _, wanted = embed_rows(encoder, table, np.array([row]), log=said.append)
-    assert all("sensor 'gelslim' was not drawn in training" in words for words in said)
+    assert all("sensor 'gelslim' was not in training" in words for words in said)
     np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
     assert "the first frame is taken for that" in capsys.readouterr().err
@@ -165,7 +167,7 @@ def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
         assert one.subtracts and run.subtracts
         rows = (config.model.sensors.index(name) for name in ("digit", "duragel", "universal"))
         for sensor in (np.full(2, row) for row in rows):  # duragel was not trained on
-            np.testing.assert_allclose(one.embed(clips, sensor), run.embed(clips, sensor), atol=1e-6)
+            np.testing.assert_allclose(one.encode_touch(clips, sensor), run.embed(clips, sensor), atol=1e-6)
 
 
 def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder):

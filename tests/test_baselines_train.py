@@ -45,8 +45,8 @@ def test_a_baseline_trains_and_embeds(data, tmp_path, compiled_once, name, stage
         assert ("touch_to_text" in told) == (name not in ("unitouch", "no_text", "no_text_aligned"))
         assert ("touch_to_vision" in told) == (name != "no_vision")
     encoder = load_encoder(tmp_path / "r")
-    with pytest.warns(UserWarning, match="was not drawn in training"):
-        z = [encoder.embed(STILLS, sensor) for sensor in ("digit", "duragel", "universal")]
+    with pytest.warns(UserWarning, match="was not in training"):
+        z = [encoder.encode_touch(STILLS, sensor) for sensor in ("digit", "duragel", "universal")]
     assert all(one.shape == (2, 12) and np.isfinite(one).all() for one in z)
     np.testing.assert_array_equal(z[1], z[2])  # duragel has a row of its own, which nothing has trained
     told_apart = bool(np.abs(z[0] - z[1]).max() > 0)

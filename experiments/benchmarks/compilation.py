@@ -23,7 +23,7 @@ from typing import Any
 import jax
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.train.mesh import (
     batch_sharding,
     donated,
@@ -227,7 +227,7 @@ def layout_table(layouts: Sequence[Layout]) -> str:
         ]
         for x in layouts
     ]
-    return markdown(heads, rows) + "\n"
+    return markdown_table(heads, rows) + "\n"
 
 
 # Start-up -------------------------------------------------------------------------------------------------------------
@@ -295,4 +295,4 @@ def start_table(found: Sequence[Start]) -> str:
         + [f"{x:.2f}" for x in (s.imports, s.trace, s.compile, s.total)]
         for s in found
     ]
-    return markdown(heads, rows) + "\n"
+    return markdown_table(heads, rows) + "\n"

@@ -67,7 +67,7 @@ def main() -> None:
         heads = ("workload", "variant", "batch", "samples/s", "of its peak", "GiB")
         text = f"# Speed against error, preset {options.preset}\n\n{here.sentence()}\n\n{speed.NOTES}\n\n"
         text += speed.speed_table(rows)
-        text += f"\n## Memory against batch size\n\n{statistics.markdown(heads, swept)}\n" if swept else ""
+        text += f"\n## Memory against batch size\n\n{statistics.markdown_table(heads, swept)}\n" if swept else ""
         numbers = {"machine": dataclasses.asdict(here), "preset": options.preset, "sweep": swept}
         return speed.write_page(options.out, "gpu", text, numbers | {"rows": [speed.record_of(row) for row in rows]})
 

@@ -27,7 +27,7 @@ from anytouch_jax.config import Config, preset
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.benchmarks.speed import interleaved
 
 SIZES = ((320, 240), (640, 480))
@@ -81,7 +81,7 @@ def loader_table(rows: Sequence[LoaderSpeed]) -> str:
         for x in rows
     ]
     about = f"{rows[0].threads} threads, pictures resized to {rows[0].pixels} x {rows[0].pixels}, JPEG"
-    return f"{about}\n\n{markdown(heads, cells)}\n"
+    return f"{about}\n\n{markdown_table(heads, cells)}\n"
 
 
 def opened_table(rows: Sequence[Opened]) -> str:
@@ -92,7 +92,7 @@ def opened_table(rows: Sequence[Opened]) -> str:
          f"{x.read_mb:.0f} MB", f"{x.peak_mb:.0f} MB")
         for x in rows
     ]  # fmt: skip
-    return markdown(heads, cells) + "\n"
+    return markdown_table(heads, cells) + "\n"
 
 
 def measure_loading(
@@ -408,4 +408,4 @@ def feed_table(rows: Sequence[Feed]) -> str:
         ]
         for row in rows
     ]
-    return markdown(heads, cells) + "\n"
+    return markdown_table(heads, cells) + "\n"

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from jax import Array
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.sim.contact.mechanics import Contact, Fidelity, Gel, press
 from anytouch_jax.sim.contact.shear import Shear, shear_step
 from anytouch_jax.sim.recorder import Recorder
@@ -315,7 +315,7 @@ def recording_speed(
 def recording_table(rows: Sequence[Recorded]) -> str:
     """A table with a line a sensor."""
     cells = [(one.sensor, f"{one.frames_per_second:.0f}") for one in rows]
-    return markdown(("recordings by", "frames/s"), cells) + "\n"
+    return markdown_table(("recordings by", "frames/s"), cells) + "\n"
 
 
 def fidelity_table(rows: Sequence[FidelityRow]) -> str:
@@ -337,7 +337,7 @@ def fidelity_table(rows: Sequence[FidelityRow]) -> str:
             f"{row.converged} of {len(row.rms)}",
         ]
         lines.append(cells + [f"{row.image[name]:.2f}" for name in names])
-    return markdown(heads, lines) + "\n"
+    return markdown_table(heads, lines) + "\n"
 
 
 # Pictures against real ones -------------------------------------------------------------------------------------------
@@ -454,7 +454,7 @@ def press_table(rows: Sequence[PressScore]) -> str:
         ms = "" if row.ms is None else f"{row.ms:.1f}"
         figures = [f"{row.mae:.2f}", f"{row.psnr:.2f}", f"{row.ssim:.4f}", f"{row.ring_mae:.2f}", ms, ratio]
         lines.append([row.sensor, name, str(row.presses), *figures])
-    return markdown(head, lines)
+    return markdown_table(head, lines)
 
 
 def _constant(presses: Presses) -> Renderer:

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown, plain
+from anytouch_jax.evaluate.statistics import markdown_table, plain
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.step import merge
 from experiments.benchmarks import machine
@@ -330,7 +330,7 @@ def speed_table(rows: Sequence[SpeedRow]) -> str:
     parts, names = [], list(dict.fromkeys(row.workload for row in rows))
     for name in names:
         members = [_cells(row) for row in rows if row.workload == name]
-        parts.append((f"### {name}\n\n" if len(names) > 1 else "") + markdown(_HEADS, members) + "\n")
+        parts.append((f"### {name}\n\n" if len(names) > 1 else "") + markdown_table(_HEADS, members) + "\n")
     single = [row for row in rows if row.samples == 1 and not row.note]
     if single:
         cells = [
@@ -345,7 +345,7 @@ def speed_table(rows: Sequence[SpeedRow]) -> str:
             for r in single
         ]
         heads = ("latency of one sample", "variant", "p50 ms", "p99 ms", "calls", "error")
-        parts.append(markdown(heads, cells) + "\n")
+        parts.append(markdown_table(heads, cells) + "\n")
     return "\n".join(parts)
 
 

@@ -21,8 +21,7 @@ import numpy as np
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.config import to_json
 from anytouch_jax.encoder.encoder import check_frames, load_encoder
-from anytouch_jax.encoder.export import call_of
-from anytouch_jax.encoder.names import describes
+from anytouch_jax.encoder.export import call_of, describes
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights.safetensors import export_safetensors
 
@@ -49,7 +48,7 @@ def main() -> int:
             touches = rng.integers(0, 256, (count, options.frames, size, size, 3), np.uint8)
             sensor = rng.integers(0, len(model.sensors), count).astype(np.int32)
             cases |= {f"touches{count}": touches, f"sensor{count}": sensor}
-            cases[f"features{count}"] = encoder.embed(touches, sensor)
+            cases[f"features{count}"] = encoder.encode_touch(touches, sensor)
         np.savez(folder / "cases.npz", **cases)
         worker = Path(__file__).with_name("worker.py")
         source = Path(__file__).resolve().parents[2] / "src"

@@ -18,7 +18,8 @@ import numpy.typing as npt
 import optax
 
 from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.encoder.encoder import Encoder, Pooling, touch_features
+from anytouch_jax.encoder.embed import Pooling
+from anytouch_jax.encoder.encoder import Encoder, touch_features
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Net
 from experiments.pouring.physics import ACTIONS, WAIT, Setup, State, Task
@@ -138,7 +139,7 @@ def features(
         part = where[start : start + batch]
         padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
         clips = segments(encoder, trials.frames, padded, ahead, sides)
-        found[tuple(part.T)] = encoder.embed(clips, sensor, pooling=pooling)[: len(part)]
+        found[tuple(part.T)] = encoder.encode_touch(clips, sensor, pooling=pooling)[: len(part)]
     return found
 
 
@@ -311,7 +312,7 @@ class Touch:
         if len(self._frames) < FRAMES:
             return np.full(len(frames), WAIT)
         stack = np.stack(self._frames[-1:] if self.stills else self._frames, 1)
-        self._z.append(self.encoder.embed(stack, self.sensor, pooling=self.pooling))
+        self._z.append(self.encoder.encode_touch(stack, self.sensor, pooling=self.pooling))
         if len(self._z) <= LIFTED:
             return np.full(len(frames), WAIT)
         before = self._z[max(len(self._z) - 1 - LAG, LIFTED)]

@@ -22,7 +22,8 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.encoder.encoder import load_encoder, text_column
+from anytouch_jax.encoder.embed import text_column
+from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 from experiments.pouring.bounds import blind_inputs, imitate_told
@@ -199,15 +200,15 @@ def save_policy(folder: Path, policy: Touch) -> None:
         safetensors.MODEL_KEY: to_json(encoder.config.model),
         safetensors.BACKGROUND_KEY: encoder.config.data.background,
     }
-    if encoder.seen is not None:
-        about[safetensors.SEEN_KEY] = ",".join(encoder.seen)
+    if encoder.trained_sensors is not None:
+        about[safetensors.SEEN_KEY] = ",".join(encoder.trained_sensors)
     safetensors.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
     told = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}
     data = io.BytesIO()
     arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
-    np.savez(data, about=np.asarray(json.dumps(told | {"encoder": encoder.mark})), **arrays)
+    np.savez(data, about=np.asarray(json.dumps(told | {"encoder": encoder.fingerprint})), **arrays)
     atomic_write(folder / POLICY, data.getvalue())
 
 
@@ -226,7 +227,7 @@ def load_policy(folder: Path | str) -> Touch:
         head = Head(arrays["mean"], arrays["basis"], layers)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{folder / POLICY} is no pouring policy ({error})") from None
-    if mark != encoder.mark:
+    if mark != encoder.fingerprint:
         raise UserError(
             f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}. Learn the policy again."
         )

@@ -11,7 +11,7 @@ from typing import Any
 
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.command import run_script
@@ -112,7 +112,7 @@ def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any])
     }
     head = ("policy", "moments as the hand chose", "mean over actions", "turns back, off by (median)")
     cells = [(k, f"{100 * a.share:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s") for k, a in rows.items()]
-    print(markdown(head, cells))
+    print(markdown_table(head, cells))
     results = {"sensor": learned.sensor} | {name: one._asdict() for name, one in rows.items()}
     return _write(out, learned, about | results)
 
@@ -134,7 +134,7 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
     setups, keys = trials.draw_runs(task, options.seed + policy.UNSEEN, options.trials)
     tried = trials.run(task, setups, keys, learned, side=side, film=1)
     cells = [(str(i + 1), f"{g:.1f}", f"{abs(g - task.target):.1f}") for i, g in enumerate(tried.poured)]
-    print(markdown(("trial", "poured, g", "error, g"), cells))
+    print(markdown_table(("trial", "poured, g", "error, g"), cells))
     results = {"touch": tried} | {k: trials.run(task, setups, keys, rival) for k, rival in rivals.items()}
     for name, one in results.items():
         found = trials.error(one.poured, task.target)

@@ -39,8 +39,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import preset
-from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots
 from anytouch_jax.files import atomic_write
@@ -109,7 +108,7 @@ def source_of(name: str, seed: int, encoder: Encoder) -> str:
     """What a row's encoder is, and a mark of its weights: a run that was trained anew is another encoder."""
     shown = "" if name in RUNS or name == "none" or not RUNS else f", {table.SHOWN}"
     path = path_of(name, seed)
-    return f"{'untrained' if path is None else Path(path).name} (weights {encoder.mark}{shown})"
+    return f"{'untrained' if path is None else Path(path).name} (weights {encoder.fingerprint}{shown})"
 
 
 LEARNING = asdict(pouring_policy.Learning(tune_steps=TUNE))

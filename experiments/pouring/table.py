@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown, seed_interval, verdict
+from anytouch_jax.evaluate.statistics import markdown_table, seed_interval, verdict
 from experiments.pouring.physics import Task
 from experiments.pouring.trials import Error, Trials, error
 from experiments.records import read_records
@@ -163,7 +163,7 @@ def table(rows: Sequence[Row]) -> str:
             cells += [_cell(row) if row else "-", _paper(name, number)]
         lines.append((title, "yes" if name in DYNAMIC else "no" if name in PAPER else "-", *cells))
     head = ("policy", "sees segments", "fine-tuned, g", "paper", "frozen, g", "paper")
-    parts = [markdown(head, lines)]
+    parts = [markdown_table(head, lines)]
     trained = [row for row in rows if row.mode != "bound"]
     if trained:
         used = "; ".join(f"{TITLES[row.name]}, {row.mode}: {', '.join(row.sources)}" for row in trained)
@@ -173,7 +173,9 @@ def table(rows: Sequence[Row]) -> str:
     found = [claim for claim in claims if claim]
     if found:
         parts.append(
-            markdown(("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), found)
+            markdown_table(
+                ("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), found
+            )
         )
     return "\n\n".join(parts) + "\n"
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, statistics
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 
 Right = dict[str, list[np.ndarray]]  # by name: for every seed, how many each object has right
 
@@ -82,4 +82,4 @@ def probe_table(
             changes.append(ahead(counts, np.mean(right[best], 0), np.mean(right[name], 0)) + "; " + seeds)
         rows.append((title, *(_percent(counts, right[name]) for name in names), *changes))
     head = ("label", *names, *(f"{best} ahead of {name} (points, 95 % over objects; by seed)" for name in rivals))
-    return markdown(head, rows)
+    return markdown_table(head, rows)

@@ -45,10 +45,11 @@ from flax import nnx
 
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
-from anytouch_jax.evaluate.statistics import markdown, seed_interval
+from anytouch_jax.evaluate.statistics import markdown_table, seed_interval
 from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim.dataset import VERSION
@@ -252,7 +253,7 @@ def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Wo
     features["pixels"] = principal_components(pixels, text_column(table, "split")[rows] == "train")
     return {
         "settings": SETTINGS,
-        "anytouch": f"{last.key} (weights {anytouch.mark})",
+        "anytouch": f"{last.key} (weights {anytouch.fingerprint})",
         "data": {name: cuts.content_hash(work.manifest(name)) for name in (*last.manifests, LEFT_OUT.name)},
         "machine": machine.describe().sentence(),
         "scores": scores,
@@ -323,7 +324,7 @@ def joined(run: dict[str, Any], label: str) -> dict[str, Any]:
 
 head = ("label", "commonest answer of train", "its own frames", "objects never touched")
 head += ("convolutional: its own frames", "convolutional: objects never touched")
-told = markdown(head, [row(label) for label in LABELS])
+told = markdown_table(head, [row(label) for label in LABELS])
 probed_runs = [{label: joined(run, label) for label in LABELS} for run in runs]
 columns = (*NAMES, CONVOLUTIONAL, "pixels", "commonest")
 left_out = probe_table(probed_runs, columns, ("untrained", "pixels"), NAMED, UNNAMED)

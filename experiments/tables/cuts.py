@@ -12,7 +12,7 @@ import pyarrow as pa
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.evaluate.contacts import deepest_rows, numbers
 
 MADE, WHOLE, STATIC, GRASP = "manifest.parquet", "contact.parquet", "static.parquet", "grasp.parquet"

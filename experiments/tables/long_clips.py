@@ -31,10 +31,11 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder
+from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, plots, tasks
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
@@ -104,7 +105,7 @@ def milliseconds(encoder: Encoder) -> list[float]:
     for turn in range(ROUNDS + 1):
         for k, (frames, join) in enumerate(LOOKS):
             start = time.perf_counter()
-            encoder.embed(clips[:, :frames], sensor, pooling="both", join=join)  # type: ignore[arg-type]
+            encoder.encode_touch(clips[:, :frames], sensor, pooling="both", join=join)  # type: ignore[arg-type]
             if turn:  # the first one compiles
                 spent[k].append(1e3 * (time.perf_counter() - start) / BATCH)
     return [float(np.median(one)) for one in spent]
@@ -117,7 +118,7 @@ def milliseconds(encoder: Encoder) -> list[float]:
 RESULTS = OUT / f"{NAME}.jsonl"
 SETTINGS: dict[str, Any] = {"version": 2, "rows": ROWS, "rounds": ROUNDS, "batch": BATCH}
 if not TABLE:
-    SETTINGS |= {"encoder": encoder.mark, "manifest": table.content_hash}
+    SETTINGS |= {"encoder": encoder.fingerprint, "manifest": table.content_hash}
 
 
 def make(key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -176,7 +177,7 @@ Linear probes of frozen features, one fit, on objects never touched in training,
 An accuracy equal to that of the commonest answer is one: the probe found nothing and gives the same answer for all.
 Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
-{markdown(head, body)}
+{markdown_table(head, body)}
 
 ![Slip against time](figures/{NAME}.png)
 """

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.tables import budget, pictures, plan, report, scores
 from experiments.tables.results import Run, differences, read
 from experiments.tables.work import Work
@@ -102,7 +102,7 @@ def yours(question: str, several: list[Run]) -> list[dict[str, object]]:
             work.make(one, SIZE)
     found = scores.score(leaf, work)["rows"]
     text(f"{run}, beside the mean over seeds of `{name}` in the results; other data make other numbers:")
-    text(markdown(("view", "task", "metric", "protocol", "yours", "95 %", "ours"), _beside(found, several, name)))
+    text(markdown_table(("view", "task", "metric", "protocol", "yours", "95 %", "ours"), _beside(found, several, name)))
     return list(found)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import markdown, seed_interval, verdict
+from anytouch_jax.evaluate.statistics import markdown_table, seed_interval, verdict
 from experiments.tables import paper, plan, scores
 from experiments.tables.real import OURS, PIXELS, UNTRAINED
 from experiments.tables.results import Change, Column, Run, spread
@@ -249,7 +249,7 @@ def new_sensor(runs: Sequence[Run]) -> Part:
         "gap to a model "
         "trained on the sensor that is closed (- below 3 points). No sign is claimed.\n\n"
     )
-    table = markdown(("tokens, frames", "seeds", *scores.STATIC), lines)
+    table = markdown_table(("tokens, frames", "seeds", *scores.STATIC), lines)
     wide = (f"fitted, {scores.FRAMES[-1]} labelled", "seen")
     pairs = [
         Pair(f"{title(one)} against {title(scores.NOTHING)}", one, scores.NOTHING, (None,) * len(columns))
@@ -328,7 +328,7 @@ def real(runs: Sequence[Run]) -> Part:
     )
     between = "95 % over test groups, by seed"
     head = ("task", "features", "accuracy, mean over seeds", between, "commonest", "test frames")
-    table = markdown(head, lines)
+    table = markdown_table(head, lines)
     said = "\n".join(f"- {one.label}: **{one.row.word}**{_by_seed(one)}." for one in statements)
     return Part(REAL_TITLE, f"{text}{table}\n\n{said}", statements)
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, random_encoder
+from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.encoder import Encoder, random_encoder
 from anytouch_jax.evaluate import probe_results, statistics
 from anytouch_jax.evaluate.array_probes import leave_groups_out, linear_probe
 from anytouch_jax.evaluate.feature_cache import pixel_features

@@ -37,7 +37,8 @@ import optax
 from anytouch_jax.config import Config, from_json
 from anytouch_jax.data.loading.samples import SampleReader
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder
+from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate import probe_results
 from anytouch_jax.evaluate.array_probes import majority_baseline
 from anytouch_jax.evaluate.feature_cache import pixel_features

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from experiments.tables import pictures, questions
 from experiments.tables.plan import LABELS
@@ -124,7 +124,7 @@ def provenance(runs: Sequence[Run]) -> str:
         notes += " The same scenes gave tables of other content (another kind of processor, by the machines above): "
         notes += f"{again}."
     head = ("question", "runs", "trainings", "training, min", "scores, min", "names")
-    return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown(head, rows)}"
+    return f"{notes}\n\nTrainings that several questions share are counted in each row.\n\n{markdown_table(head, rows)}"
 
 
 def check_page(out: Path) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
-from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
 from anytouch_jax.evaluate.contacts import contact_vector

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.tables import paper
 from experiments.tables.results import CLAIM, NO_SIGN, Change, Column, Run, Seeds, change, spread, together, values
 
@@ -137,7 +137,7 @@ def _ours(runs: Sequence[Run], table: Table) -> str:
         pairs = zip(chances, table.columns, strict=True)
         shown = ["-" if one is None else f"{one:.{column.digits}f}" for one, column in pairs]
         lines.append(("*the commonest answer*", "-", *shown, *("-" for _ in table.paper_titles)))
-    return markdown(head, lines)
+    return markdown_table(head, lines)
 
 
 def commonest(runs: Sequence[Run], question: str, column: Column) -> float | None:
@@ -160,7 +160,7 @@ def published(runs: Sequence[Run], table: Table) -> str:
     if not lines:
         return ""
     head = ("published protocol (chosen on test)", "seeds", *(column.title for column in table.columns))
-    return markdown(head, lines)
+    return markdown_table(head, lines)
 
 
 def cell(runs: Sequence[Run], question: str, name: str, column: Column) -> str:
@@ -218,4 +218,6 @@ def tally(statements: Mapping[str, Sequence[Statement]]) -> str:
     for name, several in statements.items():
         counts = Counter("no claim" if "claim" in one.row.word else one.row.word for one in several)
         lines.append((name, *(str(counts.get(word, 0)) for word in words)))
-    return markdown(("rows of", "sign agrees", "does not", "undecided", f"fewer than {CLAIM} seeds", "not run"), lines)
+    return markdown_table(
+        ("rows of", "sign agrees", "does not", "undecided", f"fewer than {CLAIM} seeds", "not run"), lines
+    )

@@ -39,12 +39,13 @@ import numpy as np
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.progress import silent
@@ -208,7 +209,10 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
             raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
         return found
     encoders = {f"stage {stage}": load_encoder(run) for stage, run in zip((1, 2), prepare(seed), strict=True)}
-    about: dict[str, Any] = {"settings": SETTINGS, "encoders": {name: one.mark for name, one in encoders.items()}}
+    about: dict[str, Any] = {
+        "settings": SETTINGS,
+        "encoders": {name: one.fingerprint for name, one in encoders.items()},
+    }
     if found is not None and found | about == found:
         return found
     config = encoders["stage 2"].config
@@ -240,7 +244,7 @@ def retrieval_table(found: list[dict[str, Any]]) -> str:
             change = ahead(counts, np.mean(best, 0), np.mean(first[name], 0))
             each = "; ".join(ahead(counts, a, b) for a, b in zip(best, first[name], strict=True))
         rows.append((name, *shares, change, each))
-    return markdown(
+    return markdown_table(
         ("features", "top-1 of 50", "top-5", "stage 2 ahead by (points, 95 % over objects)", "seed by seed"), rows
     )
 

@@ -13,10 +13,11 @@ import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder
+from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.contacts import deepest_rows
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.train.progress import silent
 from anytouch_jax.weights.tree import interpolate
 from experiments.records import read_records, write_record
@@ -108,4 +109,4 @@ def retrieval_table(results: Path) -> str:
         (name, *(f"{100 * np.mean([one[part] for one in several]):.1f} %" for part in ("top1", "top5")))
         for name, several in sorted(by_name.items())
     ]
-    return markdown(("encoder", "first of 50", "among the first five"), rows) if rows else ""
+    return markdown_table(("encoder", "first of 50", "among the first five"), rows) if rows else ""

@@ -11,7 +11,7 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.plots import sample_grid
-from anytouch_jax.evaluate.statistics import markdown, seed_interval, verdict
+from anytouch_jax.evaluate.statistics import markdown_table, seed_interval, verdict
 from experiments.records import read_records
 from experiments.translation import training
 from experiments.translation.encoders import retrieval_table
@@ -42,11 +42,14 @@ def page(results: Path) -> str:
         "",
         _about(records),
         "",
-        markdown(("mean squared error, lower is better", *_HEAD), rows.errors()),
+        markdown_table(("mean squared error, lower is better", *_HEAD), rows.errors()),
         "",
     ]
     if claims := rows.claims():
-        lines += [markdown(("is the paper's order found? (and is it below both references?)", *_HEAD), claims), ""]
+        lines += [
+            markdown_table(("is the paper's order found? (and is it below both references?)", *_HEAD), claims),
+            "",
+        ]
     lines += [
         "Images: normalised pixels (ImageNet's mean and deviation). Fields: each of the six channels in deviations "
         "over the training fields. The paper, on its own recordings (units not stated): T3 0.2261, 0.0167, 0.0155; "
@@ -54,7 +57,7 @@ def page(results: Path) -> str:
         "",
         "The same in units, root mean square of a pixel (0..255), or of a point's displacement and force:",
         "",
-        markdown(("", *_HEAD), rows.in_units()),
+        markdown_table(("", *_HEAD), rows.in_units()),
         "",
         f"Objects of the pairs that an encoder was trained on in its last stage: {_met(results, rows.names)}.",
         "",

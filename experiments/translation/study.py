@@ -126,7 +126,7 @@ def mark(encoder: Encoder | None) -> str:
     """Where an encoder is from, and a mark of its weights: a run that was trained anew is another encoder."""
     if encoder is None:
         return PIXELS
-    return f"{Path(encoder.source).name} (weights {encoder.mark})"
+    return f"{Path(encoder.source).name} (weights {encoder.fingerprint})"
 
 
 def settings(

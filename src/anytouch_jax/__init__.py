@@ -31,7 +31,8 @@ _HOMES = {
     "train.optim": ["optimizer"],
     "train.loop": ["fit"],
     "pretrain": ["pretrain"],
-    "encoder.encoder": ["Encoder", "Preprocess", "load_encoder", "random_encoder"],
+    "encoder.encoder": ["Encoder", "load_encoder", "random_encoder"],
+    "encoder.preprocess": ["Preprocess"],
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

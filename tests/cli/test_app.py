@@ -464,9 +464,9 @@ def test_convert_to_the_authors_names_and_back(tmp_path, tiny_run, capsys):
     assert run("convert", ours, again) == 0
     assert theirs.read_bytes()[-4096:] == again.read_bytes()[-4096:]
     clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
-    expected = load_encoder(tiny_run).embed(clip, "digit")
+    expected = load_encoder(tiny_run).encode_touch(clip, "digit")
     for path in (theirs, ours, again):  # two heads of width 8: the shapes alone would tell one head
-        np.testing.assert_array_equal(load_encoder(path).embed(clip, "digit"), expected)
+        np.testing.assert_array_equal(load_encoder(path).encode_touch(clip, "digit"), expected)
 
 
 def test_what_the_authors_files_cannot_hold_is_one_sentence(tmp_path, capsys):

@@ -43,7 +43,7 @@ def test_every_weight_lies_the_asked_share_from_the_first_to_the_second(two, tmp
             expected = np.asarray(start[name]) * (1 - share) + np.asarray(end[name]) * share
             np.testing.assert_allclose(weights, expected, rtol=1e-6, atol=1e-7)
     clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
-    np.testing.assert_array_equal(load_encoder(target).embed(clip), load_encoder(second).embed(clip))
+    np.testing.assert_array_equal(load_encoder(target).encode_touch(clip), load_encoder(second).encode_touch(clip))
     assert safetensors.read_file_metadata(target)["source"] == f"1 of the way from {first} to {second}"
 
 
@@ -61,7 +61,7 @@ def test_a_run_and_its_stage_1(tiny_run, tmp_path, anytouch):
     said = anytouch("convert", tiny_run, target, "--between", tiny_run, "--share", 0.5)  # by the authors' names, too
     assert (said.status, said.out) == (0, f"{target}: written\n")
     clip = np.random.default_rng(0).integers(0, 256, (1, 3, 28, 28, 3), np.uint8)
-    np.testing.assert_array_equal(load_encoder(target).embed(clip), load_encoder(tiny_run).embed(clip))
+    np.testing.assert_array_equal(load_encoder(target).encode_touch(clip), load_encoder(tiny_run).encode_touch(clip))
 
 
 def test_mistakes(two, tmp_path, mistake):

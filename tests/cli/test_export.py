@@ -13,7 +13,7 @@ def test_export_writes_an_artefact_and_says_how_far_it_is_from_the_live_model(an
     assert "for cpu, cuda" in said.out and "from the live model (1 and 5 touches)" in said.out
     assert f"{out}.json: how to call it" in said.out
     frames = np.random.default_rng(0).integers(0, 256, (2, 1, 28, 28, 3), np.uint8)
-    live = load_encoder(tiny_run).embed(frames, "digit")
+    live = load_encoder(tiny_run).encode_touch(frames, "digit")
     np.testing.assert_allclose(load(out)(frames, "digit"), live, atol=1e-5)
     assert anytouch("export", "--run", tiny_run, "--out", out, "--dtype", "bfloat16").status == 0
     assert 1e-5 < np.abs(load(out)(frames, "digit") - live).max() / np.abs(live).max() < 0.05

@@ -94,11 +94,11 @@ def test_the_result_is_a_run_that_embeds(fitted, run, tmp_path):
     np.testing.assert_array_equal(
         encoder.params["touch"]["sensor_tokens"][2], adapted.params["touch"]["sensor_tokens"][2]
     )
-    assert np.abs(encoder.embed(stills, "gelslim") - encoder.embed(stills, "universal")).max() > 1e-4
+    assert np.abs(encoder.encode_touch(stills, "gelslim") - encoder.encode_touch(stills, "universal")).max() > 1e-4
     before = load_encoder(run)
     for sensor in ("digit", "universal", "duragel"):
         row = np.full(len(stills), before.config.model.sensors.index(sensor))
-        np.testing.assert_array_equal(encoder.embed(stills, row), before.embed(stills, row))
+        np.testing.assert_array_equal(encoder.encode_touch(stills, row), before.encode_touch(stills, row))
     about = checkpoint.read_metadata(tmp_path / "out")
     assert about["seen"] == ["gelsight", "digit", "gelslim"] and about["source"]["frames"] == 8
     assert from_json((tmp_path / "out" / "config.json").read_text()) == adapted.config
@@ -117,7 +117,7 @@ def test_a_sensor_outside_the_table_gets_a_new_row(run, table, tmp_path):
     save(adapted, run, tmp_path / "out")
     stills = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
     encoder = load_encoder(tmp_path / "out")
-    np.testing.assert_array_equal(encoder.embed(stills, "my_gel"), encoder.embed(stills, "universal"))
+    np.testing.assert_array_equal(encoder.encode_touch(stills, "my_gel"), encoder.encode_touch(stills, "universal"))
 
 
 def test_a_model_without_universal_tokens_starts_from_the_mean_of_its_sensors(run, table, tmp_path):

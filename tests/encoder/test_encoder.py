@@ -14,17 +14,9 @@ from anytouch_jax.config import Config, DataConfig, from_json, to_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.encoder.encoder import (
-    Encoder,
-    Features,
-    Preprocess,
-    embed_rows,
-    load_encoder,
-    plain_column,
-    random_encoder,
-    save_npz,
-    text_column,
-)
+from anytouch_jax.encoder.embed import Features, embed_rows, plain_column, save_npz, text_column
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint, convert, load, safetensors
@@ -40,28 +32,30 @@ def encoder(tiny_run):
 
 def test_shapes_of_what_is_embedded(encoder):
     still = CLIPS[:, 0]
-    z = encoder.embed(still, "digit")
+    z = encoder.encode_touch(still, "digit")
     assert z.shape == (2, 12) and z.dtype == np.float32 and np.isfinite(z).all()
-    np.testing.assert_array_equal(encoder.embed(still[:, None], "digit"), z)
-    np.testing.assert_allclose(encoder.embed(still[0], "digit"), z[:1], atol=1e-5)
-    mean = encoder.embed(still, "digit", pooling="mean")
+    np.testing.assert_array_equal(encoder.encode_touch(still[:, None], "digit"), z)
+    np.testing.assert_allclose(encoder.encode_touch(still[0], "digit"), z[:1], atol=1e-5)
+    mean = encoder.encode_touch(still, "digit", pooling="mean")
     assert mean.shape == (2, 12) and np.abs(mean - z).max() > 1e-3
-    both = encoder.embed(still, "digit", pooling="both")
+    both = encoder.encode_touch(still, "digit", pooling="both")
     np.testing.assert_allclose(both, np.concatenate([z, mean], axis=1), atol=1e-6)
-    assert encoder.embed(still[:0], "digit").shape == (0, 12)
+    assert encoder.encode_touch(still[:0], "digit").shape == (0, 12)
 
 
 def test_a_still_equals_the_clip_that_repeats_it(encoder):
     still = CLIPS[:, :1]
-    clip = encoder.embed(np.repeat(still, 3, axis=1), np.asarray([1, 1]))
-    np.testing.assert_allclose(clip, encoder.embed(still, "digit"), atol=2e-5)
+    clip = encoder.encode_touch(np.repeat(still, 3, axis=1), np.asarray([1, 1]))
+    np.testing.assert_allclose(clip, encoder.encode_touch(still, "digit"), atol=2e-5)
 
 
 @pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
 def test_long_clips_are_segments_of_three(encoder, join, width):
-    parts = [encoder.embed(CLIPS[:, s : s + 3], "digit") for s in (0, 3, 4)]  # the last one ends with the last frame
+    parts = [
+        encoder.encode_touch(CLIPS[:, s : s + 3], "digit") for s in (0, 3, 4)
+    ]  # the last one ends with the last frame
     wanted = {"mean": np.mean(parts, 0), "sum": np.sum(parts, 0), "concat": np.concatenate(parts, 1)}[join]
-    z = encoder.embed(CLIPS, "digit", join=join)
+    z = encoder.encode_touch(CLIPS, "digit", join=join)
     assert z.shape == (2, width)
     np.testing.assert_allclose(z, wanted, atol=2e-5)
 
@@ -70,16 +64,16 @@ def test_what_cannot_be_embedded_is_one_sentence(encoder):
     for clips, word in (
         (CLIPS.astype(np.float32), "float32"),
         (CLIPS[:, :, :27], "28 x 28"),
-        (CLIPS[..., :1], r"see = Sight\(encoder\)"),
+        (CLIPS[..., :1], r"preprocess"),
         (CLIPS[:, :0], "a clip needs 3 frames"),
         (CLIPS[:, :2], "a clip needs 3 frames"),
         (CLIPS[0, 0, 0], "28 x 28"),
     ):
         with pytest.raises(UserError, match=word):
-            encoder.embed(clips, "digit")
+            encoder.encode_touch(clips, "digit")
     for ids, word in (([0, 10], "0 to 9"), ([-1, 0], "0 to 9"), ([0], "2 touches")):
         with pytest.raises(UserError, match=word):
-            encoder.embed(CLIPS[:, 0], np.asarray(ids))
+            encoder.encode_touch(CLIPS[:, 0], np.asarray(ids))
 
 
 def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
@@ -89,32 +83,32 @@ def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
     assert len(said) == 1 and "'my_sensor'" in said[0] and "universal tokens" in said[0]
     still = CLIPS[:, 0]
     with pytest.warns(UserWarning, match="'my_sensor'"):  # from Python it is said as a warning
-        served = encoder.embed(still, "my_sensor")
-    np.testing.assert_array_equal(served, encoder.embed(still))
-    assert np.abs(encoder.embed(still) - encoder.embed(still, "digit")).max() > 1e-4
+        served = encoder.encode_touch(still, "my_sensor")
+    np.testing.assert_array_equal(served, encoder.encode_touch(still))
+    assert np.abs(encoder.encode_touch(still) - encoder.encode_touch(still, "digit")).max() > 1e-4
     np.testing.assert_allclose(
-        encoder.embed(still, np.asarray([9, 1])),
-        [encoder.embed(still)[0], encoder.embed(still, "digit")[1]],
+        encoder.encode_touch(still, np.asarray([9, 1])),
+        [encoder.encode_touch(still)[0], encoder.encode_touch(still, "digit")[1]],
         atol=1e-6,
     )
 
 
 def test_a_sensor_of_the_table_that_training_never_saw_is_told_of(encoder, tmp_path):
-    assert encoder.seen == ("digit", "gelsight_mini") and encoder.universal_drawn
+    assert encoder.trained_sensors == ("digit", "gelsight_mini") and encoder.universal_drawn
     said = []
     assert [encoder.sensor_row(name, said.append) for name in ("digit", "universal", "tacto")] == [1, 9, 7]
     (line,) = said
-    assert "'tacto' was not drawn in training (that saw digit, gelsight_mini): using the universal tokens" in line
+    assert "'tacto' was not in training, which had digit, gelsight_mini: using the universal tokens" in line
     with pytest.warns(UserWarning, match="'tacto'"):
-        np.testing.assert_array_equal(encoder.embed(CLIPS[:, 0], "tacto"), encoder.embed(CLIPS[:, 0]))
+        np.testing.assert_array_equal(encoder.encode_touch(CLIPS[:, 0], "tacto"), encoder.encode_touch(CLIPS[:, 0]))
     # without universal tokens the mean of the others serves, also where the universal ones are asked for
     own, said = replace(encoder, universal_drawn=False), []
     assert [own.sensor_row(name, said.append) for name in ("digit", "tacto", "universal", "mine")] == [1, 7, 9, 9]
-    assert len(said) == 3 and all("using the mean of the tokens that training saw" in line for line in said)
+    assert len(said) == 3 and all("using the mean of the trained sensors' tokens" in line for line in said)
     about = {safetensors.MODEL_KEY: to_json(encoder.config.model), safetensors.SEEN_KEY: "digit"}
     params = build(encoder.config.model).init(jax.random.key(0))
     safetensors.write_safetensors(tmp_path / "w.safetensors", convert.to_release(params, encoder.config.model), about)
-    assert load_encoder(tmp_path / "w.safetensors").seen == ("digit",)
+    assert load_encoder(tmp_path / "w.safetensors").trained_sensors == ("digit",)
 
 
 # Where encoders come from -------------------------------------------------------------------------------------------
@@ -128,8 +122,8 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     for row in (0, 2, 4, 5, 6, 7, 8):  # sensors that the run has not seen
         np.testing.assert_array_equal(tokens[row], stored[9])
     assert "array" not in repr(encoder) and "kernel" not in repr(encoder)
-    wanted = load_encoder(tiny_run / "checkpoints", step=2).embed(CLIPS[:, 0], "digit")
-    np.testing.assert_array_equal(wanted, encoder.embed(CLIPS[:, 0], "digit"))
+    wanted = load_encoder(tiny_run / "checkpoints", step=2).encode_touch(CLIPS[:, 0], "digit")
+    np.testing.assert_array_equal(wanted, encoder.encode_touch(CLIPS[:, 0], "digit"))
 
 
 def test_an_encoder_of_a_weights_file(tmp_path):
@@ -146,8 +140,8 @@ def test_an_encoder_of_a_weights_file(tmp_path):
         found = load_encoder(path)
         np.testing.assert_array_equal(found.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
         assert found.config.model.touch == here.touch
-        wanted = Encoder(made.config, {"touch": params["touch"]}, "").embed(CLIPS[:, 0], "digit")
-        np.testing.assert_allclose(found.embed(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
+        wanted = Encoder(made.config, {"touch": params["touch"]}, "").encode_touch(CLIPS[:, 0], "digit")
+        np.testing.assert_allclose(found.encode_touch(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
 
 
 def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_tokens(tmp_path):
@@ -158,19 +152,22 @@ def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_
     safetensors.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
     safetensors.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
     encoder, untold = (load_encoder(tmp_path / f"{name}.safetensors") for name in ("authors", "untold"))
-    assert encoder.seen == ("gelsight", "digit", "gelslim", "gelsight_mini", "duragel") and untold.seen is None
+    assert (
+        encoder.trained_sensors == ("gelsight", "digit", "gelslim", "gelsight_mini", "duragel")
+        and untold.trained_sensors is None
+    )
     tokens = encoder.params["touch"]["sensor_tokens"]
     for row in range(10):
         np.testing.assert_array_equal(tokens[row], stored[row if row < 5 else 9])
     np.testing.assert_array_equal(untold.params["touch"]["sensor_tokens"], stored)
     said: list[str] = []
-    assert encoder.sensor_row("9dtact", said.append) == 5 and "was not drawn in training" in said[0]
+    assert encoder.sensor_row("9dtact", said.append) == 5 and "was not in training" in said[0]
     # through `convert` the numbers of the file stay, and what they are of is told
     assert main(["convert", str(tmp_path / "authors.safetensors"), str(tmp_path / "again.safetensors")]) == 0
     again = load.read_weights(tmp_path / "again.safetensors")
     np.testing.assert_array_equal(again["sensor_token"], stored)
     found = load_encoder(tmp_path / "again.safetensors")
-    assert found.seen == encoder.seen
+    assert found.trained_sensors == encoder.trained_sensors
     np.testing.assert_array_equal(found.params["touch"]["sensor_tokens"], tokens)
 
 
@@ -197,8 +194,8 @@ def test_weights_that_are_not_finite_embed_nothing(tmp_path, tiny_run):
 
 def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):
     config = run_config(world, 2)
-    a, b, c = (random_encoder(config, seed).embed(CLIPS[:, 0], "digit") for seed in (0, 0, 1))
-    assert a.shape == encoder.embed(CLIPS[:, 0], "digit").shape
+    a, b, c = (random_encoder(config, seed).encode_touch(CLIPS[:, 0], "digit") for seed in (0, 0, 1))
+    assert a.shape == encoder.encode_touch(CLIPS[:, 0], "digit").shape
     np.testing.assert_array_equal(a, b)
     assert np.abs(a - c).max() > 1e-3
     model = random_encoder(config).config.model
@@ -215,7 +212,7 @@ def test_a_manifest_gives_what_its_pictures_give(encoder, world):
     assert rows[order].tolist() == [0, 5, 9] and said == []
     for row, value in zip(rows, values, strict=True):
         image = touch_evaluation([decode(manifest.file(int(row)))], 28)
-        wanted = encoder.embed(image[None], manifest.value(int(row), "sensor"))
+        wanted = encoder.encode_touch(image[None], manifest.value(int(row), "sensor"))
         np.testing.assert_allclose(value, wanted[0], atol=1e-5)
 
 
@@ -223,11 +220,11 @@ def test_every_touch_may_have_a_sensor_of_its_own(encoder):
     side, names = encoder.config.model.image_size, encoder.config.model.sensors
     frames = np.random.default_rng(0).integers(0, 256, (3, side, side, 3), np.uint8)
     told = ["gelsight_mini", "digit", "gelsight_mini"]
-    found = encoder.embed(frames, told)
-    np.testing.assert_array_equal(found, encoder.embed(frames, np.array([names.index(name) for name in told])))
-    np.testing.assert_array_equal(found, encoder.embed(frames, np.array(told)))
+    found = encoder.encode_touch(frames, told)
+    np.testing.assert_array_equal(found, encoder.encode_touch(frames, np.array([names.index(name) for name in told])))
+    np.testing.assert_array_equal(found, encoder.encode_touch(frames, np.array(told)))
     with pytest.raises(UserError, match="one integer for each of the 3 touches"):
-        encoder.embed(frames, told[:2])
+        encoder.encode_touch(frames, told[:2])
 
 
 def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
@@ -235,7 +232,7 @@ def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
     rows, values = embed_rows(encoder, manifest, np.asarray([3, 6]), 3, "both", batch=8)
     assert rows.tolist() == [3, 6] and values.shape == (2, 24)
     clip = touch_evaluation([decode(world.parent / f"a{i}.png") for i in (1, 2, 3)], 28)
-    np.testing.assert_allclose(values[0], encoder.embed(clip[None], "digit", pooling="both")[0], atol=1e-5)
+    np.testing.assert_allclose(values[0], encoder.encode_touch(clip[None], "digit", pooling="both")[0], atol=1e-5)
     with pytest.raises(UserError, match="clip of 3 frames"):
         embed_rows(encoder, manifest, np.asarray([1]), 3)
     with pytest.raises(UserError, match="no rows"):
@@ -250,7 +247,7 @@ def test_an_unknown_sensor_of_a_manifest_is_said_once(encoder, world):
     _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, log=said.append)
     assert len(said) == 1 and "'gelsight_mini'" in said[0]
     image = touch_evaluation([decode(world.parent / "b0.png")], 28)[None]
-    np.testing.assert_allclose(values[0], encoder.embed(image)[0], atol=1e-5)
+    np.testing.assert_allclose(values[0], encoder.encode_touch(image)[0], atol=1e-5)
 
 
 def test_a_text_column_has_no_nulls(world):
@@ -309,7 +306,7 @@ def test_a_run_of_cudnn_can_be_used_where_there_is_none(encoder, monkeypatch, ti
     monkeypatch.setattr(checkpoint, "load_params", lambda *a: (real(*a)[0], to_json(stored), real(*a)[2]))
     found = load_encoder(tiny_run)
     assert found.config.model.attention == "auto"
-    np.testing.assert_array_equal(found.embed(CLIPS[:, 0], "digit"), encoder.embed(CLIPS[:, 0], "digit"))
+    np.testing.assert_array_equal(found.encode_touch(CLIPS[:, 0], "digit"), encoder.encode_touch(CLIPS[:, 0], "digit"))
 
 
 def test_a_run_that_keeps_an_average_is_used_by_it(tmp_path):
@@ -332,7 +329,7 @@ def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
     blind = replace(lenient, config=replace(lenient.config, data=replace(lenient.config.data, background="subtract")))
     with pytest.raises(UserError, match="background_path"):  # however it was trained
         embed_rows(blind, manifest, np.array([0, 1]))
-    with pytest.raises(UserError, match=r"none of the 2 rows can be read; `anytouch verify` says"):
+    with pytest.raises(UserError, match=r"none of the 2 rows can be read"):
         embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip")
 
 
@@ -364,11 +361,11 @@ def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
 def test_names_of_pooling_and_join_and_rows_are_checked(tiny_run):
     encoder = load_encoder(tiny_run)
     with pytest.raises(UserError, match="pooling is one of class, mean, both, not 'cls'"):
-        encoder.embed(CLIPS, "digit", pooling="cls")
+        encoder.encode_touch(CLIPS, "digit", pooling="cls")
     with pytest.raises(UserError, match="join is one of mean, sum, concat, not 'max'"):
-        encoder.embed(CLIPS, "digit", join="max")
+        encoder.encode_touch(CLIPS, "digit", join="max")
     with pytest.raises(UserError, match="one integer for each"):
-        encoder.embed(CLIPS, np.full(len(CLIPS), 0.5))
+        encoder.encode_touch(CLIPS, np.full(len(CLIPS), 0.5))
 
 
 def test_a_column_of_a_manifest_becomes_an_array_without_objects(tmp_path):

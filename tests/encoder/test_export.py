@@ -15,8 +15,7 @@ from tiny_models import touch_model
 from anytouch_jax.config import Config
 from anytouch_jax.encoder import export as exports
 from anytouch_jax.encoder.encoder import load_encoder, random_encoder
-from anytouch_jax.encoder.export import export, load
-from anytouch_jax.encoder.names import describes
+from anytouch_jax.encoder.export import describes, export, load
 from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)
@@ -51,12 +50,12 @@ def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, en
     path, about = artefact
     run = load(path)
     for count in (1, 2, 5):
-        live = encoder.embed(CLIPS[:count], ROWS[:count])
+        live = encoder.encode_touch(CLIPS[:count], ROWS[:count])
         found = run(CLIPS[:count], ROWS[:count])
         assert found.shape == (count, 12) and found.dtype == np.float32
         np.testing.assert_allclose(found, live, atol=1e-5)
-    np.testing.assert_allclose(run(CLIPS, "digit"), encoder.embed(CLIPS, "digit"), atol=1e-5)
-    np.testing.assert_allclose(run(CLIPS), encoder.embed(CLIPS), atol=1e-5)  # the universal tokens
+    np.testing.assert_allclose(run(CLIPS, "digit"), encoder.encode_touch(CLIPS, "digit"), atol=1e-5)
+    np.testing.assert_allclose(run(CLIPS), encoder.encode_touch(CLIPS), atol=1e-5)  # the universal tokens
     assert np.abs(run(CLIPS) - run(CLIPS, "digit")).max() > 1e-4
     names = list(encoder.config.model.sensors)
     for each in ([names[row] for row in ROWS], np.array(names, object)[ROWS]):  # as `Encoder.embed` takes them
@@ -74,7 +73,7 @@ def test_the_description_tells_how_to_call_it(artefact, encoder, monkeypatch):
     monkeypatch.chdir(path.parent)
     space = {"frames": CLIPS, "sensor": ROWS}
     exec(about["example"], space)  # what a reader would copy
-    np.testing.assert_allclose(space["features"], encoder.embed(CLIPS, ROWS), atol=1e-5)
+    np.testing.assert_allclose(space["features"], encoder.encode_touch(CLIPS, ROWS), atol=1e-5)
 
 
 def test_platforms_are_in_the_artefact(artefact, encoder, tmp_path):
@@ -86,7 +85,7 @@ def test_platforms_are_in_the_artefact(artefact, encoder, tmp_path):
     assert module.platforms == ("cpu",) and module.in_avals[0].shape[1:] == (1, 28, 28, 3)
     assert module.in_avals[0].dtype == np.uint8
     np.testing.assert_allclose(
-        load(tmp_path / "one.bin")(CLIPS[:, :1], "digit"), encoder.embed(CLIPS[:, 0], "digit"), atol=1e-5
+        load(tmp_path / "one.bin")(CLIPS[:, :1], "digit"), encoder.encode_touch(CLIPS[:, 0], "digit"), atol=1e-5
     )
 
 
@@ -96,7 +95,7 @@ def test_long_clips_other_poolings_and_bfloat16(tmp_path):
     about = export(encoder, tmp_path / "m.bin", frames=4, platforms=("cpu",), pooling="both", join="concat")
     found = load(tmp_path / "m.bin")(long, ROWS)
     assert found.shape == (5, 48) and about["features"] == 48 and found.dtype == np.float32
-    live = encoder.embed(long, ROWS, pooling="both", join="concat")
+    live = encoder.encode_touch(long, ROWS, pooling="both", join="concat")
     np.testing.assert_allclose(found, live, atol=0.05 * np.abs(live).max())
 
 
@@ -104,7 +103,7 @@ def test_long_clips_other_poolings_and_bfloat16(tmp_path):
 def test_attention_of_one_platform_is_exported_for_all(tmp_path, encoder, attention):
     model = replace(encoder.config.model, attention=attention)
     export(replace(encoder, config=replace(encoder.config, model=model)), tmp_path / "m.bin", frames=3)
-    np.testing.assert_allclose(load(tmp_path / "m.bin")(CLIPS, ROWS), encoder.embed(CLIPS, ROWS), atol=1e-5)
+    np.testing.assert_allclose(load(tmp_path / "m.bin")(CLIPS, ROWS), encoder.encode_touch(CLIPS, ROWS), atol=1e-5)
 
 
 def test_an_artefact_needs_no_code_of_the_network(artefact):

@@ -11,7 +11,7 @@ from runs import run_config, train
 from tiny_models import full_model
 
 from anytouch_jax.config import to_json
-from anytouch_jax.encoder.image_tower import image_tower_encoder
+from anytouch_jax.encoder.encoder import image_tower_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
@@ -37,9 +37,9 @@ def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
         params["lora"] = jax.tree.map(lambda x: np.asarray(RNG.standard_normal(x.shape), np.float32), params["lora"])
     encoder = image_tower_encoder(stored(tmp_path, config, params))
     wanted = net.apply(params, "embed_image", normalise_touch(STILLS))
-    np.testing.assert_allclose(encoder.embed(STILLS, "digit"), wanted, atol=2e-5)
+    np.testing.assert_allclose(encoder.encode_touch(STILLS, "digit"), wanted, atol=2e-5)
     for sensor in ("universal", "gelsight"):  # it knows no sensors
-        np.testing.assert_array_equal(encoder.embed(STILLS, sensor), encoder.embed(STILLS, "digit"))
+        np.testing.assert_array_equal(encoder.encode_touch(STILLS, sensor), encoder.encode_touch(STILLS, "digit"))
     assert "image tower" in encoder.source
 
 
@@ -48,7 +48,7 @@ def test_a_clip_gives_the_embedding_of_its_mean_frame(tmp_path):
     params = build(config.model).init(jax.random.key(3))
     encoder = image_tower_encoder(stored(tmp_path, config, params))
     clip = np.stack([STILLS // 4 * 3, STILLS // 4 * 3 + 3, STILLS // 4 * 3 + 6], axis=1).astype(np.uint8)
-    np.testing.assert_allclose(encoder.embed(clip), encoder.embed(clip[:, 1]), atol=2e-5)
+    np.testing.assert_allclose(encoder.encode_touch(clip), encoder.encode_touch(clip[:, 1]), atol=2e-5)
 
 
 def test_the_tower_of_clip_weights(tmp_path):
@@ -59,13 +59,13 @@ def test_the_tower_of_clip_weights(tmp_path):
     file = tmp_path / "clip.safetensors"
     safetensors.write_safetensors(file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)})
     wanted = build(model).apply(params, "embed_image", normalise_touch(STILLS))
-    np.testing.assert_allclose(image_tower_encoder(file).embed(STILLS), wanted, atol=2e-5)
+    np.testing.assert_allclose(image_tower_encoder(file).encode_touch(STILLS), wanted, atol=2e-5)
 
 
 def test_a_run_without_an_image_tower_is_one_sentence(tmp_path):
     config = run_config(tmp_path)
     run = stored(tmp_path / "r", config, build(config.model).init(jax.random.key(0)))
-    with pytest.raises(UserError, match="holds no image tower; give a stage-2 run"):
+    with pytest.raises(UserError, match="has no image tower; give a stage-2 run"):
         image_tower_encoder(run)
     with pytest.raises(UserError, match="no run folder or weights file"):
         image_tower_encoder(tmp_path / "gone")
@@ -74,4 +74,4 @@ def test_a_run_without_an_image_tower_is_one_sentence(tmp_path):
 @pytest.mark.slow
 def test_the_tower_of_a_run_that_was_trained(world, tmp_path, compiled_once):
     train(run_config(world, 2), tmp_path / "r", stop_after=1)
-    assert image_tower_encoder(tmp_path / "r").embed(STILLS).shape == (2, 12)
+    assert image_tower_encoder(tmp_path / "r").encode_touch(STILLS).shape == (2, 12)

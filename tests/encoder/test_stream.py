@@ -79,7 +79,7 @@ class Camera:
 def features_of(encoder, frames, numbers):
     """What `embed` gives of clips that end at frame i: frames RGB, numbers of the frames of each clip."""
     small = touch_evaluation(frames, encoder.config.model.image_size)
-    return encoder.embed(np.stack([small[list(one)] for one in numbers]), "digit")
+    return encoder.encode_touch(np.stack([small[list(one)] for one in numbers]), "digit")
 
 
 # Videos -------------------------------------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_pooling_and_join_are_those_of_embed(encoder, video):
     source, live = open_source(video)
     found = list(stream(encoder, source, live=live, sensor=DIGIT, frames=6, pooling="both", join="concat"))
     small = touch_evaluation(list(frames_from_video(video)), 28)
-    wanted = encoder.embed(np.stack([small[:6], small[1:7], small[2:]]), "digit", pooling="both", join="concat")
+    wanted = encoder.encode_touch(np.stack([small[:6], small[1:7], small[2:]]), "digit", pooling="both", join="concat")
     assert wanted.shape == (3, 48)
     np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
 

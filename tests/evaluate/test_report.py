@@ -23,7 +23,7 @@ from anytouch_jax.evaluate.matching import MatchScore
 from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, demo_report, write_report
 from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval
 from anytouch_jax.evaluate.sections import Section, matching_section, retrieval_section, samples_section
-from anytouch_jax.evaluate.statistics import markdown
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.weights import checkpoint
 
 NAMES = (RANDOM, "stage 1", "stage 2")
@@ -42,7 +42,7 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
         path.parent.mkdir(parents=True)
         cv2.imwrite(str(path), np.zeros((4, 4, 3), np.uint8))
     parts = [
-        Section("First", "Words.", markdown(("a", "b|c"), [("1", "two\nlines")]), elsewhere, "After."),
+        Section("First", "Words.", markdown_table(("a", "b|c"), [("1", "two\nlines")]), elsewhere, "After."),
         Section("Second", figure=out / "figures" / "mine.png"),
     ]
     numbers = {"x": np.float32(0.5), "bad": float("nan"), "list": np.arange(2), "path": Path("a"), "part": parts[1]}

@@ -267,7 +267,7 @@ def section_of(name: str, found: dict[str, Any], preset: str) -> str:
     about, first = found["about"], found["rows"][0]
     line = f"torch {about['torch']} ({about['threads']} threads), transformers {about['transformers']}"
     title = f"## {name}, preset {preset}, batch {round(first['samples_per_second'] * first['seconds'])}"
-    table = statistics.markdown(heads, rows)
+    table = statistics.markdown_table(heads, rows)
     return f"{title}\n\n{table}\n{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
 
 

@@ -19,7 +19,8 @@ from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.encoder import Encoder, Features
+    from anytouch_jax.encoder.embed import Features
+    from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.stream import Embedded
     from anytouch_jax.evaluate.heads import LinearHead
 
@@ -29,6 +30,7 @@ _MANIFESTS = (".csv", ".parquet")
 def run(options: Embed) -> int:
     """Write the features of a manifest, a folder of frames or a video as an `.npz`."""
     _refuse_unused(options)
+    from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import encoder as features
     from anytouch_jax.evaluate.heads import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
@@ -46,7 +48,7 @@ def run(options: Embed) -> int:
     features.check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
     if head is not None:
-        head.check(encoder.source, encoder.mark, options.pooled, options.frames, options.join)
+        head.check(encoder.source, encoder.fingerprint, options.pooled, options.frames, options.join)
     if options.batch < 1:
         raise UserError(f"--batch must be 1 or more, not {options.batch}")
     if options.stream:
@@ -58,7 +60,7 @@ def run(options: Embed) -> int:
     else:
         found = _embed_frames(encoder, options)
         _say_universal(encoder, options)
-    features.save_npz(options.out, _named(found, head), _about(encoder, options))
+    embedding.save_npz(options.out, _named(found, head), _about(encoder, options))
     left = f", {found.skipped} skipped" if found.skipped else ""
     print(f"{options.out}: {len(found.values)} features of {found.values.shape[1]} values{left}")
     return 0
@@ -74,7 +76,7 @@ def _about(encoder: Encoder, options: Embed) -> dict[str, str]:
     }
     return {
         "encoder": encoder.source,
-        "weights": encoder.mark,
+        "weights": encoder.fingerprint,
         "input": str(options.input),
         "pooling": options.pooled,
         "frames": str(options.frames),
@@ -88,12 +90,12 @@ def _named(found: Features, head: LinearHead | None) -> Features:
     if head is None:
         return found
     label, p = head(found.values)
-    return replace(found, said={"label": label, "p": p.max(1)})
+    return replace(found, predictions={"label": label, "p": p.max(1)})
 
 
 def _stream(encoder: Encoder, options: Embed, head: LinearHead | None) -> int:
     """Embed a camera or a video frame by frame: features to an .npz, or as JSON lines; then the latency budget."""
-    from anytouch_jax.encoder import encoder as features
+    from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import stream
 
     lines = str(options.out) == "-"
@@ -119,8 +121,8 @@ def _stream(encoder: Encoder, options: Embed, head: LinearHead | None) -> int:
         keys = {"frame_index": result.numbers, "time": result.numbers / rate if rate else result.at}
         about = _about(encoder, options) | {"stride": str(options.stride)}
         about |= {"started": f"{result.started:.6f}"} if live and len(result.numbers) else {}
-        found = features.Features(result.values, result.numbers, keys)
-        features.save_npz(options.out, _named(found, head if len(result.numbers) else None), about)
+        found = embedding.Features(result.values, result.numbers, keys)
+        embedding.save_npz(options.out, _named(found, head if len(result.numbers) else None), about)
     _say_universal(encoder, options)
     for line in stream.budget(result):
         log(line)
@@ -156,7 +158,7 @@ def _say_universal(encoder: Encoder, options: Embed) -> None:
 
 def _sight(encoder: Encoder, options: Embed) -> Any:
     from anytouch_jax.data.images import decode
-    from anytouch_jax.encoder.encoder import Preprocess
+    from anytouch_jax.encoder.preprocess import Preprocess
 
     gel = _gel(encoder, options)
     if gel is not None and not encoder.subtracts:
@@ -169,11 +171,11 @@ def _sight(encoder: Encoder, options: Embed) -> Any:
 
 def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder import encoder as features
+    from anytouch_jax.encoder import embed as embedding
 
     manifest = manifests.read(options.input)
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
-    fields = np.isin(features.text_column(manifest, "sensor")[rows], FIELD_SENSORS)
+    fields = np.isin(embedding.text_column(manifest, "sensor")[rows], FIELD_SENSORS)
     if fields.any():
         log(f"{fields.sum()} rows of sensors that measure force fields have no images and are left out")
         rows = rows[~fields]
@@ -182,21 +184,21 @@ def _embed_manifest(encoder: Encoder, options: Embed) -> Any:
     usable = rows if options.frames == 1 else np.intersect1d(rows, manifest.clips(options.frames)[:, -1])
     if len(usable) < len(rows):
         log(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
-    rows, values = features.embed_rows(
+    rows, values = embedding.embed_rows(
         encoder, manifest, usable, options.frames, options.pooled, options.join, batch=options.batch,
         on_bad_sample=options.on_bad_sample, log=log,
     )  # fmt: skip
-    keys = {name: features.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
+    keys = {name: embedding.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     more = [name for name in manifest.table.column_names if name in ("object", "unit") or name.startswith("label.")]
-    keys |= {name: features.plain_column(manifest, name)[rows] for name in more}
-    return features.Features(values, rows, keys, len(usable) - len(rows))
+    keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
+    return embedding.Features(values, rows, keys, len(usable) - len(rows))
 
 
 def _embed_frames(encoder: Encoder, options: Embed) -> Any:
     """Every window of `frames` consecutive frames of a folder or a video, keyed by its last frame; no window reaches
     over a frame that is missing or cannot be read."""
-    from anytouch_jax.encoder import encoder as features
+    from anytouch_jax.encoder import embed as embedding
 
     row, see = encoder.sensor_row(options.sensor or UNIVERSAL, log), _sight(encoder, options)
     ring: list[np.ndarray] = []
@@ -209,7 +211,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
         if waiting:
             missing = options.batch - len(waiting) if values else 0  # one shape, one compilation
             full = np.stack(waiting + waiting[-1:] * missing)
-            z = encoder.embed(full, np.full(len(full), row), pooling=options.pooled, join=options.join)
+            z = encoder.encode_touch(full, np.full(len(full), row), pooling=options.pooled, join=options.join)
             values.append(z[: len(waiting)])
             waiting.clear()
 
@@ -232,7 +234,7 @@ def _embed_frames(encoder: Encoder, options: Embed) -> Any:
         raise UserError(f"{options.input} has {count} frames, too few for clips of {options.frames} that can be read")
     index = np.array(ends)
     keys = {"frame_index": index} | ({"path": np.array(names)[index]} if any(names) else {})
-    return features.Features(np.concatenate(values), index, keys, max(0, count - options.frames + 1) - len(index))
+    return embedding.Features(np.concatenate(values), index, keys, max(0, count - options.frames + 1) - len(index))
 
 
 def _say_cut(video: Path, count: int) -> None:

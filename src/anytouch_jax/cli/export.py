@@ -5,7 +5,7 @@ from __future__ import annotations
 from anytouch_jax.cli.options_use import Export
 from anytouch_jax.cli.output import check_folder
 from anytouch_jax.cli.unused import refuse_join
-from anytouch_jax.encoder.names import describes
+from anytouch_jax.encoder.export import describes
 
 
 def run(options: Export) -> int:

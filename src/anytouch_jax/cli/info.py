@@ -9,7 +9,7 @@ import numpy as np
 
 from anytouch_jax.cli.options_use import Info
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
-from anytouch_jax.encoder.names import describes
+from anytouch_jax.encoder.export import describes
 from anytouch_jax.errors import UserError
 
 _TABLES = (".csv", ".parquet")

@@ -26,12 +26,13 @@ if TYPE_CHECKING:
 def run(options: Retrieve) -> int:
     """Score cross-sensor retrieval of frozen features, print a table, write JSON when asked."""
     from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import encoder as features
     from anytouch_jax.evaluate import retrieval
     from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
     from anytouch_jax.evaluate.feature_cache import background_difference
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
-    from anytouch_jax.evaluate.statistics import markdown, plain
+    from anytouch_jax.evaluate.statistics import markdown_table, plain
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     least = Range(2, math.inf, "2 or more, the touch and at least one other")
@@ -46,7 +47,7 @@ def run(options: Retrieve) -> int:
         features.check_frames(encoder.config.model, options.frames)
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
-    rows = rows[~np.isin(features.text_column(table, "sensor")[rows], FIELD_SENSORS)]
+    rows = rows[~np.isin(embedding.text_column(table, "sensor")[rows], FIELD_SENSORS)]
     rows = deepest_rows(table, rows, frames=options.frames)
     asked: dict[str, Any] = {
         "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
@@ -55,7 +56,7 @@ def run(options: Retrieve) -> int:
     retrieval.cross_sensor_retrieval(table, {}, rows, **asked)  # a gallery that cannot be is told before the work
     found: dict[str, Any] = {}
     for name, encoder in encoders.items():
-        kept, found[name] = features.embed_rows(encoder, table, rows, options.frames, options.pooling, log=log)
+        kept, found[name] = embedding.embed_rows(encoder, table, rows, options.frames, options.pooling, log=log)
         if len(kept) < len(rows):
             raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows could not be read; repair the manifest first")
     if options.controls:
@@ -66,7 +67,7 @@ def run(options: Retrieve) -> int:
                 log(f"no control by {name}: {error}")
     scored = retrieval.cross_sensor_retrieval(table, found, rows, metrics={VECTOR: "euclidean"}, **asked)
     head = ("features", "query", "gallery", "centred", "top-1", "95 %", "top-5", "chance", "of", "queries")
-    text = markdown(head, [_row(one) for one in scored])
+    text = markdown_table(head, [_row(one) for one in scored])
     Console().print(Markdown(text)) if Console().is_terminal else print(text)
     for note in dict.fromkeys(note for one in scored for note in one.notes):
         log(note)

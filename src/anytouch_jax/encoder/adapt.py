@@ -19,7 +19,8 @@ from anytouch_jax import objectives
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import embed_rows, load_encoder, text_column
+from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write
 from anytouch_jax.nn.attention import usable

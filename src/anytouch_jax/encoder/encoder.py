@@ -204,19 +204,22 @@ class Encoder:
         return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
 
     def similarity(
-        self, touch: npt.ArrayLike, texts: str | Sequence[str] | np.ndarray, *, probabilities: bool = False
+        self,
+        touch: npt.ArrayLike,
+        texts: str | Sequence[str] | npt.NDArray[np.floating],
+        *,
+        probabilities: bool = False,
     ) -> np.ndarray:
         """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
 
         With `probabilities`, return their softmax over the texts with the learned temperature: a zero-shot classifier.
         Raises UserError without a text tower. With `objective.centre`, training subtracted the batch mean first.
         """
-        z_touch = _unit(touch)
-        z_text = _unit(texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts))
+        embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
+        z_touch, z_text = _unit(touch), _unit(embeddings)
         if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
-            raise UserError(
-                f"touch must be features (B, {z_text.shape[-1]}) of encode_touch with pooling class, not {z_touch.shape}"
-            )
+            width = z_text.shape[-1]
+            raise UserError(f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}")
         cosine = z_touch @ z_text.T
         if not probabilities:
             return np.asarray(np.clip(cosine, -1, 1))
@@ -267,9 +270,7 @@ def sensor_rows(sensor: Any, count: int, row: Callable[[str], int], rows: int) -
     if ids.dtype.kind in "UO":
         ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)
     if ids.shape != (count,) or ids.dtype.kind not in "iu":
-        raise UserError(
-            f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}"
-        )
+        raise UserError(f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}")
     if ids.min(initial=0) < 0 or ids.max(initial=0) >= rows:
         raise UserError(f"sensor rows must be 0 to {rows - 1}")
     return ids.astype(np.int32)

@@ -20,12 +20,12 @@ import numpy as np
 from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.encoder.names import describes
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.encoder import Encoder, Join, Pooling
+    from anytouch_jax.encoder.embed import Join, Pooling
+    from anytouch_jax.encoder.encoder import Encoder
 
 FORMAT = "anytouch_jax.export.1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -71,6 +71,11 @@ class Exported:
         if str(name) not in sensors:
             raise UserError(f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other")
         return sensors[str(name)]
+
+
+def describes(path: Path) -> Path:
+    """Return the JSON description of an exported encoder."""
+    return path.with_name(f"{path.name}.json")
 
 
 def load(path: str | Path) -> Exported:
@@ -152,7 +157,7 @@ def call_of(
         "join": join,
         "dtype": model.dtype,
         "sensors": {name: row for row, name in enumerate(model.sensors)},
-        "seen": None if encoder.seen is None else list(encoder.seen),
+        "seen": None if encoder.trained_sensors is None else list(encoder.trained_sensors),
     }
 
 
@@ -188,7 +193,7 @@ def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: J
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, model.image_size, model.image_size, 3), np.uint8)
         rows = rng.integers(0, len(model.sensors), count).astype(np.int32)
-        live = encoder.embed(clips, rows, pooling=pooling, join=join)
+        live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
         found = np.asarray(run(clips, rows))
         if found.shape != live.shape or not np.isfinite(found).all():
             raise UserError(f"the artefact gives {found.shape}, the live model {live.shape}, or what is not finite")

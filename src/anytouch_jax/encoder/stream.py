@@ -20,7 +20,9 @@ import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.encoder.encoder import Encoder, Join, Pooling, Preprocess, check_frames, touch_features
+from anytouch_jax.encoder.embed import Join, Pooling
+from anytouch_jax.encoder.encoder import Encoder, check_frames, touch_features
+from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.train.progress import Terminated, terminating
 

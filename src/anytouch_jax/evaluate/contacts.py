@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]

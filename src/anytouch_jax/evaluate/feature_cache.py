@@ -22,7 +22,8 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import Encoder, Features, Join, Pooling, check_backgrounds, save_npz, text_column
+from anytouch_jax.encoder.embed import Features, Join, Pooling, check_backgrounds, save_npz, text_column
+from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
@@ -114,7 +115,7 @@ def encoder_features(
             clip = reorder_frames(part.clip[: len(ids)], ids, order)
             clip = np.concatenate([clip, np.repeat(clip[-1:], BATCH - len(ids), axis=0)])  # one shape, one compilation
             sensor = np.full(BATCH, universal_row, np.int32) if universal else part.sensor
-            values.append(encoder.embed(clip, sensor, pooling=pooling, join=join)[: len(ids)])
+            values.append(encoder.encode_touch(clip, sensor, pooling=pooling, join=join)[: len(ids)])
             read += len(ids)
         if read != len(rows):
             raise UserError(f"{len(rows) - read} rows could not be read. Repair the manifest first.")

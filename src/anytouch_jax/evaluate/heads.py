@@ -23,7 +23,7 @@ from anytouch_jax.evaluate.logistic import Logistic
 from anytouch_jax.files import atomic_path
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.encoder import Pooling
+    from anytouch_jax.encoder.embed import Pooling
 
 Array = npt.NDArray[Any]
 HeadName = Literal["linear", "knn", "gradient"]

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from anytouch_jax.config import from_json
 from anytouch_jax.data.loading.matching import Matches, MatchKeys
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import mean_interval
 from anytouch_jax.nn.functional import build

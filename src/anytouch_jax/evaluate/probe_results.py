@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import Protocol, markdown, mean_interval, plain
+from anytouch_jax.evaluate.statistics import Protocol, markdown_table, mean_interval, plain
 
 Array = npt.NDArray[Any]
 
@@ -153,10 +153,10 @@ def probe_table(results: Sequence[Result]) -> str:
             classification.append((f"{one.probe}: {part.name}", one.protocol, *cells))
     if classification:
         head = ("probe", "protocol", "accuracy", "95 % over test groups", "balanced", "commonest class", "refits")
-        blocks.append(markdown((*head, "train", "test (groups)", "classes", "penalty or k"), classification))
+        blocks.append(markdown_table((*head, "train", "test (groups)", "classes", "penalty or k"), classification))
     if regression:
         head = ("probe", "protocol", "R2", "95 % over test groups", "MAE", "MAE 95 %", "MAE of the mean")
-        blocks.append(markdown((*head, "train", "test (groups)", "penalty"), regression))
+        blocks.append(markdown_table((*head, "train", "test (groups)", "penalty"), regression))
     notes = dict.fromkeys(f"- {one.probe} ({one.protocol}): {note}" for one in results for note in one.notes)
     return "\n\n".join([*blocks, *(["\n".join(notes)] if notes else [])]) + "\n"
 
@@ -177,7 +177,7 @@ def task_table(report: Mapping[str, Any]) -> str:
         notes |= dict.fromkeys(f"- {row['task']}: {note}" for note in row["notes"])
     if report["paper"] is not None:
         notes[f"- the paper reports {100 * report['paper']:.2f} % for AnyTouch, its epoch chosen on test"] = None
-    return "\n\n".join([markdown(head, rows), *(["\n".join(notes)] if notes else [])]) + "\n"
+    return "\n\n".join([markdown_table(head, rows), *(["\n".join(notes)] if notes else [])]) + "\n"
 
 
 def _share(value: float) -> str:

@@ -21,7 +21,8 @@ import numpy.typing as npt
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import Encoder, Join, Pooling, check_frames, load_encoder, random_encoder
+from anytouch_jax.encoder.embed import Join, Pooling
+from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, feature_cache, heads, logistic, splits, statistics, tasks
 from anytouch_jax.evaluate.array_probes import LabelledFeatures
@@ -124,7 +125,7 @@ def probe_label(
             assert found[0].outcome is not None and found[0].outcome.fitted is not None
             model, names = found[0].outcome.fitted
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
-            heads.save_head(save, heads.linear_head(model, names, fingerprint=source.encoder.mark, **about))
+            heads.save_head(save, heads.linear_head(model, names, fingerprint=source.encoder.fingerprint, **about))
             log(f"{save}: the linear head")
         results += found
         log(f"probed {source.name}")
@@ -372,7 +373,7 @@ def _run_plans(source: _Source, plans: Sequence[_Plan], settings: _Settings) -> 
         labelled = LabelledFeatures(x, plan.roles.y, plan.names, plan.roles.groups)
         notes, encoder = list(plan.notes), source.encoder
         if encoder is not None:
-            trained = encoder.config.model.sensors if encoder.seen is None else encoder.seen
+            trained = encoder.config.model.sensors if encoder.trained_sensors is None else encoder.trained_sensors
             unknown = sorted(set(plan.rows.sensors) - set(trained))
             notes += [f"universal tokens for {', '.join(unknown)}"] if unknown else []
         about = {"frames": plan.frames, "order": settings.order if plan.frames > 1 else "right"}

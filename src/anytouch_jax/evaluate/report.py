@@ -19,7 +19,8 @@ import numpy.typing as npt
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import Encoder, embed_rows, load_encoder, random_encoder, text_column
+from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, geometry, matching, probe_results, retrieval, statistics
 from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
@@ -192,7 +193,7 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
     shown = (first.config.data.background, second.config.data.background)
     if shown[0] != shown[1]:
         lineage += f" Stage 1 sees touches with background {shown[0]}, stage 2 with background {shown[1]}."
-    counted = statistics.markdown(("split", "frames", "touches", "objects", "sensors"), rows)
+    counted = statistics.markdown_table(("split", "frames", "touches", "objects", "sensors"), rows)
     return Section("Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else "")
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.contacts import COVARIATES, deepest_rows, numbers
 from anytouch_jax.evaluate.galleries import GALLERY, Galleries, Metric, draw_galleries, score, texts

@@ -18,7 +18,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.evaluate import matching, plots, probe_results, retrieval, statistics
 from anytouch_jax.evaluate.contacts import deepest_rows
 from anytouch_jax.evaluate.figures import reconstruction_panels, write_png
@@ -118,7 +118,7 @@ def losses_section(runs: Mapping[str, Path], folder: Path) -> Section:
             if len(values):
                 smooth = plots.smoothed(values)
                 rows.append((title, name.replace("_", " "), str(len(lines)), f"{smooth[0]:.3f}", f"{smooth[-1]:.3f}"))
-    table = statistics.markdown(("run", "term", "steps", "at the start", "at the end"), rows)
+    table = statistics.markdown_table(("run", "term", "steps", "at the start", "at the end"), rows)
     return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
 
 
@@ -167,7 +167,9 @@ def _pixels_table(scores: Mapping[str, Any]) -> str:
         (words, *(f"{scores[key]:.4f}" for key in (term, *(f"{kind} {term}" for kind in rivals))))
         for term, words in terms.items()
     ]
-    return statistics.markdown((f"error on {scores['clips']} clips in contact", "stage 1", *rivals.values()), rows)
+    return statistics.markdown_table(
+        (f"error on {scores['clips']} clips in contact", "stage 1", *rivals.values()), rows
+    )
 
 
 def _deepest_of_sensors(manifest: Manifest, rows: Array) -> Array:
@@ -195,7 +197,7 @@ def space_section(
         "best). Uniformity: lower is more even. Silhouette (-1 to 1): a low one by sensor and a high one by object is "
         "what alignment is for."
     )
-    return Section("The space of touches", text, statistics.markdown(head, rows), path)
+    return Section("The space of touches", text, statistics.markdown_table(head, rows), path)
 
 
 def retrieval_section(
@@ -227,8 +229,10 @@ def retrieval_section(
         ahead += [(grade, name, _change(*change)) for name, change in changes[grade].items()]
     head = ("data", "features", "top-1 matched", "top-5 matched", "top-1 matched, centred", "top-1 by chance",
             "top-1 by chance, centred", "gallery", "queries")  # fmt: skip
-    table = statistics.markdown(head, rows) + f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
-    table += statistics.markdown(("data", "features", f"{best} minus these"), ahead)
+    table = (
+        statistics.markdown_table(head, rows) + f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
+    )
+    table += statistics.markdown_table(("data", "features", f"{best} minus these"), ahead)
     path = folder / "figures" / "retrieval.png"
     if panels:
         plots.bars(path, panels, label="top-1")
@@ -252,7 +256,7 @@ def matching_section(found: Sequence[matching.MatchScore], notes: Sequence[str])
         "other. In brackets: 95 % over objects drawn anew."
     )
     listed = "\n".join(f"- {note}" for note in notes)
-    table = statistics.markdown(*matching.table(found)) if found else ""
+    table = statistics.markdown_table(*matching.table(found)) if found else ""
     return Section("Cross-sensor matching", text, table, notes=listed)
 
 

@@ -136,7 +136,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table of texts; bars and line breaks in a cell are made harmless."""
     lines = [head, ["---"] * len(head), *rows]
     clean = [[" ".join(str(cell).split()).replace("|", "\\|") for cell in line] for line in lines]

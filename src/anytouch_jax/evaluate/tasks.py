@@ -18,7 +18,7 @@ import pyarrow as pa
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest.manifest import KEYS, Manifest
 from anytouch_jax.data.prepare.contact import known_contact
-from anytouch_jax.encoder.encoder import Pooling, text_column
+from anytouch_jax.encoder.embed import Pooling, text_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import GradientRecipe
 

@@ -110,7 +110,7 @@ def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder,
         said.append(np.stack([one.act(frames) for frames in shown.frames]))
     np.testing.assert_array_equal(*said)
     assert again.stills == stills and again.sensor == "gelsight_mini" and again.encoder.subtracts
-    assert again.encoder.seen is None  # as before: nobody told
+    assert again.encoder.trained_sensors is None  # as before: nobody told
 
 
 def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_path):
@@ -118,7 +118,7 @@ def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_p
     touch = serve_unseen(encoder.params["touch"], encoder.config.model, seen, universal_drawn=True)  # as it is loaded
     encoder = replace(encoder, seen=seen, params={"touch": touch})
     recordings.save_policy(tmp_path, pouring_policy.learn_frozen(encoder, shown, FAST, stills=True))
-    assert recordings.load_policy(tmp_path).encoder.seen == seen
+    assert recordings.load_policy(tmp_path).encoder.trained_sensors == seen
 
 
 def test_a_policy_on_disk_knows_how_its_features_are_pooled_and_its_votes(shown, encoder, tmp_path):

@@ -214,9 +214,9 @@ def test_features_of_demonstrations_are_those_of_the_encoder(shown, encoder):
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
     assert z.shape == (7, 2, 24)
     clip = shown.frames[2:5, 1][None]
-    np.testing.assert_allclose(z[2, 1], encoder.embed(clip, "gelsight_mini", pooling="both")[0], atol=1e-5)
+    np.testing.assert_allclose(z[2, 1], encoder.encode_touch(clip, "gelsight_mini", pooling="both")[0], atol=1e-5)
     still = pouring_policy.features(encoder, shown, stills=True, pooling="mean", batch=8)
-    frame = encoder.embed(shown.frames[4, 1], "gelsight_mini", pooling="mean")
+    frame = encoder.encode_touch(shown.frames[4, 1], "gelsight_mini", pooling="mean")
     np.testing.assert_allclose(still[2, 1], frame[0], atol=1e-5)
     assert np.abs(z[..., 12:] - still).max() > 1e-4
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import text_column
+from anytouch_jax.encoder.embed import text_column
 from experiments.tables import cuts, plan, scores
 
 SENSORS = ("digit", "gelsight", plan.UNSEEN)

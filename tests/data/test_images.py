@@ -1,3 +1,4 @@
+import io
 import struct
 import zlib
 
@@ -7,9 +8,12 @@ import pytest
 from places import SHARED
 
 from anytouch_jax.data import images
+from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes
 from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)
+
+
 RGB = RNG.integers(0, 256, (9, 13, 3), np.uint8)
 
 
@@ -299,3 +303,98 @@ def test_frames_are_numbered_by_what_counts_them():
 )
 def test_series_that_share_numbers_are_apart(names, series):
     assert images.split_series(names) == (series or {"": names})
+
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
+
+
+def _mutants(data, rng):
+    data = bytearray(data)
+    for _ in range(int(rng.integers(1, 6))):
+        at = int(rng.integers(min(len(data), 64 if rng.random() < 0.5 else len(data))))
+        kind = rng.integers(4)
+        if kind == 0:
+            data[at] = int(rng.integers(256))
+        elif kind == 1:
+            data[at : at + 4] = b"\xff\xff\xff\x7f"
+        elif kind == 2:
+            del data[at : at + int(rng.integers(1, 40))]
+        else:
+            data[at:at] = bytes(rng.integers(0, 256, int(rng.integers(1, 40)), np.uint8))
+        if not data:
+            break
+    return bytes(data)
+
+
+def _npy():
+    stream = io.BytesIO()
+    np.save(stream, IMAGE)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".bmp", ".webp", ".npy"])
+def test_spoiled_bytes_are_a_picture_or_an_error(suffix, capfd):
+    whole = _npy() if suffix == ".npy" else _encoded(suffix)
+    rng, refused = np.random.default_rng(7), 0
+    for _ in range(150):
+        try:
+            got = decode_bytes(_mutants(whole, rng), f"x{suffix}")
+            assert got.dtype == np.uint8 and got.ndim == 3 and got.shape[2] == 3 and got.size <= 3 * MAX_PIXELS
+        except ImageError as error:
+            refused += 1
+            assert f"x{suffix}" in str(error) and "\n" not in str(error)
+    assert refused > 5
+
+
+def _chunk(kind, body, length=None):
+    length = len(body) if length is None else length
+    return length.to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda png: png[:33] + _chunk(b"tEXt", b"a\0b", 0x7FFFFFF0) + png[33:], "cut short"),
+        (lambda png: png[:33] + png[8:33] + png[33:], "corrupt"),
+        (lambda png: png[:8] + _chunk(b"tEXt", b"a\0b") + png[8:], "corrupt"),
+        (lambda png: png[:-12], "cut short"),
+        (lambda png: png[:-2], "cut short"),
+    ],
+)
+def test_a_png_is_walked_before_it_is_decoded(spoil, words, monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))  # 4 GB and 13 seconds for the first
+    with pytest.raises(ImageError, match=words):
+        decode_bytes(spoil(_encoded(".png")), "x.png")
+
+
+@pytest.mark.parametrize("first", [4, 60000])
+def test_a_tiff_that_declares_two_sizes_is_refused(tmp_path, first):
+    data = bytearray(_encoded(".tiff"))
+    order = "little" if data[:2] == b"II" else "big"
+    at = int.from_bytes(data[4:8], order)
+    count = int.from_bytes(data[at : at + 2], order)
+    body = data[at + 2 : at + 2 + 12 * count]
+    sizes = b"".join(
+        tag.to_bytes(2, order) + (4).to_bytes(2, order) + (1).to_bytes(4, order) + value.to_bytes(4, order)
+        for value in (first, 60004 - first)
+        for tag in (256, 257)
+    )
+    data[4:8] = len(data).to_bytes(4, order)
+    (tmp_path / "two.tiff").write_bytes(bytes(data) + (count + 4).to_bytes(2, order) + sizes + body + bytes(4))
+    with pytest.raises(ImageError, match="a tag twice"):
+        decode(tmp_path / "two.tiff")
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "words"),
+    [
+        ((9999999, 9999999, 3), "|u1", "cut short"), ((4, 4, 3), "|O", "Python objects"), ((0, 4, 3), "|u1", "shape"),
+        ((4, 4, 3), "<i8", "cut short"), ((2**70,), "|u1", "cut short"), ((4, 4, 3), "|V1", "type"),
+        ((-4, -4, 3), "|u1", "cannot be read"), ((4, 4, 3), "<M8[s]", "cut short"),
+    ],
+)  # fmt: skip
+def test_an_array_cannot_declare_more_than_it_has(shape, kind, words):
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
+    with pytest.raises(ImageError, match=words):
+        decode_bytes(stream.getvalue() + bytes(48), "x.npy")

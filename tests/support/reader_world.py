@@ -23,6 +23,11 @@ def fill(root: Path, files: Iterable[str]) -> None:
         path.write_bytes(BYTES[path.suffix])
 
 
+def fill_ycb(root: Path, objects: Iterable[str] = ("mug",), frames: int = 4) -> None:
+    """Write YCB-Slide with one recording of each object."""
+    fill(root, [f"real/{name}/dataset_0/frames/frame_{i:07d}.jpg" for name in objects for i in range(frames)])
+
+
 class Table:
     """A written manifest, read back: columns as lists, rows by path."""
 

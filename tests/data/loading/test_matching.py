@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
@@ -107,3 +109,36 @@ def test_laws_hold_on_random_tables(seed):
             p, n = pool[list(elsewhere.draw(int(anchor), np.random.default_rng(key)))]
             assert keys.touch[n] != keys.touch[a]
             assert keys.object[n] != keys.object[a] or keys.object[a] == -1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_negative_of_the_same_sensor_on_random_tables(seed):
+    rng = np.random.default_rng(seed)
+    columns = {name: rng.integers(-1, high, 50) for name, high in zip(MatchKeys._fields, (9, 4, 4, 4, 2), strict=True)}
+    columns["sensor"] = np.abs(columns["sensor"])
+    keys = _keys(**columns)
+    matches = Matches(np.arange(50), keys, same_sensor=True)
+    places = {s: set(keys.touch[keys.sensor == s].tolist()) - {-1} for s in range(4)}
+    brute = []
+    for a in range(50):
+        same = [r for r in range(50) if keys.touch[r] == keys.touch[a] >= 0]
+        others = [r for r in same if keys.sensor[r] != keys.sensor[a]]
+        fit = [r for r in others if len(places[keys.sensor[r]]) > 1]
+        units = {keys.unit[r] for r in same} - {-1}
+        lock = not others and len(units) > 1 and keys.unit[a] >= 0 and len(places[keys.sensor[a]]) > 1
+        brute += [a] if fit or lock else []
+    assert matches.anchors.tolist() == brute and len(brute) > 5
+    for anchor in brute:
+        for key in range(20):
+            p, n = matches.draw(anchor, np.random.default_rng(key))
+            assert keys.sensor[n] == keys.sensor[p] and keys.touch[n] != keys.touch[anchor] == keys.touch[p]
+
+
+def test_a_sensor_that_felt_one_place_only_is_no_partner():
+    keys = _keys(touch=[0, 0, 0, 1, 2], sensor=[0, 1, 2, 0, 1])
+    assert Matches(np.arange(5), keys).anchors.tolist() == [0, 1, 2]
+    matches = Matches(np.arange(5), keys, same_sensor=True)
+    assert matches.anchors.tolist() == [0, 1, 2]
+    assert {matches.draw(0, np.random.default_rng(k)) for k in range(50)} == {(1, 4)}  # never 2: sensor 2 felt 0 only
+    lock = _keys(touch=[0, 0, 1], sensor=[0, 1, 2])
+    assert Matches(np.arange(3), lock).anchors.size and not Matches(np.arange(3), lock, same_sensor=True).anchors.size

@@ -1,9 +1,13 @@
+from __future__ import annotations
+
+from collections import Counter
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from anytouch_jax.data.loading import sampling as s
+from anytouch_jax.data.loading.sampling import EpochSampler, Shard
 
 
 def test_uniform_is_a_function_of_seed_tag_and_step():
@@ -111,3 +115,35 @@ def test_filling_moves_at_most_half_of_a_stratum():
     shares = [Fraction(0), Fraction(1, 2), Fraction(1, 2), Fraction(1)]
     assert sum(s._fill(shares, 1, 2)) == 2
     assert s._fill(shares, 2, 2)[s.TEXT] >= Fraction(1, 4)
+
+
+@pytest.mark.parametrize("weights", [[2, 2, 2, 1, 1], [3, 0.5, 0.5, 0.5, 0.5], [1, 2.5, 2.5, 1, 1], [0.2] * 5])
+def test_an_epoch_draws_each_thing_by_its_weight(weights):
+    weights = np.array(weights, float)
+    stream = EpochSampler(5, 0, 9, weights)
+    epochs = 400
+    drawn = stream.take(0, epochs * stream.size)
+    for e in range(20):
+        counts = Counter(thing for thing, _ in drawn[e * stream.size : (e + 1) * stream.size])
+        for weight in np.unique(weights):
+            of = [counts[t] for t in np.flatnonzero(weights == weight)]
+            assert sum(of) == max(1, round(weight * len(of))) and max(of) - min(of) <= 1
+    many = Counter(thing for thing, _ in drawn)
+    for weight in np.unique(weights):
+        ids = np.flatnonzero(weights == weight)
+        share = max(1, round(weight * len(ids))) / len(ids)
+        assert all(abs(many[t] / epochs - share) < 0.15 for t in ids)
+    assert len(set(drawn)) == len(drawn)  # each time with another augmentation
+    assert EpochSampler(5, 0, 9, weights).take(377, 20) == drawn[377:397]  # no need to walk there
+    assert stream.take(0, stream.size) != stream.take(stream.size, stream.size)
+
+
+def test_weights_of_one_change_nothing():
+    assert EpochSampler(7, 3, 9, np.ones(7)).take(5, 40) == EpochSampler(7, 3, 9).take(5, 40)
+
+
+def test_slots_fall_into_the_parts_in_order():
+    places = [Shard(i, 3).place(slot, 9) for slot in range(9) for i in range(3)]
+    assert [place for place in places if place is not None] == [0, 1, 2] * 3
+    assert [i for slot in range(9) for i in range(3) if Shard(i, 3).place(slot, 9) is not None] == sorted([0, 1, 2] * 3)
+    assert Shard(1, 3).place(None, 9) is None and Shard(1, 3).cut(np.arange(9)).tolist() == [3, 4, 5]

@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches, run_jobs
+from anytouch_jax.data.loading.threads import BatchJobs, bounded_map, prefetch_batches, run_jobs
 
 
 def _ours():
@@ -98,3 +98,31 @@ def test_an_error_in_the_plan_ends_the_threads():
     with pytest.raises(ValueError, match="no plan"):
         list(prefetch_batches(plan, range(9), 2, 2))
     assert not _ours()
+
+
+@pytest.mark.parametrize("threads", [0, 1, 4])
+def test_a_bounded_map_keeps_order_and_stays_close(threads):
+    taken = []
+
+    def items():
+        for i in range(50):
+            taken.append(i)
+            yield i
+
+    done = 0
+    for i, result in enumerate(bounded_map(lambda x: x * x, items(), threads, 6)):
+        assert result == i * i and len(taken) <= i + 6 + 1
+        done += 1
+    assert done == 50
+
+
+def test_a_bounded_map_raises_the_first_error_and_ends_its_threads():
+    before = threading.active_count()
+    results = bounded_map(lambda x: 1 // (x - 3), range(100), 3)
+    assert [next(results) for _ in range(3)] == [-1, -1, -1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+    early = bounded_map(str, range(100), 3)
+    next(early)
+    early.close()
+    assert threading.active_count() == before

@@ -2,13 +2,19 @@ import os
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet
 import pytest
 
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import manifest as m
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import attach_text, replace_column
+from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.errors import UserError
 
 HEAD = "path,sensor,sequence,frame_index,split"
+
+
 GOOD = f"{HEAD},stride,touch,commercial,label.slip,label.name,other\n" + (
     'a.png,digit,s,0,train,2,,1,0,x,7\nb.png,digit,s,2,train,2,t,0,1,"y, z",\nc.png,gelslim,r,5,test,,t,,,,q\n'
 )
@@ -306,3 +312,73 @@ def test_labels_of_a_csv_keep_what_they_say(tmp_path):
     both = m.read([tmp_path / "again.csv", tmp_path / "other.parquet"])
     assert both.column("label.object").to_pylist() == ["001", "007", "100"] * 2
     assert both.column("label.stable").to_pylist() == [True, False, None] * 2
+
+
+def _clean(count=6, **extra):
+    return [{"sequence": f"s{i // 3}", "frame_index": i % 3, "dataset": "d", **extra} for i in range(count)]
+
+
+def test_captions_are_attached_by_a_table(make, tmp_path):
+    loose = make(_clean(text=None))
+    csv = '\ufeffsequence,text\ns0,"soft, ""very""\nand round"\nq,unused\ns1,  \n'
+    (tmp_path / "t.csv").write_text(csv, encoding="utf-8")
+    got, notes = attach_text(loose, tmp_path / "t.csv")
+    assert got.column("text").to_pylist() == ['soft, "very" and round'] * 3 + [None] * 3
+    assert notes == ["3 rows got a caption by 'sequence'", "1 of 2 keys of t.csv are not in the manifest"]
+    table = pa.table({"frame_index": [0, 1], "words": ["new", "one"], "n": [1, 2]})
+    pa.parquet.write_table(table, tmp_path / "t.parquet")
+    more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
+    assert more.column("text").to_pylist() == ['soft, "very" and round'] * 3 + ["new", "one", None]
+    assert notes == ["2 rows got a caption by 'frame_index'", "2 rows kept the caption they had"]
+    nested = replace_column(got, "extra", pa.array([[0]] * len(got)))
+    pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
+    with pytest.raises(UserError, match="column 'extra' of the manifest is no key: it is list"):
+        attach_text(nested, tmp_path / "e.parquet")
+    over, _ = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
+    assert over.column("text").to_pylist() == ["new", "one", 'soft, "very" and round', "new", "one", None]
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("sequence,text\ns0,a\ns0,b\n", {}, "row 1: sequence 's0' has another caption"),
+        ("sequence,caption\ns0,a\n", {}, "no column 'text'; it has sequence, caption"),
+        ("sequence,touch,text\ns0,x,a\n", {}, "name the key column"),
+        ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
+        ("sequence,text\ns0,a\n", {"key": "tuoch"}, "no column 'tuoch'"),
+        ("grip,text\ns0,a\n", {}, "has no column 'grip'"),
+        ('sequence,text\n"s0,a\n', {}, "cannot be read as a csv|in the manifest"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(UserError, match=words):
+        attach_text(make(_clean()), tmp_path / "t.csv", **options)
+    with pytest.raises(UserError, match="there is no table"):
+        attach_text(make(_clean()), tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"split": None}, "lacks the column 'split'"),
+        ({"frame_index": ["one", "two"]}, "'frame_index' must be a whole"),
+        ({"frame_index": [1.5, 2.0]}, "row 0: column 'frame_index'"), ({"sensor": [1, 2]}, "'sensor' must be text"),
+        ({"path": [["a"], ["b"]]}, "'path' must be text"), ({"commercial": [2, 0]}, "'commercial' must be a 0 or 1"),
+        ({"path": ["a", None]}, "row 1: column 'path' is empty"),
+        ({"split": [b"train", b"test"]}, "'split' must be text"),
+    ],
+)  # fmt: skip
+def test_a_parquet_with_a_missing_or_mistyped_column_is_named(tmp_path, change, words):
+    good = {
+        "path": ["a", "b"],
+        "sensor": ["x"] * 2,
+        "sequence": ["s"] * 2,
+        "frame_index": [0, 1],
+        "split": ["train"] * 2,
+    }
+    columns = {name: values for name, values in (good | change).items() if values is not None}
+    pa.parquet.write_table(pa.table(columns), tmp_path / "m.parquet")
+    with pytest.raises(manifests.ManifestError, match=words) as error:
+        verify(manifests.read(tmp_path / "m.parquet"))
+    assert "m.parquet" in str(error.value) and "\n" not in str(error.value)

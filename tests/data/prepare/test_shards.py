@@ -1,7 +1,6 @@
 import hashlib
 import json
 import os
-import threading
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -15,7 +14,6 @@ import pytest
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError
-from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import files as packed
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import select_rows
@@ -378,37 +376,6 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
     monkeypatch.setattr(packed, "MAX_BYTES", 10)
     with pytest.raises(ImageError, match="11 bytes, more than the limit of 10"):
         decode(tmp_path / "big.png")
-
-
-# The map ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("threads", [0, 1, 4])
-def test_a_bounded_map_keeps_order_and_stays_close(threads):
-    taken = []
-
-    def items():
-        for i in range(50):
-            taken.append(i)
-            yield i
-
-    done = 0
-    for i, result in enumerate(bounded_map(lambda x: x * x, items(), threads, 6)):
-        assert result == i * i and len(taken) <= i + 6 + 1
-        done += 1
-    assert done == 50
-
-
-def test_a_bounded_map_raises_the_first_error_and_ends_its_threads():
-    before = threading.active_count()
-    results = bounded_map(lambda x: 1 // (x - 3), range(100), 3)
-    assert [next(results) for _ in range(3)] == [-1, -1, -1]
-    with pytest.raises(ZeroDivisionError):
-        next(results)
-    early = bounded_map(str, range(100), 3)
-    next(early)
-    early.close()
-    assert threading.active_count() == before
 
 
 def test_errors_are_the_users():

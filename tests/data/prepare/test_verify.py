@@ -1,18 +1,14 @@
-import io
 import json
 import os
 import shutil
-import zlib
 
 import cv2
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet
 import pytest
 
-from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes
+from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.manifest import attach_text, replace_column, select_rows
+from anytouch_jax.data.manifest.manifest import replace_column, select_rows
 from anytouch_jax.data.prepare.licences import NO, UNKNOWN, YES, allows, commercial_only, commercial_use, licences
 from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.shards import pack
@@ -423,144 +419,6 @@ def test_commercial_rows_are_those_that_certainly_are(make):
         commercial_only(select_rows(loose, np.array([2, 3, 5, 7])))
 
 
-# Captions by table ------------------------------------------------------------------------------------------------
-
-
-def test_captions_are_attached_by_a_table(make, tmp_path):
-    loose = make(_clean(text=None))
-    csv = '\ufeffsequence,text\ns0,"soft, ""very""\nand round"\nq,unused\ns1,  \n'
-    (tmp_path / "t.csv").write_text(csv, encoding="utf-8")
-    got, notes = attach_text(loose, tmp_path / "t.csv")
-    assert got.column("text").to_pylist() == ['soft, "very" and round'] * 3 + [None] * 3
-    assert notes == ["3 rows got a caption by 'sequence'", "1 of 2 keys of t.csv are not in the manifest"]
-    table = pa.table({"frame_index": [0, 1], "words": ["new", "one"], "n": [1, 2]})
-    pa.parquet.write_table(table, tmp_path / "t.parquet")
-    more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
-    assert more.column("text").to_pylist() == ['soft, "very" and round'] * 3 + ["new", "one", None]
-    assert notes == ["2 rows got a caption by 'frame_index'", "2 rows kept the caption they had"]
-    nested = replace_column(got, "extra", pa.array([[0]] * len(got)))
-    pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
-    with pytest.raises(UserError, match="column 'extra' of the manifest is no key: it is list"):
-        attach_text(nested, tmp_path / "e.parquet")
-    over, _ = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
-    assert over.column("text").to_pylist() == ["new", "one", 'soft, "very" and round', "new", "one", None]
-
-
-@pytest.mark.parametrize(
-    ("text", "options", "words"),
-    [
-        ("sequence,text\ns0,a\ns0,b\n", {}, "row 1: sequence 's0' has another caption"),
-        ("sequence,caption\ns0,a\n", {}, "no column 'text'; it has sequence, caption"),
-        ("sequence,touch,text\ns0,x,a\n", {}, "name the key column"),
-        ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
-        ("sequence,text\ns0,a\n", {"key": "tuoch"}, "no column 'tuoch'"),
-        ("grip,text\ns0,a\n", {}, "has no column 'grip'"),
-        ('sequence,text\n"s0,a\n', {}, "cannot be read as a csv|in the manifest"),
-    ],
-)
-def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):
-    (tmp_path / "t.csv").write_text(text)
-    with pytest.raises(UserError, match=words):
-        attach_text(make(_clean()), tmp_path / "t.csv", **options)
-    with pytest.raises(UserError, match="there is no table"):
-        attach_text(make(_clean()), tmp_path / "none.csv")
-
-
-# Fuzz -------------------------------------------------------------------------------------------------------------
-
-
-def _mutants(data, rng):
-    data = bytearray(data)
-    for _ in range(int(rng.integers(1, 6))):
-        at = int(rng.integers(min(len(data), 64 if rng.random() < 0.5 else len(data))))
-        kind = rng.integers(4)
-        if kind == 0:
-            data[at] = int(rng.integers(256))
-        elif kind == 1:
-            data[at : at + 4] = b"\xff\xff\xff\x7f"
-        elif kind == 2:
-            del data[at : at + int(rng.integers(1, 40))]
-        else:
-            data[at:at] = bytes(rng.integers(0, 256, int(rng.integers(1, 40)), np.uint8))
-        if not data:
-            break
-    return bytes(data)
-
-
-def _npy():
-    stream = io.BytesIO()
-    np.save(stream, IMAGE)
-    return stream.getvalue()
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".bmp", ".webp", ".npy"])
-def test_spoiled_bytes_are_a_picture_or_an_error(suffix, capfd):
-    whole = _npy() if suffix == ".npy" else _encoded(suffix)
-    rng, refused = np.random.default_rng(7), 0
-    for _ in range(150):
-        try:
-            got = decode_bytes(_mutants(whole, rng), f"x{suffix}")
-            assert got.dtype == np.uint8 and got.ndim == 3 and got.shape[2] == 3 and got.size <= 3 * MAX_PIXELS
-        except ImageError as error:
-            refused += 1
-            assert f"x{suffix}" in str(error) and "\n" not in str(error)
-    assert refused > 5
-
-
-def _chunk(kind, body, length=None):
-    length = len(body) if length is None else length
-    return length.to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda png: png[:33] + _chunk(b"tEXt", b"a\0b", 0x7FFFFFF0) + png[33:], "cut short"),
-        (lambda png: png[:33] + png[8:33] + png[33:], "corrupt"),
-        (lambda png: png[:8] + _chunk(b"tEXt", b"a\0b") + png[8:], "corrupt"),
-        (lambda png: png[:-12], "cut short"),
-        (lambda png: png[:-2], "cut short"),
-    ],
-)
-def test_a_png_is_walked_before_it_is_decoded(spoil, words, monkeypatch):
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))  # 4 GB and 13 seconds for the first
-    with pytest.raises(ImageError, match=words):
-        decode_bytes(spoil(_encoded(".png")), "x.png")
-
-
-@pytest.mark.parametrize("first", [4, 60000])
-def test_a_tiff_that_declares_two_sizes_is_refused(tmp_path, first):
-    data = bytearray(_encoded(".tiff"))
-    order = "little" if data[:2] == b"II" else "big"
-    at = int.from_bytes(data[4:8], order)
-    count = int.from_bytes(data[at : at + 2], order)
-    body = data[at + 2 : at + 2 + 12 * count]
-    sizes = b"".join(
-        tag.to_bytes(2, order) + (4).to_bytes(2, order) + (1).to_bytes(4, order) + value.to_bytes(4, order)
-        for value in (first, 60004 - first)
-        for tag in (256, 257)
-    )
-    data[4:8] = len(data).to_bytes(4, order)
-    (tmp_path / "two.tiff").write_bytes(bytes(data) + (count + 4).to_bytes(2, order) + sizes + body + bytes(4))
-    with pytest.raises(ImageError, match="a tag twice"):
-        decode(tmp_path / "two.tiff")
-
-
-@pytest.mark.parametrize(
-    ("shape", "kind", "words"),
-    [
-        ((9999999, 9999999, 3), "|u1", "cut short"), ((4, 4, 3), "|O", "Python objects"), ((0, 4, 3), "|u1", "shape"),
-        ((4, 4, 3), "<i8", "cut short"), ((2**70,), "|u1", "cut short"), ((4, 4, 3), "|V1", "type"),
-        ((-4, -4, 3), "|u1", "cannot be read"), ((4, 4, 3), "<M8[s]", "cut short"),
-    ],
-)  # fmt: skip
-def test_an_array_cannot_declare_more_than_it_has(shape, kind, words):
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
-    with pytest.raises(ImageError, match=words):
-        decode_bytes(stream.getvalue() + bytes(48), "x.npy")
-
-
 # Manifests that come from elsewhere -------------------------------------------------------------------------------
 
 
@@ -573,32 +431,6 @@ def test_a_csv_with_bom_quotes_and_strange_names_is_verified(make, tmp_path):
     assert got.column("path").to_pylist() == names and verify(got).findings == ()
     again = manifests.read(pack(got, tmp_path / "out"))
     assert verify(again).findings == ()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"split": None}, "lacks the column 'split'"),
-        ({"frame_index": ["one", "two"]}, "'frame_index' must be a whole"),
-        ({"frame_index": [1.5, 2.0]}, "row 0: column 'frame_index'"), ({"sensor": [1, 2]}, "'sensor' must be text"),
-        ({"path": [["a"], ["b"]]}, "'path' must be text"), ({"commercial": [2, 0]}, "'commercial' must be a 0 or 1"),
-        ({"path": ["a", None]}, "row 1: column 'path' is empty"),
-        ({"split": [b"train", b"test"]}, "'split' must be text"),
-    ],
-)  # fmt: skip
-def test_a_parquet_with_a_missing_or_mistyped_column_is_named(tmp_path, change, words):
-    good = {
-        "path": ["a", "b"],
-        "sensor": ["x"] * 2,
-        "sequence": ["s"] * 2,
-        "frame_index": [0, 1],
-        "split": ["train"] * 2,
-    }
-    columns = {name: values for name, values in (good | change).items() if values is not None}
-    pa.parquet.write_table(pa.table(columns), tmp_path / "m.parquet")
-    with pytest.raises(manifests.ManifestError, match=words) as error:
-        verify(manifests.read(tmp_path / "m.parquet"))
-    assert "m.parquet" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_backgrounds_that_changed_places_too_are_no_witness(make, tmp_path):

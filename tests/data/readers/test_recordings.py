@@ -1,173 +1,236 @@
-"""VisGel, Cloth, ObjectFolder Real, YCB-Slide and Octopi: folders of frames, with or without the authors' lists."""
+"""Recordings of one's own: what counts as a recording, as its frames, and as what lies beside it."""
 
-import json
+from __future__ import annotations
 
+import cv2
+import numpy as np
 import pytest
 from reader_world import fill
 
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import replace_column
+from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.data.readers.recordings import ranked_split
 from anytouch_jax.errors import UserError
 
 
-def _visgel(root, names=("a/rec_0", "a/rec_1", "größe 3/rec 2"), frames=5, place="images"):
-    for kind in ("touch", "vision"):
-        fill(root, [f"{place}/{kind}/{name}/frame{i:04d}.jpg" for name in names for i in range(frames)])
+def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
+    fill(tmp_path, [f"mug/{take}/{n}.png" for take in ("one", "two") for n in range(12)])
+    fill(tmp_path, [f"ball/{n}.jpg" for n in (3, 4, 6)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
+    assert set(table["sensor"]) == {"digit"} and set(table["dataset"]) == {tmp_path.name}
+    assert [row["frame_index"] for path, row in table.rows.items() if "mug/one" in path] == list(range(12))
+    of_ball = [clip for clip in table.clips(2) if "ball" in clip[0]]
+    assert of_ball == [["ball/3.jpg", "ball/4.jpg"]]  # 5 is not there: no clip reaches over it
 
 
-def test_visgel_pairs_photographs_and_takes_frame_0_as_background(tmp_path, read):
-    _visgel(tmp_path)
-    table = read("visgel")
-    assert len(table.rows) == 15
-    row = table.rows["images/touch/größe 3/rec 2/frame0002.jpg"]
-    assert row["image_path"] == "images/vision/größe 3/rec 2/frame0002.jpg"
-    assert row["background_path"] == "images/touch/größe 3/rec 2/frame0000.jpg"
-    assert (row["sensor"], row["frame_index"]) == ("gelsight", 2)
-    assert len(table.clips(3)) == 9
-    assert table.clips(4)[0] == [f"images/touch/a/rec_0/frame{i:04d}.jpg" for i in range(4)]  # all four with folder
+def test_frames_whose_names_do_not_count_are_counted(tmp_path, read):
+    fill(tmp_path, [f"a/{stamp}.png" for stamp in (1700000033, 1700000066, 1700000100)])
+    fill(tmp_path, ["b/first.png", "b/second.png", "c/1.png", "c/1.jpg"])
+    table = read("recordings", sensor="my_gel", val=0, test=0)
+    of = {name: [row["frame_index"] for row in table.rows.values() if row["sequence"] == name] for name in "abc"}
+    assert of == {"a": [0, 1, 2], "b": [0, 1], "c": [0, 1]}
 
 
-def test_visgel_contact_list_and_missing_files(tmp_path, read):
-    _visgel(tmp_path)
-    (tmp_path / "images/vision/a/rec_0/frame0003.jpg").unlink()
-    (tmp_path / "images/touch/a/rec_1/frame0000.jpg").unlink()
-    lines = ["a/rec_0/frame0003.jpg", "images/touch/a/rec_0/frame0004.jpg", "a/rec_0/frame0099.jpg"]
-    (tmp_path / "contact_visgel.csv").write_text("\n".join(lines))
-    table = read("visgel", val=0, test=0)
-    assert table.report.splits == {"train": 2, "unused": 12}
-    assert [row["frame_index"] for row in table.rows.values() if row["label.contact"]] == [3, 4]
-    assert table.rows["images/touch/a/rec_0/frame0003.jpg"]["image_path"] is None
-    assert table.rows["images/touch/a/rec_1/frame0001.jpg"]["background_path"] is None  # frame 0 is not there
-    assert table.reasons["listed contact frame that is not on disk"] == 1
-    assert table.reasons["photograph missing (kept without)"] == 1
-
-
-def test_visgel_unseen_objects_are_test(tmp_path, read):
-    _visgel(tmp_path, ("a/rec_0",), place="data_seen")
-    _visgel(tmp_path, ("a/rec_0",), place="data_unseen")
-    table = read("visgel", val=0, test=0)
-    assert table.report.splits == {"train": 5, "test": 5}
-    assert len(set(table["sequence"])) == 2
-
-
-def test_cloth_has_its_properties(tmp_path, read):
-    base = "Data_ICRA18/Data"
-    fill(tmp_path, [f"{base}/{cloth}/t{k}/gelsight_frame/{i:04d}.png" for cloth in (11, 12) for k in (0, 1)
-                    for i in range(4)])  # fmt: skip
-    fill(tmp_path, [f"{base}/13/t0/gsframes/frame{i:06d}.jpg" for i in range(1, 4)])
-    (tmp_path / base / "13/t1").mkdir()
-    (tmp_path / base / "13/t1/GelSight_video.mp4").write_bytes(b"x")
-    (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(json.dumps({"11": list(range(11)), "12": [0] * 11}))
-    table = read("cloth")
-    assert len(table.rows) == 19
-    row = table.rows[f"{base}/11/t1/gelsight_frame/0003.png"]
-    assert (row["object"], row["label.fuzziness"], row["label.textile_type"]) == ("11", 0, 10)
-    assert table.rows[f"{base}/13/t0/gsframes/frame000002.jpg"]["label.textile_type"] is None
-    assert table.reasons["cloth without properties (kept without labels)"] == 1
-    assert table.reasons["video that is not unpacked (expected gelsight_frame/0000.png)"] == 1
-    for wrong in ([1, 2], [None] * 11, [1.5] * 11, "eleven"):
-        (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(json.dumps({"11": wrong}))
-        with pytest.raises(UserError, match="cloth '11' must have 11 whole numbers"):
-            read("cloth")
-
-
-@pytest.mark.parametrize("layout", ["tactile/{}/tactile_data/{}/0/gelsight", "{}/tactile_data/{}/0/gelsight"])
-def test_objectfolder_real_in_both_layouts(tmp_path, read, layout):
-    fill(
-        tmp_path, [layout.format(obj, trial) + f"/{i}.png" for obj in (1, 10, 2) for trial in (0, 1) for i in range(11)]
+def test_what_lies_beside_or_above_belongs_to_a_recording(tmp_path, read):
+    fill(tmp_path, ["background.png", "mug/photo.jpg", "mug/one/0.png", "mug/one/1.png", "mug/two/0.png"])
+    fill(tmp_path, ["mug/two/Background.png", "ball/0.png"])
+    (tmp_path / "mug" / "caption.txt").write_text("smooth,\n cold\n", encoding="utf-8")
+    (tmp_path / "mug" / "one" / "film.mp4").write_bytes(b"")
+    table = read("recordings", sensor="digit", val=0, test=0)
+    one, two, ball = (table.rows[path] for path in ("mug/one/1.png", "mug/two/0.png", "ball/0.png"))
+    assert len(table.rows) == 4
+    assert (one["background_path"], one["image_path"], one["text"]) == (
+        "background.png",
+        "mug/photo.jpg",
+        "smooth, cold",
     )
-    fill(tmp_path, [layout.format(1, 0).replace("gelsight", "camera") + "/0.png"])
-    (tmp_path / "objectfolder_real_metadata.csv").write_text("Index,Name,Material\n1,Soup_Spoon,Ceramic\n")
-    table = read("objectfolder_real")
-    assert len(table.rows) == 66
-    numbers = [row["frame_index"] for row in table.rows.values() if row["sequence"].endswith("1/tactile_data/0/0")]
-    assert numbers == list(range(11))  # 10.png comes after 9.png, not after 1.png
-    row = table.rows[layout.format(1, 1) + "/3.png"]
-    assert (row["object"], row["label.material"], row["label.object"]) == ("1", "Ceramic", "Soup_Spoon")
-    seen = [row["image_path"] for row in table.rows.values() if row.get("image_path")]
-    assert seen == [layout.format(1, 0).replace("gelsight", "camera") + "/0.png"]
-    by_object = {row["object"]: row["split"] for row in table.rows.values()}
-    assert all(row["split"] == by_object[row["object"]] for row in table.rows.values())
+    assert (two["background_path"], two["image_path"]) == ("mug/two/Background.png", "mug/photo.jpg")
+    assert (ball["background_path"], ball["image_path"], ball["text"]) == ("background.png", None, None)
+    assert table.reasons == {"video (--export writes its frames as pictures)": 1}
 
 
-def test_objectfolder_real_photographs_come_from_the_authors_list(tmp_path, read):
-    fill(tmp_path, ["tactile/1/0/gelsight/0.png", "tactile/1/0/gelsight/1.png", "tactile/1/0/cam/1.png"])
-    (tmp_path / "contact_text_obj.csv").write_text("1/0/gelsight/1.png,1/0/cam/1.png,17\n1/0/gelsight/7.png,x.png,3\n")
-    table = read("objectfolder_real", val=0, test=0)
-    row = table.rows["tactile/1/0/gelsight/1.png"]
-    assert (row["image_path"], row["caption_id"], row["label.contact"]) == ("tactile/1/0/cam/1.png", "obj_17", 1)
-    assert table.rows["tactile/1/0/gelsight/0.png"]["split"] == "unused"
-    assert table.reasons["listed contact frame that is not on disk"] == 1
+def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
+    fill(tmp_path / "mine", ["0.png", "1.png"])
+    table = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0)
+    assert list(table.rows) == ["0.png", "1.png"] and set(table["sequence"]) == {"."}
+    assert "too few objects or recordings for split test" in " ".join(
+        read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0.001).report.notes
+    )
 
 
-def test_ycb_slide_clips_take_every_third_frame(tmp_path, read):
-    fill(tmp_path, [f"real/035_power_drill/dataset_{k}/frames/frame_{i:07d}.jpg" for k in (0, 4) for i in range(10)])
-    fill(tmp_path, ["real/035_power_drill/dataset_0/webcam_frames/frame_0000000.jpg"])
-    table = read("ycb_slide")
-    assert set(table["stride"]) == {3}
-    clips = [[table.rows[path]["frame_index"] for path in clip] for clip in table.clips(3)]
-    assert clips == [[i - 6, i - 3, i] for i in range(6, 10)] * 2
-    assert len(set(table["split"])) == 1  # one object
-    assert not any("webcam" in path for path in table.rows)
-
-
-def test_octopi_follows_its_own_sample_files(tmp_path, read):
-    frames = (0, 1, 2, 7, 8)
-    samples = ("physiclear_apple_0", "physiclear_apple_1", "physiclear_tea_towel_0", "physiclear_rest_0")
-    fill(tmp_path, [f"processed/{name}/{i:010d}.jpg" for name in samples for i in frames])
-    for split, name in zip(("train", "val", "test"), samples, strict=False):
-        (tmp_path / f"processed/{split}_samples.json").write_text(json.dumps({"x": [f"C:\\out/{name}"]}))
-    table = read("octopi")
-    assert table.report.splits == {"train": 5, "val": 5, "test": 5, "unused": 5}
-    row = table.rows[f"processed/{samples[2]}/{7:010d}.jpg"]
-    assert (row["split"], row["object"], row["sensor"]) == ("test", "tea_towel", "gelsight_mini")
-    assert len(table.clips(3)) == 4  # frames with gaps: only 0, 1, 2 of each sample
-    (tmp_path / "processed/val_samples.json").write_text(json.dumps({"x": [samples[0]]}))
-    with pytest.raises(UserError, match=f"the sample {samples[0]} is also in train_samples.json"):
-        read("octopi")
-
-
-def test_octopi_without_sample_files_splits_by_object(tmp_path, read):
-    fill(tmp_path, [f"physiclear_o{k}_{n}/{0:010d}.jpg" for k in range(30) for n in (0, 1)])
-    table = read("octopi", val=0.3, test=0.3)
-    of = {}
+def test_an_object_is_never_on_two_sides(tmp_path, read):
+    fill(tmp_path, [f"thing {n}/take {k}/0.png" for n in range(30) for k in range(3)])
+    table = read("recordings", sensor="digit", val=0.3, test=0.3)
+    sides = {}
     for row in table.rows.values():
-        of.setdefault(row["object"], set()).add(row["split"])
-    assert all(len(splits) == 1 for splits in of.values())
-    assert set(table["split"]) == {"train", "val", "test"}
+        sides.setdefault(row["object"], set()).add(row["split"])
+    assert all(len(one) == 1 for one in sides.values()) and set.union(*sides.values()) == {"train", "val", "test"}
+
+
+def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, read):
+    splits = []
+    for name in ("mine", "renamed"):
+        fill(tmp_path / name, [f"thing {n}/{take}/0.png" for n in range(3) for take in (0, 1)])
+        table = read("recordings", tmp_path / name, sensor="digit")
+        splits.append({row["object"]: row["split"] for row in table.rows.values()})
+    assert splits[0] == splits[1] and sorted(splits[0].values()) == ["test", "train", "val"]
+    assert any("--split-by recording" in note for note in table.report.notes)
+
+
+def test_ranked_splits_have_their_shares_and_hardly_move():
+    names = [f"o{n}" for n in range(40)]
+    before = ranked_split(names, IndexOptions(0.2, 0.3))
+    assert [list(before.values()).count(split) for split in ("val", "train", "test")] == [8, 20, 12]
+    for new in (f"new {n}" for n in range(20)):
+        after = ranked_split([*names, new], IndexOptions(0.2, 0.3))
+        assert sum(after[name] != before[name] for name in names) <= 2
+    few = {n: sorted(ranked_split(names[:n], IndexOptions(0.05, 0.05)).values()) for n in (1, 2, 3)}
+    assert few == {1: ["train"], 2: ["test", "train"], 3: ["test", "train", "val"]}
+    assert sorted(ranked_split(names[:3], IndexOptions(0.05, 0.9)).values()) == ["test", "train", "val"]
+    assert set(ranked_split(names, IndexOptions(0, 1)).values()) == {"test"}
+    assert set(ranked_split(names, IndexOptions(0, 0)).values()) == {"train"}
+
+
+def test_by_recording_every_object_is_in_every_split(tmp_path, read):
+    fill(tmp_path, [f"thing {n}/{take}/{k}.png" for n in range(5) for take in range(4) for k in (0, 1)])
+    table = read("recordings", sensor="digit", split_by="recording")
+    for n in range(5):
+        of = {row["sequence"]: row["split"] for row in table.rows.values() if row["object"] == f"thing {n}"}
+        assert sorted(of.values()) == ["test", "train", "train", "val"]
+
+
+def test_labels_are_joined_by_object_and_sequence(tmp_path, read):
+    fill(tmp_path, [f"{name}/0.png" for name in ("mug/one", "mug/two", "ball/one", "cup/one")])
+    labels = tmp_path / "labels.csv"
+    labels.write_text(
+        "object,sequence,material,label.hardness,code,unit\nmug,,clay,9,007,\n,mug/two,glass,,,left\nball,ball/one,,2.5,1,\n"
+        "vase,,clay,1,1,\n"
+    )
+    table = read("recordings", sensor="digit", val=0, test=0, labels=labels)
+    of = {row["sequence"]: row for row in table.rows.values()}
+    names = ("label.material", "label.hardness", "label.code", "unit")
+    assert {name: tuple(row[one] for one in names) for name, row in of.items()} == {
+        "mug/one": ("clay", 9.0, "007", None), "mug/two": ("glass", 9.0, "007", "left"),
+        "ball/one": (None, 2.5, "1", None), "cup/one": (None, None, None, None),
+    }  # fmt: skip
+    skipped = {reason: example for reason, (_, example) in table.report.skipped.items()}
+    assert skipped == {
+        "key of labels.csv that no recording has": "vase", "recording without a line in labels.csv": "cup/one"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("name", "renamed", "says"),
+    ("text", "says"),
     [
-        ("visgel", "images/toch/a/frame0000.jpg", "images/touch"),
-        ("cloth", "Data/nothing.txt.png", "no frame of cloth that could be used"),
-        ("cloth", "Daten/11/t/gelsight_frame/0000.png", "'Data_ICRA18/Data' or a folder 'Data'"),
-        ("objectfolder_real", "tactile/1/0/gelsite/0.png", "gelsight/<n>.png"),
-        ("ycb_slide", "real/mug/dataset_0/frame/frame_0000000.jpg", "is ROOT the folder that holds 'real'"),
-        ("octopi", "dataset/apple_0.mov.png", "process_dataset.py"),
+        (
+            "name,material\nmug,clay\n",
+            "no column object or sequence, by which labels are joined; it has name, material",
+        ),
+        ("object,a,a\nmug,1,2\n", "has the column 'a' twice"),
+        ("object,a\nmug,1\nmug,2\n", "row 1: mug is there twice"),
+        ("object,a\n,1\n", "row 0: there is neither an object nor a sequence"),
     ],
 )
-def test_a_renamed_folder_is_told(tmp_path, read, name, renamed, says):
-    fill(tmp_path, [renamed])
+def test_tables_of_labels_that_cannot_be_joined(tmp_path, read, text, says):
+    fill(tmp_path, ["mug/0.png"])
+    (tmp_path / "labels.csv").write_text(text)
     with pytest.raises(UserError, match=says):
-        read(name)
+        read("recordings", sensor="digit", labels=tmp_path / "labels.csv")
+    with pytest.raises(UserError, match="cannot be read"):
+        read("recordings", sensor="digit", labels=tmp_path / "none.csv")
 
 
-EMPTY = ("visgel", "cloth", "objectfolder_real", "ycb_slide", "octopi", "tacquad", "tvl", "ssvtp", "feel",
-         "objectfolder", "real_touch", "touch_and_go")  # fmt: skip
+def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
+    fill(tmp_path, [f"mug/one/{finger}_{n}.png" for finger in ("left", "right") for n in range(4)])
+    fill(tmp_path, [f"{finger}{n}.png" for finger in ("a", "b") for n in range(2)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    units = {row["sequence"]: (row["unit"], row["object"]) for row in table.rows.values()}
+    assert units == {"mug/one/left": ("left", "mug"), "mug/one/right": ("right", "mug"), "a": ("a", None),
+                     "b": ("b", None)}  # fmt: skip
+    assert sum("mug" in clip[0] for clip in table.clips(3)) == 4
+    assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
 
 
-@pytest.mark.parametrize("name", EMPTY)
-def test_an_empty_folder_is_told(tmp_path, read, name):
-    with pytest.raises(UserError, match=r"expected .*is ROOT the folder"):
-        read(name)
+def _film(path, frames=5):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
+    for number in range(frames):
+        writer.write(np.full((32, 32, 3), (200, 20 * number, 10), np.uint8))  # blue first
+    writer.release()
 
 
-def test_objectfolder_real_camera_views_lie_beside_the_touch(tmp_path, read):
-    frames = [f"tactile/3/0/gelsight/{n}.png" for n in range(4)]
-    fill(tmp_path, [*frames, *(f"tactile/3/0/cam_{view}/{n}.png" for view in "ab" for n in range(3))])
-    fill(tmp_path, ["tactile/3/notes/0.png"])
-    table = read("objectfolder_real", val=0, test=0)
-    first, last = table.rows[frames[0]], table.rows[frames[3]]
-    assert (first["image_path"], first["image2_path"]) == ("tactile/3/0/cam_a/0.png", "tactile/3/0/cam_b/0.png")
-    assert last["image_path"] is None and last["image2_path"] is None
-    assert any("its siblings" in reason for reason in table.report.skipped)
+def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):
+    root = tmp_path / "mine"
+    _film(root / "mug" / "one.avi")
+    _film(root / "mug" / "two.avi")
+    (root / "mug" / "broken.mp4").write_bytes(b"no film")
+    fill(root, ["ball/0.png"])
+    table = read("recordings", root, sensor="digit", val=0, test=0)
+    assert len(table.rows) == 1 and table.reasons == {"video (--export writes its frames as pictures)": 3}
+    encode, count = cv2.imencode, []
+    monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1] if len(count) < 7 else 1 / 0)
+    with pytest.raises(ZeroDivisionError):  # in the second film
+        index("recordings", root, options=IndexOptions(sensor="digit", export=True))
+    assert sorted(path.name for path in (root / "mug").iterdir()) == ["broken.mp4", "one", "one.avi", "two.avi"]
+    monkeypatch.setattr(cv2, "imencode", lambda *of: (count.append(of), encode(*of))[1])
+    table = read("recordings", root, sensor="digit", val=0, test=0, export=True)
+    assert len(count) == 7 + 5 and len(table.clips(5)) == 2  # the first film is not written again
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
+    assert decode(root / "mug" / "two" / "000004.png")[0, 0] == pytest.approx([10, 80, 200], abs=6)  # red first
+    assert table.reasons["video that cannot be read"] == 1
+
+
+def test_mistakes(tmp_path, read):
+    fill(tmp_path, ["a/0.png"])
+    with pytest.raises(UserError, match="sensor 'DIGIT': it is called digit"):
+        read("recordings", sensor="DIGIT")
+    for sensor in (None, "tac3d", "universal"):
+        with pytest.raises(UserError, match="--sensor: gelsight"):
+            read("recordings", sensor=sensor)
+    (tmp_path / "a" / "caption.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match=r"caption\.txt cannot be read as UTF-8 text"):
+        read("recordings", sensor="digit")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "film.mp4").write_bytes(b"")
+    with pytest.raises(UserError, match=r"no frame of recordings .*--export writes its frames"):
+        read("recordings", tmp_path / "empty", sensor="digit")
+
+
+def test_arrays_count_where_there_is_nothing_else(tmp_path, read):
+    fill(tmp_path, ["a/1.png", "a/2.png", "a/4.png"])
+    for name in ("a/force.npy", "a/2.npy", "b/0.npy"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        np.save(tmp_path / name, np.zeros((8, 8, 3), np.uint8))
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert {path: row["frame_index"] for path, row in table.rows.items()} == {
+        "a/1.png": 1, "a/2.png": 2, "a/4.png": 4, "b/0.npy": 0
+    }  # fmt: skip
+    assert table.reasons == {"array next to pictures": 2}
+
+
+def test_what_is_no_recording(tmp_path, read):
+    fill(tmp_path, ["mug/background/0.png", "mug/1700000000.5.png", "mug/1700000000.1234567.png"])
+    fill(tmp_path, [f"{tmp_path.name}/0.png", "0.png"])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
+    assert table.reasons == {"folder called background or photo, where one picture is expected": 1}
+    assert set(table["sequence"]) == {".", "mug", tmp_path.name}
+
+
+@pytest.fixture
+def edited(tmp_path, read):
+    """edited(ending): the manifest of two objects, to which somebody added label.material and changed a split."""
+
+    def make(ending):
+        fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
+        out = tmp_path / f"hand{ending}"
+        table = read("recordings", out=out, sensor="digit", val=0, test=0).manifest
+        split = ["test" if path.startswith("mug") else "train" for path in table.column("path").to_pylist()]
+        material = [None, *["clay"] * 5]
+        manifests.write(replace_column(replace_column(table, "split", split), "label.material", material), out)
+        return out
+
+    return make

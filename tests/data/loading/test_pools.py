@@ -1,14 +1,150 @@
-"""Which samples a baseline draws: complete ones, stills alone, without certain text."""
+"""Pools: which rows a run draws, how often, with which modalities, and the notes and errors about them."""
 
 from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from anytouch_jax.config import baselines
+from anytouch_jax.config import baselines, from_json, to_json
 from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.errors import UserError
+
+
+def _sets(counts, **extra):
+    """Stills of datasets {name: rows}."""
+    return [{"dataset": name, **extra} for name, count in counts.items() for _ in range(count)]
+
+
+def _drawn(loader, manifest, read_back, draws):
+    rows = [row for step in range(draws // 4) for row in read_back(loader.batch(step).clip)[:, -1]]
+    names = manifest.column("dataset").to_pylist()
+    return Counter(names[row] for row in rows), rows
+
+
+def test_an_epoch_of_the_loader_draws_datasets_by_weight(make, settings, read_back):
+    manifest = make(_sets({"a": 6, "b": 4, None: 2}))
+    loader = Loader(manifest, settings(weights=(("a", 3.0), ("b", 0.5))))
+    assert loader.steps_per_epoch == 6 and "an epoch draws a 3 times, b 0.5 times, other datasets once" in loader.notes
+    counts, rows = _drawn(loader, manifest, read_back, 24)
+    assert counts == {"a": 18, "b": 2, None: 2} | ({} if sum(counts.values()) == 22 else counts)
+    assert Counter(rows[:22])[0] == 3
+
+
+def test_weight_zero_leaves_a_dataset_out_of_stills_clips_and_matching(make, settings, read_back, rich):
+    rows = [row | {"dataset": "a" if i < 24 else "b"} for i, row in enumerate(rich)]
+    loader = Loader(make(rows), settings(2, weights=(("b", 0.0),)))
+    for _, batch, _ in loader.stream(0, 20):
+        for clip in (batch.align.clip, batch.match.clip, batch.match.positive, batch.match.negative):
+            assert read_back(clip).max() < 24
+
+
+def test_the_release_has_weights_of_its_own_where_its_datasets_are(make, settings):
+    there = make(_sets({"touch_and_go": 4, "octopi": 4, "x": 4}, image_path="v.png"))
+    release, paper = Loader(there, settings(2, "release")), Loader(there, settings(2))
+    assert Loader(there, settings(1, "release")).steps_per_epoch == 3  # its stage 1 draws every row once
+    assert release.steps_per_epoch == (8 + 12 + 4) // 4 and paper.steps_per_epoch == 3
+    assert any("touch_and_go 2 times, octopi 3 times" in note for note in release.notes)
+    assert Loader(there, settings(2, "release", weights=())).steps_per_epoch == 3
+    some = Loader(make(_sets({"octopi": 4, "x": 4}), "some"), settings(2, "release"))
+    assert some.steps_per_epoch == 4 and not any("touch_and_go" in note for note in some.notes)
+    none = Loader(make(_sets({"x": 4}), "none"), settings(2, "release"))
+    assert not any("an epoch draws" in note for note in none.notes)
+
+
+def test_strata_follow_the_weights(make, settings):
+    rows = _sets({"a": 8}, image_path="v.png") + _sets({"b": 8})
+    few, many = (Loader(make(rows), settings(2, weights=(("a", w),))) for w in (1.0, 3.0))
+    assert (len(few.batch(0).align.image), len(many.batch(0).align.image)) == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("weights", "told"),
+    [
+        ((("c", 2.0),), r"names the dataset 'c', but split 'train' has a, b"),
+        ((("a", -1.0),), r"--data\.weights of 'a'"),
+        ((("a", float("nan")),), r"--data\.weights of 'a'"),
+        ((("a", 1.0), ("a", 2.0)), "a dataset twice"),
+        ((("a", 0.0), ("b", 0.0)), "leaves out every row"),
+    ],
+)
+def test_weights_that_make_no_sense_are_errors(make, settings, weights, told):
+    with pytest.raises(UserError, match=told):
+        Loader(make(_sets({"a": 4, "b": 4})), settings(weights=weights))
+
+
+def test_weights_survive_the_configuration_file(settings):
+    config = settings(weights=(("a", 2.0), ("b", 0.5)))
+    assert from_json(to_json(config)) == config and from_json(to_json(settings())).data.weights is None
+
+
+def test_with_the_option_the_sensor_alone_tells_nothing(make, settings, rich):
+    manifest = make(rich)
+
+    def told_apart(config):  # how often "another sensor than the anchor's" is right of the positive, wrong of the other
+        batches = [Loader(manifest, config).batch(step).match for step in range(12)]
+        differs = [np.mean([b.sensor != getattr(b, name) for b in batches]) for name in
+                   ("positive_sensor", "negative_sensor")]  # fmt: skip
+        return (differs[0] + 1 - differs[1]) / 2
+
+    assert told_apart(settings(2, negatives="same_sensor")) == 0.5
+    assert told_apart(settings(2)) > 0.6
+
+
+def test_where_the_batch_is_the_negatives_they_are_of_one_sensor(make, settings, rich):
+    manifest, config = make(rich), settings(2, negatives="same_sensor")
+    config = replace(config, model=replace(config.model, match_head="cosine"))
+    loader = Loader(manifest, config)
+    batches = [loader.batch(step).match for step in range(12)]
+    looked_for = [set(batch.positive_sensor.tolist()) for batch in batches]
+    assert all(len(sensors) == 1 for sensors in looked_for) and len(set.union(*looked_for)) > 1
+    assert all((batch.sensor != batch.positive_sensor).all() for batch in batches)
+    assert all(np.array_equal(a, b) for a, b in zip(batches[3], Loader(manifest, config).batch(3).match, strict=True))
+
+
+def test_without_negatives_of_the_same_sensor_there_is_no_matching_and_a_note(make, settings):
+    seen = {"text": "words"}
+    rows = [{"touch": "p", "sensor": name, "object": "o", **seen} for name in ("digit", "gelslim")]
+    loader = Loader(make([*rows, {"touch": "q", "object": "r", "sensor": "duragel"}] * 2), settings(2))
+    assert loader.batch(0).match is not None
+    loader = Loader(loader.manifest, settings(2, negatives="same_sensor"))
+    assert loader.batch(0).match is None and any("data.negatives=same_sensor" in note for note in loader.notes)
+
+
+def test_text_of_downstream_test_frames_is_withheld_and_counted(make, settings):
+    rows = [{"text": f"word{i}", "downstream_test": "material" if i < 3 else None} for i in range(10)]
+    manifest = make(rows)
+    loader = Loader(manifest, settings(2))
+    assert any(note.startswith("the text of 3 rows is withheld") for note in loader.notes)
+    assert loader.tokenizer is not None
+    used = set()
+    for step in range(10):
+        batch = loader.batch(step).align
+        for text, row in zip(batch.text, batch.text_row, strict=True):
+            used.add(tuple(text.tolist()) if row < 4 else None)
+    wanted = {tuple(loader.tokenizer.encode([f"word{i}"], 8)[0][0].tolist()) for i in range(3, 10)}
+    assert used - {None} == wanted
+    assert pools.training_captions(manifest, np.arange(10)) == [f"word{i}" for i in range(3, 10)]
+    assert not any("withheld" in note for note in Loader(manifest, settings(1)).notes)
+
+
+@pytest.mark.parametrize(
+    ("values", "set_"),
+    [([True, False, None], [1, 0, 0]), ([1, 0, None], [1, 0, 0]), (["1", "0", "False"], [1, 0, 0]),
+     (["rough", "", "NO"], [1, 0, 0]), ([0.0, 1.0, None], [0, 1, 0])],
+)  # fmt: skip
+def test_what_counts_as_set(make, values, set_):
+    manifest = make([{"downstream_test": value} for value in values])
+    assert pools.withheld_text(manifest).tolist() == [bool(one) for one in set_]
+
+
+def test_all_text_withheld_means_no_text_slots(make, settings):
+    loader = Loader(make([{"text": "x", "downstream_test": "a", "image_path": "v.png"}] * 4), settings(2))
+    assert len(loader.batch(0).align.text) == 0 and loader.tokenizer is None
+
 
 SIZE = 4
 
@@ -26,18 +162,12 @@ def world():
     return rows
 
 
-COMPLETE = {(f"s{i}", i) for i in (2, 4, 5, 7)}
-
-
 def batches(loader, steps=24):
     return [loader.batch(step) for step in range(steps)]
 
 
 def changed(config, name):
     return baselines.apply(name, config)
-
-
-# Complete samples ----------------------------------------------------------------------------------------------------
 
 
 def test_tlv_link_draws_only_samples_with_all_three(make, settings, read_back):
@@ -105,9 +235,6 @@ def test_contact_only_needs_the_contact_column(make, settings):
         Loader(make(free), settings(1, contact_only=True))
 
 
-# Withheld modalities -------------------------------------------------------------------------------------------------
-
-
 def captions_drawn(loader, steps=24):
     found = set()
     for batch in batches(loader, steps):
@@ -155,9 +282,6 @@ def test_without_matching_no_triple_is_drawn(make, settings):
     assert all(batch.match is None for batch in batches(loader, 6))
     release = Loader(make(world()), changed(settings(2, "release"), "no_matching"))
     assert all(batch.match is None and batch.align is not None for batch in batches(release, 6))
-
-
-# Stills alone --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])

@@ -1,0 +1,153 @@
+"""Samples: cache, augmentation, and bad files that are named, or replaced and counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from batch_leaves import assert_same
+
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.loading import samples
+from anytouch_jax.data.loading.loader import Loader
+from anytouch_jax.data.loading.samples import SampleError, fill_slot
+from anytouch_jax.data.transforms import TOUCH, augmentation_rng, subtract_background, touch_transform
+from anytouch_jax.errors import UserError
+
+
+def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, monkeypatch):
+    rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
+    manifest = make(rows)
+    noise = np.random.default_rng(0)
+    for name in (*(f"f{i}" for i in range(8)), "gel0", "gel1"):
+        path = Path(manifest.file(0)).with_name(f"{name}.png")
+        assert cv2.imwrite(str(path), noise.integers(0, 255, (45, 60, 3), np.uint8))
+    read: list[str] = []
+    monkeypatch.setattr(samples, "decode", lambda path: (read.append(Path(path).name), decode(path))[1])
+    whole, counts = [], []
+    for cache in (0, 512):
+        config = settings(1, plain=False, background="subtract", cache=cache)
+        batches = [Loader(manifest, config).batch(step).clip for step in range(2)]
+        read.clear()
+        loader = Loader(manifest, config)
+        batches += [loader.batch(step).clip for step in range(2, 8)]
+        whole.append(batches)
+        counts.append(len(read))
+    for one, other in zip(*whole, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert counts[0] > 60 and counts[1] == len(set(read)) == 10
+    config = settings(1, plain=False, background="subtract")
+    rng = augmentation_rng(config.run.seed, 3, 3, TOUCH)
+    files = [decode(manifest.file(row)) for row in range(4)] + [decode(manifest.file(3, "background_path"))]
+    *seen, gel = touch_transform(files, config.model.image_size, rng, config.data)
+    made = samples.SampleReader(manifest, config).touch(np.arange(4), 3)
+    np.testing.assert_array_equal(made, subtract_background(seen, gel))
+
+
+def test_augmentation_does_not_depend_on_the_batch(make, settings):
+    manifest = make([{} for _ in range(6)])
+    gradient = np.tile(np.arange(0, 240, 15, dtype=np.uint8)[None, :, None], (12, 1, 3))
+    for i in range(6):
+        cv2.imwrite(str(manifest.file(i)), gradient + np.uint8(2 * i))
+    seen = {}
+    for size in (2, 3, 6):
+        loader = Loader(manifest, settings(plain=False, batch_size=size))
+        seen[size] = {frame.tobytes() for step in range(6 // size) for frame in loader.batch(step).clip}
+        assert len(seen[size]) == 6
+    assert seen[2] == seen[3] == seen[6]  # epoch 0 is the same set of six images
+    assert not seen[6] & {
+        frame.tobytes() for frame in Loader(manifest, settings(plain=False, batch_size=6)).batch(1).clip
+    }
+
+
+def _truncate(path):
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def _garbage(path):
+    path.write_bytes(b"\x00" * 100)
+
+
+def _nan(path):
+    array = np.full((8, 8, 3), 0.5, np.float32)
+    array[3, 4] = np.nan
+    path.write_bytes(cv2.imencode(".tiff", array)[1].tobytes())
+
+
+def _outside_link(path):
+    outside = path.parent.parent / f"outside-{path.parent.name}.png"
+    path.rename(outside)
+    path.symlink_to(outside)
+
+
+BAD = {
+    "missing": (lambda path: path.unlink(), "there is no file"),
+    "truncated": (_truncate, "corrupt or cut short"),
+    "garbage": (_garbage, "not a PNG"),
+    "nan": (_nan, "NaN pixels"),
+    "link": (_outside_link, "leaves the folder"),
+    "path": (None, "leaves the folder"),
+}
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+@pytest.mark.parametrize("what", list(BAD))
+def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back, what, threads):
+    spoil, words = BAD[what]
+    rows = [{"path": "../escape.png" if what == "path" and i == 2 else f"f{i}.png"} for i in range(5)]
+    manifest = make(rows, folder="data")
+    if spoil:
+        spoil(manifest.file(2))
+    name = "escape.png" if what == "path" else "f2.png"
+    with pytest.raises(SampleError) as error:
+        list(Loader(manifest, settings(batch_size=5, threads=threads)).stream(0, 1))
+    message = str(error.value)
+    assert isinstance(error.value, UserError) and "\n" not in message
+    for word in ("row 2 of", "manifest.csv", "'path'", name, words):
+        assert word in message
+    skipping = settings(batch_size=5, threads=threads, on_bad_sample="skip")
+    loader = Loader(manifest, skipping)
+    ((_, batch, info),) = loader.stream(0, 1)
+    drawn = read_back(batch.clip)[:, 0]
+    assert info["skipped_samples"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
+    assert_same(batch, Loader(manifest, skipping).batch(0))  # the replacement is deterministic
+
+
+def test_replacements_differ_by_step_slot_and_attempt(settings):
+    bad = {3}
+
+    def replaced(step, slot):
+        tried = []
+
+        def write(index, _):
+            tried.append(index)
+            if index in bad or len(tried) < 3:
+                raise SampleError("bad")
+
+        assert fill_slot(write, 1000, step, slot, settings(on_bad_sample="skip"), 3, 0) == len(tried) - 1
+        return tuple(tried[1:])
+
+    drawn = [replaced(step, slot) for step in range(4) for slot in range(4)]
+    assert drawn == [replaced(step, slot) for step in range(4) for slot in range(4)]
+    assert len({index for pair in drawn for index in pair}) > 25
+
+
+def test_only_bad_samples_end_in_an_error(make, settings):
+    manifest = make([{}, {}])
+    for i in range(2):
+        manifest.file(i).unlink()
+    with pytest.raises(
+        SampleError, match=r"20 samples in a row .* step 0; the last one is row \d of .*there is no file"
+    ):
+        Loader(manifest, settings(on_bad_sample="skip")).batch(0)
+
+
+def test_a_bad_picture_names_its_column(make, settings):
+    manifest = make([{"image_path": f"v{i}.png"} for i in range(4)])
+    manifest.file(1, "image_path").write_bytes(b"x" * 50)
+    with pytest.raises(SampleError, match=r"row 1 of .*column 'image_path': .*v1\.png"):
+        Loader(manifest, settings(2)).batch(0)
+    _, batch, info = next(Loader(manifest, settings(2, on_bad_sample="skip")).stream(0, 1))
+    assert info["skipped_samples"] >= 1 and 1 not in batch.align.image[:, 14, 14, 0] - 1

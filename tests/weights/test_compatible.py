@@ -1,11 +1,24 @@
-"""The bicubic resize of position tables."""
+"""Positions resized, sensor rows by name, and options named that weights need."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from tiny_models import tiny_config
 
-from anytouch_jax.weights.compatible import resize_position
+from anytouch_jax.config import UNIVERSAL
+from anytouch_jax.errors import UserError
+from anytouch_jax.weights.compatible import (
+    SHAPED,
+    check_activation,
+    check_form,
+    match_sensors,
+    resize_position,
+    serve_unseen,
+)
 
 # torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
 UP = [
@@ -48,3 +61,33 @@ def test_turns_with_the_grid():
 def test_only_square_grids(rows, wanted):
     with pytest.raises(ValueError, match="square"):
         resize_position(np.zeros((rows, 2), "f4"), wanted)
+
+
+def test_rows_of_sensors_go_by_name():
+    table = np.arange(6.0).reshape(3, 2)
+    stored, wanted = ("digit", "gelsight", UNIVERSAL), ("gelsight", "my_gel", UNIVERSAL, "digit")
+    np.testing.assert_array_equal(match_sensors(table, stored, wanted), table[[1, 2, 2, 0]])
+
+
+def test_every_missing_option_is_named():
+    config = tiny_config()
+    model = config.model
+    other = replace(model, embed=model.embed + 1, touch=replace(model.touch, heads=1), norm_eps=1e-3)
+    check_form(Path("run"), model, config)
+    with pytest.raises(UserError, match=r"add --model\.embed 13 --model\.touch\.heads 1 --model\.norm-eps 0\.001$"):
+        check_form(Path("run"), other, config)
+    check_form(Path("run"), replace(model, norm_eps=1e-3), config, SHAPED)
+    check_activation(Path("run"), None, config)
+    with pytest.raises(UserError, match=r"add --model\.activation quick_gelu"):
+        check_activation(Path("run"), "quick_gelu", config)
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_sensors_outside_training_get_the_universal_row_or_the_mean(drawn):
+    model = tiny_config().model
+    table = np.random.default_rng(0).normal(size=(len(model.sensors), 2, 3))
+    served = serve_unseen({"sensor_tokens": table}, model, ["digit", "gelsight"], universal_drawn=drawn)
+    rows = [model.sensors.index(name) for name in ("gelsight", "digit")]
+    expected = np.broadcast_to(table[model.universal_row] if drawn else table[rows].mean(0), table.shape).copy()
+    expected[rows] = table[rows]
+    np.testing.assert_allclose(served["sensor_tokens"], expected, atol=1e-12)

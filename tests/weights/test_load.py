@@ -1,0 +1,335 @@
+"""Loading: runs and files give the same model, and what starts a run is checked, fitted and reported."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from tiny_models import tiny_config
+from weights_world import (
+    STAGE1,
+    STAGE2,
+    assert_same,
+    openclip_of,
+    params_of,
+    save_clip,
+    save_run,
+    weights_of,
+)
+
+from anytouch_jax.config import SENSORS, UNIVERSAL
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.weights.compatible import resize_position
+from anytouch_jax.weights.convert import to_params, to_release
+from anytouch_jax.weights.load import (
+    clip_to_touch,
+    first_params,
+    load_init,
+    load_model,
+    model_of_file,
+    read_weights,
+)
+from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, export_safetensors, write_safetensors
+
+TRAINED = ["digit", "gelsight_mini"]
+
+
+# Runs and files -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stage1(tmp_path):
+    """A stage-1 run of random parameters, trained on two sensors: (folder, config, parameters)."""
+    config = tiny_config()
+    params = params_of(config.model, seed=3)
+    return save_run(tmp_path / "stage1", config, params, seen=TRAINED), config, params
+
+
+def test_a_run_and_its_export_are_the_same_model(tmp_path):
+    config = tiny_config(2)
+    config = replace(config, data=replace(config.data, background="subtract"))
+    params = params_of(config.model)
+    run = load_model(save_run(tmp_path / "run", config, params, seen=TRAINED))
+    assert {"touch", "decoder", "image", "text", "matcher", "logit_scale"} <= run.params.keys()  # towers survive
+    assert run.from_run and run.trained_sensors == tuple(TRAINED) and run.universal_drawn
+    export_safetensors(tmp_path / "run.safetensors", run.params, run.export_metadata())
+    file = load_model(tmp_path / "run.safetensors")
+    assert_same(file.params, run.params)
+    assert (file.config.model, file.config.data.background) == (run.config.model, "subtract")
+    assert not file.from_run and file.trained_sensors == run.trained_sensors
+
+
+def test_sensors_outside_training_get_the_universal_row(stage1):
+    run, config, params = stage1
+    tokens = load_model(run).params["touch"]["sensor_tokens"]
+    for row, name in enumerate(config.model.sensors):
+        expected = row if name in TRAINED else config.model.universal_row
+        np.testing.assert_array_equal(tokens[row], params["touch"]["sensor_tokens"][expected], err_msg=name)
+    never = replace(config, objective=replace(config.objective, universal_start=0.0, universal_end=0.0))
+    loaded = load_model(save_run(run.parent / "never", never, params, seen=TRAINED))
+    rows = [config.model.sensors.index(name) for name in TRAINED]
+    mean = params["touch"]["sensor_tokens"][rows].mean(axis=0)
+    np.testing.assert_array_equal(loaded.params["touch"]["sensor_tokens"][config.model.universal_row], mean)
+    assert not loaded.universal_drawn
+
+
+def test_the_authors_weights_are_known_by_their_table(tmp_path):
+    config = tiny_config()
+    params = params_of(config.model)
+    path = tmp_path / "authors.safetensors"
+    write_safetensors(path, to_release(params, config.model), {"format": "pt"})
+    tokens = load_model(path).params["touch"]["sensor_tokens"]
+    for row in range(len(SENSORS)):
+        np.testing.assert_array_equal(tokens[row], params["touch"]["sensor_tokens"][row if row < 5 else -1])
+    stored = load_model(path, stored_rows=True)
+    assert_same(stored.params, params)
+    assert stored.trained_sensors == SENSORS[:5]
+    few = replace(config.model, sensors=("digit", UNIVERSAL))
+    write_safetensors(path, to_release(params_of(few), few), {})
+    assert load_model(path).trained_sensors is None  # of another table, and without metadata
+
+
+def test_what_is_no_model_is_one_sentence(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for path, words in ((tmp_path / "gone", "no run folder or weights file"), (tmp_path / "empty", "no complete")):
+        with pytest.raises(UserError, match=words) as caught:
+            load_model(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+# The start of a run ---------------------------------------------------------------------------------------------------
+
+
+def start(config, **paths):
+    """`load_init` of fresh parameters: (fresh, first parameters, notes, sensors)."""
+    fresh = build(config.model).init(jax.random.key(0))
+    return fresh, *load_init(fresh, config, **paths)
+
+
+def test_stage_two_takes_touch_and_decoder_of_stage_one(stage1):
+    run, _, _ = stage1
+    fresh, params, notes, sensors = start(tiny_config(2), init=run)
+    loaded = load_model(run).params
+    for part in fresh:
+        assert_same({part: params[part]}, {part: loaded.get(part, fresh[part])})
+    assert (notes, sensors) == ([], tuple(TRAINED))
+    _, params, notes, sensors = start(tiny_config(2))
+    assert_same(params, fresh)
+    assert sensors == () and len(notes) == 1 and "--init" in notes[0]
+
+
+def test_parts_that_start_untrained_are_named(tmp_path):
+    config = tiny_config(2)
+    run = save_run(tmp_path / "stage2", config, params_of(config.model), seen=TRAINED)
+    (note,) = start(config, init=run)[2]
+    assert "image, logit_scale, matcher, text" in note
+
+
+@pytest.mark.parametrize("form", ["run", "file"])
+def test_positions_are_resized_for_another_image_size(stage1, form):
+    init, config, _ = stage1
+    before = load_model(init)
+    if form == "file":
+        init = init.parent / "w.safetensors"
+        metadata = {MODEL_KEY: before.export_metadata()[MODEL_KEY]}
+        write_safetensors(init, to_release(before.params, config.model), metadata)
+    _, params, notes, _ = start(tiny_config(image_size=56), init=init)
+    for part in ("touch", "decoder"):
+        table = before.params[part]["position"]
+        assert len(params[part]["position"]) == 1 + 4 * (len(table) - 1)
+        expected = resize_position(table, len(params[part]["position"]))
+        np.testing.assert_allclose(params[part]["position"], expected, atol=1e-6)
+    assert len(notes) == 1 and "positions" in notes[0] and "56 pixels" in notes[0]
+
+
+@pytest.mark.parametrize("place", [len(SENSORS), 2], ids=["last", "in the middle"])
+def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(stage1, place):
+    run, config, _ = stage1
+    names = (*SENSORS[:place], "new_sensor", *SENSORS[place:])
+    tokens = start(tiny_config(2, sensors=names), init=run)[1]["touch"]["sensor_tokens"]
+    old = dict(zip(config.model.sensors, load_model(run).params["touch"]["sensor_tokens"], strict=True))
+    for name, row in zip(names, tokens, strict=True):
+        np.testing.assert_array_equal(row, old.get(name, old[UNIVERSAL]), err_msg=name)
+
+
+def test_tokens_and_backgrounds_that_change_are_reported(tmp_path):
+    wide = tiny_config(sensors=(*SENSORS[:-1], "my_gel", UNIVERSAL))
+    run = save_run(tmp_path / "run", wide, params_of(wide.model), seen=["digit", "my_gel"])
+    assert start(wide, init=run)[2] == []
+    (note,) = start(tiny_config(), init=run)[2]
+    assert "my_gel" in note and "--model.sensors " in note
+    other = replace(wide, data=replace(wide.data, background="subtract"))
+    (note,) = start(other, init=run)[2]
+    assert "--data.background keep" in note and "subtract" in note
+
+
+def test_a_start_that_does_not_fit_names_the_options(stage1, tmp_path):
+    run, config, params = stage1
+    touch = config.model.touch
+    wide = replace(touch, width=32, heads=1)
+    for model, options in (
+        ({"embed": 16}, "--model.embed 12"),
+        ({"embed": 16, "touch": wide}, "--model.embed 12 --model.touch.width 16 --model.touch.heads 2"),
+        ({"touch": replace(touch, heads=1)}, "--model.touch.heads 2"),
+        ({"activation": "quick_gelu"}, "--model.activation gelu"),
+    ):
+        with pytest.raises(UserError) as caught:
+            start(tiny_config(2, **model), init=run)
+        assert str(caught.value).endswith(f"add {options}") and "\n" not in str(caught.value)
+    small = replace(tiny_config(2, touch=wide), preset="small")
+    with pytest.raises(UserError, match=r"add --preset tiny$"):
+        start(small, init=run)
+    # A file without our metadata: its head counts are guessed, and not compared.
+    file = tmp_path / "authors.safetensors"
+    write_safetensors(file, to_release(params, config.model), {})
+    start(tiny_config(2, touch=replace(touch, heads=1)), init=file)
+    export_safetensors(tmp_path / "half.safetensors", {"touch": params["touch"]}, load_model(run).export_metadata())
+    with pytest.raises(UserError, match="no touch encoder and decoder"):
+        start(tiny_config(2), init=tmp_path / "half.safetensors")
+
+
+# CLIP -----------------------------------------------------------------------------------------------------------------
+
+
+def test_clip_gives_the_towers_and_without_stage_one_the_touch_encoder(stage1, tmp_path):
+    config = tiny_config(2, "paper", "pretrained")
+    clip = params_of(config.model, seed=9)
+    folder = save_clip(tmp_path / "clip", config.model, clip)
+    for init in (stage1[0], None):
+        fresh, params, _, _ = start(config, init=init, clip=folder)
+        for part in ("image", "text", "logit_scale"):
+            assert_same({part: params[part]}, {part: clip[part]})
+        assert_same(params["lora"], fresh["lora"])
+        loaded = clip["image"] if init is None else load_model(init).params["touch"]
+        np.testing.assert_array_equal(params["touch"]["position"], loaded["position"])
+    text_only = replace(config, model=replace(config.model, image=None, lora_rank=0))
+    params = start(text_only, clip=folder)[1]
+    np.testing.assert_array_equal(params["touch"]["position"], clip["image"]["position"])
+    params = start(tiny_config(), clip=folder / "model.safetensors")[1]  # stage 1
+    for frame in params["touch"]["patch"]["kernel"]:  # repeated, not divided (golden Q1)
+        np.testing.assert_array_equal(frame, clip["image"]["patch"]["kernel"])
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("config.json", {"text_config": {"hidden_act": "quick_gelu"}, "vision_config": {"hidden_act": "quick_gelu"}}),
+        ("config.json", {"model_type": "clip", "vision_config": {}}),  # HF's default
+        ("open_clip_config.json", {"model_cfg": {"quick_gelu": True}}),
+    ],
+)
+def test_clip_weights_of_another_activation_are_refused(tmp_path, file, content, stage):
+    config = tiny_config(2, "paper", "pretrained")
+    folder = save_clip(tmp_path / "clip", config.model, params_of(config.model))
+    (folder / file).write_text(json.dumps(content))
+    for path in (folder, folder / "model.safetensors"):
+        with pytest.raises(UserError, match=r"model\.safetensors .* --model\.activation quick_gelu"):
+            start(config if stage == 2 else tiny_config(), clip=path)
+
+
+def test_clip_weights_of_another_size_or_none_are_one_sentence(tmp_path):
+    config = tiny_config(2, "paper", "pretrained")
+    folder = save_clip(tmp_path / "clip", config.model, params_of(config.model))
+    wide = replace(config.model.touch, width=32)
+    flat = tiny_config(touch=replace(config.model.touch, depth=1), patch=14)
+    for other, words in (
+        (replace(config, model=replace(config.model, touch=wide, image=wide)), "image tower width 32, depth 2 and"),
+        (flat, "touch encoder width 16, depth 1 and patches of 14"),
+    ):
+        with pytest.raises(UserError, match=words) as caught:
+            start(other, clip=folder)
+        assert "--preset large" in str(caught.value) and "\n" not in str(caught.value)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no weights"):
+        start(config, clip=tmp_path / "empty")
+
+
+@pytest.mark.parametrize("layout", ["clip", "openclip"])
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own patch encoders"])
+def test_clip_starts_the_touch_encoder(layout, own):
+    clip = weights_of(STAGE2, "clip")
+    tower = to_params(clip, STAGE2)
+    weights = clip if layout == "clip" else openclip_of(tower, STAGE2)
+    model = replace(STAGE1, patch_encoder="sensor" if own else "shared")
+    fresh = params_of(model, seed=1)
+    params = clip_to_touch(weights, model, fresh)
+    assert_same(params["decoder"], fresh["decoder"])  # kept, as the sensor tokens are
+    np.testing.assert_array_equal(params["touch"]["sensor_tokens"], fresh["touch"]["sensor_tokens"])
+    for part in ("class_token", "position", "pre_norm", "blocks", "post_norm", "projection"):
+        assert_same({part: params["touch"][part]}, {part: tower["image"][part]})
+    kernel = clip["vision_model.embeddings.patch_embedding.weight"]
+    inflated = np.repeat(kernel[:, None], 3, axis=1)  # golden Q1: not divided
+    for row in params["touch"]["patch"]["kernel"] if own else [params["touch"]["patch"]["kernel"]]:
+        one = {**params, "touch": {**params["touch"], "patch": {"kernel": row}}}
+        theirs = to_release(one, STAGE1)["video_patch_embedding.weight"]
+        np.testing.assert_allclose(theirs, inflated, rtol=1e-7)
+    assert_same({"fresh": fresh}, {"fresh": params_of(model, seed=1)})  # the given tree is not written to
+
+
+def test_stage2_takes_each_part_from_its_source():
+    fresh, stage1 = params_of(STAGE2, seed=1), to_params(weights_of(STAGE1), STAGE1)
+    weights = weights_of(STAGE2, "clip")
+    clip = to_params(weights, STAGE2)
+    params = first_params(fresh, STAGE2, stage1=stage1, clip=weights)
+    sources = {"touch": stage1, "decoder": stage1, "image": clip, "text": clip, "logit_scale": clip}
+    for part in fresh:
+        assert_same({part: params[part]}, {part: sources.get(part, fresh)[part]})
+    only_clip = first_params(fresh, STAGE2, clip=weights)
+    assert_same({"decoder": only_clip["decoder"]}, {"decoder": fresh["decoder"]})
+    assert_same({"blocks": only_clip["touch"]["blocks"]}, {"blocks": clip["image"]["blocks"]})
+    no_image = replace(STAGE2, image=None, lora_rank=0)
+    without = first_params(params_of(no_image, seed=1), no_image, clip=weights)
+    assert_same({"blocks": without["touch"]["blocks"], "text": without["text"]},
+         {"blocks": clip["image"]["blocks"], "text": clip["text"]})  # fmt: skip
+    only_stage1 = first_params(fresh, STAGE2, stage1=stage1)
+    assert_same({"image": only_stage1["image"]}, {"image": fresh["image"]})
+    other = to_params(weights_of(replace(STAGE1, embed=13)), replace(STAGE1, embed=13))
+    with pytest.raises(UserError, match=r"touch/projection/kernel has \(16, 13\) instead of \(16, 12\)"):
+        first_params(fresh, STAGE2, stage1=other)
+
+
+@pytest.mark.parametrize(
+    ("beside", "activation"),
+    [
+        ({}, "gelu"),
+        ({"config.json": {"hidden_act": "quick_gelu"}}, "gelu"),  # not CLIP's
+        ({"config.json": {"vision_config": {"hidden_act": "gelu"}, "text_config": {"hidden_act": "gelu"}}}, "gelu"),
+        ({"config.json": {"vision_config": {"hidden_act": "quick_gelu"}}}, "quick_gelu"),
+        ({"open_clip_config.json": {"model_cfg": {"embed_dim": 768}}}, "gelu"),
+        ({"open_clip_config.json": {"model_cfg": {"quick_gelu": True}}}, "quick_gelu"),
+    ],
+)
+def test_the_activation_of_clip_is_what_stands_beside_it(tmp_path, beside, activation):
+    for name, content in beside.items():
+        (tmp_path / name).write_text(json.dumps(content))
+    assert model_of_file(tmp_path / "clip.bin", weights_of(STAGE2, "clip")).activation == activation
+    assert model_of_file(tmp_path / "x.bin", weights_of(STAGE1)).activation == "gelu"  # the authors' own
+
+
+def test_an_activation_that_the_network_lacks_is_refused(tmp_path):
+    file, clip = tmp_path / "config.json", weights_of(STAGE2, "clip")
+    for text, word in (
+        ('{"vision_config": {"hidden_act": "relu"}}', "relu"),
+        ('{"vision_config": {"hidden_act": "gelu"}, "text_config": {"hidden_act": "quick_gelu"}}', "gelu and quick"),
+        ("{", "not JSON"),
+    ):
+        file.write_text(text)
+        with pytest.raises(WeightsError, match=word):
+            model_of_file(tmp_path / "clip.bin", clip)
+
+
+def test_files_of_every_kind_hold_the_same(torch_files, tmp_path):
+    weights = weights_of(STAGE1)
+    params = to_params(weights, STAGE1)
+    write_safetensors(tmp_path / "w.safetensors", {k: v.T.copy().T for k, v in weights.items()}, {"source": "test"})
+    np.savez(tmp_path / "w.npz", **weights)
+    torch_files.write({"model": {key: torch_files.tensor(value) for key, value in weights.items()}}, "w.pth")
+    torch_files.write({key: torch_files.tensor(value) for key, value in weights.items()}, "w.bin", legacy=True)
+    for name in ("w.safetensors", "w.npz", "w.pth", "w.bin"):
+        assert_same(to_params(read_weights(tmp_path / name), STAGE1), params)
+    assert not list(tmp_path.glob(".*"))  # no leftovers of the atomic write

@@ -1,0 +1,50 @@
+"""Files of flat arrays: written whole or not at all, types kept."""
+
+from __future__ import annotations
+
+import jax
+import ml_dtypes
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.weights.load import read_weights
+from anytouch_jax.weights.safetensors import export_safetensors, read_safetensors, write_safetensors
+from anytouch_jax.weights.tree import nest
+
+
+def test_a_tree_is_written_and_read_back(tmp_path):
+    tree = {"a": {"view": np.arange(6.0).reshape(2, 3).T, "none": np.zeros((0, 3), "f4")}, "scale": np.float32(2.5)}
+    export_safetensors(tmp_path / "p.safetensors", tree, {"config": "{}"})
+    arrays, metadata = read_safetensors(tmp_path / "p.safetensors")
+    assert metadata == {"config": "{}"}
+    assert jax.tree.structure(nest(arrays)) == jax.tree.structure(tree)
+    for first, second in zip(jax.tree.leaves(nest(arrays)), jax.tree.leaves(tree), strict=True):
+        assert first.dtype == second.dtype
+        np.testing.assert_array_equal(first, second)
+
+
+def test_half_precision_becomes_float32(tmp_path, torch_files):
+    values = np.array([1.0, -2.5, 3.140625], "f4")
+    for kind in (np.float16, ml_dtypes.bfloat16):
+        write_safetensors(tmp_path / "h.safetensors", {"x": values.astype(kind), "ids": np.arange(3)}, {})
+        read = read_weights(tmp_path / "h.safetensors")
+        assert read["x"].dtype == np.float32 and read["ids"].dtype == np.int64
+        np.testing.assert_array_equal(read["x"], values.astype(kind).astype("f4"))
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "w.safetensors"
+    write_safetensors(path, {"x": np.ones(2)}, {})
+    before = path.read_bytes()
+    with pytest.raises(UserError, match=r"w\.safetensors"):
+        write_safetensors(path, {"x": np.array([object()])}, {})
+    with pytest.raises(UserError, match="must be text"):
+        write_safetensors(path, {"x": np.ones(2)}, {"step": 3})
+    (tmp_path / "blocked").write_text("")
+    with pytest.raises(UserError, match="blocked"):
+        write_safetensors(tmp_path / "blocked" / "w.safetensors", {"x": np.ones(2)}, {})
+    assert path.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["blocked", "w.safetensors"]
+    path.write_bytes(before[:-3])
+    with pytest.raises(UserError, match="not a whole safetensors"):
+        read_weights(path)

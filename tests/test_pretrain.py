@@ -1,7 +1,6 @@
-"""Whole runs on a small world on disk: stage 1, then stage 2 from it, resumed, refused, started from other weights."""
+"""Whole runs on a small world on disk: stage 1, then stage 2 from it, resumed and refused."""
 
 import fcntl
-import json
 import os
 import shutil
 import subprocess
@@ -13,17 +12,15 @@ import jax
 import numpy as np
 import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
-from touch_world import make_touches
+from weights_world import save_clip
 
-from anytouch_jax.cli.app import main
-from anytouch_jax.config import SENSORS, from_json, to_json
+from anytouch_jax.config import SENSORS, from_json
 from anytouch_jax.data import tokenizer as texts
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import checkpoint, convert, safetensors
-from anytouch_jax.weights.compatible import resize_position
+from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
 
@@ -58,6 +55,21 @@ def clips_only(config):
     return replace(config, data=replace(config.data, clip_share=1.0))
 
 
+@pytest.fixture(scope="session")
+def aligned(tmp_path_factory, world, straight):
+    """Stage 2 on clips from that stage 1, four steps at once: (run folder, result, log)."""
+    run, log = tmp_path_factory.mktemp("aligned") / "run", []
+    return run, train(clips_only(run_config(world, 2)), run, log, init=straight[0]), log
+
+
+def assert_equal_results(first, second):
+    """Two runs ended with the same arrays, to the bit, the optimiser's too."""
+    wanted, arrays = arrays_of(first), arrays_of(second)
+    assert arrays.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in arrays)
+    for name, array in wanted.items():
+        np.testing.assert_array_equal(arrays[name], array, err_msg=name)
+
+
 # Stage 1 ------------------------------------------------------------------------------------------------------------
 
 
@@ -78,21 +90,18 @@ def test_a_run_folder(straight, world):
 
 def test_stopping_and_going_on_is_bit_for_bit_one_run(straight, world, tmp_path):
     run, result = straight
-    said = []
+    log = []
     config = replace(run_config(world), run=replace(run_config(world).run, figure_every=4))
     first = train(config, tmp_path / "r", stop_after=2)
     assert (first.step, saved_steps(tmp_path / "r")) == (2, [2])
-    second = train(config, tmp_path / "r", said)
-    assert second.resumed == 2 and "going on from the checkpoint of step 2" in said
-    wanted, found = arrays_of(result), arrays_of(second)
-    assert found.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in found)
-    for name, array in wanted.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    second = train(config, tmp_path / "r", log)
+    assert second.resumed == 2 and "going on from the checkpoint of step 2" in log
+    assert_equal_results(result, second)
     assert read_metrics(tmp_path / "r") == read_metrics(run)
     figures = sorted((tmp_path / "r" / "figures").iterdir())  # at the end of each part
     assert [figure.name for figure in figures] == ["reconstruction_000002.png", "reconstruction_000004.png"]
     assert all(figure.stat().st_size > 1000 for figure in figures)
-    assert train(config, tmp_path / "r", said).step == 4 and "nothing to do" in said[-1]
+    assert train(config, tmp_path / "r", log).step == 4 and "nothing to do" in log[-1]
 
 
 @pytest.mark.slow
@@ -141,55 +150,43 @@ def parts(params, *names):
     return flatten({name: params[name] for name in names})
 
 
-def as_used(run, result):
-    """What a run learned, the rows of sensors that it never saw served by the universal tokens."""
-    loaded = load_model(run)
-    assert 0 < len(loaded.trained_sensors) < len(SENSORS)
-    return loaded.params
-
-
-def test_stage_two_starts_from_stage_one_learns_and_goes_on(straight, world, tmp_path):
-    run, stage1 = straight
-    config, said = clips_only(run_config(world, 2)), []
-    init = shutil.copytree(run, tmp_path / "stage1")
-    first = train(config, tmp_path / "r", said, init=init, stop_after=1)
-    # the learning rate of step 0 is 0: what stage 1 learned is still whole
-    for name, array in parts(as_used(run, stage1), "touch", "decoder").items():
-        np.testing.assert_array_equal(parts(first.params, "touch", "decoder")[name], array, err_msg=name)
-    assert not any("without a stage-1 run" in line for line in said)
-
-    tokenizer = (tmp_path / "r" / "tokenizer.json").read_bytes()
-    vocabulary = texts.load_tokenizer(tmp_path / "r" / "tokenizer.json").vocab_size
-    assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == vocabulary < 2048
-    assert first.params["text"]["token"].shape == (vocabulary, 16)
-
-    whole = train(config, tmp_path / "whole", said, init=init)
-    shutil.rmtree(init)  # what goes on needs it no more, whether or not it is named
-    assert train(config, tmp_path / "r", said, init=init, stop_after=2).step == 2
-    assert not any("is not read" in line for line in said)
-    assert train(config, tmp_path / "r", said, init=run, clip="other.bin", stop_after=2).step == 2
-    assert "--clip-weights (nothing): other.bin is not read" in "".join(said)
-    assert f"was started with --init {init}: {run} is not read" in said[-1] + "".join(said)
-    last = train(config, tmp_path / "r", said)
-    assert (last.resumed, last.step, last.traces) == (2, 4, 1)
-    wanted, found = arrays_of(whole), arrays_of(last)
-    assert found.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in found)
-    for name, array in wanted.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
-    assert not any("without a stage-1 run" in line for line in said)
-    assert (tmp_path / "r" / "tokenizer.json").read_bytes() == tokenizer
-    lines = read_metrics(tmp_path / "r")
+def test_stage_two_starts_from_stage_one_and_learns(straight, aligned, world, tmp_path):
+    run, result, log = aligned
+    assert result.traces == 1 and not any("without --init" in line for line in log)
+    vocabulary = texts.load_tokenizer(run / "tokenizer.json").vocab_size
+    assert from_json((run / "config.json").read_text()).model.text.vocab == vocabulary < 2048
+    assert result.params["text"]["token"].shape == (vocabulary, 16)
+    lines = read_metrics(run)
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
     for line in lines:
         assert line["align"] > 0 and line["match"] > 0 and "reconstruction" not in line
         assert line["touch_text_pairs"] > 0 and line["touch_vision_pairs"] > 0
         assert line["loss"] == pytest.approx(line["align"] + 0.1 * line["match"], rel=1e-5)
-    moved = parts(last.params, "touch", "image", "text", "matcher", "logit_scale")
-    same = {n for n, a in parts(first.params, "touch", "image", "text", "matcher", "logit_scale").items()
-            if np.array_equal(a, moved[n])}  # fmt: skip
-    assert same == set()
-    source = checkpoint.read_metadata(tmp_path / "r")["source"]
-    assert source == {"init": str(init), "clip": None}
+    assert checkpoint.read_metadata(run)["source"] == {"init": str(straight[0]), "clip": None}
+
+
+def test_stage_two_resumes_bit_for_bit_without_its_stage_one(straight, aligned, world, tmp_path):
+    config, log = clips_only(run_config(world, 2)), []
+    init, run = shutil.copytree(straight[0], tmp_path / "stage1"), tmp_path / "r"
+    first = train(config, run, log, init=init, stop_after=1)
+    # the learning rate of step 0 is 0: what stage 1 learned is still whole
+    before = parts(load_model(init).params, "touch", "decoder")
+    for name, array in parts(first.params, "touch", "decoder").items():
+        np.testing.assert_array_equal(array, before[name], err_msg=name)
+    tokenizer = (run / "tokenizer.json").read_bytes()
+    shutil.rmtree(init)  # a resumed run does not need it, whether or not it is named
+    assert train(config, run, log, init=init, stop_after=1).step == 1
+    assert not any("is not read" in line for line in log)
+    assert train(config, run, log, init=straight[0], clip="other.bin", stop_after=1).step == 1
+    ignored = [line for line in log if line.endswith("is not read")]
+    assert len(ignored) == 2 and str(init) in ignored[0] and "other.bin" in ignored[1]
+    last = train(config, run, log)
+    assert (last.resumed, last.step, last.traces) == (1, 4, 1)
+    assert_equal_results(aligned[1], last)
+    assert (run / "tokenizer.json").read_bytes() == tokenizer and read_metrics(run) == read_metrics(aligned[0])
+    learned = ("touch", "image", "text", "matcher", "logit_scale")
+    after = parts(last.params, *learned)
+    assert not [name for name, array in parts(first.params, *learned).items() if np.array_equal(array, after[name])]
 
 
 def test_the_tokenizer_made_of_the_captions_is_no_larger_than_was_asked_for(world, tmp_path):
@@ -214,15 +211,12 @@ def test_stage_two_of_the_release(straight, world, tmp_path):
 
 
 def clip_folder(folder, config):
-    """Weights and tokenizer as CLIP's download has them, of the smallest towers."""
+    """The weights and the tokenizer of a CLIP download, of the smallest towers."""
     tokenizer = texts.train_tokenizer(["a round thing", "an edge", "smooth and hard"], 300)
     tokenizer.save(folder)
     model = replace(config.model, text=replace(config.model.text, vocab=tokenizer.vocab_size))
     params = build(model).init(jax.random.key(9))
-    plain = replace(model, lora_rank=0)
-    full = convert.to_release({n: p for n, p in params.items() if n != "lora"}, plain, allow_extra=True)
-    keys = convert.release_names(plain, "clip")
-    safetensors.write_safetensors(folder / "model.safetensors", {key: full[key] for key in keys}, {"format": "pt"})
+    save_clip(folder, model, params)
     return replace(config, model=model), params
 
 
@@ -239,92 +233,21 @@ def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora
     assert "model.bin" in refused(config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin")
 
 
-def test_without_stage_one_the_touch_encoder_is_clips_with_or_without_an_image_tower(world, tmp_path):
-    config, clip = clip_folder(tmp_path / "clip", clips_only(run_config(world, 2, towers="pretrained")))
-    config = replace(config, model=replace(config.model, image=None, lora_rank=0))
-    result = train(config, tmp_path / "r", clip=tmp_path / "clip", stop_after=0)
-    np.testing.assert_array_equal(result.params["touch"]["position"], clip["image"]["position"])
-    np.testing.assert_array_equal(result.params["text"]["position"], clip["text"]["position"])
-
-
-def test_stage_one_starts_its_touch_encoder_from_clip(world, tmp_path):
-    _, clip = clip_folder(tmp_path / "clip", run_config(world, 2))
-    result = train(run_config(world), tmp_path / "r", clip=tmp_path / "clip", stop_after=0)
-    touch = result.params["touch"]
-    np.testing.assert_array_equal(touch["position"], clip["image"]["position"])
-    for frame in np.asarray(touch["patch"]["kernel"]):  # repeated, not divided (golden Q1)
-        np.testing.assert_array_equal(frame, clip["image"]["patch"]["kernel"])
-
-
-@pytest.mark.parametrize(
-    ("file", "told"),
-    [
-        ("config.json", {"text_config": {"hidden_act": "quick_gelu"}, "vision_config": {"hidden_act": "quick_gelu"}}),
-        ("config.json", {"model_type": "clip", "vision_config": {}}),  # HF's default
-        ("open_clip_config.json", {"model_cfg": {"quick_gelu": True}}),
-    ],
-)
-@pytest.mark.parametrize("stage", [1, 2])
-def test_clip_weights_of_another_activation_are_refused(world, tmp_path, file, told, stage):
-    clip_folder(tmp_path / "clip", run_config(world, 2))
-    towers = "scratch" if stage == 1 else "pretrained"
-    (tmp_path / "clip" / file).write_text(json.dumps(told))
-    for path in (tmp_path / "clip", tmp_path / "clip" / "model.safetensors"):
-        message = refused(run_config(world, stage, towers=towers), tmp_path / "r", clip=path)
-        assert "model.safetensors was trained with quick_gelu" in message and "--model.activation quick_gelu" in message
-
-
-def test_clip_weights_of_another_size_are_one_short_sentence(world, tmp_path):
-    config, _ = clip_folder(tmp_path / "clip", run_config(world, 2, towers="pretrained"))
-    stack = replace(config.model.touch, width=32)
-    wide = replace(config, model=replace(config.model, touch=stack, image=stack))
-    stage1 = run_config(world, model={"touch": replace(config.model.touch, depth=1), "patch": 14})
-    for name, one, told in (
-        ("image tower", wide, "width 32, depth 2 and patches of 7"),
-        ("touch encoder", stage1, "width 16, depth 1 and patches of 14"),
-    ):
-        message = refused(one, tmp_path / "r", clip=tmp_path / "clip")
-        assert (
-            f"model.safetensors has width 16, depth 2 and patches of 7, this run's {name} {told}: --preset" in message
-        )
-        assert "--preset large fits ViT-L/14" in message and len(message) < 400
-
-
 # Mistakes -----------------------------------------------------------------------------------------------------------
 
 
 def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
-    run, _ = straight
-    stage2 = run_config(world, 2)
-    assert "no run folder or weights file" in refused(stage2, tmp_path / "a", init=tmp_path / "gone")
+    stage2, pretrained = run_config(world, 2), run_config(world, 2, towers="pretrained")
     (tmp_path / "empty").mkdir()
-    assert str(tmp_path / "empty") in refused(stage2, tmp_path / "a", init=tmp_path / "empty")
+    for init in ("gone", "empty"):
+        assert str(tmp_path / init) in refused(stage2, tmp_path / "a", init=tmp_path / init)
     other = run_config(world, 2, model={"embed": 16})
-    assert "this run would use 16: add --model.embed 12" in refused(other, tmp_path / "b", init=run)
-    wide = replace(other.model.touch, width=32, heads=1)
-    several = refused(replace(other, model=replace(other.model, touch=wide)), tmp_path / "b", init=run)
-    assert several.endswith(
-        f"add --model.embed 12 --model.touch.width 16 --model.touch.heads {other.model.touch.heads}"
-    )
-    other = run_config(world, 2, model={"activation": "quick_gelu"})
-    assert "trained with gelu, this run would use quick_gelu" in refused(other, tmp_path / "b", init=run)
-    other = run_config(world, 2)
-    stack = replace(other.model.touch, heads=other.model.touch.heads // 2)
-    other = replace(other, model=replace(other.model, touch=stack))
-    assert f"this run would use {stack.heads}: add --model.touch.heads" in refused(other, tmp_path / "b", init=run)
-    narrow = replace(stage2.model.touch, width=8)
-    other = replace(stage2, preset="small", model=replace(stage2.model, touch=narrow))
-    assert "would have preset small: add --preset tiny" in refused(other, tmp_path / "b", init=run)
-    pretrained = run_config(world, 2, towers="pretrained")
-    assert "--clip" in refused(pretrained, tmp_path / "c")
-    assert "tokenizer" in refused(pretrained, tmp_path / "c", clip=tmp_path / "empty")
+    assert "--model.embed 12" in refused(other, tmp_path / "a", init=straight[0])
+    assert "--clip-weights" in refused(pretrained, tmp_path / "a")
+    assert "tokenizer" in refused(pretrained, tmp_path / "a", clip=tmp_path / "empty")
     texts.train_tokenizer(["a"], 300).save(tmp_path / "empty")
-    assert "no weights" in refused(pretrained, tmp_path / "d", clip=tmp_path / "empty")
-    assert not (tmp_path / "a").exists() or not saved_steps_if_any(tmp_path / "a")
-
-
-def saved_steps_if_any(run):
-    return saved_steps(run) if (run / "checkpoints").exists() else []
+    assert "no weights" in refused(pretrained, tmp_path / "a", clip=tmp_path / "empty")
+    assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize("content", [b'{"architectures": ["CLIPModel"]}', b"\xff\xfe\x00"], ids=["foreign", "binary"])
@@ -363,24 +286,6 @@ def test_settings_that_would_do_nothing_are_one_sentence(world, tmp_path):
     assert "--init and --clip-weights" in both and not (tmp_path / "r").exists()
 
 
-@pytest.mark.parametrize("form", ["run", "file"])
-def test_weights_for_another_image_size_have_their_positions_resized(straight, world, tmp_path, form):
-    run, result = straight
-    init, before = run, as_used(run, result)
-    if form == "file":
-        model = from_json((run / "config.json").read_text()).model
-        init = tmp_path / "w.safetensors"
-        safetensors.write_safetensors(init, convert.to_release(before, model), {safetensors.MODEL_KEY: to_json(model)})
-    said: list[str] = []
-    params = train(run_config(world, model={"image_size": 56}), tmp_path / "r", said, init=init, stop_after=0).params
-    for part in ("touch", "decoder"):
-        table = np.asarray(before[part]["position"])
-        rows = len(params[part]["position"])
-        assert rows == 1 + 4 * (len(table) - 1)
-        np.testing.assert_allclose(params[part]["position"], resize_position(table, rows), atol=1e-6)
-    assert f"the positions of {init} are resized for images of 56 pixels" in said
-
-
 def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):
     assert "4 devices" in refused(run_config(world, batch=6), tmp_path / "r")
 
@@ -396,32 +301,6 @@ def test_without_captions_and_photographs_stage_two_still_matches(world, tmp_pat
     assert line["match"] > 0 and line["align"] == 0 and result.step == 1
 
 
-def test_touches_shown_otherwise_than_to_stage_one_are_told_of(tmp_path):
-    file = make_touches(tmp_path / "touches", touches={"train": 8}, frames=4, size=28, each=2)
-    train(run_config(file), tmp_path / "one", stop_after=1)
-    config = clips_only(run_config(file, 2))
-    other = replace(config, data=replace(config.data, background="subtract"))
-    for name, one, told in (("same", config, False), ("other", other, True)):
-        said: list[str] = []
-        train(one, tmp_path / name, said, init=tmp_path / "one", stop_after=0)
-        assert any("trained with --data.background keep, this run with subtract" in line for line in said) == told
-
-    release_file = tmp_path / "one.safetensors"  # the same is told of weights that say how they saw touches
-    assert main(["convert", str(tmp_path / "one"), str(release_file)]) == 0
-    said = []
-    train(other, tmp_path / "third", said, init=release_file, stop_after=0)
-    assert any("trained with --data.background keep, this run with subtract" in line for line in said)
-
-
-def test_what_starts_anew_is_told_of(straight, world, tmp_path):
-    train(run_config(world, 2), tmp_path / "two", init=straight[0], stop_after=1)
-    for name, init, told in (("a", straight[0], False), ("b", tmp_path / "two", True)):
-        said: list[str] = []
-        train(run_config(world, 2), tmp_path / name, said, init=init, stop_after=0)
-        assert any("gives the touch encoder and the decoder; " in line for line in said) == told
-    assert any("image, " in line and line.endswith("start untrained") for line in said)
-
-
 def test_two_processes_never_train_one_run(straight, world, tmp_path):
     run = tmp_path / "r"
     for begun in (False, True):
@@ -429,9 +308,9 @@ def test_two_processes_never_train_one_run(straight, world, tmp_path):
         with (run / ".lock").open("ab") as held:
             fcntl.flock(held, fcntl.LOCK_EX)  # as another process holds it, from before its first checkpoint
             before = sorted(path.name for path in run.iterdir())
-            assert f"another process trains {run}" in refused(run_config(world, 2), run, init=straight[0])
+            assert f"another process trains {run}" in refused(clips_only(run_config(world, 2)), run, init=straight[0])
             assert sorted(path.name for path in run.iterdir()) == before  # not even a tokenizer
-        assert begun or train(run_config(world, 2), run, init=straight[0], stop_after=1).step == 1
+        assert begun or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step == 1
 
 
 def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
@@ -466,50 +345,3 @@ def test_a_start_that_failed_leaves_no_tokenizer_behind_that_counts(straight, wo
 
 
 # Sensors ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("place", [len(SENSORS), 2], ids=["last", "in the middle"])
-def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(straight, world, tmp_path, place):
-    run, stage1 = straight
-    names = (*SENSORS[:place], "new_sensor", *SENSORS[place:])
-    config = clips_only(run_config(world, 2, model={"sensors": names}))
-    tokens = train(config, tmp_path / "r", init=run, stop_after=0).params["touch"]["sensor_tokens"]
-    old = dict(zip(SENSORS, as_used(run, stage1)["touch"]["sensor_tokens"], strict=True))
-    new = dict(zip(names, np.asarray(tokens), strict=True))
-    for name in SENSORS:
-        np.testing.assert_array_equal(new[name], old[name], err_msg=name)
-    np.testing.assert_array_equal(new["new_sensor"], old["universal"])
-    named = np.asarray(stage1.params["touch"]["sensor_tokens"])[SENSORS.index("allsight")]  # but never seen
-    np.testing.assert_array_equal(new["allsight"], old["universal"])
-    assert not np.array_equal(named, old["universal"])
-    assert json.loads((tmp_path / "r" / "config.json").read_text())["model"]["sensors"] == list(names)
-
-
-def test_the_authors_weights_start_sensors_that_they_never_saw_from_the_universal_tokens(world, tmp_path):
-    config, init = run_config(world), tmp_path / "authors.safetensors"
-    params = build(config.model).init(jax.random.key(5))
-    safetensors.write_safetensors(init, convert.to_release(params, config.model), {"format": "pt"})
-    first = train(config, tmp_path / "r", init=init, stop_after=1).params["touch"]["sensor_tokens"]  # at a rate of 0
-    stored = np.asarray(params["touch"]["sensor_tokens"])
-    for row in range(len(SENSORS)):
-        np.testing.assert_array_equal(first[row], stored[row if row < 5 else -1], err_msg=SENSORS[row])
-    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == list(SENSORS[:5])
-    said: list[str] = []
-    train(run_config(world, model={"sensors": ("digit", "gelsight_mini", "universal")}), tmp_path / "few", said,
-          init=init, stop_after=0)  # fmt: skip
-    assert any(line.startswith(f"the tokens of gelsight, gelslim, duragel in {init} are left out") for line in said)
-
-
-def test_tokens_of_a_sensor_that_are_left_behind_are_told_of(world, tmp_path):
-    config = run_config(world)
-    wide = replace(config.model, sensors=(*config.model.sensors[:-1], "my_gel", config.model.sensors[-1]))
-    stored = checkpoint.Checkpoints(
-        tmp_path / "one" / "checkpoints", keep=1, config_json=to_json(replace(config, model=wide)),
-        metadata={"seen": ["digit", "my_gel"]},
-    )  # fmt: skip
-    stored.save(1, {"trainable": build(wide).init(jax.random.key(0))}, {"loss": 1.0})
-    stored.close()
-    for name, model, told in (("a", config.model, True), ("b", wide, False)):
-        said: list[str] = []
-        train(replace(run_config(world), model=model), tmp_path / name, said, init=tmp_path / "one", stop_after=0)
-        assert any("the tokens of my_gel" in line and "--model.sensors " in line for line in said) == told, said

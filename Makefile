@@ -36,12 +36,12 @@ export-onnx: FRAMES ?= 1
 # The demo learns from scratch in minutes on two cores: small towers, contact frames less the untouched gel, and each
 # touch against all others of its batch (experiments/tables/teaching.py says why).
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
-DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --loader.background subtract --loader.contact-only --loader.jitter 0 0 0 0
+DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --data.background subtract --data.contact-only --data.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps $(DEMO_STEPS1) --batch 48
 # A longer demo lies beside the plain one, on the same scenes: stage1-3000, stage2-3000-600, report-3000-600.
 DEMO_LONGER1 := $(if $(filter-out 400,$(DEMO_STEPS1)),-$(DEMO_STEPS1))
 DEMO_LONGER := $(DEMO_LONGER1)$(if $(DEMO_LONGER1)$(filter-out 200,$(DEMO_STEPS)),-$(DEMO_STEPS))
-DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --loader.negatives same_sensor
+DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --data.negatives same_sensor
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile

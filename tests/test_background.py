@@ -127,7 +127,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     cv2.imwrite(str(frames / "0.png"), shot)
     ground = table.file(row, "background_path")
     monkeypatch.setattr("anytouch_jax.encoder.encoder.load_encoder", lambda _: encoder)
-    words = ["embed", "--run", "unused", "--input", str(frames), "--sensor", str(table.value(row, "sensor"))]
+    words = ["embed", "--model", "unused", "--data", str(frames), "--sensor", str(table.value(row, "sensor"))]
     assert main([*words, "--out", str(tmp_path / "a.npz"), "--background", str(ground)]) == 0
     assert "first frame" not in capsys.readouterr().err
     said: list[str] = []
@@ -159,8 +159,24 @@ def test_training_says_at_once_which_rows_have_no_background(touches):
 def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
     config = replace(tiny_config(1), data=settings(touches).data)
     pretrain(replace(config, run=replace(config.run, steps=2, save_every=2, figure_every=0)), tmp_path / "r", log=str)
-    assert main(["convert", str(tmp_path / "r"), str(tmp_path / "w.safetensors")]) == 0
-    assert main(["convert", str(tmp_path / "w.safetensors"), str(tmp_path / "o.safetensors"), "--names", "own"]) == 0
+    assert (
+        main(["export", "--to", "release", "--model", str(tmp_path / "r"), "--out", str(tmp_path / "w.safetensors")])
+        == 0
+    )
+    assert (
+        main(
+            [
+                "export",
+                "--to",
+                "safetensors",
+                "--model",
+                str(tmp_path / "w.safetensors"),
+                "--out",
+                str(tmp_path / "o.safetensors"),
+            ]
+        )
+        == 0
+    )
     run, *files = (load_encoder(tmp_path / name) for name in ("r", "w.safetensors", "o.safetensors"))
     clips = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
     for one in files:

@@ -54,4 +54,9 @@ def test_a_baseline_trains_and_embeds(data, tmp_path, compiled_once, name, stage
     stored = flatten(checkpoint.load_params(tmp_path / "r")[0])
     assert ("force/kernel" in stored) == (name == "force_heads" and stage == 1)
     if name == "force_heads":
-        assert main(["convert", str(tmp_path / "r"), str(tmp_path / "w.safetensors")]) == 0
+        assert (
+            main(
+                ["export", "--to", "release", "--model", str(tmp_path / "r"), "--out", str(tmp_path / "w.safetensors")]
+            )
+            == 0
+        )

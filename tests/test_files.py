@@ -68,7 +68,7 @@ def test_a_full_disk_is_one_sentence_of_the_command(tmp_path, monkeypatch, capsy
     monkeypatch.setattr("os.fsync", full)
     picture = tmp_path / "a.csv"
     picture.write_text("path,sensor,sequence,frame,split\nx.png,digit,0,0,train\n")
-    assert main(["contact", str(picture), "--out", str(tmp_path / "b.csv")]) == 1
+    assert main(["data", "contact", str(picture), "--out", str(tmp_path / "b.csv")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 

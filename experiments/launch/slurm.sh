@@ -1,5 +1,5 @@
 #!/bin/bash
-# sbatch experiments/launch/slurm.sh --stage 1 --data data.parquet --run runs/stage1 --preset large --loop.fsdp 8
+# sbatch experiments/launch/slurm.sh --stage 1 --data data.parquet --run runs/stage1 --preset large --run.fsdp 8
 # One process an accelerator; jax learns from srun where the first one runs. Submit it again to go on with the run.
 #SBATCH --job-name=anytouch
 #SBATCH --nodes=2

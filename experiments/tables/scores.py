@@ -274,7 +274,7 @@ def adapted(work: Places, run: Path, data: Path, frames: int) -> Path:
         table = manifests.read(data)
         mine = (text_column(table, "sensor") == plan.UNSEEN) & (text_column(table, "split") == "train")
         count = min(frames, int(mine.sum()))  # toy sizes have fewer
-        words = ["--run", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", count, "--labels", NEW_SENSOR]
+        words = ["--model", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", count, "--labels", NEW_SENSOR]
         if main([str(word) for word in ("adapt", *words, "--out", out)]):
             raise UserError(f"anytouch adapt failed with {count} frames of {plan.UNSEEN}. Its message is above.")
         atomic_write(note, json.dumps(of) + "\n")

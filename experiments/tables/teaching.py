@@ -62,7 +62,7 @@ SEEDS = env.numbers("SEEDS", "0,1,2")
 GRADES = env.names("GRADES", "fine,coarse", ("fine", "coarse"))
 CONVOLUTIONS = env.switch("CONVOLUTIONS")
 NAME = "teaching_convolutional" if CONVOLUTIONS else "teaching"
-SENSORS, LEFT_OUT = "gelsight_mini,digit,duragel", "gelslim"
+SENSORS, LEFT_OUT = ("gelsight_mini", "digit", "duragel"), "gelslim"
 STACK, DEPTH = {"width": 128, "heads": 4, "mlp": 512}, {"touch": 4, "image": 2, "text.stack": 2}
 KNOWN = ["gelsight_mini", "digit", "duragel", "universal"]  # the sensor table of the encoders
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)
@@ -86,8 +86,9 @@ def anytouch(*words: Any) -> None:
 # minute.
 #
 # **Contact frames.** The paper's data are contact frames. A simulated recording begins before anything shows, and pairs
-# of such a frame with one of full contact teach little: with them contrast learned more slowly. So `anytouch contact`
-# marks the frames that have six tenths of the strongest contact of their recording, and only these are drawn.
+# of such a frame with one of full contact teach little: with them contrast learned more slowly. So
+# `anytouch data contact` marks the frames that have six tenths of the strongest contact of their recording, and only
+# these are drawn.
 #
 # Matching departs from the paper here. Its head tells a pair from *one* other pair, on an encoder that already knows
 # pictures (CLIP); the same loss on an encoder from scratch stays at chance for as long as a CPU can wait. Cosines
@@ -99,9 +100,9 @@ def anytouch(*words: Any) -> None:
 # %%
 SMALL = ["--preset", "tiny", "--model.image-size", 84]
 SMALL += ["--model.patch-encoder", "convolutional"] if CONVOLUTIONS else []
-LESS = ["--loader.background", "subtract"]  # the contact alone: units differ more than touches do
-LESS += ["--loader.contact-only", "--loader.jitter", 0, 0, 0, 0]  # colours tell slopes
-LESS += ["--loader.cache", 5000]  # all frames, once read
+LESS = ["--data.background", "subtract"]  # the contact alone: units differ more than touches do
+LESS += ["--data.contact-only", "--data.jitter", 0, 0, 0, 0]  # colours tell slopes
+LESS += ["--data.cache", 5000]  # all frames, once read
 
 
 def tower(name: str) -> list[Any]:
@@ -110,7 +111,7 @@ def tower(name: str) -> list[Any]:
 
 TRAIN1 = [*SMALL, *tower("touch"), "--steps", STEPS1, "--batch", 48, "--optim.learning-rate", 1e-3]
 TRAIN2 = [*SMALL, *tower("touch"), *tower("image"), *tower("text.stack"), "--steps", STEPS2, "--batch", 64]
-TRAIN2 += ["--optim.learning-rate", 1e-3, "--loader.negatives", "same_sensor"]
+TRAIN2 += ["--optim.learning-rate", 1e-3, "--data.negatives", "same_sensor"]
 TRAIN2 += ["--model.match-head", "cosine", "--objective.match-weight", 8.0]
 
 
@@ -120,16 +121,17 @@ def scenes(grade: str) -> list[Path]:
     sets = {  # sensors, touches, number of the first
         f"scenes-{grade}": (SENSORS, TOUCHES, TOUCHES * turn),
         f"more-{grade}": (SENSORS, MORE, TOUCHES * len(GRADES) + MORE * turn),
-        f"{LEFT_OUT}-{grade}": (LEFT_OUT, 6 * OBJECTS, 6 * OBJECTS * turn),
+        f"{LEFT_OUT}-{grade}": ((LEFT_OUT,), 6 * OBJECTS, 6 * OBJECTS * turn),
     }
     for name, (sensors, touches, first) in sets.items():
         folder, how = WORK / name, ["--objects", OBJECTS, "--grade", grade, "--size", 128]
         if touches:
-            anytouch("simulate", "--out", folder, "--sensors", sensors, "--touches", touches, "--first", first, *how)
+            words = ["--sensors", *sensors, "--touches", touches, "--first", first, *how]
+            anytouch("data", "simulate", "--out", folder, *words)
         if touches and sensors == SENSORS:
             marked.append(folder / "manifest_contact.parquet")
             if not marked[-1].exists():
-                anytouch("contact", folder / "manifest.parquet", "--share", 0.6, "--out", marked[-1])
+                anytouch("data", "contact", folder / "manifest.parquet", "--share", 0.6, "--out", marked[-1])
     return marked
 
 

@@ -62,7 +62,7 @@ def _pairs(manifest: Manifest, source: str, target: str, split: str) -> Pairs:
     if not shared and split != "val":
         raise UserError(
             f"split {split} has no frame of one touch felt by both {source} and {target}; give fine-aligned data "
-            f"(anytouch simulate --grade fine --units one --sensors {source},{target})"
+            f"(anytouch data simulate --grade fine --units one --sensors {source},{target})"
         )
     return Pairs(*(np.array([rows[key] for key in shared], np.int64) for rows in (first, second)))
 

@@ -7,3 +7,7 @@ class UserError(ValueError):
 
 class ConfigError(UserError):
     """A configuration that cannot be read or is inconsistent. The message says what to change."""
+
+
+class CheckError(UserError):
+    """A check that failed, such as an export that differs from its model. The command line exits with 1."""

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: a status, what is printed, and what is told on standard error."""
+"""The command line as a user meets it: an exit status, standard output and standard error."""
 
 from __future__ import annotations
 
@@ -14,38 +14,34 @@ from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests
 
 
-class Said(NamedTuple):
+class Outcome(NamedTuple):
     status: int
     out: str
     err: str
 
 
 @pytest.fixture
-def anytouch(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+def anytouch(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
     """anytouch(*words): run the command line in this process."""
 
-    def run(*words: object) -> Said:
+    def run(*words: object) -> Outcome:
         capsys.readouterr()
-        try:
-            status = main([str(word) for word in words])
-        except SystemExit as stop:  # the parser's own exit
-            status = int(stop.code or 0)
-        out, err = capsys.readouterr()
-        return Said(status, out, err)
+        status = main([str(word) for word in words])
+        return Outcome(status, *capsys.readouterr())
 
     return run
 
 
 @pytest.fixture
-def mistake(anytouch: Callable[..., Said]) -> Callable[..., str]:
-    """mistake(*words): the one sentence that a user's mistake is answered with, at status 1."""
+def mistake(anytouch: Callable[..., Outcome]) -> Callable[..., str]:
+    """mistake(*words): the one sentence that answers a user's mistake, with status 2."""
 
     def run(*words: object) -> str:
-        said = anytouch(*words)
-        assert said.status == 1, said
-        assert said.err.startswith(f"anytouch {words[0]}: ") and "Traceback" not in said.err
-        assert len(said.err.strip().splitlines()) == 1, said.err
-        return said.err
+        done = anytouch(*words)
+        assert done.status == 2, done
+        assert done.err.startswith(f"anytouch {words[0]}") and "Traceback" not in done.err
+        assert len(done.err.strip().splitlines()) == 1, done.err
+        return done.err
 
     return run
 

@@ -1,27 +1,152 @@
-"""`anytouch export`: what is written and said."""
+"""`anytouch export`: an encoder for jax alone, weights by both kinds of names, and weights between two runs."""
 
+from __future__ import annotations
+
+import stat
+from dataclasses import replace
+
+import jax
 import numpy as np
+import pytest
+from tiny_models import touch_model
 
+from anytouch_jax.config import SENSORS, to_json
+from anytouch_jax.encoder import export
 from anytouch_jax.encoder.encoder import load_encoder
-from anytouch_jax.encoder.export import load
+from anytouch_jax.errors import CheckError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.weights import load, safetensors
+from anytouch_jax.weights.safetensors import export_safetensors
+from anytouch_jax.weights.tree import flatten
 
 
-def test_export_writes_an_artefact_and_says_how_far_it_is_from_the_live_model(anytouch, tmp_path, tiny_run):
+@pytest.fixture
+def weights(anytouch):
+    """weights(to, model, out, *words): write weights, which must succeed; returns `out`."""
+
+    def run(to, model, out, *words):
+        done = anytouch("export", "--to", to, "--model", model, "--out", out, *words)
+        assert done.status == 0 and str(out) in done.out, done.err
+        return out
+
+    return run
+
+
+def write(path, model, params, **metadata):
+    arrays = {name: np.asarray(array) for name, array in flatten(params).items()}
+    safetensors.write_safetensors(path, arrays, {safetensors.MODEL_KEY: to_json(model)} | metadata)
+    return path
+
+
+def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_path, tiny_run):
     out = tmp_path / "made" / "model.bin"
-    said = anytouch("export", "--run", tiny_run, "--out", out, "--frames", 1, "--platforms", "cpu, cuda")
-    assert said.status == 0, said
-    assert "for cpu, cuda" in said.out and "from the live model (1 and 5 touches)" in said.out
-    assert f"{out}.json: how to call it" in said.out
+    done = anytouch("export", "--model", tiny_run, "--out", out, "--frames", 1, "--platforms", "cpu", "cuda")
+    assert done.status == 0, done
+    assert "cpu, cuda" in done.out and f"{out}.json" in done.out
     frames = np.random.default_rng(0).integers(0, 256, (2, 1, 28, 28, 3), np.uint8)
     live = load_encoder(tiny_run).encode_touch(frames, "digit")
-    np.testing.assert_allclose(load(out)(frames, "digit"), live, atol=1e-5)
-    assert anytouch("export", "--run", tiny_run, "--out", out, "--dtype", "bfloat16").status == 0
-    assert 1e-5 < np.abs(load(out)(frames, "digit") - live).max() / np.abs(live).max() < 0.05
+    np.testing.assert_allclose(export.load(out)(frames, "digit"), live, atol=1e-5)
+    assert anytouch("export", "--model", tiny_run, "--out", out, "--dtype", "bfloat16").status == 0
+    assert 1e-5 < np.abs(export.load(out)(frames, "digit") - live).max() / np.abs(live).max() < 0.05
 
 
-def test_mistakes_of_export(mistake, tmp_path, tiny_run):
-    args = ("export", "--run", tiny_run, "--out", tmp_path / "m.bin")
-    assert "not gpu" in mistake(*args, "--platforms", "cpu,gpu")
-    assert "a clip needs 3 frames" in mistake(*args, "--frames", 2)
-    assert "no run folder" in mistake("export", "--run", tmp_path / "gone", "--out", tmp_path / "m.bin")
-    assert list(tmp_path.iterdir()) == []
+def test_a_difference_from_the_live_model_is_a_failed_check(anytouch, tmp_path, tiny_run, monkeypatch):
+    def differs(*_, **__):
+        raise CheckError("the artefact differs")
+
+    monkeypatch.setattr(export, "export", differs)
+    done = anytouch("export", "--model", tiny_run, "--out", tmp_path / "m.bin")
+    assert done.status == 1 and "differs" in done.err
+
+
+def test_weights_go_to_the_authors_names_and_back(tmp_path, tiny_run, weights):
+    theirs = weights("release", tiny_run, tmp_path / "release.safetensors")
+    ours = weights("safetensors", theirs, tmp_path / "own.safetensors")
+    again = weights("release", ours, tmp_path / "again.safetensors")
+    assert theirs.read_bytes()[-4096:] == again.read_bytes()[-4096:]
+    assert stat.S_IMODE(ours.stat().st_mode) == 0o644  # others may read it
+    clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
+    expected = load_encoder(tiny_run).encode_touch(clip, "digit")
+    for path in (theirs, ours, again):  # two heads of width 8: the shapes alone would suggest one head
+        np.testing.assert_array_equal(load_encoder(path).encode_touch(clip, "digit"), expected)
+
+
+def test_the_universal_tokens_go_to_the_last_row(tmp_path, weights):
+    # A sensor added at the end of the table is after them, and the authors' code reads the last row.
+    model = touch_model(sensors=(*SENSORS, "mine"))
+    params = build(model).init(jax.random.key(0))
+    export_safetensors(tmp_path / "own.safetensors", params, {safetensors.MODEL_KEY: to_json(model)})
+    theirs = weights("release", tmp_path / "own.safetensors", tmp_path / "theirs.safetensors")
+    table = load.read_weights(theirs)["sensor_token"]
+    np.testing.assert_array_equal(table[-1], params["touch"]["sensor_tokens"][SENSORS.index("universal")])
+    np.testing.assert_array_equal(table[-2], params["touch"]["sensor_tokens"][-1])
+    assert load_encoder(theirs).sensor_row("mine") == len(SENSORS) - 1
+
+
+@pytest.fixture
+def two(tmp_path):
+    """(first, second): files of two encoders of one network, and the parameters of both."""
+    model = touch_model()
+    params = [{"touch": build(model).init(jax.random.key(seed))["touch"]} for seed in (0, 1)]
+    files = [write(tmp_path / f"{name}.safetensors", model, tree) for name, tree in zip("ab", params, strict=True)]
+    return files, params
+
+
+def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
+    (first, second), params = two
+    start, end = (flatten(tree) for tree in params)
+    for share in (0, 0.25, 1):
+        out = weights("safetensors", second, tmp_path / "w.safetensors", "--between", first, "--share", share)
+        arrays = load.read_weights(out)
+        assert arrays.keys() == end.keys()
+        for name, array in arrays.items():
+            expected = np.asarray(start[name]) * (1 - share) + np.asarray(end[name]) * share
+            np.testing.assert_allclose(array, expected, rtol=1e-6, atol=1e-7)
+    clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
+    np.testing.assert_array_equal(load_encoder(out).encode_touch(clip), load_encoder(second).encode_touch(clip))
+    source = safetensors.read_file_metadata(out)["source"]
+    assert str(first) in source and str(second) in source
+
+
+def test_a_run_between_itself_is_itself(tiny_run, tmp_path, weights):
+    out = weights("release", tiny_run, tmp_path / "w.safetensors", "--between", tiny_run)
+    clip = np.random.default_rng(0).integers(0, 256, (1, 3, 28, 28, 3), np.uint8)
+    np.testing.assert_array_equal(load_encoder(out).encode_touch(clip), load_encoder(tiny_run).encode_touch(clip))
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--out", "m.bin", "--frames", 2], "3 frames"),
+        (["--out", "m.bin", "--model", "gone"], "gone"),
+        (["--out", "m.bin", "--join", "sum"], "--join"),
+        (["--out", "m.bin", "--share", 0.3], "--share"),
+        (["--out", "afile/m.bin"], "--out"),
+        (["--out", "w.bin", "--to", "release"], ".safetensors"),
+        (["--out", "w.safetensors", "--to", "release"], "--to safetensors"),  # it lacks a decoder
+        (["--out", "w.safetensors", "--to", "release", "--model", "gone.pth"], "gone.pth"),
+        (["--out", "b.safetensors", "--to", "safetensors"], "--out"),
+        (["--out", "a.safetensors", "--to", "safetensors", "--between", "a.safetensors"], "--out"),
+        (["--out", "w.safetensors", "--to", "safetensors", "--frames", 3], "--frames"),
+        (["--out", "w.safetensors", "--to", "safetensors", "--share", 0.25], "--share"),
+        (["--out", "w.safetensors", "--to", "safetensors", "--between", "a.safetensors", "--share", 1.5], "--share"),
+        (["--out", "w.safetensors", "--to", "safetensors", "--between", "gone.safetensors"], "gone"),
+        (["--out", "w.safetensors", "--to", "safetensors", "--between", "eps.safetensors"], "norm_eps"),
+        (["--out", "w.safetensors", "--to", "safetensors", "--between", "gel.safetensors"], "background"),
+    ],
+)
+def test_mistakes_write_nothing(two, tmp_path, mistake, monkeypatch, words, named):
+    monkeypatch.chdir(tmp_path)
+    params = two[1][0]
+    write(tmp_path / "eps.safetensors", replace(touch_model(), norm_eps=1e-3), params)
+    write(tmp_path / "gel.safetensors", touch_model(), params, **{safetensors.BACKGROUND_KEY: "subtract"})
+    (tmp_path / "afile").write_text("")
+    before = sorted(tmp_path.iterdir())
+    model = [] if "--model" in words else ["--model", "b.safetensors"]
+    assert named in mistake("export", *model, *words)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_unknown_platform_is_a_usage_error(anytouch, tiny_run, tmp_path):
+    done = anytouch("export", "--model", tiny_run, "--out", tmp_path / "m.bin", "--platforms", "cpu", "gpu")
+    assert done.status == 2 and "gpu" in done.err and not list(tmp_path.iterdir())

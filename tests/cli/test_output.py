@@ -1,140 +1,150 @@
-"""Where a command writes is asked before its long work begins."""
+"""Where a command writes is checked before its long work begins, and nothing is written over."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 
 import pytest
+from reader_world import fill
 
-from anytouch_jax.cli.output import check_apart, check_folder, check_home
+from anytouch_jax.cli.output import check_apart, check_folder, check_home, refuse_unused
 from anytouch_jax.errors import UserError
 
 WORK = {
     "contact": "anytouch_jax.data.prepare.contact.contact_scores",
     "verify": "anytouch_jax.data.prepare.verify.verify",
     "export": "anytouch_jax.encoder.encoder.load_encoder",
-    "probe": "anytouch_jax.evaluate.probing.probe_label",
+    "label": "anytouch_jax.evaluate.probing.probe_label",
     "retrieve": "anytouch_jax.data.manifest.manifest.read",
-    "bench": "experiments.benchmarks.machine.describe",
     "annotate": "anytouch_jax.data.prepare.captions.annotate",
     "report": "anytouch_jax.evaluate.report.demo_report",
     "adapt": "anytouch_jax.data.manifest.manifest.read",
-    "translate": "anytouch_jax.encoder.encoder.load_encoder",
 }
 
 
-def test_what_is_read_is_not_written_over(tmp_path):
+@pytest.fixture
+def no_work(monkeypatch, pressed):
+    """no_work(command): the long work of that command must not begin; the folder is that of `pressed`."""
+    monkeypatch.chdir(pressed.parent)
+    (pressed.parent / "afile").write_text("")
+
+    def guard(words):
+        work = next(WORK[word] for word in words[:2] if word in WORK)
+        monkeypatch.setattr(work, lambda *args, **options: pytest.fail("the work began"))
+
+    return guard
+
+
+def test_a_file_that_is_read_is_not_written_over(tmp_path):
     path, other = tmp_path / "m.csv", tmp_path / "other.csv"
     path.write_text("mine")
     check_folder(other, read=(path,))
-    check_folder(path, read=(other,))  # a result of before is made anew
+    check_folder(path, read=(other,))  # an older result is replaced
     (tmp_path / "link").symlink_to(tmp_path)
     for same in (path, tmp_path / "link" / "m.csv"):
-        with pytest.raises(UserError, match=r"m.csv is a file that is read; name another one with --out"):
+        with pytest.raises(UserError, match=r"m\.csv .*--out"):
             check_folder(same, read=(other, path))
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UserError, match="pipe is no regular file"):
+    with pytest.raises(UserError, match="pipe"):
         check_folder(tmp_path / "pipe")
 
 
 def test_two_outputs_are_two_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     check_apart(out=tmp_path / "a", report=None, sheet=tmp_path / "b", other=None)
-    with pytest.raises(UserError, match="--out and --commercial-only name the same file; give each its own"):
+    with pytest.raises(UserError, match="--out and --commercial-only"):
         check_apart(out=tmp_path / "a", commercial_only=tmp_path / "b" / ".." / "a")
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["contact", "touch.parquet", "--picture", "c.parquet", "--out", "c.parquet"], "--out and --picture name the"),
-        (["contact", "touch.parquet", "--picture", "c.jpg"], "must end in .png"),
-        (["verify", "touch.parquet", "--repair", "r.csv", "--out", "r.csv"], "--repair and --out name the same file"),
-        (["verify", "touch.parquet", "--commercial-only", "r.csv", "--out", "r.csv"], "--commercial-only and --out"),
-        (["annotate", "touch.parquet", "--sheet", "x.csv", "--out", "x.csv", "--yes"], "--out and --sheet name"),
-    ],
-)
-def test_outputs_that_would_replace_each_other_are_refused(mistake, pressed, monkeypatch, words, told):
-    monkeypatch.chdir(pressed.parent)
-    monkeypatch.setattr(WORK[words[0]], lambda *args, **options: pytest.fail("the work began"))
-    assert told in mistake(*words)
-
-
-def test_a_picture_of_the_data_is_not_written_over(mistake, pressed, monkeypatch):
-    frame = next(path for path in sorted(pressed.parent.rglob("*.png")))
-    before = frame.read_bytes()
-    assert "is a file that is read; name another one with --picture" in mistake(
-        "contact", pressed, "--picture", frame, "--out", pressed.parent / "c.parquet"
-    )
-    assert frame.read_bytes() == before
-
-
-def test_the_files_of_a_run_are_not_written_over(mistake, pressed, tiny_run, monkeypatch):
-    monkeypatch.setattr(WORK["probe"], lambda *args, **options: pytest.fail("the work began"))
-    words = ("probe", "--run", tiny_run, "--data", pressed, "--out", tiny_run / "config.json")
-    assert "config.json is a file that is read" in mistake(*words)
-
-
-@pytest.mark.parametrize(
-    ("words", "option"),
-    [
-        (["contact", "touch.parquet", "--picture", "afile/c.png"], "--picture"),
-        (["verify", "touch.parquet", "--out", "afile/report.json"], "--out"),
-        (["export", "--run", "nowhere", "--out", "afile/e.bin"], "--out"),
-        (["probe", "--data", "touch.parquet", "--out", "afile/deep/p.json"], "--out"),
-        (["retrieve", "--data", "touch.parquet", "--out", "afile/r.json"], "--out"),
-        (["bench", "embed", "--quick", "--out", "afile"], "--out"),
-        (["annotate", "touch.parquet", "--yes", "--sheet", "afile/look.html"], "--sheet"),
-        (["report", "--data", "touch.parquet", "--stage1", "a", "--stage2", "b", "--out", "afile/r"], "--out"),
-        (["adapt", "--run", "a", "--data", "touch.parquet", "--sensor", "digit", "--out", "afile/r"], "--out"),
-        (
-            ["translate", "--fit", "--run", ".", "--data", "t.parquet", "--from", "a", "--to", "b", "--out", "afile/t"],
-            "--out",
-        ),
-    ],
-)
-def test_a_place_that_cannot_be_is_named_before_the_work(mistake, pressed, monkeypatch, words, option):
-    monkeypatch.chdir(pressed.parent)
-    (pressed.parent / "afile").write_text("")
-    before = sorted(pressed.parent.iterdir())
-    monkeypatch.setattr(WORK[words[0]], lambda *a, **k: pytest.fail("long work began"))
-    assert f"afile is a file, not a folder; choose another {option}" in mistake(*words)
-    assert sorted(pressed.parent.iterdir()) == before
-
-
-def test_a_folder_of_results_is_not_made_before_there_are_any(tmp_path):
-    check_home(tmp_path / "a" / "b")
-    assert [path.name for path in tmp_path.rglob("*")] == ["a"]
-    check_home(tmp_path / "a")  # one that is there will do
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="file is a file, not a folder; choose another --out"):
-        check_home(tmp_path / "file")
-
-
-def test_the_folder_is_made_where_it_can_be(tmp_path, monkeypatch):
+def test_the_folder_of_an_output_is_made_where_it_can_be(tmp_path, monkeypatch):
     check_folder(tmp_path / "a" / "b" / "c.json")
     assert (tmp_path / "a" / "b").is_dir()
-    with pytest.raises(UserError, match="b is a folder; name a file with --out"):
+    with pytest.raises(UserError, match=r"b is a folder.*--out"):
         check_folder(tmp_path / "a" / "b")
-    with pytest.raises(UserError, match="cannot be made: File name too long; choose another --sheet"):
+    with pytest.raises(UserError, match=r"\.npz.*--save"):
+        check_folder(tmp_path / "a.json", "--save", suffix=".npz")
+    with pytest.raises(UserError, match="--sheet"):
         check_folder(tmp_path / ("x" * 300) / "c.json", "--sheet")
-    monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of somebody else
-    with pytest.raises(UserError, match="cannot be written to; choose another --out"):
-        check_folder(tmp_path / "c.json")
+    check_home(tmp_path / "c" / "d")
+    assert (tmp_path / "c").is_dir() and not (tmp_path / "c" / "d").exists()
+    check_home(tmp_path / "c")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"file .*--cache"):
+        check_home(tmp_path / "file", "--cache")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of another user
+    for check in (check_folder, check_home):
+        with pytest.raises(UserError, match="--out"):
+            check(tmp_path / "c" / "c.json")
+    with pytest.raises(UserError, match="--out"):
+        check_home(tmp_path / "c")
 
 
-def test_commands_do_not_write_over_their_input(anytouch, tiny_run, tmp_path):
-    mine = tmp_path / "m.csv"
-    mine.write_text("path,sensor,sequence,frame_index\n")
-    for words in (
-        ["embed", "--run", tiny_run, "--input", mine, "--out", mine],
-        ["probe", "--data", mine, "--label", "object", "--run", tiny_run, "--out", mine],
-        ["retrieve", "--data", mine, "--run", tiny_run, "--out", mine],
-    ):
-        said = anytouch(*words)
-        assert said.status == 1 and "is a file that is read" in said.err, words
-    assert mine.read_text().startswith("path,sensor")
-    weights = tmp_path / "w.safetensors"
-    assert anytouch("convert", tiny_run, weights, "--names", "own").status == 0
-    assert "must end in .safetensors" in anytouch("convert", tiny_run, tiny_run / "config.json").err
-    assert "is a file that is read" in anytouch("convert", weights, weights).err
+def test_only_changed_options_are_refused():
+    @dataclass(frozen=True)
+    class Options:
+        model: str
+        max_rows: int = 3
+        join: str = "mean"
+
+    refuse_unused(Options("m"), ("max_rows", "join"), "here")
+    with pytest.raises(UserError, match=r"^--max-rows has"):
+        refuse_unused(Options("m", 4), ("max_rows", "join"), "here")
+    with pytest.raises(UserError, match=r"^--max-rows, --join have"):
+        refuse_unused(Options("m", 4, "sum"), ("max_rows", "join"), "here")
+
+
+@pytest.mark.parametrize(
+    ("typed", "named"),
+    [
+        ("data contact touch.parquet --picture c.parquet --out c.parquet", ["--out", "--picture"]),
+        ("data contact touch.parquet --picture c.jpg", ["--picture", ".png"]),
+        ("data contact touch.parquet --picture afile/c.png", ["afile", "--picture"]),
+        ("data contact touch.parquet --picture 5.png", ["5.png", "--picture"]),
+        ("data verify touch.parquet --repair r.csv --out r.csv", ["--repair", "--out"]),
+        ("data verify touch.parquet --commercial-only r.csv --out r.csv", ["--commercial-only", "--out"]),
+        ("data verify touch.parquet --repair o.csv --commercial-only o.csv", ["--repair", "--commercial-only"]),
+        ("data verify touch.parquet --out afile/report.json", ["afile", "--out"]),
+        ("data annotate touch.parquet --sheet x.csv --out x.csv --yes", ["--sheet", "--out"]),
+        ("data annotate touch.parquet --yes --sheet afile/look.html", ["afile", "--sheet"]),
+        ("export --model nowhere --out afile/e.bin", ["afile", "--out"]),
+        ("probe label --data touch.parquet --out afile/deep/p.json", ["afile", "--out"]),
+        ("probe label --data touch.parquet --out touch.parquet", ["touch.parquet", "--out"]),
+        ("probe label --model run --data touch.parquet --out run/config.json", ["config.json", "--out"]),
+        ("retrieve --data touch.parquet --out afile/r.json", ["afile", "--out"]),
+        ("retrieve --data touch.parquet --out touch.parquet", ["touch.parquet", "--out"]),
+        ("retrieve --data touch.parquet --gallery 1", ["--gallery"]),
+        ("report --data touch.parquet --stage1 a --stage2 b --out afile/r", ["afile", "--out"]),
+        ("report --data touch.parquet --stage1 a --stage2 b --out r --touches 0", ["--touches"]),
+        ("adapt --model a --data touch.parquet --sensor digit --out afile/r", ["afile", "--out"]),
+        ("adapt --model a --data touch.parquet --sensor digit --out r --seed -1", ["--seed"]),
+        ("adapt --model a --data touch.parquet --sensor digit --out r --seed 100000000000000000000", ["--seed"]),
+        ("adapt --model a --data touch.parquet --sensor digit --out r --steps 0", ["--steps"]),
+        ("adapt --model a --data touch.parquet --sensor digit --out r --frames 0 --labels x", ["--labels"]),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_named_before_the_work(mistake, no_work, pressed, tiny_run, typed, named):
+    (pressed.parent / "run").symlink_to(tiny_run)
+    no_work(typed.split())
+    before = {path: path.is_file() and path.read_bytes() for path in pressed.parent.iterdir()}
+    sentence = mistake(*typed.split())
+    assert all(name in sentence for name in named), sentence
+    assert {path: path.is_file() and path.read_bytes() for path in pressed.parent.iterdir()} == before
+
+
+def test_a_manifest_is_not_written_over_another_table(anytouch, mistake, tmp_path):
+    fill(tmp_path, [f"real/mug/dataset_{k}/frames/frame_{i:07d}.jpg" for k in range(2) for i in range(3)])
+    words = ("data", "index", "ycb_slide", tmp_path, "--out")
+    table = tmp_path / "labels.csv"
+    table.write_text("name,hardness\nmug,hard\n")
+    assert "labels.csv" in mistake(*words, table)
+    assert table.read_text().startswith("name,hardness")
+    for _ in range(2):  # a manifest may be made again
+        assert anytouch(*words, tmp_path / "m.csv").status == 0
+    (tmp_path / "broken.parquet").write_bytes(b"no parquet")
+    assert "broken.parquet" in mistake(*words, tmp_path / "broken.parquet")
+
+
+def test_a_table_with_semicolons_is_named(mistake, tmp_path):
+    (tmp_path / "semi.csv").write_text("path;sensor;sequence;frame_index;split\na.png;digit;s;0;train\n")
+    assert "semicolons" in mistake("info", tmp_path / "semi.csv")

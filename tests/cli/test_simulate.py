@@ -29,34 +29,35 @@ def _no_physics(monkeypatch, compiled_once):
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(mistake, tmp_path, words, told):
-    assert told in mistake("simulate", "--out", tmp_path / "x", *words)
+    assert told in mistake("data", "simulate", "--out", tmp_path / "x", *words)
     assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.parametrize("place", ["file", "file/below"])
 def test_a_file_is_no_folder(mistake, tmp_path, place):
     (tmp_path / "file").write_text("")
-    assert "is a file" in mistake("simulate", "--out", tmp_path / place, "--touches", "1")
+    words = ("--touches", 1, "--held-out", 0)
+    assert str(tmp_path / "file") in mistake("data", "simulate", "--out", tmp_path / place, *words)
 
 
 def test_the_command_makes_a_data_set(anytouch, tmp_path):
     out = tmp_path / "scenes"
-    said = anytouch("simulate", "--out", out, "--touches", 2, "--sensors", "digit", *SMALL)
+    said = anytouch("data", "simulate", "--out", out, "--touches", 2, "--sensors", "digit", *SMALL)
     assert said.status == 0, said
     few, compiling, *_ = said.err.splitlines()
-    assert "val and test" in few and "compiling" in compiling and "2 touches by digit" in said.err
+    assert "val" in few and "test" in few and "compiling" in compiling and "2 touches by digit" in said.err
     assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
 
 
 def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(anytouch, tmp_path, monkeypatch):
     monkeypatch.setattr(dataset, "GROUP", 1)
     words = ["--sensors", "digit", "--vision", "0", "--held-out", "0", *SMALL]
-    said = anytouch("simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
+    said = anytouch("data", "simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
     assert said.status == 0, said
     assert [line for line in said.err.splitlines() if " of 25 touches" in line] == [
         f"{done} of 25 touches" for done in (3, 5, 8, 10, 13, 15, 18, 20, 23, 25)
     ]
-    again = anytouch("simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
+    again = anytouch("data", "simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
     assert again.status == 0 and len(again.err.splitlines()) == 1  # nothing is left to do, nothing is compiled
 
 
@@ -68,5 +69,5 @@ def test_frames_that_did_not_converge_are_counted(anytouch, tmp_path, monkeypatc
 
     monkeypatch.setattr(dataset, "Recorder", Rough)
     words = ["--touches", 3, "--sensors", "digit", "--fidelity", "exact", *SMALL]
-    said = anytouch("simulate", "--out", tmp_path, *words)
+    said = anytouch("data", "simulate", "--out", tmp_path, *words)
     assert said.status == 0 and "3 of 6 frames did not converge" in said.err

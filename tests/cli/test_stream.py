@@ -1,4 +1,4 @@
-"""`anytouch embed --stream`: features of a video or a camera, kept also after Ctrl-C."""
+"""`anytouch stream`: features of a video or a camera, saved also after Ctrl-C."""
 
 import json
 import signal
@@ -24,19 +24,19 @@ def video(tmp_path_factory):
 
 def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video, tiny_run):
     streamed, plain = tmp_path / "streamed.npz", tmp_path / "plain.npz"
-    args = ("embed", "--run", tiny_run, "--input", video, "--frames", 3, "--sensor", "digit")
-    said = anytouch(*args, "--stream", "--out", streamed)
+    args = ("--model", tiny_run, "--data", video, "--frames", 3, "--sensor", "digit")
+    said = anytouch("stream", *args, "--out", streamed)
     assert said.status == 0 and "4 features of 12 values" in said.out
     words = " ".join(said.err.split())
     assert "p50 ms p99 ms decode" in words and "4 frames embedded, 0 dropped" in words
-    assert anytouch(*args, "--batch", 4, "--out", plain).status == 0
+    assert anytouch("embed", *args, "--batch", 4, "--out", plain).status == 0
     with np.load(streamed) as a, np.load(plain) as b:
         np.testing.assert_allclose(a["features"], b["features"], atol=1e-5)
         assert a["key/frame_index"].tolist() == b["key/frame_index"].tolist() == [2, 3, 4, 5]
         np.testing.assert_allclose(a["key/time"], [0.2, 0.3, 0.4, 0.5])  # in the film of ten frames a second
         assert str(a["about/stride"]) == "1" and "about/started" not in a
 
-    said = anytouch(*args, "--stream", "--out", "-")
+    said = anytouch("stream", *args, "--out", "-")
     lines = [json.loads(line) for line in said.out.splitlines()]
     assert said.status == 0 and [line["frame"] for line in lines] == [2, 3, 4, 5]
     assert [line["time"] for line in lines] == [0.2, 0.3, 0.4, 0.5]
@@ -46,12 +46,12 @@ def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video,
 
 
 def test_what_cannot_be_streamed(mistake, tmp_path, video, tiny_run):
-    args = ("embed", "--stream", "--run", tiny_run, "--out", tmp_path / "f.npz")
-    assert "too few frames for a clip of 3 at stride 4" in mistake(
-        *args, "--input", video, "--frames", 3, "--stride", 4
-    )
-    assert "a clip needs 3 frames" in mistake(*args, "--input", video, "--frames", 2)
-    assert "no video" in mistake(*args, "--input", tmp_path / "gone.avi")
+    args = ("stream", "--model", tiny_run, "--out", tmp_path / "f.npz")
+    assert "stride 4" in mistake(*args, "--data", video, "--frames", 3, "--stride", 4)
+    assert "3 frames" in mistake(*args, "--data", video, "--frames", 2)
+    assert "--stride" in mistake(*args, "--data", video, "--stride", 4)
+    assert ".npz" in mistake(*args, "--data", video, "--out", tmp_path / "f.csv")
+    assert "gone.avi" in mistake(*args, "--data", tmp_path / "gone.avi")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -82,9 +82,7 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
         signal.SIGINT, signal.default_int_handler
     )  # ignored, where a shell put pytest in the background
     try:
-        said = anytouch(
-            "embed", "--stream", "--run", tiny_run, "--input", 0, "--frames", 3, "--out", tmp_path / "f.npz"
-        )
+        said = anytouch("stream", "--model", tiny_run, "--data", 0, "--frames", 3, "--out", tmp_path / "f.npz")
     finally:
         signal.signal(signal.SIGINT, before)
         over.set()
@@ -112,9 +110,9 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
             writer.write(frame)
         writer.release()
         turn = ("--rotate", 90, "--flip", "across") if name == "lying" else ()
-        for form, more in ((name, ()), (f"{name}.avi", ("--stream",))):
+        for form, command in ((name, "embed"), (f"{name}.avi", "stream")):
             out = tmp_path / "f.npz"
-            said = anytouch("embed", "--run", tiny_run, "--input", tmp_path / form, "--out", out, *turn, *more)
+            said = anytouch(command, "--model", tiny_run, "--data", tmp_path / form, "--out", out, *turn)
             assert said.status == 0, said
             with np.load(out) as file:
                 found[form] = file["features"]
@@ -138,7 +136,7 @@ def test_a_camera_tells_when_it_began(anytouch, tmp_path, tiny_run, monkeypatch)
 
     monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
     before = time.time()
-    said = anytouch("embed", "--stream", "--run", tiny_run, "--input", 0, "--out", tmp_path / "f.npz")
+    said = anytouch("stream", "--model", tiny_run, "--data", 0, "--out", tmp_path / "f.npz")
     assert said.status == 0, said
     with np.load(tmp_path / "f.npz") as file:
         clock = float(str(file["about/started"])) + file["key/time"]

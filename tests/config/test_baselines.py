@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from anytouch_jax.cli import app
+from anytouch_jax.cli import app, train
 from anytouch_jax.config import Config, baselines, from_json, preset, to_json
 from anytouch_jax.errors import UserError
 
@@ -127,35 +127,35 @@ TRAIN = ["--data", "m.csv", "--run", "r"]
 
 
 def test_train_takes_a_baseline_before_the_users_own_overrides() -> None:
-    _, config = app._parse_train([*TRAIN, "--baseline", "t3"])
+    _, config = train.parse(train.TrainOptions, "train", [*TRAIN, "--baseline", "t3"])
     assert config.model.patch_encoder == "sensor" and config.data.clip_share == 0
-    args = [*TRAIN, "--baseline", "t3", "--model.sensor-tokens", "2", "--loader.clip-share", "0.25"]
-    _, config = app._parse_train(args)
+    args = [*TRAIN, "--baseline", "t3", "--model.sensor-tokens", "2", "--data.clip-share", "0.25"]
+    _, config = train.parse(train.TrainOptions, "train", args)
     assert config.model.patch_encoder == "sensor" and config.model.sensor_tokens == 2
     assert config.data.clip_share == 0.25 and not config.objective.next_frame
-    _, config = app._parse_train([*TRAIN, "--stage", "2", "--loader.require", "image", "text"])
+    _, config = train.parse(train.TrainOptions, "train", [*TRAIN, "--stage", "2", "--data.require", "image", "text"])
     assert config.data.require == ("image", "text")
 
 
 def test_train_refuses_a_baseline_that_does_not_fit(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     def told(*args: str) -> str:
-        assert app.main(["train", *TRAIN, *args]) == 1
+        assert app.main(["train", *TRAIN, *args]) == 2
         return capsys.readouterr().err
 
     assert "no baseline is called 'moco'" in told("--baseline", "moco")
     assert "no_pretraining is not trained" in told("--baseline", "no_pretraining")
     assert "t3 has no stage 2" in told("--baseline", "t3", "--stage", "2")
     init = ("--stage", "2", "--init", str(tmp_path))
-    assert "--objective.match-keep does nothing in stage 1; leave it out" in told("--objective.match-keep", "0.5")
+    assert "--objective.match-keep has no effect in stage 1" in told("--objective.match-keep", "0.5")
     for option, value in (("match-head", "cosine"), ("lora-rank", "4"), ("temperature", "0.2")):
-        assert f"--model.{option} does nothing in stage 1; leave it out" in told(f"--model.{option}", value)
-    assert "--loader.negatives does nothing in stage 1" in told("--loader.negatives", "same_sensor")
-    clip = ("--stage", "2", "--towers", "pretrained", "--clip", str(tmp_path), "--model.temperature")
-    assert "--model.temperature does nothing with --clip, whose temperature is taken" in told(*clip, "0.2")
+        assert f"--model.{option} has no effect in stage 1" in told(f"--model.{option}", value)
+    assert "--data.negatives has no effect in stage 1" in told("--data.negatives", "same_sensor")
+    clip = ("--stage", "2", "--towers", "pretrained", "--clip-weights", str(tmp_path), "--model.temperature")
+    assert "--model.temperature has no effect with --clip-weights" in told(*clip, "0.2")
     assert "there is no manifest" in told(*clip, "0.07")
     masked = ("--objective.mask-ratio", "0.5", *init)
-    assert "--objective.mask-ratio does nothing in stage 2 without --objective.reconstruct" in told(*masked)
+    assert "--objective.mask-ratio has no effect in stage 2 without --objective.reconstruct" in told(*masked)
     for kept in (("--objective.reconstruct", *masked), ("--recipe", "release", *masked), ("--baseline", "t3")):
         assert "there is no manifest" in told(*kept)
-    assert "no_stage1 has no stage 1: leave out --init" in told("--baseline", "no_stage1", *init)
+    assert "no_stage1 has no stage 1" in told("--baseline", "no_stage1", *init)
     assert "there is no manifest" in told("--baseline", "no_matching", *init)

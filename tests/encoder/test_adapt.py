@@ -247,10 +247,10 @@ def test_what_training_saw_is_written_down(world, tiny_run, tmp_path, compiled_o
 
 
 def test_the_command(run, data, tmp_path, capsys, compiled_once):
-    args = ["adapt", "--run", run, "--data", data, "--sensor", "gelslim", "--frames", 8, "--steps", 40, "--out"]
+    args = ["adapt", "--model", run, "--data", data, "--sensor", "gelslim", "--frames", 8, "--steps", 40, "--out"]
     assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 0
     assert "tokens of gelslim fitted to 8 frames; loss on frames of split val" in capsys.readouterr().out
-    assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 1
+    assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 2
     assert "is not empty" in capsys.readouterr().err
     args[args.index("--frames") + 1] = 0
     del args[args.index("--steps") : args.index("--steps") + 2]

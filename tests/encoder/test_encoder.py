@@ -163,7 +163,8 @@ def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_
     said: list[str] = []
     assert encoder.sensor_row("9dtact", said.append) == 5 and "was not in training" in said[0]
     # through `convert` the numbers of the file stay, and what they are of is told
-    assert main(["convert", str(tmp_path / "authors.safetensors"), str(tmp_path / "again.safetensors")]) == 0
+    words = ["--model", str(tmp_path / "authors.safetensors"), "--out", str(tmp_path / "again.safetensors")]
+    assert main(["export", "--to", "release", *words]) == 0
     again = load.read_weights(tmp_path / "again.safetensors")
     np.testing.assert_array_equal(again["sensor_token"], stored)
     found = load_encoder(tmp_path / "again.safetensors")

@@ -14,7 +14,7 @@ import pytest
 from places import ROOT
 from tiny_models import tiny_config
 
-from anytouch_jax.cli import app
+from anytouch_jax.cli.app import COMMANDS, GROUPS
 from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
 
@@ -37,12 +37,12 @@ def typed(program: str) -> list[str]:
 @pytest.mark.parametrize("line", typed("anytouch"))
 def test_a_command_of_the_readme_is_understood(line: str) -> None:
     name, *args = shlex.split(line)
-    if name == "train":
-        if "--data" not in args:  # the example leaves to the reader what every run needs
-            args += ["--data", "m.csv", "--run", "r"]
-        app._parse_train(args)
-    else:
-        app._parse(app._COMMANDS[name][0], name, args)
+    if name in GROUPS:
+        name = f"{name} {args.pop(0)}"
+    if name == "train" and "--data" not in args:  # the example leaves out what every run needs
+        args += ["--data", "m.csv", "--run", "r"]
+    command = COMMANDS[name]
+    command.parse(command.options, name, args)
 
 
 def test_one_spelling_of_the_command() -> None:

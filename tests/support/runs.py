@@ -33,7 +33,7 @@ SEQUENCES = {
 SIZES = {
     "model.image-size": 28, "model.patch": 7, "model.embed": 12, "model.touch.width": 16, "model.touch.depth": 1,
     "model.touch.heads": 2, "model.touch.mlp": 32, "model.decoder.width": 8, "model.decoder.depth": 1,
-    "model.decoder.heads": 2, "model.decoder.mlp": 16, "loader.clip-share": 0,
+    "model.decoder.heads": 2, "model.decoder.mlp": 16, "data.clip-share": 0,
 }  # fmt: skip
 
 

@@ -33,7 +33,7 @@ def test_the_mesh_takes_all_devices_and_leaves_placement_to_jit():
 
 
 def test_a_mesh_that_does_not_fit_is_refused():
-    with pytest.raises(ConfigError, match=r"--loop\.fsdp 3 must be a divisor of the 4 devices"):
+    with pytest.raises(ConfigError, match=r"--run\.fsdp 3 must be a divisor of the 4 devices"):
         make_mesh(fsdp=3)
     with pytest.raises(ConfigError, match="needs 8 devices, but there are 4"):
         make_mesh(4, 2)

@@ -1,1 +1,1 @@
-"""The `anytouch` command line: one file a command."""
+"""Commands of the `anytouch` command line: one file each, with its options and its `run`."""

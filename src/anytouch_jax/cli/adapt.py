@@ -1,15 +1,40 @@
-"""`anytouch adapt`: tokens of its own for a sensor that a run has never seen."""
+"""`anytouch adapt`: sensor tokens for a sensor that a run was not trained on."""
 
 from __future__ import annotations
 
-from anytouch_jax.cli.options_use import Adapt
-from anytouch_jax.cli.output import check_home
-from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import log
+from dataclasses import dataclass
+from pathlib import Path
+
+from anytouch_jax.cli.output import check_home, log, refuse_unused
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, SEED, in_range
 
 
-def run(options: Adapt) -> int:
+@dataclass(frozen=True)
+class AdaptOptions:
+    """Fit sensor tokens for a new sensor to a few of its frames. All other parameters stay frozen.
+
+    Example: anytouch adapt --model runs/stage1 --data mine.csv --sensor my_gel --frames 20 --out runs/my_gel
+    """
+
+    model: Path
+    """Run folder of stage 1 or stage 2."""
+    data: tuple[Path, ...]
+    """Manifests with frames of the sensor in split train."""
+    sensor: str
+    """Name of the sensor, as in the column sensor of the manifest."""
+    out: Path
+    """Run folder to write, for embed, probe and retrieve."""
+    frames: int = 100
+    """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
+    labels: str | None = None
+    """Label column to fit to, with examples of its classes by known sensors (default: masked reconstruction)."""
+    steps: int = 200
+    """Steps of the fit."""
+    seed: int = 0
+    """Random seed."""
+
+
+def run(options: AdaptOptions) -> int:
     """Fit the tokens of a new sensor and write a run folder."""
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.adapt import adapt, check_empty, save
@@ -17,28 +42,22 @@ def run(options: Adapt) -> int:
 
     in_range("--", options, seed=SEED, steps=COUNT, frames=NOT_NEGATIVE)
     if not options.frames:
-        refuse(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
+        refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
     check_empty(options.out)
     check_home(options.out)
     enable_compilation_cache()
     table = manifests.read([str(path) for path in options.data])
-    found = adapt(
-        options.run,
-        table,
-        options.sensor,
-        frames=options.frames,
-        labels=options.labels,
-        steps=options.steps,
-        seed=options.seed,
-        log=log,
-    )
-    save(found, options.run, options.out)
+    adapted = adapt(
+        options.model, table, options.sensor, frames=options.frames, labels=options.labels, steps=options.steps,
+        seed=options.seed, log=log,
+    )  # fmt: skip
+    save(adapted, options.model, options.out)
     if not options.frames:
         print(f"{options.out}: {options.sensor} has the universal tokens")
         return 0
-    where = "of split val" if found.measured == "val" else "that were fitted"
+    where = "of split val" if adapted.measured == "val" else "of the fit"
     print(
-        f"{options.out}: tokens of {options.sensor} fitted to {options.frames} frames; "
-        f"loss on frames {where} {found.before:.4f} -> {found.after:.4f}"
+        f"{options.out}: tokens of {options.sensor} fitted to {options.frames} frames. "
+        f"The loss on frames {where} went from {adapted.before:.4f} to {adapted.after:.4f}."
     )
     return 0

@@ -1,15 +1,23 @@
-"""`anytouch annotate`: captions from a vision-language model behind an OpenAI-compatible endpoint."""
+"""`anytouch data annotate`: captions from a vision-language model behind an OpenAI-compatible endpoint."""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from anytouch_jax.cli.options_data import Annotate
-from anytouch_jax.cli.output import beside, check_apart, check_folder, check_new, write_new
-from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import log
+from tyro.conf import Positional
+
+from anytouch_jax.cli.output import (
+    check_apart,
+    check_folder,
+    check_new,
+    default_target,
+    log,
+    refuse_unused,
+    write_new,
+)
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.errors import UserError
 
@@ -18,33 +26,97 @@ if TYPE_CHECKING:
     from anytouch_jax.data.prepare.captions import CaptionResult, CostEstimate, Endpoint
 
 
-_ASKING = (
-    "split", "limit", "sheet", "estimate", "family", "answers", "second_image", "url", "model", "key_variable", "yes",
-    "price_in", "price_out", "threads", "side", "timeout", "tries", "max_tokens", "token_field", "temperature",
-    "json_mode",
-)  # fmt: skip
+@dataclass(frozen=True)
+class AnnotateOptions:
+    """Caption every touch without a text by a vision-language model, as the paper did with GPT-4o.
+
+    Example: anytouch data annotate tacquad.parquet --vlm gpt-4o --limit 20 --sheet look.html
+
+    Prints an estimate of the cost and asks before it starts. The key comes from the environment and is never stored.
+    Run the same command again to continue: answers are kept. Exits with 1 if a caption is missing.
+    """
+
+    manifest: Positional[Path]
+    """Manifest with photographs or phrases (.csv, .parquet)."""
+    out: Path | None = None
+    """Manifest to write (default: NAME_captions, next to the manifest)."""
+    answers: Path | None = None
+    """Folder that keeps every answer (default: NAME_answers, next to the manifest)."""
+    url: str = "https://api.openai.com/v1"
+    """Base address of an OpenAI-compatible endpoint. A local one needs no key."""
+    vlm: str = "gpt-4o"
+    """Name of the vision-language model."""
+    key_variable: str = "OPENAI_API_KEY"
+    """Environment variable that holds the key."""
+    yes: bool = False
+    """Do not ask for confirmation."""
+    estimate: bool = False
+    """Print the estimate and stop."""
+    price_in: float | None = None
+    """Price of a million input tokens, for the estimate."""
+    price_out: float | None = None
+    """Price of a million output tokens."""
+    limit: int | None = None
+    """Number of captions to ask for, to look at a sample first."""
+    captions: Path | None = None
+    """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no model."""
+    key: str | None = None
+    """Column that joins --captions and the manifest: caption_id, sequence, object, path, ..."""
+    sheet: Path | None = None
+    """HTML page of captions with their pictures, to check by eye."""
+    sheet_count: int = 40
+    """Captions on that page."""
+    split: str | None = None
+    """Only rows of this split."""
+    family: tuple[tuple[str, Literal["photograph", "object", "phrase"]], ...] = ()
+    """Prompt of your dataset, as in: mydata photograph."""
+    second_image: str = "image2_path"
+    """Column of a second photograph, for the prompt object."""
+    overwrite: bool = False
+    """Also ask for rows that have a caption."""
+    threads: int = 4
+    """Questions at a time."""
+    side: int = 512
+    """Longest side of the pictures that are sent, pixels."""
+    timeout: float = 60.0
+    """Seconds to wait for an answer."""
+    tries: int = 5
+    """Tries for a question."""
+    max_tokens: int = 200
+    """Largest number of tokens of an answer."""
+    token_field: str = "max_tokens"
+    """Name of that limit in the protocol. Newer models need max_completion_tokens."""
+    temperature: float | None = 0.0
+    """Temperature. None is not sent."""
+    json_mode: bool = True
+    """Ask for a JSON object. Use --no-json-mode for servers without it."""
 
 
-class _OnlyAnEstimate(Exception):
-    """What was asked for has been printed; nothing goes out."""
+class _EstimateOnly(Exception):
+    """The estimate is printed and nothing is sent."""
 
 
-def run(options: Annotate) -> int:
-    """Estimate, ask for consent, annotate, write the manifest with its captions; 1 when a caption could not be had."""
+# Only these have an effect with --captions, which asks no model.
+_WITH_CAPTIONS = ("manifest", "out", "captions", "key", "overwrite", "sheet_count")
+
+
+def run(options: AnnotateOptions) -> int:
+    """Estimate, ask for consent, annotate, and write the manifest with its captions."""
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.prepare.captions import annotate, sample_sheet
 
     if options.captions is not None:
-        refuse(options, _ASKING, "with --captions, which asks nothing")
+        asking = [name for name in vars(options) if name not in _WITH_CAPTIONS]
+        refuse_unused(options, asking, "with --captions, which asks no model")
     else:
-        refuse(options, ("key",), "without --captions, the table that it is a column of")
+        refuse_unused(options, ("key",), "without --captions")
     if options.sheet is None:
-        refuse(options, ("sheet_count",), "without --sheet")
+        refuse_unused(options, ("sheet_count",), "without --sheet")
     if (options.price_in is None) != (options.price_out is None):
-        raise UserError("--price-in and --price-out go together: a question costs by what is sent and what comes back")
+        raise UserError("--price-in needs --price-out, and the reverse: both count in the estimate")
     in_range("--", options, price_in=NOT_NEGATIVE, price_out=NOT_NEGATIVE, sheet_count=COUNT)
     manifest = manifests.read(options.manifest)
-    target = options.out or beside(options.manifest, "captions")
+    target = options.out or default_target(options.manifest, "captions")
     if not options.estimate:
         check_new(manifest, target)
         check_folder(target, read=() if options.captions is None else (options.captions,))
@@ -52,68 +124,69 @@ def run(options: Annotate) -> int:
     if options.sheet is not None:
         check_folder(options.sheet, "--sheet", read=manifest.files)
     if options.captions is not None:
-        return _attach(options, manifest, target)
+        return _attach(manifest, options.captions, options.key, options.overwrite, target)
     try:
-        found = annotate(
-            manifest, _endpoint(options), options.answers or beside(options.manifest, "answers", ""),
-            confirm=lambda estimate: _consent(options, estimate), price_in=options.price_in,
+        annotated = annotate(
+            manifest, _endpoint(options), options.answers or default_target(options.manifest, "answers", ""),
+            confirm=lambda estimate: _confirm(options, estimate), price_in=options.price_in,
             price_out=options.price_out, threads=options.threads, side=options.side, split=options.split,
             families=dict(options.family), overwrite=options.overwrite, second_image=options.second_image,
             limit=options.limit, log=log,
         )  # fmt: skip
-    except _OnlyAnEstimate:
+    except _EstimateOnly:
         return 0
-    _tell(found)
+    _print_summary(annotated)
     if options.sheet is not None:
-        log(f"{sample_sheet(manifest, found.captions, options.sheet, count=options.sheet_count)}: captions to check")
-    print(f"{write_new(found.manifest, target)}: {len(found.captions):,} captions")
-    return 1 if found.failures else 0
+        sheet = sample_sheet(manifest, annotated.captions, options.sheet, count=options.sheet_count)
+        log(f"{sheet}: captions to check")
+    print(f"{write_new(annotated.manifest, target)}: {len(annotated.captions):,} captions")
+    return 1 if annotated.failures else 0
 
 
-def _attach(options: Annotate, manifest: Manifest, target: Path) -> int:
-    """Captions that are there already, in a table."""
+def _attach(manifest: Manifest, captions: Path, key: str | None, overwrite: bool, target: Path) -> int:
+    """Write the manifest with the captions of a table."""
     from anytouch_jax.data.manifest.manifest import attach_text
 
-    assert options.captions is not None
-    named, notes = attach_text(manifest, options.captions, key=options.key, overwrite=options.overwrite)
+    captioned, notes = attach_text(manifest, captions, key=key, overwrite=overwrite)
     for note in notes:
         log(note)
-    print(f"{write_new(named, target)}: {int(named.present('text').sum()):,} of {len(named):,} rows have a caption")
+    count = int(captioned.present("text").sum())
+    print(f"{write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a caption")
     return 0
 
 
-def _endpoint(options: Annotate) -> Endpoint:
+def _endpoint(options: AnnotateOptions) -> Endpoint:
     from anytouch_jax.data.prepare.captions import Endpoint
 
     return Endpoint(
-        options.url, options.model, key_variable=options.key_variable, timeout=options.timeout, tries=options.tries,
+        options.url, options.vlm, key_variable=options.key_variable, timeout=options.timeout, tries=options.tries,
         max_tokens=options.max_tokens, temperature=options.temperature, json_mode=options.json_mode,
         token_field=options.token_field,
     )  # fmt: skip
 
 
-def _consent(options: Annotate, estimate: CostEstimate) -> bool:
-    print(f"{options.model} at {options.url}: {estimate}", flush=True)
+def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
+    print(f"{options.vlm} at {options.url}: {estimate}", flush=True)
     if options.estimate:
-        raise _OnlyAnEstimate
+        raise _EstimateOnly
     if not estimate.questions:
         return True
-    _endpoint(options).check()  # a missing key is reported before the question
+    _endpoint(options).check()  # raises for a missing key, before the question
     if options.yes:
         return True
     if not sys.stdin.isatty():
-        raise UserError("nobody is there to confirm this; add --yes, or --estimate to see the estimate only")
+        raise UserError("There is no terminal to confirm on. Add --yes, or --estimate to print the estimate only.")
     try:
         return input("Ask now? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:
         return False
 
 
-def _tell(found: CaptionResult) -> None:
-    print(f"{found.asked:,} questions asked, {found.tokens_in:,} tokens in, {found.tokens_out:,} tokens out")
-    for reason, count in found.left_out.items():
+def _print_summary(annotated: CaptionResult) -> None:
+    print(f"{annotated.asked:,} questions, {annotated.tokens_in:,} tokens in, {annotated.tokens_out:,} tokens out")
+    for reason, count in annotated.left_out.items():
         print(f"left out, {reason}: {count:,} rows")
-    for failure in found.failures[:5]:
+    for failure in annotated.failures[:5]:
         log(f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}")
-    if len(found.failures) > 5:
-        log(f"... and {len(found.failures) - 5} more: failures.jsonl has them all")
+    if len(annotated.failures) > 5:
+        log(f"and {len(annotated.failures) - 5} more, listed in failures.jsonl")

@@ -1,55 +1,96 @@
-"""`anytouch contact`: which frames are touched, by difference from the untouched gel."""
+"""`anytouch data contact`: contact scores by difference from the untouched gel."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from pathlib import Path
 
-import numpy as np
+from tyro.conf import Positional
 
-from anytouch_jax.cli.options_data import Contact
-from anytouch_jax.cli.output import beside, check_apart, check_folder, check_new, write_new
-from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import log
+from anytouch_jax.cli.output import (
+    check_apart,
+    check_folder,
+    check_new,
+    default_target,
+    log,
+    refuse_unused,
+    write_new,
+)
 from anytouch_jax.config.parsing import Range, in_range
-from anytouch_jax.errors import UserError
 
 
-def run(options: Contact) -> int:
-    """Score every frame; write the marked manifest, the picture of both sides, or compare with what is known."""
+@dataclass(frozen=True)
+class ContactOptions:
+    """Mark the frames in contact by their difference from the untouched gel, without markers.
+
+    Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --picture contact.png
+
+    The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown.
+    """
+
+    manifest: Positional[Path]
+    """Manifest to mark (.csv, .parquet)."""
+    out: Path | None = None
+    """Manifest to write (default: NAME_contact, next to the manifest)."""
+    drop: bool = False
+    """Drop frames without contact. The split background and unknown frames stay."""
+    threshold: tuple[tuple[str, float], ...] = ()
+    """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
+    share: float = 0.0
+    """Also require this share (0 to 1) of the highest score of the recording. This removes the start and end of a
+    contact. --picture and --check ignore it."""
+    picture: Path | None = None
+    """PNG of kept and dropped frames by rising score. Look at it before you trust a threshold."""
+    check: bool = False
+    """Print precision and recall against a reference column. Writes a manifest only with --out."""
+    reference: str | None = None
+    """Column for --check (default: label.force, label.contact or label.contact_score)."""
+    above: float | None = None
+    """Value of the reference column above which a frame is in contact."""
+    threads: int = 2
+    """Threads that read pictures."""
+
+
+def run(options: ContactOptions) -> int:
+    """Score every frame, then write the marked manifest, the picture, or the comparison with a column."""
+    import numpy as np
+
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.prepare import contact
 
     if not options.check:
-        refuse(options, ("reference", "above"), "without --check, which compares with a column")
+        refuse_unused(options, ("reference", "above"), "without --check")
     elif options.out is None:
-        refuse(options, ("drop",), "with --check alone, which writes no manifest", "; or name one with --out")
+        refuse_unused(options, ("drop",), "on --check, which writes a manifest only with --out")
     in_range("--", options, above=Range(-math.inf, math.inf, "a number"))
     manifest = manifests.read(options.manifest)
-    target = options.out or (None if options.check else beside(options.manifest, "contact"))
+    target = options.out or (None if options.check else default_target(options.manifest, "contact"))
     if target is not None:
         check_new(manifest, target)
     check_apart(out=target, picture=options.picture)
     if options.picture is not None:
-        if options.picture.suffix.lower() != ".png":
-            raise UserError(f"--picture {options.picture} must end in .png")
         frames = map(manifest.file, range(len(manifest))) if options.picture.exists() else ()
-        check_folder(options.picture, "--picture", read=(*manifest.files, *frames))
-    limits = dict(options.threshold)
-    contact.threshold_of_rows(manifest, limits, options.share)  # mistakes are told before the work
+        check_folder(options.picture, "--picture", read=(*manifest.files, *frames), suffix=".png")
+    thresholds = dict(options.threshold)
+    contact.threshold_of_rows(manifest, thresholds, options.share)  # raises for a mistake, before the work
     if options.check:
         contact.reference_contact(manifest, options.reference)
     if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
-        refuse(options, ("threshold", "share"), "where every row has a label.contact, which is kept")
+        refuse_unused(options, ("threshold", "share"), "on rows that all have a label.contact, which is kept")
     scores = contact.contact_scores(manifest, workers=options.threads)
-    marked, report = contact.mark_contact(manifest, scores, thresholds=limits, share=options.share, drop=options.drop)
+    marked, report = contact.mark_contact(
+        manifest, scores, thresholds=thresholds, share=options.share, drop=options.drop
+    )
     print("\n".join(report.lines()))
     if options.check:
         quality = contact.contact_quality(
-            manifest, scores, reference=options.reference, above=options.above, thresholds=limits
+            manifest, scores, reference=options.reference, above=options.above, thresholds=thresholds
         )
         print("\n".join(quality.lines()))
     if options.picture is not None:
-        log(f"{contact.contact_sheet(manifest, scores, options.picture, thresholds=limits)}: kept and dropped frames")
+        picture = contact.contact_sheet(manifest, scores, options.picture, thresholds=thresholds)
+        log(f"{picture}: kept and dropped frames")
     if target is not None:
         print(f"{write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
     return 0

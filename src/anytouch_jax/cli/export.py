@@ -1,29 +1,142 @@
-"""`anytouch export`: a trained encoder as one file that needs jax alone."""
+"""`anytouch export`: an encoder for jax alone, or weights as safetensors."""
 
 from __future__ import annotations
 
-from anytouch_jax.cli.options_use import Export
-from anytouch_jax.cli.output import check_folder
-from anytouch_jax.cli.unused import refuse_join
-from anytouch_jax.encoder.export import describes
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
+from anytouch_jax.config import UNIVERSAL, ModelConfig, to_json
+from anytouch_jax.errors import UserError
+
+Loaded = tuple[dict[str, Any], ModelConfig, dict[str, str]]  # parameters, their model, metadata
 
 
-def run(options: Export) -> int:
-    """Write the artefact and its description, after a comparison with the live model; say how far they differ."""
+@dataclass(frozen=True)
+class ExportOptions:
+    """Export a touch encoder as one file for jax alone, or weights as safetensors.
+
+    Example: anytouch export --model runs/stage2 --out encoder.bin --frames 3
+
+    The file for jax takes uint8 frames and sensor rows, and returns features. OUT.json describes how to call it. It is
+    compared with the live model before it is written.
+    Example: anytouch export --to safetensors --model runs/stage2 --out weights.safetensors
+    """
+
+    model: Path
+    """Run folder or weights file (.pth, .safetensors)."""
+    out: Path
+    """The file to write. Weights must end in .safetensors."""
+    to: Literal["jax", "safetensors", "release"] = "jax"
+    """jax: the touch encoder as a program. safetensors: all weights by this package's names. release: weights by the
+    names of the authors' files."""
+    frames: int = 1
+    """jax: frames of a touch. 1 for stills, 3 or more for clips (in segments of three)."""
+    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
+    """jax: the platforms it runs on."""
+    pooling: Literal["class", "mean", "both"] = "class"
+    """jax: the class token, the mean of the patch tokens, or both."""
+    join: Literal["mean", "sum", "concat"] = "mean"
+    """jax: how the segments of a long clip are joined."""
+    dtype: Literal["trained", "float32", "bfloat16"] = "trained"
+    """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
+    between: Path | None = None
+    """Weights: the run or file that MODEL was trained from. Writes an interpolation of the two."""
+    share: float = 0.5
+    """Weights: position from BETWEEN (0) to MODEL (1)."""
+
+
+def run(options: ExportOptions) -> int:
+    """Write an encoder for jax, or weights."""
+    if options.to != "jax":
+        refuse_unused(options, ("frames", "platforms", "pooling", "join", "dtype"), f"with --to {options.to}")
+        return _export_weights(options)
+    refuse_unused(options, ("between", "share"), "with --to jax")
     from anytouch_jax.encoder import encoder as features
     from anytouch_jax.encoder import export
+    from anytouch_jax.encoder.export import describes
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    check_folder(options.out, read=(options.run,))
+    check_folder(options.out, read=(options.model,))
     enable_compilation_cache()
-    encoder = features.load_encoder(options.run).computed_in(options.dtype)
+    encoder = features.load_encoder(options.model).computed_in(options.dtype)
     refuse_join(options, encoder.config.model.frames)
-    platforms = [name.strip() for name in options.platforms.split(",") if name.strip()]
     about = export.export(
-        encoder, options.out, frames=options.frames, platforms=platforms, pooling=options.pooling, join=options.join
-    )
-    worst = about["worst_difference"]
-    print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(platforms)}; {about['input']}")
-    print(f"at most {worst:.1e} of the largest feature from the live model (1 and 5 touches)")
+        encoder, options.out, frames=options.frames, platforms=options.platforms, pooling=options.pooling,
+        join=options.join,
+    )  # fmt: skip
+    print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(options.platforms)}; {about['input']}")
+    print(f"largest difference from the live model: {about['worst_difference']:.1e} of the largest feature")
     print(f"{describes(options.out)}: how to call it")
     return 0
+
+
+def _export_weights(options: ExportOptions) -> int:
+    from anytouch_jax.weights import convert, safetensors
+
+    source, before = options.model, options.between
+    if before is None:
+        refuse_unused(options, ("share",), "without --between")
+    if not 0 <= options.share <= 1:
+        raise UserError(f"--share must be 0 to 1, not {options.share:g}")
+    read = [path for path in (source, before) if path is not None and not path.is_dir()]
+    check_folder(options.out, read=read, suffix=".safetensors")
+    params, model, about = _loaded(source)
+    if before is not None:
+        params = _between(_loaded(before), (params, model, about), options)
+        about |= {"source": f"{options.share:g} of the way from {before} to {source}"}
+    if options.to == "release":
+        if not {"touch", "decoder"} <= params.keys():
+            raise UserError(f"{source} lacks the touch encoder or decoder of the authors' files. Use --to safetensors.")
+        params, model = _universal_last(params, model)
+    about |= {safetensors.MODEL_KEY: to_json(model)}
+    if options.to == "safetensors":
+        safetensors.export_safetensors(options.out, params, about)
+    else:
+        if "matcher" in params and model.match_head == "mlp":
+            log("the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code ignores")
+        if "force" in params:
+            log("the force heads are left out: the authors' files have none. Use --to safetensors to keep them.")
+            params = {name: tree for name, tree in params.items() if name != "force"}
+        arrays = convert.to_release(params, model, allow_extra=True)
+        safetensors.write_safetensors(options.out, arrays, about | {"format": "pt"})
+    print(f"{options.out}: written")
+    return 0
+
+
+def _loaded(source: Path) -> Loaded:
+    """Return the parameters of a run or a file, their model, and the metadata to store."""
+    from anytouch_jax.weights import load
+
+    loaded = load.load_model(source, stored_rows=True)
+    return loaded.params, loaded.config.model, loaded.export_metadata()
+
+
+def _between(first: Loaded, second: Loaded, options: ExportOptions) -> dict[str, Any]:
+    """Return parameters between `first` and `second`. Raises UserError if their networks differ."""
+    from anytouch_jax.weights import safetensors, tree
+
+    names = ("touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "activation", "sensors")
+    other = [name for name in names if getattr(first[1], name) != getattr(second[1], name)]
+    if first[2].get(safetensors.BACKGROUND_KEY, "keep") != second[2].get(safetensors.BACKGROUND_KEY, "keep"):
+        other.append("background")
+    if other:
+        raise UserError(
+            f"{options.between} and {options.model} have different networks ({', '.join(other)}). --between takes the "
+            "run that MODEL was trained from."
+        )
+    return tree.interpolate(first[0], second[0], options.share)
+
+
+def _universal_last(params: dict[str, Any], model: ModelConfig) -> tuple[dict[str, Any], ModelConfig]:
+    """Return the same model with its universal tokens in the last row, where the authors' code reads them (id -1)."""
+    import numpy as np
+
+    from anytouch_jax.weights import compatible
+
+    if model.sensors[-1] == UNIVERSAL:
+        return params, model
+    names = (*(name for name in model.sensors if name != UNIVERSAL), UNIVERSAL)
+    rows = compatible.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
+    return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(model, sensors=names)

@@ -1,18 +1,62 @@
-"""`anytouch index`: a downloaded dataset becomes a manifest."""
+"""`anytouch data index`: a manifest of a downloaded dataset."""
 
 from __future__ import annotations
 
-from anytouch_jax.cli.options_data import Index
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
 
 
-def run(options: Index) -> int:
-    """Read the dataset, write its manifest, print what was found beside the paper's count."""
+@dataclass(frozen=True)
+class DatasetOptions:
+    """Make a manifest of a downloaded dataset or of your recordings: one row per tactile frame.
+
+    Example: anytouch data index ycb_slide ~/data/YCB-Slide --out ~/data/YCB-Slide/ycb_slide.parquet
+
+    Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel,
+    objectfolder, real_touch, taxim_presses, recordings. Use recordings for your data: a folder of pictures for each
+    recording, as OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder above.
+    """
+
+    name: Positional[str]
+    """Name of the dataset."""
+    root: Positional[Path]
+    """Folder that holds the unpacked dataset."""
+    out: Path | None = None
+    """Manifest to write, .parquet or .csv, in ROOT or a folder above it (default: ROOT/NAME.parquet)."""
+    keep: bool = False
+    """Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path."""
+    val: float = 0.05
+    """Share of the objects or recordings in split val, for a dataset without splits."""
+    test: float = 0.05
+    """Share of the objects or recordings in split test, for a dataset without splits."""
+    lists: Path | None = None
+    """Folder of the dataset's list files, if they are not in ROOT."""
+    task: Literal["material", "rough"] = "material"
+    """touch_and_go: the task whose lists decide the split."""
+    fold: int = 0
+    """feel: the fold k whose split_<k>.npy decides the split."""
+    export: bool = False
+    """Let the reader write pictures into ROOT, for a dataset of arrays or films."""
+    sensor: str | None = None
+    """recordings: the sensor, by its name in the configuration or a new name."""
+    split_by: Literal["object", "recording"] = "object"
+    """recordings: hold out whole objects, or recordings of each object."""
+    labels: Path | None = None
+    """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
+    touch and text keep their names."""
+
+
+def run(options: DatasetOptions) -> int:
+    """Read the dataset, write its manifest, and print the counts with the paper's."""
     from anytouch_jax.data import readers
 
-    told = readers.IndexOptions(
+    settings = readers.IndexOptions(
         val=options.val, test=options.test, lists=options.lists, task=options.task, fold=options.fold,
         export=options.export, sensor=options.sensor, split_by=options.split_by, labels=options.labels,
     )  # fmt: skip
-    report = readers.index(options.name, options.root, options.out, options=told, keep=options.keep)
+    report = readers.index(options.name, options.root, options.out, options=settings, keep=options.keep)
     print("\n".join(report.lines()))
     return 0

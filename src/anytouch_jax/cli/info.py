@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+from tyro.conf import Positional
 
-from anytouch_jax.cli.options_use import Info
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
 from anytouch_jax.encoder.export import describes
 from anytouch_jax.errors import UserError
@@ -16,7 +17,18 @@ _TABLES = (".csv", ".parquet")
 _WEIGHTS = (".safetensors", ".pth", ".pt", ".bin", ".npz")
 
 
-def run(options: Info) -> int:
+@dataclass(frozen=True)
+class InfoOptions:
+    """Describe files and folders: a run, weights, a manifest, features, a head or an exported encoder.
+
+    Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Files and folders."""
+
+
+def run(options: InfoOptions) -> int:
     """Print some lines on every path."""
     if not options.paths:
         raise UserError("name a file or a folder")
@@ -113,20 +125,22 @@ def _sensors(model: ModelConfig, seen: Sequence[str] | None) -> str:
 
 
 def _weights(path: Path) -> list[str]:
+    import numpy as np
+
     from anytouch_jax.weights import load, safetensors
     from anytouch_jax.weights.convert import detect_layout
 
-    weights, told = load.read_weights(path), safetensors.read_file_metadata(path)
+    weights, metadata = load.read_weights(path), safetensors.read_file_metadata(path)
     names = {"own": "our own", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
     layout = detect_layout(weights)
     model = load.model_of_file(path, weights)
-    seen = load.trained_sensors(told, model)
+    trained = load.trained_sensors(metadata, model)
     count = sum(array.size for array in weights.values())
     finite = all(np.isfinite(array).all() for array in weights.values() if array.dtype.kind == "f")
     return [
         f"{path}: {len(weights)} arrays of {count:,} numbers by {names.get(layout, f'the authors ({layout})')} names",
         _model(model),
-        *([] if layout in ("clip", "openclip") else [_sensors(model, seen)]),
+        *([] if layout in ("clip", "openclip") else [_sensors(model, trained)]),
         *([] if finite else ["some of them are not finite: nothing can be embedded with them"]),
     ]
 
@@ -158,9 +172,13 @@ def _manifest(path: Path) -> list[str]:
 
 def _features(path: Path) -> list[str]:
     """What `anytouch embed` wrote; [] for another .npz."""
-    from anytouch_jax.weights.safetensors import read_npz
+    import numpy as np
 
-    arrays = read_npz(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return []
     if not {"features", "rows"} <= arrays.keys():
         return []
     values = arrays["features"]

@@ -1,11 +1,12 @@
-"""Where a command writes a manifest that it made from another one."""
+"""Places where commands write, options that have no effect, and what commands print."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
@@ -14,28 +15,64 @@ if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
 
 
-def beside(manifest: Path, word: str, suffix: str | None = None) -> Path:
-    """The default place of a result: `<name>_<word>` beside the manifest, with its ending unless `suffix` is given."""
+def log(sentence: str) -> None:
+    """Print a sentence that is not a result on standard error."""
+    from rich.console import Console
+
+    Console(stderr=True, highlight=False).print(sentence, markup=False, soft_wrap=True)
+
+
+def print_table(markdown: str) -> None:
+    """Print a Markdown table, drawn by rich on a terminal."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    console = Console()
+    if console.is_terminal:
+        console.print(Markdown(markdown))
+    else:
+        print(markdown)
+
+
+def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
+    """Raise UserError for those of the options `names` that differ from their defaults and have no effect.
+
+    `reason` ends the sentence, as in "has no effect <with a folder>".
+    """
+    defaults = {field.name: field.default for field in fields(options)}
+    changed = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) != defaults[name]]
+    if changed:
+        raise UserError(f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. Remove it.")
+
+
+def refuse_join(options: Any, segment: int) -> None:
+    """Raise UserError for --join where a touch of `options.frames` frames is one segment, of `segment` at most."""
+    if (options.frames or 1) <= segment:
+        refuse_unused(options, ("join",), f"on touches of up to {segment} frames, which have one segment")
+
+
+def default_target(manifest: Path, word: str, suffix: str | None = None) -> Path:
+    """Return the default place of a result: `<name>_<word>` in the folder of `manifest`."""
     return manifest.with_name(f"{manifest.stem}_{word}{manifest.suffix if suffix is None else suffix}")
 
 
 def check_new(manifest: Manifest, path: Path) -> Path:
-    """The absolute path of a manifest that `write_new` can write: to be asked before long work. Raises UserError."""
+    """Return the absolute path of a manifest that `write_new` can write. Raises UserError before long work."""
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.manifest.schema import is_manifest
 
     target = path.expanduser().resolve()
     if target in manifest.files:
-        raise UserError(f"{target} is the manifest that was read; name another file")
+        raise UserError(f"{target} is the manifest that was read. Name another file with --out.")
     if target.is_file() and not is_manifest(target):
-        raise UserError(f"{target} is there and is no manifest; name another file with --out, or remove it")
+        raise UserError(f"{target} exists and is no manifest. Name another file with --out, or remove it.")
     manifests.check_target(manifest, target)
     check_folder(target)
     return target
 
 
 def write_new(manifest: Manifest, path: Path) -> Path:
-    """Write `manifest` to `path`, whole or not at all. Raises UserError for one of the files that it was read from."""
+    """Write `manifest` atomically to `path`. Raises UserError for one of the files that it was read from."""
     from anytouch_jax.data.manifest import manifest as manifests
 
     target = check_new(manifest, path)
@@ -46,57 +83,57 @@ def write_new(manifest: Manifest, path: Path) -> Path:
     return target
 
 
-def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path] = ()) -> None:
+def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path] = (), suffix: str = "") -> None:
     """Make the folder of a file that will be written after long work; `option` named it.
 
-    Raises UserError where that cannot be, where `path` is a folder or a device, and where it is one of the files that
-    are `read`.
+    Raises UserError for a folder that cannot be made, for a `path` that is a folder, a device or one of the files
+    that are `read`, and for another ending than `suffix`.
     """
+    if suffix and path.suffix.lower() != suffix:
+        raise UserError(f"{path} must end in {suffix}. Choose another {option}.")
     try:
         if path.is_dir():
-            raise UserError(f"{path} is a folder; name a file with {option}")
+            raise UserError(f"{path} is a folder. Name a file with {option}.")
         if path.exists() and not path.is_file():
-            raise UserError(f"{path} is no regular file; name one with {option}")
-        if path.exists() and path.resolve() in {Path(one).expanduser().resolve() for one in read}:
-            raise UserError(f"{path} is a file that is read; name another one with {option}")
+            raise UserError(f"{path} is no regular file. Name one with {option}.")
+        if path.exists() and path.resolve() in {Path(file).expanduser().resolve() for file in read}:
+            raise UserError(f"{path} is a file that is read. Name another one with {option}.")
         for folder in reversed(path.parents):
             if folder.exists() and not folder.is_dir():
-                raise UserError(f"{folder} is a file, not a folder; choose another {option}")
+                raise UserError(f"{folder} is a file, not a folder. Choose another {option}.")
         path.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(path.parent, os.W_OK)
     except OSError as error:
-        raise UserError(
-            f"the folder {path.parent} cannot be made: {error.strerror or error}; choose another {option}"
-        ) from None
+        reason = error.strerror or error
+        raise UserError(f"the folder {path.parent} cannot be made: {reason}. Choose another {option}.") from None
     if not writable:
-        raise UserError(f"the folder {path.parent} cannot be written to; choose another {option}")
-
-
-def check_apart(**outputs: Path | None) -> None:
-    """Raise UserError where two outputs, by the names of their options, are one file: the second would replace the
-    first."""
-    named: dict[Path, str] = {}
-    for name, path in outputs.items():
-        if path is not None:
-            option, place = f"--{name.replace('_', '-')}", path.expanduser().resolve()
-            if place in named:
-                raise UserError(f"{named[place]} and {option} name the same file; give each its own")
-            named[place] = option
+        raise UserError(f"the folder {path.parent} cannot be written to. Choose another {option}.")
 
 
 def check_home(folder: Path, option: str = "--out") -> None:
-    """As `check_folder`, for a folder that will be filled after long work: its parents are made, it is not."""
+    """Check a folder that will be filled after long work: its parents are made, the folder itself is not."""
     if folder.is_dir():
         if not os.access(folder, os.W_OK):
-            raise UserError(f"the folder {folder} cannot be written to; choose another {option}")
+            raise UserError(f"the folder {folder} cannot be written to. Choose another {option}.")
         return
     if folder.exists():
-        raise UserError(f"{folder} is a file, not a folder; choose another {option}")
+        raise UserError(f"{folder} is a file, not a folder. Choose another {option}.")
     check_folder(folder, option)
 
 
+def check_apart(**outputs: Path | None) -> None:
+    """Raise UserError where two outputs, by the names of their options, are the same file."""
+    options: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if path is not None:
+            option, place = f"--{name.replace('_', '-')}", path.expanduser().resolve()
+            if place in options:
+                raise UserError(f"{options[place]} and {option} name the same file. Give each another name.")
+            options[place] = option
+
+
 def write_text(text: str, path: Path) -> Path:
-    """Write a report to `path`, whole or not at all; its folder is made."""
+    """Write a report atomically to `path` and return its absolute path; its folder is made."""
     target = path.expanduser().resolve()
     try:
         atomic_write(target, text)

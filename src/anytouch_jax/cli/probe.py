@@ -1,86 +1,199 @@
-"""`anytouch probe`: heads on frozen features, for a label, for tasks of the battery, or as a public benchmark."""
+"""`anytouch probe`: simple heads on frozen features, for a label column, for tasks, or as a public benchmark."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
-from rich.console import Console
-from rich.markdown import Markdown
-
-from anytouch_jax.cli.options import Probe
-from anytouch_jax.cli.output import check_apart, check_folder, check_home
-from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import log
+from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, print_table, refuse_unused
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
 from anytouch_jax.errors import UserError
 
-_OF_LABEL = ("label", "group", "leave_out", "where", "sensor", "save")
-_OF_SPLITS = ("group", "seeds", "protocol", "save")  # of a label; --leave-out has folds instead
-_OF_BATTERY = (
-    "join", "heads", "order", "train_sensors", "test_sensors", "train_units", "test_units", "max_rows", "cache",
-)  # fmt: skip
-_SIDES = ("train_sensors", "test_sensors", "train_units", "test_units")
-_OF_TASKS = ("frames", "pooling", "join", "heads", "protocol")  # a benchmark has the authors'
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """The options that all probes share."""
+
+    data: tuple[Path, ...]
+    """Manifests to probe on."""
+    model: tuple[Path, ...] = ()
+    """Run folders or weights files to compare."""
+    features: tuple[Path, ...] = ()
+    """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed writes it."""
+    controls: bool = True
+    """Also probe raw pixels and a random encoder."""
+    out: Path | None = None
+    """Write the results as JSON."""
 
 
-def run(options: Probe) -> int:
-    """Probe frozen features on a label column or on tasks, print a table, write JSON when asked."""
-    from anytouch_jax.train.mesh import enable_compilation_cache
+@dataclass(frozen=True)
+class LabelOptions(ProbeOptions):
+    """Probe a label column with linear and kNN heads on frozen features.
 
-    check_options(options)
-    if options.out is not None:
-        own = (run / name for run in options.run for name in ("config.json", "metrics.jsonl", "tokenizer.json"))
-        check_folder(options.out, read=(*options.data, *options.run, *options.features, *own))
+    Example: anytouch probe label --model runs/stage1 --data manifest.csv --label object
+
+    Use --where label.contact_score 7 for firm touches only, after `anytouch data contact`. The penalty is chosen on
+    split val, or by grouped cross-validation inside train. The report is on split test.
+    """
+
+    label: str = "object"
+    """Label column. The prefix "label." may be left out."""
+    group: str = ""
+    """Column whose values never appear in two splits (default: the first of grasp_group, object, touch, sequence that
+    the manifest has and that is not the label)."""
+    leave_out: str | None = None
+    """Leave out each value of this column in turn instead of using the splits, such as object for slip."""
+    where: tuple[str, float] | None = None
+    """Keep rows whose column is above a number."""
+    sensor: str | None = None
+    """Keep rows of this sensor."""
+    frames: int = 1
+    """Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row."""
+    pooling: Literal["class", "mean", "both"] = "class"
+    """Features: the class token, the mean of the patch tokens, or both."""
+    seeds: int = 5
+    """Bootstrap resamples of the training groups."""
+    protocol: Literal["honest", "published"] = "honest"
+    """published chooses the penalty on the test split, as the authors' code does. The report says so."""
+    save: Path | None = None
+    """Write the linear head of one --model as .npz, for embed --head and stream --head."""
+
+
+@dataclass(frozen=True)
+class BatteryOptions(ProbeOptions):
+    """The options that tasks and benchmarks share."""
+
+    seeds: int = 5
+    """Random splits of the groups."""
+    train_sensors: tuple[str, ...] = ()
+    """Train on these sensors only."""
+    test_sensors: tuple[str, ...] = ()
+    """Test on these sensors only."""
+    train_units: tuple[str, ...] = ()
+    """Train on these units only. Patterns such as cam0_* are allowed."""
+    test_units: tuple[str, ...] = ()
+    """Test on these units only."""
+    max_rows: int | None = None
+    """Largest number of rows per task, drawn with a fixed seed."""
+    cache: Path | None = None
+    """Folder that caches features by content, so that each frame is encoded once."""
+
+
+@dataclass(frozen=True)
+class TasksOptions(BatteryOptions):
+    """Probe named tasks: every seed splits the groups again, so that no object or recording is in two splits.
+
+    Example: anytouch probe tasks --model runs/stage2 --data manifest.parquet --tasks material slip force twist
+    """
+
+    tasks: tuple[str, ...] = ("all",)
+    """Tasks: material, roughness, hardness, grasp, grasp_after, object, slip, force, twist, slide, indenter, or all."""
+    heads: tuple[Literal["linear", "knn", "gradient"], ...] = ("linear",)
+    """Heads. gradient is the authors': one layer trained by AdamW."""
+    protocol: Literal["honest", "published"] = "honest"
+    """published also reports the choice on the test split, as in the authors' code."""
+    frames: int | None = None
+    """Frames of a touch (default: those of each task)."""
+    pooling: Literal["class", "mean", "both"] = "class"
+    """Features: the class token, the mean of the patch tokens, or both."""
+    join: Literal["mean", "sum", "concat"] = "mean"
+    """How the segments of a clip longer than the model's are joined."""
+    order: Literal["right", "shuffled", "repeated"] = "right"
+    """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions(BatteryOptions):
+    """Probe a public benchmark with the authors' settings.
+
+    Example: anytouch probe benchmark --benchmark feel_grasp --model runs/stage2 --data feel.parquet
+    """
+
+    benchmark: str = "touch_and_go_material"
+    """Benchmark: touch_and_go_material, touch_and_go_roughness, touch_and_go_hardness, feel_grasp,
+    objectfolder1_material, objectfolder2_material."""
+
+
+def run_label(options: LabelOptions) -> int:
+    """Probe a label column, print a table, and write JSON with --out."""
+    from anytouch_jax.evaluate.probe_results import probe_table
+    from anytouch_jax.evaluate.probing import probe_label
+
+    in_range("--", options, frames=COUNT)
+    if options.leave_out is not None:
+        refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
     if options.save is not None:
-        check_folder(options.save, "--save", read=(*options.data, *options.run, *options.features))
-        if options.save.suffix.lower() != ".npz":
-            raise UserError(f"{options.save}: a head is written as .npz; name such a file with --save")
+        if len(options.model) != 1:
+            raise UserError(f"--save writes the head of one encoder. Give one --model, not {len(options.model)}.")
+        check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
-    if options.cache is not None:
-        check_home(options.cache, "--cache")
-    enable_compilation_cache()
-    from anytouch_jax.evaluate import probing
-    from anytouch_jax.evaluate.probe_results import probe_table, task_table
-
-    shared: dict[str, Any] = {name: getattr(options, name) for name in ("features", "seeds", "controls", "out")}
-    sides = {name: _names(getattr(options, name)) for name in _SIDES} | {"max_rows": options.max_rows}
-    if options.tasks and options.benchmark:
-        raise UserError("give --benchmark, which has its own settings, or --tasks, not both")
-    if options.benchmark:
-        shared |= sides | {"cache": options.cache, "log": log}
-        table = task_table(probing.probe_benchmark(options.run, options.data, options.benchmark, **shared))
-    elif options.tasks:
-        names: tuple[str, ...] = ("protocol", "frames", "pooling", "join", "order", "cache")
-        shared |= sides | {name: getattr(options, name) for name in names} | {"log": log}
-        tasks = "all" if options.tasks == "all" else _names(options.tasks)
-        heads = _names(options.heads)
-        table = task_table(probing.probe_tasks(options.run, options.data, tasks, heads=heads, **shared))
-    else:
-        names = ("group", "leave_out", "where", "sensor", "pooling", "protocol", "save")
-        shared |= {name: getattr(options, name) for name in names} | {"frames": options.frames or 1, "log": log}
-        table = probe_table(probing.probe_label(options.run, options.data, options.label, **shared))
-    Console().print(Markdown(table)) if Console().is_terminal else print(table)
+    _prepare(options, options.seeds)
+    results = probe_label(
+        options.model, options.data, options.label, features=options.features, group=options.group,
+        leave_out=options.leave_out, where=options.where, sensor=options.sensor, frames=options.frames,
+        pooling=options.pooling, seeds=options.seeds, protocol=options.protocol, controls=options.controls,
+        save=options.save, out=options.out, log=log,
+    )  # fmt: skip
+    print_table(probe_table(results))
     return 0
 
 
-def _names(text: str) -> Any:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def run_tasks(options: TasksOptions) -> int:
+    """Probe named tasks, print a table, and write JSON with --out."""
+    from anytouch_jax.evaluate.probe_results import task_table
+    from anytouch_jax.evaluate.probing import probe_tasks
+
+    in_range("--", options, frames=COUNT, max_rows=COUNT)
+    if options.frames is None:
+        refuse_unused(options, ("join",), "without --frames: tasks use stills or single segments")
+    if options.frames == 1:
+        refuse_unused(options, ("order",), "on stills")
+    _prepare(options, options.seeds, options.cache)
+    results = probe_tasks(
+        options.model, options.data, "all" if options.tasks == ("all",) else options.tasks,
+        features=options.features, heads=options.heads, seeds=options.seeds, protocol=options.protocol,
+        frames=options.frames, pooling=options.pooling, join=options.join, order=options.order,
+        train_sensors=options.train_sensors, test_sensors=options.test_sensors, train_units=options.train_units,
+        test_units=options.test_units, max_rows=options.max_rows, controls=options.controls, cache=options.cache,
+        out=options.out, log=log,
+    )  # fmt: skip
+    print_table(task_table(results))
+    return 0
 
 
-def check_options(options: Probe) -> None:
-    """Refuse what differs from its default and would do nothing. Raises UserError that names it and says why."""
-    in_range("--", options, frames=COUNT, max_rows=COUNT, seeds=NOT_NEGATIVE)
-    if options.save is not None and len(options.run) != 1:
-        raise UserError(f"--save keeps the linear head of one encoder: give one --run, not {len(options.run)}")
-    if options.tasks or options.benchmark:
-        refuse(options, _OF_LABEL, "beside --tasks or --benchmark, which have labels and groups of their own")
-        if options.frames == 1 or (options.benchmark and not options.tasks):
-            refuse(options, ("order",), "for stills")
-        if options.benchmark and not options.tasks:
-            refuse(options, _OF_TASKS, "beside --benchmark, which has the authors' settings")
-        elif options.frames is None:
-            refuse(options, ("join",), "without --frames: tasks are of stills and of single segments")
-        return
-    refuse(options, _OF_BATTERY, "without --tasks or --benchmark", "; or name tasks: --tasks all")
-    if options.leave_out is not None:
-        refuse(options, _OF_SPLITS, "beside --leave-out, which groups by its own column and needs no split")
+def run_benchmark(options: BenchmarkOptions) -> int:
+    """Probe a public benchmark, print a table, and write JSON with --out."""
+    from anytouch_jax.evaluate.probe_results import task_table
+    from anytouch_jax.evaluate.probing import probe_benchmark
+
+    in_range("--", options, max_rows=COUNT)
+    _prepare(options, options.seeds, options.cache)
+    results = probe_benchmark(
+        options.model, options.data, options.benchmark, features=options.features, seeds=options.seeds,
+        train_sensors=options.train_sensors, test_sensors=options.test_sensors, train_units=options.train_units,
+        test_units=options.test_units, max_rows=options.max_rows, controls=options.controls, cache=options.cache,
+        out=options.out, log=log,
+    )  # fmt: skip
+    print_table(task_table(results))
+    return 0
+
+
+def _prepare(options: ProbeOptions, seeds: int, cache: Path | None = None) -> None:
+    """Check where results go, before the work."""
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    if seeds < 0:
+        raise UserError(f"--seeds must be {NOT_NEGATIVE.words}, not {seeds}")
+    if not options.model and not options.features and not options.controls:
+        raise UserError("There is nothing to probe. Give --model or --features, or leave out --no-controls.")
+    if options.out is not None:
+        check_folder(options.out, read=_files_read(options))
+    if cache is not None:
+        check_home(cache, "--cache")
+    enable_compilation_cache()
+
+
+def _files_read(options: ProbeOptions) -> tuple[Path, ...]:
+    records = [run / name for run in options.model for name in ("config.json", "metrics.jsonl", "tokenizer.json")]
+    return (*options.data, *options.model, *options.features, *records)

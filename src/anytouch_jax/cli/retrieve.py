@@ -1,19 +1,14 @@
-"""`anytouch retrieve`: the same touch by another sensor, among touches that resemble it in place, depth and force."""
+"""`anytouch retrieve`: cross-sensor retrieval of the same touch among similar touches."""
 
 from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-from rich.console import Console
-from rich.markdown import Markdown
-
-from anytouch_jax.cli.options import Retrieve
-from anytouch_jax.cli.output import check_folder
-from anytouch_jax.cli.unused import refuse
-from anytouch_jax.cli.words import log
+from anytouch_jax.cli.output import check_folder, log, print_table, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.config.parsing import COUNT, Range, in_range
 from anytouch_jax.errors import UserError
@@ -23,8 +18,41 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
 
 
-def run(options: Retrieve) -> int:
-    """Score cross-sensor retrieval of frozen features, print a table, write JSON when asked."""
+@dataclass(frozen=True)
+class RetrieveOptions:
+    """Retrieve the same touch felt by another sensor: recall@1 and recall@5 with controls and intervals.
+
+    Example: anytouch retrieve --model runs/stage2 --data data/scenes/manifest.parquet
+
+    A gallery holds the true touch once, and the touches most similar to it in position, depth and force.
+    """
+
+    data: Path
+    """Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force)."""
+    model: tuple[Path, ...] = ()
+    """Run folders or weights files to compare."""
+    split: str = "test"
+    """Split to retrieve in."""
+    frames: int = 1
+    """Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame."""
+    pooling: Literal["class", "mean", "both"] = "class"
+    """Features: the class token, the mean of the patch tokens, or both."""
+    gallery: int = 50
+    """Touches in a gallery."""
+    by_chance: bool = False
+    """Draw the galleries at random, not by similarity."""
+    seeds: int = 5
+    """Galleries drawn for each query, with --by-chance."""
+    controls: bool = True
+    """Also score a random encoder, background-subtracted pixels, and the contact's area, centroid and force."""
+    out: Path | None = None
+    """Write the results as JSON."""
+
+
+def run(options: RetrieveOptions) -> int:
+    """Score cross-sensor retrieval, print a table, and write JSON with --out."""
+    import numpy as np
+
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import encoder as features
@@ -35,12 +63,12 @@ def run(options: Retrieve) -> int:
     from anytouch_jax.evaluate.statistics import markdown_table, plain
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    least = Range(2, math.inf, "2 or more, the touch and at least one other")
-    in_range("--", options, gallery=least, frames=COUNT, seeds=COUNT)
+    at_least_two = Range(2, math.inf, "2 or more, the touch and at least one other")
+    in_range("--", options, gallery=at_least_two, frames=COUNT, seeds=COUNT)
     if not options.by_chance:
-        refuse(options, ("seeds",), "without --by-chance: what resembles a touch most is not drawn")
+        refuse_unused(options, ("seeds",), "without --by-chance")
     if options.out is not None:
-        check_folder(options.out, read=(options.data, *options.run))
+        check_folder(options.out, read=(options.data, *options.model))
     enable_compilation_cache()
     encoders = _encoders(options)
     for encoder in encoders.values():
@@ -49,49 +77,47 @@ def run(options: Retrieve) -> int:
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(embedding.text_column(table, "sensor")[rows], FIELD_SENSORS)]
     rows = deepest_rows(table, rows, frames=options.frames)
-    asked: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
         "seeds": options.seeds,
     }  # fmt: skip
-    retrieval.cross_sensor_retrieval(table, {}, rows, **asked)  # a gallery that cannot be is told before the work
-    found: dict[str, Any] = {}
+    retrieval.cross_sensor_retrieval(table, {}, rows, **settings)  # raises for an impossible gallery, before the work
+    values: dict[str, Any] = {}
     for name, encoder in encoders.items():
-        kept, found[name] = embedding.embed_rows(encoder, table, rows, options.frames, options.pooling, log=log)
+        kept, values[name] = embedding.embed_rows(encoder, table, rows, options.frames, options.pooling, log=log)
         if len(kept) < len(rows):
-            raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows could not be read; repair the manifest first")
+            raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first.")
     if options.controls:
         for name, make in ((PIXELS, background_difference), (VECTOR, contact_vector)):
             try:
-                found[name] = make(table, rows)
+                values[name] = make(table, rows)
             except UserError as error:
                 log(f"no control by {name}: {error}")
-    scored = retrieval.cross_sensor_retrieval(table, found, rows, metrics={VECTOR: "euclidean"}, **asked)
+    scores = retrieval.cross_sensor_retrieval(table, values, rows, metrics={VECTOR: "euclidean"}, **settings)
     head = ("features", "query", "gallery", "centred", "top-1", "95 %", "top-5", "chance", "of", "queries")
-    text = markdown_table(head, [_row(one) for one in scored])
-    Console().print(Markdown(text)) if Console().is_terminal else print(text)
-    for note in dict.fromkeys(note for one in scored for note in one.notes):
+    print_table(markdown_table(head, [_cells(score) for score in scores]))
+    for note in dict.fromkeys(note for score in scores for note in score.notes):
         log(note)
     if options.out is not None:
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
-        atomic_write(options.out, json.dumps(about | {"results": plain(scored)}, indent=2) + "\n")
+        atomic_write(options.out, json.dumps(about | {"results": plain(scores)}, indent=2) + "\n")
     return 0
 
 
-def _encoders(options: Retrieve) -> dict[str, Encoder]:
+def _encoders(options: RetrieveOptions) -> dict[str, Encoder]:
     from anytouch_jax.encoder import encoder as features
 
-    encoders = {str(run): features.load_encoder(run) for run in options.run}
+    encoders = {str(path): features.load_encoder(path) for path in options.model}
     if options.controls and encoders:
         encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
     if not encoders and not options.controls:
-        raise UserError("nothing to compare: give --run, or leave the controls on")
+        raise UserError("There is nothing to compare. Give --model, or leave out --no-controls.")
     return encoders
 
 
-def _row(one: Any) -> tuple[str, ...]:
-    interval = "-" if one.low is None else f"{100 * one.low:.1f} to {100 * one.high:.1f}"
-    shares = (f"{100 * one.top1:.1f} %", interval, f"{100 * one.top5:.1f} %", f"{100 * one.chance1:.1f} %")
-    return (
-        one.name, one.query_sensor, one.gallery_sensor, "yes" if one.centred else "no", *shares, str(one.gallery),
-        str(one.queries),
-    )  # fmt: skip
+def _cells(score: Any) -> tuple[str, ...]:
+    interval = "-" if score.low is None else f"{100 * score.low:.1f} to {100 * score.high:.1f}"
+    shares = (f"{100 * score.top1:.1f} %", interval, f"{100 * score.top5:.1f} %", f"{100 * score.chance1:.1f} %")
+    centred = "yes" if score.centred else "no"
+    sizes = (str(score.gallery), str(score.queries))
+    return (score.name, score.query_sensor, score.gallery_sensor, centred, *shares, *sizes)

@@ -1,4 +1,4 @@
-"""`anytouch simulate`: touch scenes on disk."""
+"""`anytouch data simulate`: touch scenes on disk."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from anytouch_jax.cli.options import Simulate
-from anytouch_jax.cli.words import log
+from anytouch_jax.cli.output import log
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -19,8 +19,53 @@ if TYPE_CHECKING:
     from anytouch_jax.sim.scene import Scenes
 
 
-def run(options: Simulate) -> int:
-    """Simulate a data set, or finish one that was begun; 130 after Ctrl-C (what is finished is kept)."""
+@dataclass(frozen=True)
+class SimulateOptions:
+    """Simulate touches felt by several sensors, with photographs, captions, forces and slip.
+
+    Example: anytouch data simulate --out data/scenes --touches 400 --sensors gelsight_mini digit --seed 0
+
+    Run the same command again to continue after an interruption.
+    """
+
+    out: Path
+    """Folder for images and manifest.parquet."""
+    touches: int = 400
+    """Number of places to touch. Every sensor feels each place once."""
+    sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
+    """Sensors: gelsight, gelsight_mini, gelslim, digit, duragel, tac3d (a force field)."""
+    seed: int = 0
+    """Random seed."""
+    grade: Literal["fine", "coarse"] = "fine"
+    """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
+    fidelity: Literal["fast", "exact"] = "fast"
+    """Solve contact in a few rounds, or to convergence."""
+    frames: int = 10
+    """Frames of a recording. One gesture fills them; 10 are a third of a second at 30 Hz."""
+    objects: int = 200
+    """Number of objects."""
+    depth: tuple[float, float] = (0.3, 1.0)
+    """Range of the deepest press, mm."""
+    vision: float = 0.7
+    """Share of the recordings with a photograph."""
+    text: float = 0.7
+    """Share of the recordings with a caption."""
+    held_out: float = 0.25
+    """Share of the objects in the test split, by pairs of primitive and texture."""
+    first: int = 0
+    """Number of the first touch. Another number gives other touches of the same objects and splits."""
+    fields: tuple[str, ...] = ()
+    """Fields to write as .npy: displacement, pressure, shear."""
+    size: int = 224
+    """Pixels of an image's shorter side. 0 keeps the sensor's resolution."""
+    units: Literal["each", "one"] = "each"
+    """each simulates a new device for every recording; one uses one device of each sensor, mounted straight."""
+    threads: int = 2
+    """Threads that render photographs and write files."""
+
+
+def run(options: SimulateOptions) -> int:
+    """Simulate a data set, or finish one that was interrupted; 130 after Ctrl-C."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -29,38 +74,24 @@ def run(options: Simulate) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
-    scenes = Scenes(
-        touches=options.touches,
-        sensors=_names(options.sensors),
-        seed=options.seed,
-        grade=options.grade,
-        fidelity=options.fidelity,
-        frames=options.frames,
-        objects=options.objects,
-        depth=options.depth,
-        vision=options.vision,
-        text=options.text,
-        held_out=options.held_out,
-        fields=_names(options.fields),
-        size=options.size,
-        units=options.units,
-        first=options.first,
-    )
-    if missing := _missing(scenes):
-        log(f"no touch is of split {' and '.join(missing)}: more touches or more objects (some 16) give some")
+    scenes = Scenes(**{name: value for name, value in asdict(options).items() if name not in ("out", "threads")})
+    if missing := _missing_splits(scenes):
+        log(f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more.")
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar, _ended_by_interrupt(bar):
-        told = _teller(bar, scenes.sensors)
-        path = simulate(scenes, options.out, threads=options.threads, progress=told)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar, _exit_on_interrupt(bar):
+        progress = _progress(bar, scenes.sensors)
+        path = simulate(scenes, options.out, threads=options.threads, progress=progress)
     log(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
     return 0
 
 
 @contextmanager
-def _ended_by_interrupt(bar: Progress) -> Iterator[None]:
-    """Ctrl-C ends the process at once: a thread that compiles hears of nothing for a minute, and no file is there half
-    written. Nothing changes where Ctrl-C is ignored or another program's, and outside the main thread."""
+def _exit_on_interrupt(bar: Progress) -> Iterator[None]:
+    """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are written atomically.
+
+    Nothing changes outside the main thread, or where another handler is set.
+    """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
         yield
@@ -68,7 +99,7 @@ def _ended_by_interrupt(bar: Progress) -> Iterator[None]:
 
     def end(*_: Any) -> None:
         bar.stop()
-        log("interrupted: what is finished is kept, the same command goes on")
+        log("interrupted: finished touches are kept. Run the same command again to continue.")
         os._exit(130)
 
     signal.signal(signal.SIGINT, end)
@@ -78,32 +109,32 @@ def _ended_by_interrupt(bar: Progress) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _missing(scenes: Scenes) -> list[str]:
-    """The splits that no touch is of, where objects are held out."""
+def _missing_splits(scenes: Scenes) -> list[str]:
+    """Return the splits without a touch, where objects are held out."""
     from anytouch_jax.sim.scene import draw_touch, objects_and_splits
 
     splits = objects_and_splits(scenes)[1]
-    numbers = range(scenes.first, scenes.first + min(scenes.touches, len(splits)))  # by then each object had its turn
-    there = {draw_touch(scenes, number, splits).split for number in numbers}
-    return [name for name in ("val", "test") if scenes.held_out and name not in there]
+    numbers = range(scenes.first, scenes.first + min(scenes.touches, len(splits)))  # one turn of each object
+    present = {draw_touch(scenes, number, splits).split for number in numbers}
+    return [name for name in ("val", "test") if scenes.held_out and name not in present]
 
 
 def _unconverged(manifest: Path) -> str:
-    """How many frames of fidelity exact did not converge, in words; "" for none."""
+    """Return how many frames of fidelity exact did not converge, in words; "" for none."""
     import pyarrow.parquet as pq
 
     if "label.converged" not in pq.read_schema(manifest).names:
         return ""
     column = pq.read_table(manifest, columns=["label.converged"])["label.converged"].drop_null().to_numpy()
-    few = int((column < 1).sum())
-    return f"; {few} of {len(column)} frames did not converge (label.converged)" if few else ""
+    count = int((column < 1).sum())
+    return f". {count} of {len(column)} frames did not converge (label.converged)" if count else ""
 
 
-def _teller(bar: Progress, sensors: tuple[str, ...]) -> Callable[[int, int], None]:
-    """What is told of (touches done, touches): a bar on a terminal, a line every tenth of them elsewhere."""
+def _progress(bar: Progress, sensors: tuple[str, ...]) -> Callable[[int, int], None]:
+    """Return a callback of (touches done, touches): a bar on a terminal, elsewhere a line every tenth."""
     task, last = bar.add_task("touches"), -1
 
-    def tell(done: int, of: int) -> None:
+    def report(done: int, of: int) -> None:
         nonlocal last
         line = ""
         if last < 0 and done < of:
@@ -115,8 +146,4 @@ def _teller(bar: Progress, sensors: tuple[str, ...]) -> Callable[[int, int], Non
         last = done
         bar.update(task, completed=done, total=of)
 
-    return tell
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    return report

@@ -1,12 +1,14 @@
-"""`anytouch verify`: is a manifest fit to train on? And copies of it, repaired or for commercial use."""
+"""`anytouch data verify`: problems of a manifest and its files, with repaired and commercial copies."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anytouch_jax.cli.options_data import Verify
-from anytouch_jax.cli.output import check_apart, check_folder, check_new, write_new, write_text
-from anytouch_jax.cli.words import log
+from tyro.conf import Positional
+
+from anytouch_jax.cli.output import check_apart, check_folder, check_new, log, write_new, write_text
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -14,23 +16,50 @@ if TYPE_CHECKING:
     from anytouch_jax.data.prepare.verify import VerifyReport
 
 
-def run(options: Verify) -> int:
-    """Print the report; 1 when there are errors that no repair took away."""
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Check manifests and their files: missing, broken, repeated, swapped, or leaking between splits.
+
+    Example: anytouch data verify touch.parquet --repair touch_clean.parquet
+
+    Exits with 1 if there are errors, or errors that --repair could not remove. Ends with the licences of the data.
+    """
+
+    manifests: Positional[tuple[Path, ...]]
+    """Manifests to check together (.csv, .parquet)."""
+    repair: Path | None = None
+    """Write a repaired copy: without unusable rows and files and repeated rows, with swapped folders exchanged."""
+    commercial_only: Path | None = None
+    """Write a copy with the rows that certainly allow commercial use, after any --repair."""
+    swap: tuple[str, ...] = ()
+    """With --repair: exchange touch image and photograph in these datasets. Look at them first."""
+    decode: bool = True
+    """Decode every picture. --no-decode only checks that the files exist."""
+    objects: bool = False
+    """Report an object in two splits as an error."""
+    threads: int = 4
+    """Threads that read files."""
+    out: Path | None = None
+    """Write the report as JSON too."""
+
+
+def run(options: VerifyOptions) -> int:
+    """Print the report; 1 if errors remain."""
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.prepare import verify
     from anytouch_jax.data.prepare.licences import commercial_only
     from anytouch_jax.data.prepare.repair import check_swap
 
     if options.swap and options.repair is None:
-        raise UserError("--swap exchanges files in the repaired copy: say where it goes with --repair OUT")
+        raise UserError("--swap exchanges files in the repaired copy. Name that copy with --repair.")
     check_apart(repair=options.repair, commercial_only=options.commercial_only, out=options.out)
     manifest = manifests.read(options.manifests)
-    check_swap(manifest, options.swap)  # before the work
+    check_swap(manifest, options.swap)
     for target in (options.repair, options.commercial_only):
         if target is not None:
             check_new(manifest, target)
     if options.commercial_only is not None:
-        commercial_only(manifest)  # a manifest without such rows is told before the work
+        commercial_only(manifest)  # raises for a manifest without such rows, before the work
     if options.out is not None:
         check_folder(options.out, read=manifest.files)
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, log=log)
@@ -39,32 +68,27 @@ def run(options: Verify) -> int:
         log(f"{write_text(report.to_json(), options.out)}: the report")
     errors = [finding.sentence for finding in report.findings if finding.level == "error"]
     if options.repair is not None:
-        manifest, errors = _repair(options, manifest, report, errors)
+        manifest, errors = _repair(manifest, report, options.repair, options.swap, errors)
     if options.commercial_only is not None:
-        _commercial(options, manifest)
+        commercial = commercial_only(manifest)
+        target = write_new(commercial.manifest, options.commercial_only)
+        print(
+            f"{target}: {len(commercial.manifest):,} rows, without {commercial.non_commercial:,} non-commercial rows "
+            f"and {commercial.unknown:,} rows of unknown licence"
+        )
     return 1 if errors else 0
 
 
-def _repair(options: Verify, manifest: Manifest, report: VerifyReport, errors: list[str]) -> tuple[Manifest, list[str]]:
-    """Write the repaired copy: (the manifest, the errors that are left)."""
+def _repair(
+    manifest: Manifest, report: VerifyReport, path: Path, swap: tuple[str, ...], errors: list[str]
+) -> tuple[Manifest, list[str]]:
+    """Write the repaired copy and return it with the errors that remain."""
     from anytouch_jax.data.prepare.repair import repair
 
-    assert options.repair is not None
-    repaired = repair(manifest, report, swap=options.swap)
-    target = write_new(repaired.manifest, options.repair)
+    repaired = repair(manifest, report, swap=swap)
+    target = write_new(repaired.manifest, path)
     print(f"\n{target}: {len(repaired.manifest):,} of {len(manifest):,} rows")
-    print("\n".join(f"* {sentence}" for sentence in repaired.done or ("nothing had to be repaired",)))
-    print("\n".join(f"* left to you: {sentence}" for sentence in repaired.left), end="\n" if repaired.left else "")
+    print("\n".join(f"* {sentence}" for sentence in repaired.done or ("nothing to repair",)))
+    for sentence in repaired.left:
+        print(f"* left to you: {sentence}")
     return repaired.manifest, [sentence for sentence in errors if sentence in repaired.left]
-
-
-def _commercial(options: Verify, manifest: Manifest) -> None:
-    from anytouch_jax.data.prepare.licences import commercial_only
-
-    assert options.commercial_only is not None
-    kept = commercial_only(manifest)
-    target = write_new(kept.manifest, options.commercial_only)
-    print(
-        f"{target}: {len(kept.manifest):,} rows; left out {kept.non_commercial:,} that are not for commercial use and "
-        f"{kept.unknown:,} that do not say"
-    )

@@ -103,7 +103,7 @@ class DataConfig:
     weights: tuple[tuple[str, float], ...] | None = None  # dataset, times an epoch (0: never; 1 if not named)
     negatives: Literal["any", "same_sensor"] = "any"  # sensors of matching's negatives: any, the positive's
     require: tuple[Literal["image", "text"], ...] = ()  # draw only rows that have these
-    contact_only: bool = False  # leave out rows that `label.contact` calls free (`anytouch contact`)
+    contact_only: bool = False  # leave out rows that `label.contact` calls free (`anytouch data contact`)
     aligned_text: bool = True  # use the text of rows whose touch other sensors or units felt too
     background: Literal["keep", "subtract"] = "keep"  # as it is, or less the untouched gel (`background_path`)
     flip: float = 0.5  # chance of a mirror image, for each direction
@@ -117,10 +117,10 @@ class DataConfig:
     on_bad_sample: Literal["error", "skip"] = "error"  # a file that cannot be read: stop, or replace and count it
 
     def __post_init__(self) -> None:
-        chosen("--loader.", self)
-        in_range("--loader.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE)
+        chosen("--data.", self)
+        in_range("--data.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE)
         others = ("affine", "jitter", "rotation", "threads", "prefetch", "cache")
-        in_range("--loader.", self, **dict.fromkeys(others, NOT_NEGATIVE))
+        in_range("--data.", self, **dict.fromkeys(others, NOT_NEGATIVE))
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,8 @@ class RunConfig:
     fsdp: int = 1  # devices that share parameters and moments
 
     def __post_init__(self) -> None:
-        in_range("--loop.", self, seed=SEED, steps=COUNT, keep=COUNT, fsdp=COUNT)
-        in_range("--loop.", self, save_every=NOT_NEGATIVE, figure_every=NOT_NEGATIVE, max_skipped=NOT_NEGATIVE)
+        in_range("--run.", self, seed=SEED, steps=COUNT, keep=COUNT, fsdp=COUNT)
+        in_range("--run.", self, save_every=NOT_NEGATIVE, figure_every=NOT_NEGATIVE, max_skipped=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)

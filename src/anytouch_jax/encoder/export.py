@@ -20,7 +20,7 @@ import numpy as np
 from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
@@ -196,11 +196,11 @@ def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: J
         live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
         found = np.asarray(run(clips, rows))
         if found.shape != live.shape or not np.isfinite(found).all():
-            raise UserError(f"the artefact gives {found.shape}, the live model {live.shape}, or what is not finite")
+            raise CheckError(f"the artefact gives {found.shape}, the live model {live.shape}, or what is not finite")
         worst = max(worst, float(np.abs(found - live).max() / np.abs(live).max()))
         width = live.shape[1]
     if worst > TOLERANCE[model.dtype]:
-        raise UserError(f"the artefact differs from the live model by {worst:.2g} of its largest feature: not written")
+        raise CheckError(f"the artefact differs from the live model by {worst:.2g} of its largest feature: not written")
     return worst, width
 
 

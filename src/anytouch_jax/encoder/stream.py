@@ -1,4 +1,4 @@
-"""Features of a camera or a video, frame by frame, and the time that each part takes (`anytouch embed --stream`).
+"""Features of a camera or a video, frame by frame, and the time that each part takes (`anytouch stream`).
 
 A thread reads, resizes and keeps the ring of the last frames; a mailbox of one slot holds the newest clip. A camera
 is never waited for and never lagged behind: what the encoder has no time for is dropped, and a clip still is made of

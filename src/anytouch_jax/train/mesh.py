@@ -29,7 +29,7 @@ def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Devi
     """
     devices = list(jax.devices() if devices is None else devices)
     if fsdp < 1 or (data is None and len(devices) % fsdp):
-        raise ConfigError(f"--loop.fsdp {fsdp} must be a divisor of the {len(devices)} devices")
+        raise ConfigError(f"--run.fsdp {fsdp} must be a divisor of the {len(devices)} devices")
     data = len(devices) // fsdp if data is None else data
     if not 0 < data * fsdp <= len(devices):
         raise ConfigError(f"a mesh of {data} x {fsdp} needs {data * fsdp} devices, but there are {len(devices)}")

@@ -1,0 +1,87 @@
+"""`anytouch stream`: live features of a camera or a video, frame by frame, with their latency."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from anytouch_jax.cli import embed
+from anytouch_jax.cli.output import check_folder, log, refuse_unused
+from anytouch_jax.config import UNIVERSAL
+from anytouch_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.stream import Embedded
+    from anytouch_jax.evaluate.heads import LinearHead
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamOptions(embed.FrameOptions):
+    """Embed a camera or a video frame by frame, and report the latency of each part.
+
+    Example: anytouch stream --model runs/stage2 --data 0 --sensor digit --out -
+
+    A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save.
+    """
+
+    data: str
+    """Number of a camera, such as 0, or a video file."""
+    out: Path
+    """The .npz to write, or - for one JSON line per frame on standard output."""
+    stride: int = 1
+    """Frames from one frame of a clip to the next, as in the training data."""
+
+
+def run(options: StreamOptions) -> int:
+    """Embed frame by frame, write features or JSON lines, then print the latency."""
+    lines = str(options.out) == "-"
+    data = Path(options.data)
+    if not lines:
+        check_folder(options.out, read=(options.model, data), suffix=".npz")
+    if options.frames == 1:
+        refuse_unused(options, ("stride",), "on single frames. Ask for clips with --frames, or")
+    encoder, pooling, head = embed.load_inputs(options)
+    from anytouch_jax.encoder import stream
+    from anytouch_jax.encoder.embed import Features, save_npz
+
+    source, live = stream.open_source(data)
+    rate = 0.0 if live else stream.rate_of(data)
+    embedded = stream.stream(
+        encoder,
+        source,
+        embed.preprocess_of(encoder, options, data),
+        live=live,
+        sensor=encoder.sensor_row(options.sensor or UNIVERSAL, log),
+        frames=options.frames,
+        stride=options.stride,
+        pooling=pooling,
+        join=options.join,
+    )
+    result = stream.collect(embedded, (lambda frame: _print_line(frame, rate, head)) if lines else None)
+    if not live and not result.interrupted:
+        if not len(result.numbers):
+            raise UserError(f"{data} has too few frames for a clip of {options.frames} at stride {options.stride}")
+        embed.log_if_cut(data, int(result.numbers[-1]) + 1)
+    if not lines:
+        keys = {"frame_index": result.numbers, "time": result.numbers / rate if rate else result.at}
+        about = embed.frames_metadata(encoder, options, pooling, data) | {"stride": str(options.stride)}
+        about |= {"started": f"{result.started:.6f}"} if live and len(result.numbers) else {}
+        features = Features(result.values, result.numbers, keys)
+        save_npz(options.out, embed.with_labels(features, head if len(result.numbers) else None), about)
+    embed.log_universal(encoder, options)
+    for line in stream.budget(result):
+        log(line)
+    if not lines:
+        print(f"{options.out}: {len(result.values)} features of {result.values.shape[1]} values")
+    return 0
+
+
+def _print_line(frame: Embedded, rate: float, head: LinearHead | None) -> None:
+    values = [float(str(value)) for value in frame.values]  # the shortest digits of the same float32
+    line: dict[str, Any] = {"frame": frame.number, "time": round(frame.number / rate if rate else frame.at, 6)}
+    if head is not None:
+        (label,), p = head(frame.values[None])
+        line |= {"label": str(label), "p": round(float(p.max()), 6)}
+    print(json.dumps(line | {"features": values}), flush=True)

@@ -1,0 +1,259 @@
+"""`anytouch embed`: manifests, folders and videos, and the head that names what is touched."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from runs import run_config, train
+
+from anytouch_jax.evaluate.heads import load_head
+
+
+def write_video(path, frames, codec="MJPG"):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 10, frames[0].shape[1::-1])
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def embed(anytouch, tiny_run, tmp_path):
+    """embed(data, *words): the arrays of the features file, which must be written."""
+
+    def run(data, *words):
+        out = tmp_path / "features.npz"
+        done = anytouch("embed", "--model", tiny_run, "--data", data, "--out", out, "--batch", 4, *words)
+        assert done.status == 0, done.err
+        with np.load(out) as file:
+            return dict(file) | {"done": done}
+
+    return run
+
+
+def test_a_manifest_and_a_folder_of_its_frames_have_the_same_features(embed, tmp_path, world):
+    of_manifest = embed(world, "--split", "test")
+    assert of_manifest["features"].shape == (2, 12) and of_manifest["rows"].tolist() == [10, 11]
+    assert of_manifest["key/path"].tolist() == ["c2.png", "c3.png"] and set(of_manifest["key/split"]) == {"test"}
+    assert of_manifest["key/object"].tolist() == of_manifest["key/label.object"].tolist() == ["ball", "cube"]
+    assert len(str(of_manifest["about/weights"])) == 8 and "about/sensor" not in of_manifest
+
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for frame in (2, 3):
+        shutil.copy(world.parent / f"c{frame}.png", folder)
+    of_folder = embed(folder, "--sensor", "digit")
+    np.testing.assert_allclose(of_folder["features"], of_manifest["features"], atol=1e-6)
+    assert of_folder["key/frame_index"].tolist() == [0, 1] and str(of_folder["about/input"]) == str(folder)
+    assert of_folder["key/path"].tolist() == ["c2.png", "c3.png"] and str(of_folder["about/sensor"]) == "digit"
+    of_picture = embed(folder / "c3.png", "--sensor", "digit")
+    np.testing.assert_allclose(of_picture["features"], of_folder["features"][1:], rtol=1e-5, atol=1e-6)
+    other = embed(folder, "--sensor", "new_sensor")
+    assert "'new_sensor'" in other["done"].err and "universal" in other["done"].err
+    assert np.abs(other["features"] - of_folder["features"]).max() > 1e-4
+    half = embed(folder, "--sensor", "digit", "--dtype", "bfloat16")
+    error = np.abs(half["features"] - of_folder["features"]).max() / np.abs(of_folder["features"]).max()
+    assert str(half["about/dtype"]) == "bfloat16" and 1e-5 < error < 0.05
+
+
+def test_several_manifests_are_read_together(anytouch, tiny_run, world, tmp_path):
+    shutil.copytree(world.parent, tmp_path / "other")
+    words = ("--model", tiny_run, "--data", world, tmp_path / "other" / world.name, "--out", tmp_path / "f.npz")
+    assert anytouch("embed", *words).status == 0
+    with np.load(tmp_path / "f.npz") as file:
+        np.testing.assert_allclose(file["features"][:12], file["features"][12:], atol=1e-6)
+
+
+def test_clips_of_a_manifest_and_of_a_video(embed, mistake, tmp_path, world, tiny_run):
+    of_manifest = embed(world, "--frames", 3)
+    assert of_manifest["rows"].tolist() == [2, 3, 6, 7] and "8 of 12" in of_manifest["done"].err
+    video = write_video(tmp_path / "touch.avi", [np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(5)])
+    of_video = embed(video, "--frames", 3)
+    assert of_video["features"].shape == (3, 12) and of_video["key/frame_index"].tolist() == [2, 3, 4]
+    words = ("embed", "--model", tiny_run, "--data", video, "--out", tmp_path / "f.npz")
+    assert "frames" in mistake(*words, "--frames", 6)
+    assert not (tmp_path / "f.npz").exists()
+
+
+def test_a_bad_picture_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path, world, tiny_run):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for place, name in enumerate(("a0", "a1", "a2", "a3", "b0", "b1", "b2")):
+        shutil.copy(world.parent / f"{name}.png", folder / f"{place}.png")
+    (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:-20])
+    words = ("embed", "--model", tiny_run, "--data", folder, "--out", tmp_path / "features.npz")
+    assert "2.png" in mistake(*words) and not (tmp_path / "features.npz").exists()
+    for frames, ends in ((1, [0, 1, 3, 4, 5, 6]), (3, [5, 6])):  # no clip spans a missing frame
+        lenient = embed(folder, "--sensor", "gelsight_mini", "--on-bad-sample", "skip", "--frames", frames)
+        assert lenient["rows"].tolist() == lenient["key/frame_index"].tolist() == ends
+        assert lenient["key/path"].tolist() == [f"{end}.png" for end in ends]
+        assert f"{8 - frames - len(ends)} skipped" in lenient["done"].out
+    of_manifest = embed(world, "--frames", 3)
+    same = of_manifest["features"][of_manifest["rows"] == 6]
+    np.testing.assert_allclose(same, lenient["features"][-1:], atol=1e-6)
+
+
+def test_a_bad_row_of_a_manifest_is_named_however_the_run_was_trained(anytouch, mistake, tmp_path, world, tiny_run):
+    shutil.copytree(world.parent, tmp_path / "w")
+    (tmp_path / "w" / "c2.png").write_bytes(b"no picture")
+    shutil.copytree(tiny_run, tmp_path / "r")
+    record = next((tmp_path / "r" / "checkpoints").glob("*/checkpoint.json"))
+    content = json.loads(record.read_text())["record"]
+    content["config"] = content["config"].replace('"on_bad_sample": "error"', '"on_bad_sample": "skip"')
+    assert '"skip"' in content["config"]
+    body = json.dumps(content, sort_keys=True)
+    record.write_text(json.dumps({"checksum": zlib.crc32(body.encode()), "record": content}))
+    shared = ("--model", tmp_path / "r", "--data", tmp_path / "w" / world.name)
+    words = ("embed", *shared, "--out", tmp_path / "f.npz", "--batch", 4)
+    assert "row 10 of" in mistake(*words)
+    done = anytouch(*words, "--on-bad-sample", "skip")
+    assert done.status == 0 and "1 skipped" in done.out
+    done = anytouch("probe", "label", *shared)
+    assert done.status == 2 and "row 10 of" in done.err
+
+
+@pytest.mark.parametrize(
+    ("names", "ends"),
+    [
+        ([f"{finger}_{number}" for finger in ("left", "right") for number in range(3)], ["left_2", "right_2"]),
+        ([f"img{number:03d}" for number in (0, 1, 2, 5, 6, 7, 8)], ["img002", "img007", "img008"]),
+    ],
+    ids=["fingers", "gap"],
+)  # fmt: skip
+def test_no_clip_spans_two_fingers_or_a_missing_number(embed, tmp_path, world, names, ends):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for name in names:
+        shutil.copy(world.parent / "a0.png", folder / f"{name}.png")
+    paths = embed(folder, "--sensor", "digit", "--frames", 3)["key/path"].tolist()
+    assert paths == [f"{end}.png" for end in ends]
+
+
+def test_a_batch_larger_than_the_folder_costs_nothing(embed, tmp_path, world):
+    (tmp_path / "frames").mkdir()
+    for name in ("a0", "a1"):
+        shutil.copy(world.parent / f"{name}.png", tmp_path / "frames")
+    assert len(embed(tmp_path / "frames", "--sensor", "digit", "--batch", 10**7)["features"]) == 2
+
+
+def test_a_missing_sensor_is_noted_once_and_a_misspelled_one_refused(embed, mistake, tmp_path, world, tiny_run):
+    assert embed(world.parent)["done"].err.count("--sensor") == 1
+    assert "--sensor" not in embed(world.parent, "--sensor", "universal")["done"].err
+    words = ("embed", "--model", tiny_run, "--data", world.parent, "--out", tmp_path / "f.npz")
+    assert "digit" in mistake(*words, "--sensor", "DIGIT")
+
+
+def test_a_folder_without_pictures_names_what_to_give_instead(tmp_path, world, tiny_run, mistake):
+    folder = tmp_path / "mine"
+    (folder / "mug").mkdir(parents=True)
+    words = ("embed", "--model", tiny_run, "--data", folder, "--out", tmp_path / "features.npz")
+    assert str(folder) in mistake(*words)
+    shutil.copy(world.parent / "a0.png", folder / "mug" / "0.png")
+    assert "anytouch data index recordings" in mistake(*words)
+    (folder / "labels.csv").write_text("object,material\nmug,clay\n")
+    (folder / "mine.csv").write_text("path,sensor,sequence,frame_index,split\nmug/0.png,digit,mug,0,train\n")
+    assert str(folder / "mine.csv") in mistake(*words)
+
+
+@pytest.mark.parametrize("command", ["embed", "stream"])
+def test_a_video_that_ends_early_is_reported(anytouch, tiny_run, tmp_path, command):
+    film = write_video(tmp_path / "a.avi", list(np.random.default_rng(0).integers(0, 255, (30, 64, 64, 3), np.uint8)))
+    words = (command, "--model", tiny_run, "--data", film, "--sensor", "digit", "--out", tmp_path / "f.npz")
+    done = anytouch(*words)
+    assert done.status == 0 and str(film) not in done.err
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    done = anytouch(*words)
+    assert done.status == 0 and str(film) in done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["m.csv", "--sensor", "digit"], ["--sensor"]),
+        (["m.csv", "--rotate", "90", "--flip", "across"], ["--rotate", "--flip"]),
+        (["m.parquet", "--background", "g.png"], ["--background"]),
+        (["m.csv", "frames"], ["--data"]),
+        (["m.csv", "--batch", "0"], ["--batch"]),
+        (["m.csv", "--out", "f.csv"], ["--out", ".npz"]),
+        (["m.csv", "--out", "afile/f.npz"], ["--out", "afile"]),
+        (["m.csv"], ["nowhere"]),
+        (["m.csv", "--split", "test", "--frames", "3", "--batch", "8"], ["nowhere"]),
+        (["frames", "--split", "test"], ["--split"]),
+        (["frames", "--sensor", "digit", "--batch", "8", "--rotate", "270", "--flip", "down"], ["nowhere"]),
+        (["film.mp4", "--on-bad-sample", "skip"], ["--on-bad-sample"]),
+        (["gone"], ["gone"]),
+    ],
+)
+def test_mistakes_are_named_before_the_encoder_is_loaded(mistake, tmp_path, monkeypatch, words, named):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").mkdir()
+    for name in ("m.csv", "film.mp4", "afile"):
+        (tmp_path / name).write_text("")
+    out = [] if "--out" in words else ["--out", "f.npz"]
+    sentence = mistake("embed", "--model", "nowhere", "--data", *words, *out)
+    assert all(name in sentence for name in named), sentence
+
+
+def test_an_absolute_path_in_a_manifest_is_a_mistake(mistake, tiny_run, tmp_path):
+    picture, manifest = tmp_path / "a.png", tmp_path / "m.csv"
+    cv2.imwrite(str(picture), np.zeros((32, 32, 3), np.uint8))
+    manifest.write_text(f"path,sensor,sequence,frame_index,split\n{picture},digit,s,0,train\n")
+    assert "absolute" in mistake("embed", "--model", tiny_run, "--data", manifest, "--out", tmp_path / "f.npz")
+
+
+# A head that names what is touched ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory, world, tiny_run):
+    from anytouch_jax.cli.app import main
+
+    path = tmp_path_factory.mktemp("head") / "head.npz"
+    words = ["probe", "label", "--model", tiny_run, "--data", world, "--label", "object", "--group", "sequence"]
+    words += ["--seeds", "0", "--pooling", "both", "--no-controls", "--save", path]
+    assert main([str(word) for word in words]) == 0
+    return path
+
+
+def test_the_head_of_a_probe_names_the_rows_of_a_manifest(embed, anytouch, world, head):
+    arrays = embed(world, "--head", head, "--split", "train")
+    truth = [("ball", "cube")[number % 2] for number in arrays["key/frame_index"]]
+    assert arrays["label"].tolist() == truth and (arrays["p"] > 0.5).all() and (arrays["p"] <= 1).all()
+    labels, p = load_head(head)(arrays["features"])
+    np.testing.assert_array_equal(labels, arrays["label"])
+    np.testing.assert_array_equal(p.max(1), arrays["p"])
+    np.testing.assert_allclose(p.sum(1), 1, atol=1e-6)
+    about = anytouch("info", head).out
+    assert "object" in about and "ball, cube" in about and "--pooling both --frames 1" in about
+    saved = load_head(head)
+    assert (saved.classes.tolist(), saved.label, saved.pooling, saved.frames) == (["ball", "cube"], "object", "both", 1)
+
+
+def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
+    video = write_video(tmp_path / "touch.avi", [np.full((32, 32, 3), value, np.uint8) for value in (40, 180)])
+    words = ("stream", "--model", tiny_run, "--data", video, "--head", head)  # whose pooling is taken
+    lines = [json.loads(line) for line in anytouch(*words, "--out", "-").out.splitlines()]
+    labels, p = load_head(head)(np.array([line["features"] for line in lines], np.float32))
+    assert [line["label"] for line in lines] == labels.tolist()
+    np.testing.assert_allclose([line["p"] for line in lines], p.max(1), atol=1e-6)
+    assert anytouch(*words, "--out", tmp_path / "f.npz").status == 0
+    with np.load(tmp_path / "f.npz") as file:
+        assert file["label"].tolist() == labels.tolist() and file["about/pooling"] == "both"
+    assert "--pooling both" in mistake(*words, "--pooling", "class", "--out", "-")
+
+
+def test_a_head_of_other_features_is_refused(mistake, tmp_path, world, tiny_run, head):
+    words = ("embed", "--data", world, "--out", tmp_path / "f.npz", "--head")
+    other = ("--model", tiny_run, "--pooling", "mean")
+    assert "--pooling both" in mistake(*words, head, *other)
+    assert "--pooling both --frames 1" in mistake(*words, head, *other, "--frames", 3)
+    train(run_config(world, seed=5, steps=1), tmp_path / "other")
+    assert str(tmp_path / "other") in mistake(*words, head, "--model", tmp_path / "other")
+    (tmp_path / "odd.npz").write_bytes(b"odd")
+    assert "odd.npz" in mistake(*words, tmp_path / "odd.npz", "--model", tiny_run)
+    assert "gone.npz" in mistake(*words, tmp_path / "gone.npz", "--model", tiny_run)

@@ -31,6 +31,9 @@ _HOMES = {
     "train.optim": ["optimizer"],
     "train.loop": ["fit"],
     "pretrain": ["pretrain"],
+    "evaluate.array_probes": ["knn_probe", "leave_groups_out", "linear_probe", "regression_probe"],
+    "evaluate.heads": ["load_head"],
+    "evaluate.probing": ["probe_benchmark", "probe_label", "probe_tasks"],
     "encoder.encoder": ["Encoder", "load_encoder", "random_encoder"],
     "encoder.preprocess": ["Preprocess"],
 }

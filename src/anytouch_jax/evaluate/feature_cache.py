@@ -236,7 +236,7 @@ def image_digest(table: Manifest, count: int = 32) -> str:
 
 
 def raw_pixels(frame: Array, background: Array | None, size: Size = SMALL) -> Array:
-    """Return pixels in colour and their difference from the background (0 without one), averaged down to `size`.
+    """Return pixels in colour and their difference from the background (0 if it is None), averaged down to `size`.
 
     `frame`, `background`: u8 RGB (h, w, 3) -> f32 (2 * rows * columns * 3,) in 0..1. Raises UserError if shapes differ.
     """

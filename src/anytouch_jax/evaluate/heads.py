@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 HeadName = Literal["linear", "knn", "gradient"]
 Scaling = Literal["column", "common"]
+Predict = Callable[[Array], list[Array]]  # features (m, d) -> class numbers or numbers (m,) for each option
 
 PENALTIES = (1.0, 0.1, 0.01, 0.001, 0.0001)  # of logistic regression
 RIDGE = (100.0, 10.0, *PENALTIES)
@@ -67,13 +68,10 @@ class ProbeHead:
 
 
 class FittedHead(NamedTuple):
-    """A fit for each option: `predict` maps features (m, d) to one array (m,) of class numbers or numbers an option.
-
-    `models` are those of logistic regression, empty for the other heads.
-    """
+    """A fit for each option; `models` are those of logistic regression, empty for the other heads."""
 
     options: tuple[float, ...]
-    predict: Callable[[Array], list[Array]]
+    predict: Predict
     models: Sequence[LinearModel] = ()
 
 
@@ -104,22 +102,25 @@ def fit_head(
     `weights` (n,): how often each row counts in "linear" (whole times in "knn"). `start` is where logistic regression
     starts. Raises UserError for an unknown head.
     """
-    if classes and len(np.unique(y)) == 1 and head.name in get_args(HeadName):  # a small fold may hold one class only
-        return FittedHead((0.0,), lambda rows: [np.full(len(rows), y[0])])
+    if head.name not in get_args(HeadName):
+        raise UserError(f"Unknown head {head.name!r}. Choose among {', '.join(get_args(HeadName))}.")
+    options = head.options or {
+        "linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": range(1, head.recipe.epochs + 1)
+    }[head.name]  # fmt: skip
+    options, models = tuple(map(float, options)), list[LinearModel]()
+    if classes and len(np.unique(y)) == 1:  # a small fold may hold one class only
+        return FittedHead(options, lambda rows: [np.full(len(rows), y[0])] * len(options))
     if head.name == "gradient":
-        epochs = _gradient_epochs(x, y, classes, head.recipe, head.seed)
-        return FittedHead(tuple(range(1, len(epochs) + 1)), lambda rows: [predict(rows) for predict in epochs])
-    if head.name == "knn":
-        times = None if weights is None else weights.astype(np.int64)
-        repeated = (x, y) if times is None else (np.repeat(x, times, 0), np.repeat(y, times))
-        return _fit_neighbours(*repeated, classes, head.options or NEIGHBOURS)
-    if head.name != "linear":
-        raise UserError(f"Unknown head {head.name!r}. Choose among linear, knn, gradient.")
-    if not classes:
-        return FittedHead(head.options or RIDGE, fit_ridge(x, y, head.options or RIDGE, head.scaling))
-    options = head.options or PENALTIES
-    models = linear_path(x, y, options, scaling=head.scaling, weights=weights, start=start)
-    return FittedHead(options, lambda rows: [model(rows) for model in models], models)
+        predict = _fit_gradient(x, y, classes, head.recipe, head.seed)
+    elif head.name == "knn":
+        times = np.ones(len(x), np.int64) if weights is None else weights.astype(np.int64)
+        predict = _fit_neighbours(np.repeat(x, times, 0), np.repeat(y, times), classes, options)
+    elif classes:
+        models = linear_path(x, y, options, scaling=head.scaling, weights=weights, start=start)
+        return FittedHead(options, lambda rows: [model(rows) for model in models], models)
+    else:
+        predict = fit_ridge(x, y, options, head.scaling)
+    return FittedHead(options, predict)
 
 
 def head_score(predicted: Array, truth: Array, classes: int) -> float:
@@ -167,9 +168,7 @@ def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "
     return mean, np.where(scale > 1e-6 * np.abs(mean), scale, 1.0).astype(np.float32)
 
 
-def fit_ridge(
-    x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column"
-) -> Callable[[Array], list[Array]]:
+def fit_ridge(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column") -> Predict:
     """Return a function from features (m, d) to ridge predictions (m,), one array a penalty.
 
     One eigendecomposition of the covariance serves all penalties. A penalty is added to the mean squared error.
@@ -186,20 +185,19 @@ def fit_ridge(
     return predict
 
 
-def _fit_neighbours(x: Array, y: Array, classes: int, options: Sequence[float]) -> FittedHead:
-    z_train = _unit(x)
+def _fit_neighbours(x: Array, y: Array, classes: int, options: Sequence[float]) -> Predict:
+    def unit(rows: Array) -> Array:
+        return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12))
+
+    z_train, numbers = unit(x), [int(k) for k in options]
 
     def predict(rows: Array) -> list[Array]:
-        near, cosines = nearest(z_train, _unit(rows), int(max(options)))
+        near, cosines = nearest(z_train, unit(rows), max(numbers))
         if classes:
-            return [vote(y[near[:, : int(k)]], cosines[:, : int(k)], classes) for k in options]
-        return [y[near[:, : int(k)]].mean(1) for k in options]
+            return [vote(y[near[:, :k]], cosines[:, :k], classes) for k in numbers]
+        return [y[near[:, :k]].mean(1) for k in numbers]
 
-    return FittedHead(tuple(map(float, options)), predict)
-
-
-def _unit(x: Array) -> Array:
-    return np.asarray(x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12))
+    return predict
 
 
 def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
@@ -244,10 +242,8 @@ def majority_class(y: Array) -> int:
     return int(np.bincount(y).argmax())
 
 
-def _gradient_epochs(
-    x: Array, y: Array, classes: int, recipe: GradientRecipe, seed: int
-) -> list[Callable[[Array], Array]]:
-    """Return a predictor for the end of each epoch; numbers are fitted in standard deviations."""
+def _fit_gradient(x: Array, y: Array, classes: int, recipe: GradientRecipe, seed: int) -> Predict:
+    """Fit the authors' layer; numbers are fitted in standard deviations. An option is the end of an epoch."""
     rng = np.random.default_rng(seed)
     x, (n, d), columns = np.asarray(x, np.float32), x.shape, classes if classes > 2 else 1
     middle, spread = (0.0, 1.0) if classes else (float(y.mean()), float(y.std()) or 1.0)
@@ -257,15 +253,21 @@ def _gradient_epochs(
         np.asarray(rng.uniform(-1, 1, columns) / np.sqrt(d), np.float32),
     )
     init, step = _gradient_step(recipe, classes)
-    state, batch, predictors = init(params), min(recipe.batch, n), list[Callable[[Array], Array]]()
+    state, batch, epochs = init(params), min(recipe.batch, n), list[tuple[Array, Array]]()
     steps = n // batch
     for epoch in range(recipe.epochs):
         for number, rows in enumerate(rng.permutation(n)[: steps * batch].reshape(steps, batch), epoch * steps):
             rate = recipe.rate * 0.5 * (1 + np.cos(np.pi * number / (steps * recipe.epochs)))
             params, state = step(params, state, x[rows], target[rows], np.float32(rate))
-        weights, bias = map(np.asarray, params)
-        predictors.append(functools.partial(_predict_layer, weights, bias, classes, middle, spread))
-    return predictors
+        epochs.append((np.asarray(params[0]), np.asarray(params[1])))
+
+    def predict(rows: Array) -> list[Array]:
+        logits = [rows @ weights + bias for weights, bias in epochs]
+        if classes > 2:
+            return [each.argmax(1) for each in logits]
+        return [(each[:, 0] > 0).astype(np.int64) if classes else each[:, 0] * spread + middle for each in logits]
+
+    return predict
 
 
 @functools.cache
@@ -289,13 +291,6 @@ def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., 
         return optax.apply_updates(params, jax.tree.map(lambda update: rate * update, updates)), state
 
     return tx.init, jax.jit(step)
-
-
-def _predict_layer(weights: Array, bias: Array, classes: int, middle: float, spread: float, x: Array) -> Array:
-    logits = x @ weights + bias
-    if classes > 2:
-        return logits.argmax(1)
-    return (logits[:, 0] > 0).astype(np.int64) if classes else logits[:, 0] * spread + middle
 
 
 @dataclass(frozen=True, eq=False)

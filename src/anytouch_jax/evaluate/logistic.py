@@ -1,8 +1,8 @@
-"""Multinomial logistic regression fast enough for 100,000 features: preconditioned L-BFGS along falling penalties.
+"""Multinomial logistic regression for 100,000 rows: preconditioned L-BFGS along falling penalties.
 
 Features of a network are correlated, which costs L-BFGS hundreds of passes. The Hessian at equal probabilities is
-known, 1/K (I - 11'/K) (x) X'X/n: in the coordinates of its Cholesky factor with the penalty on its diagonal tens of
-passes do. Arithmetic on the features is float32; losses are summed in float64.
+known: 1/K (I - 11'/K) (x) X'X/n. We change to the coordinates of its Cholesky factor, with the penalty on the diagonal.
+There tens of passes suffice. Arithmetic on the features is float32, and losses are summed in float64.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ STEPS = 300
 
 
 class Logistic(NamedTuple):
-    """`weights` f32 (d, columns) and `bias` f32 (columns,): one column for two classes, one a class for more.
+    """A fit: `weights` f32 (d, columns) and `bias` f32 (columns,), one column for two classes, else one a class.
 
-    `loss` is the mean log loss with half the squared weights times the penalty; `finished` within STEPS.
+    `loss` is the mean log loss plus the penalty times half the squared weights. `finished`: within STEPS.
     """
 
     weights: Array
@@ -35,7 +35,7 @@ class Logistic(NamedTuple):
     finished: bool
 
     def __call__(self, x: Array) -> Array:
-        """Class numbers i64 (n,) of features (n, d)."""
+        """Return class numbers i64 (n,) of features (n, d)."""
         logits = x @ self.weights + self.bias
         return (logits[:, 0] > 0).astype(np.int64) if logits.shape[1] == 1 else logits.argmax(1)
 
@@ -44,10 +44,10 @@ def path(
     x: Array, y: Array, classes: int, penalties: Sequence[float], start: Logistic | None = None,
     weights: Array | None = None,
 ) -> Iterator[Logistic]:  # fmt: skip
-    """Fits of class numbers `y` (n,) below `classes` on features `x` f32 (n, d), a penalty each, from the one before.
+    """Yield fits of class numbers `y` (n,) below `classes` on features `x` f32 (n, d), one a penalty.
 
-    A penalty is the factor of half the squared weights beside the mean log loss; the bias is free. Give standardised
-    features, and the strongest penalty first. `weights` (n,): how much each row counts in that mean.
+    Each starts from the fit before. A penalty is the factor of half the squared weights, added to the mean log loss;
+    the bias is free. Give standardised features, and the strongest penalty first. `weights` (n,) of rows in that mean.
     """
     x = np.ascontiguousarray(x, np.float32)
     columns = 1 if classes == 2 else classes
@@ -64,7 +64,7 @@ def _fit(
     x: Array, y: Array, shares: Array, columns: int, penalty: float, covariance: Array, start: Logistic | None
 ) -> Logistic:
     d, share = x.shape[1], 0.25 if columns == 1 else 1 / columns
-    # A touch of the diagonal keeps the factor when there are fewer rows than features.
+    # A small diagonal keeps the factor when there are fewer rows than features.
     diagonal = penalty + 1e-6 * share * np.trace(covariance) / d
     factor = cholesky(share * covariance + diagonal * np.eye(d), lower=True, check_finite=False)
     back = functools.partial(solve_triangular, factor, lower=True, trans="T", check_finite=False)
@@ -86,13 +86,13 @@ def _fit(
     if start is not None and start.weights.shape == (d, columns):
         first = np.concatenate([factor.T @ start.weights, np.sqrt(share) * start.bias[None]])
     options = {"maxiter": STEPS, "maxfun": 2 * STEPS, "maxcor": 20, "ftol": 1e-7, "gtol": 1e-6}
-    found = minimize(value, first.ravel(), jac=True, method="L-BFGS-B", options=options)
-    weights, bias = unpacked(found.x)
-    return Logistic(weights.astype(np.float32), bias.astype(np.float32), float(found.fun), found.nit < STEPS)
+    optimum = minimize(value, first.ravel(), jac=True, method="L-BFGS-B", options=options)
+    weights, bias = unpacked(optimum.x)
+    return Logistic(weights.astype(np.float32), bias.astype(np.float32), float(optimum.fun), optimum.nit < STEPS)
 
 
 def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
-    """Log loss, the mean by the rows' `shares` (n, 1), and its gradient by the logits (n, columns), overwritten."""
+    """Return the log loss, weighted by `shares` (n, 1), and its gradient by the logits (n, columns), overwritten."""
     if logits.shape[1] == 1:
         signed = np.where(y == 1, logits[:, 0], -logits[:, 0])
         loss = float(np.sum(shares[:, 0] * np.logaddexp(0, -signed), dtype=np.float64))
@@ -111,9 +111,9 @@ def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
 
 @functools.cache
 def _libraries() -> ThreadpoolController:
-    return ThreadpoolController()  # looking for the libraries takes longer than a small fit
+    return ThreadpoolController()  # finding the libraries takes longer than a small fit
 
 
 def threads(size: int) -> contextlib.AbstractContextManager[Any]:
-    """One thread for a small fit, on which threads cost more than they bring; all for a large one."""
+    """Limit numerical libraries to one thread for a small fit, where more threads are slower."""
     return _libraries().limit(limits=1 if size < 1e8 else None)

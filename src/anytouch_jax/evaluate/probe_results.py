@@ -136,35 +136,39 @@ def probe_json(results: Sequence[Result]) -> str:
 def probe_table(results: Sequence[Result]) -> str:
     """Return the results as Markdown: one table of classification, one of regression, then the notes."""
     blocks, classification, regression = [], list[tuple[str, ...]](), list[tuple[str, ...]]()
-    for one in results:
-        size = f"{one.n_test} ({one.test_groups})"
-        chosen = "-" if one.penalty is None else f"{one.penalty:g} ({one.chosen_on})"
-        if isinstance(one, RegressionResult):
-            r2, mae = _interval(one.low, one.high, 1.0, 3), _interval(one.mae_low, one.mae_high, 1.0, 3)
-            errors = (f"{one.r2:.3f}", r2, f"{one.mae:.4g}", mae, f"{one.baseline_mae:.4g}")
-            regression.append((one.probe, one.protocol, *errors, str(one.n_train), size, chosen))
+    for result in results:
+        size = f"{result.n_test} ({result.test_groups})"
+        chosen = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
+        if isinstance(result, RegressionResult):
+            r2, mae = _interval(result.low, result.high, 1.0, 3), _interval(result.mae_low, result.mae_high, 1.0, 3)
+            errors = (f"{result.r2:.3f}", r2, f"{result.mae:.4g}", mae, f"{result.baseline_mae:.4g}")
+            regression.append((result.probe, result.protocol, *errors, str(result.n_train), size, chosen))
             continue
-        refits = "-" if one.refit_mean is None else f"{_share(one.refit_mean)} ± {100 * (one.refit_std or 0):.1f}"
-        shares = (_share(one.accuracy), _interval(one.low, one.high), _share(one.balanced_accuracy))
-        sizes = (str(one.n_train), size, str(len(one.classes)), chosen)
-        classification.append((one.probe, one.protocol, *shares, _share(one.baseline), refits, *sizes))
-        for part in one.parts:
+        refits = (
+            "-" if result.refit_mean is None else f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}"
+        )
+        shares = (_share(result.accuracy), _interval(result.low, result.high), _share(result.balanced_accuracy))
+        sizes = (str(result.n_train), size, str(len(result.classes)), chosen)
+        classification.append((result.probe, result.protocol, *shares, _share(result.baseline), refits, *sizes))
+        for part in result.parts:
             cells = (_share(part.accuracy), _interval(part.low, part.high), "", "", "", "", str(part.n_test), "", "")
-            classification.append((f"{one.probe}: {part.name}", one.protocol, *cells))
+            classification.append((f"{result.probe}: {part.name}", result.protocol, *cells))
     if classification:
         head = ("probe", "protocol", "accuracy", "95 % over test groups", "balanced", "commonest class", "refits")
         blocks.append(markdown_table((*head, "train", "test (groups)", "classes", "penalty or k"), classification))
     if regression:
         head = ("probe", "protocol", "R2", "95 % over test groups", "MAE", "MAE 95 %", "MAE of the mean")
         blocks.append(markdown_table((*head, "train", "test (groups)", "penalty"), regression))
-    notes = dict.fromkeys(f"- {one.probe} ({one.protocol}): {note}" for one in results for note in one.notes)
+    notes = dict.fromkeys(
+        f"- {result.probe} ({result.protocol}): {note}" for result in results for note in result.notes
+    )
     return "\n\n".join([*blocks, *(["\n".join(notes)] if notes else [])]) + "\n"
 
 
 def task_table(report: Mapping[str, Any]) -> str:
     """Return the report of `probe_tasks` or `probe_benchmark` as Markdown, with notes below."""
     head = ("features", "task", "head", "protocol", "score", "95 %", "chance", "train", "test (groups)")
-    rows, notes = [], dict[str, None]()
+    rows, notes = [], list[str]()
     for row in report["results"]:
         if row["metric"] == "r2":
             score, interval = f"R2 {row['mean']:.3f}, {row['mae']:.3g} {row['unit']}", (row["low"], row["high"], 1.0, 3)
@@ -174,10 +178,15 @@ def task_table(report: Mapping[str, Any]) -> str:
         names = (row["features"], row["task"], row["head"], row["protocol"])
         size = f"{row['test']} ({row['groups']})"
         rows.append((*names, score, _interval(*interval), chance, str(row["train"]), size))
-        notes |= dict.fromkeys(f"- {row['task']}: {note}" for note in row["notes"])
+        notes += [f"- {row['task']}: {note}" for note in row["notes"]]
     if report["paper"] is not None:
-        notes[f"- the paper reports {100 * report['paper']:.2f} % for AnyTouch, its epoch chosen on test"] = None
-    return "\n\n".join([markdown_table(head, rows), *(["\n".join(notes)] if notes else [])]) + "\n"
+        notes.append(f"- the paper reports {100 * report['paper']:.2f} % for AnyTouch, its epoch chosen on test")
+    return _with_notes([markdown_table(head, rows)], notes)
+
+
+def _with_notes(blocks: Sequence[str], notes: Sequence[str]) -> str:
+    """Return tables and then each note once."""
+    return "\n\n".join([*blocks, *(["\n".join(dict.fromkeys(notes))] if notes else [])]) + "\n"
 
 
 def _share(value: float) -> str:

@@ -114,20 +114,18 @@ def probe_label(
             source.store.add(rows.rows, frames)
     for source in sources:
         if source.encoder is not None:
-            for sensor_name in sorted(set(rows.sensors)):
-                source.encoder.sensor_row(sensor_name, log)  # warns of universal tokens
+            for name in sorted(set(rows.sensors)):
+                source.encoder.sensor_row(name, log)  # warns of universal tokens
         values = pixel_components(source.store, rows) if source.name == RAW else source.store.get(rows.rows, frames)
-        found = probe_rows(
-            values, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds, scaling=source.scaling,
-            subsets=subsets,
-        )  # fmt: skip
+        options: dict[str, Any] = {"leave_out": leave_out, "protocol": protocol, "seeds": seeds, "subsets": subsets}
+        scored = probe_rows(values, rows, source.name, scaling=source.scaling, **options)
         if save is not None and source.encoder is not None and source.name != RANDOM:
-            assert found[0].outcome is not None and found[0].outcome.fitted is not None
-            model, names = found[0].outcome.fitted
+            assert scored[0].outcome is not None and scored[0].outcome.fitted is not None
+            model, names = scored[0].outcome.fitted
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             heads.save_head(save, heads.linear_head(model, names, fingerprint=source.encoder.fingerprint, **about))
             log(f"{save}: the linear head")
-        results += found
+        results += scored
         log(f"probed {source.name}")
     if leave_out is None:
         results.append(array_probes.majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
@@ -315,7 +313,7 @@ def _side_masks(rows: TaskRows, sides: _Sides) -> list[Array]:
                 if not any(fnmatch(name, pattern) for name in known):
                     raise UserError(f"No row has the {kind} {pattern!r}. There are {', '.join(known) or 'none'}.")
             if patterns:
-                mask &= np.isin(column, [name for name in known if any(fnmatch(name, one) for one in patterns)])
+                mask &= np.isin(column, [name for name in known if any(fnmatch(name, each) for each in patterns)])
         masks.append(mask)
     return masks
 

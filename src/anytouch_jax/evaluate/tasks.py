@@ -179,9 +179,11 @@ def label_task(
         conditions.append(("sensor", sensor))
     name, groups = label.removeprefix("label."), [group] if group else []
     if not group:
-        groups = [one for one in GROUPS if one != name
-                  and any(_has_values(table, column) for column in (one, f"label.{one}"))]  # fmt: skip
-    columns = tuple(find_column(table, one) for one in groups[:1])
+        groups = [
+            column for column in GROUPS
+            if column != name and (_has_values(table, column) or _has_values(table, f"label.{column}"))
+        ]  # fmt: skip
+    columns = tuple(find_column(table, column) for column in groups[:1])
     return Task(name, find_column(table, label), groups=columns, which="all", where=tuple(conditions))
 
 
@@ -191,7 +193,7 @@ def find_column(table: Manifest, name: str) -> str:
     for candidate in (f"label.{name}", name):
         if candidate in columns:
             if pa.types.is_nested(table.column(candidate).type):
-                raise UserError(f"Column {candidate!r} holds lists. A probe needs one value a row.")
+                raise UserError(f"Column {candidate!r} contains lists. A probe needs one value a row.")
             return candidate
     raise UserError(f"The manifest has no column {name!r} or 'label.{name}'. It has {', '.join(columns)}.")
 
@@ -229,14 +231,14 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
         known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
         raise UserError(f"Task {task.name}: the manifest has no label in column {task.label!r}. It has {known}.")
     labels, split = _labels(table, task), _split(table, task)
-    kept = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
-    kept &= np.isin(split, ("train", "val", "test")) & ~np.isin(text_column(table, "sensor"), FIELD_SENSORS)
+    used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
+    used &= np.isin(split, ("train", "val", "test")) & ~np.isin(text_column(table, "sensor"), FIELD_SENSORS)
     for column, value in task.where:
-        kept &= text_column(table, column) == value if isinstance(value, str) else _numbers(table, column) > value
+        used &= text_column(table, column) == value if isinstance(value, str) else _numbers(table, column) > value
     length = max(task.frames, frames or 1)
     if length > 1:
-        kept &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
-    first = _choose_frames(table, task.which, np.flatnonzero(kept))
+        used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
+    first = _choose_frames(table, task.which, np.flatnonzero(used))
     rows, first, notes = _pair_fingers(table, task, first) if task.fingers else (first[:, None], first, ())
     if not len(rows):
         lacking = " and two fingers" if task.fingers else "" if task.which == "all" else " and contact"
@@ -255,7 +257,7 @@ def label_text(value: Any, source: str = "The label") -> str:
     if not isinstance(value, float | np.floating):
         return str(value)
     if not np.isfinite(value) or value != int(value):
-        raise UserError(f"{source} holds {value:g}, a measured quantity, not a class. Probe it as a number.")
+        raise UserError(f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number.")
     return str(int(value))
 
 
@@ -287,7 +289,7 @@ def _numbers(table: Manifest, name: str) -> Array:
     try:
         return table.column(name).cast(pa.float64()).to_numpy().astype(np.float64)
     except pa.ArrowException:
-        raise UserError(f"Column {name!r} holds text. This task needs numbers.") from None
+        raise UserError(f"Column {name!r} contains text. This task needs numbers.") from None
 
 
 def _split(table: Manifest, task: Task) -> Array:
@@ -326,16 +328,17 @@ def _best_of_sequence(rows: Array, sequence: Array, first: Array, second: Array)
 
 
 def _touching(table: Manifest) -> Array:
-    """Return whether each frame is contact, bool (rows,): by force, contact mark or contact score; all without these.
+    """Return whether each frame is contact, bool (rows,), by force, contact flag or contact score.
 
-    Force comes first: a mark or a score depends on the picture, and would leave out soft objects, by sensors unequally.
+    All frames are, in a file without these. Force comes first: a flag or a score depends on the picture. It would leave
+    out soft objects, more for some sensors than for others.
     """
     force, contact_score = (_numbers(table, f"label.{name}") for name in ("force", "contact_score"))
-    mark = known_contact(table)
+    flag = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
         here = table.source == source
-        for values, least in ((force, FORCE), (mark, 0.5), (contact_score, SCORE)):
+        for values, least in ((force, FORCE), (flag, 0.5), (contact_score, SCORE)):
             if np.isfinite(values[here]).any():
                 touches[here] = np.nan_to_num(values[here], nan=-1.0) > least
                 break

@@ -15,10 +15,10 @@ from task_world import painted, row, simulated, table
 from tiny_models import tiny_config
 from touch_world import make_touches
 
-from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, heads
@@ -213,11 +213,11 @@ def counted(monkeypatch) -> list[int]:
     """Rows that are read, by every pass over a manifest."""
     passes: list[int] = []
 
-    def counting(table, rows, *args, **options):
+    def counting(encoder, table, rows, *args, **options):
         passes.append(len(rows))
-        return evaluation(table, rows, *args, **options)
+        return embed_rows(encoder, table, rows, *args, **options)
 
-    monkeypatch.setattr(feature_cache, "evaluation", counting)
+    monkeypatch.setattr(feature_cache, "embed_rows", counting)
     return passes
 
 

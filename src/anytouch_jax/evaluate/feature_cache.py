@@ -8,7 +8,8 @@ import json
 import os
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,11 +19,10 @@ import numpy as np
 import numpy.typing as npt
 from sklearn.decomposition import PCA
 
-from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.embed import Features, Join, Pooling, check_backgrounds, save_npz, text_column
+from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, save_npz, text_column
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 
@@ -32,7 +32,6 @@ Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f
 Size = tuple[int, int]  # rows, columns
 
 VERSION = 3  # of the features; a change to their computation raises it
-BATCH = 64
 RAW_SIZE = (240, 320)  # of a picture before its area averages
 SMALL = (24, 32)
 COMPONENTS = 200  # principal components of raw pixels
@@ -98,8 +97,12 @@ def encoder_features(
     order: Order = "right",
     universal: bool = False,
     folder: Path | None = None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> FeatureStore:
-    """Return the features of an encoder; `universal`: the universal tokens for every sensor."""
+    """Return the features of an encoder; `universal`: the universal tokens for every sensor.
+
+    An unknown sensor gets these too, which is reported by `log`.
+    """
 
     def describe() -> dict[str, Any]:
         return _content(table, encoder_digest(encoder), order) | {
@@ -107,19 +110,9 @@ def encoder_features(
         }  # fmt: skip
 
     def compute(rows: Array, frames: int) -> Array:
-        check_backgrounds(encoder, table, rows)
-        config = replace(encoder.config, data=replace(encoder.config.data, batch_size=BATCH))
-        kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
-        values, read, universal_row = [], 0, encoder.config.model.universal_row
-        for ids, part in evaluation(table, rows, config, kind, frames=frames, unknown="universal"):
-            clip = reorder_frames(part.clip[: len(ids)], ids, order)
-            clip = np.concatenate([clip, np.repeat(clip[-1:], BATCH - len(ids), axis=0)])  # one shape, one compilation
-            sensor = np.full(BATCH, universal_row, np.int32) if universal else part.sensor
-            values.append(encoder.encode_touch(clip, sensor, pooling=pooling, join=join)[: len(ids)])
-            read += len(ids)
-        if read != len(rows):
-            raise UserError(f"{len(rows) - read} rows could not be read. Repair the manifest first.")
-        return np.concatenate(values)
+        sensor_row = encoder.config.model.universal_row if universal else None
+        edit = partial(reorder_frames, order=order)
+        return embed_rows(encoder, table, rows, frames, pooling, join, sensor_row=sensor_row, edit=edit, log=log)[1]
 
     return FeatureStore(compute, describe, folder)
 

@@ -144,9 +144,8 @@ def probe_table(results: Sequence[Result]) -> str:
             errors = (f"{result.r2:.3f}", r2, f"{result.mae:.4g}", mae, f"{result.baseline_mae:.4g}")
             regression.append((result.probe, result.protocol, *errors, str(result.n_train), size, chosen))
             continue
-        refits = (
-            "-" if result.refit_mean is None else f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}"
-        )
+        spread = 100 * (result.refit_std or 0)
+        refits = "-" if result.refit_mean is None else f"{_share(result.refit_mean)} ± {spread:.1f}"
         shares = (_share(result.accuracy), _interval(result.low, result.high), _share(result.balanced_accuracy))
         sizes = (str(result.n_train), size, str(len(result.classes)), chosen)
         classification.append((result.probe, result.protocol, *shares, _share(result.baseline), refits, *sizes))
@@ -159,10 +158,8 @@ def probe_table(results: Sequence[Result]) -> str:
     if regression:
         head = ("probe", "protocol", "R2", "95 % over test groups", "MAE", "MAE 95 %", "MAE of the mean")
         blocks.append(markdown_table((*head, "train", "test (groups)", "penalty"), regression))
-    notes = dict.fromkeys(
-        f"- {result.probe} ({result.protocol}): {note}" for result in results for note in result.notes
-    )
-    return "\n\n".join([*blocks, *(["\n".join(notes)] if notes else [])]) + "\n"
+    notes = [f"- {result.probe} ({result.protocol}): {note}" for result in results for note in result.notes]
+    return _with_notes(blocks, notes)
 
 
 def task_table(report: Mapping[str, Any]) -> str:

@@ -108,14 +108,11 @@ def probe_label(
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
     array_probes.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
     results: list[Any] = []
-    sources = _sources(table, models, features, controls, frames, cache, pooling=pooling, join=join)
+    sources = _sources(table, models, features, controls, frames, cache, pooling=pooling, join=join, log=log)
     for source in sources:
         if source.is_file:  # a file that lacks rows is reported before the work
             source.store.add(rows.rows, frames)
     for source in sources:
-        if source.encoder is not None:
-            for name in sorted(set(rows.sensors)):
-                source.encoder.sensor_row(name, log)  # warns of universal tokens
         values = pixel_components(source.store, rows) if source.name == RAW else source.store.get(rows.rows, frames)
         options: dict[str, Any] = {"leave_out": leave_out, "protocol": protocol, "seeds": seeds, "subsets": subsets}
         scored = probe_rows(values, rows, source.name, scaling=source.scaling, **options)

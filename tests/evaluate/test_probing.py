@@ -236,7 +236,7 @@ def test_nothing_is_encoded_twice(monkeypatch, encoder, pictures, tmp_path):
 
 
 def test_a_sensor_that_training_never_saw_is_noted(encoder, pictures):
-    some = replace(encoder, seen=("digit",))  # the table of the model has it
+    some = replace(encoder, trained_sensors=("digit",))  # the table of the model has it
     (found,) = run_tasks(some, pictures, ["material"], seeds=1)
     assert any("duragel" in note for note in found["notes"])
 

@@ -218,7 +218,7 @@ def test_what_cannot_be_streamed_is_one_sentence(encoder, tmp_path):
         stream(encoder, Camera(), live=True, sensor=DIGIT, frames=2)
     with pytest.raises(UserError, match="stride of a clip must be at least 1, not 0"):
         stream(encoder, Camera(), live=True, sensor=DIGIT, frames=3, stride=0)
-    with pytest.raises(UserError, match=r"no video .*gone\.avi; a camera is given by its number"):
+    with pytest.raises(UserError, match=r"no video .*gone\.avi; give a video file"):
         open_source(tmp_path / "gone.avi")
     text = tmp_path / "text.avi"
     text.write_text("no video")

@@ -1,7 +1,8 @@
-"""A new sensor in minutes: tokens of its own, fitted to a few of its frames with everything else frozen (Sec. 3.5)."""
+"""Adaptation to a new sensor: its own tokens, fitted to a few labelled frames with all else frozen (Sec. 3.5)."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,31 +16,32 @@ import numpy as np
 import optax
 import pyarrow as pa
 
-from anytouch_jax import objectives
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.embed import Log, embed_rows, text_column
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
-from anytouch_jax.train.metrics import Record
 from anytouch_jax.weights import checkpoint, compatible
 
 Params = dict[str, Any]
-Log = Callable[[str], None]
-Loss = Callable[[Params, jax.Array, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32, key)
-BATCH = 16  # frames a step; fewer frames come again under other masks
+Loss = Callable[[Params, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32)
+BATCH = 16  # frames of a step
 MEASURED = 64  # frames on which the loss is measured before and after
-PROTOTYPE_ROWS = 1000  # frames of the known sensors that make the classes' prototypes
+PROTOTYPE_ROWS = 1000  # frames of the known sensors for the prototypes of the classes
 
 
 class Adapted(NamedTuple):
-    """A model with a fitted row: `params` of the whole run, `losses` (steps,); mean losses `before` and `after` on
-    `measured` frames ("val", or "fitted" where the sensor has none in val); metadata `about`."""
+    """A model with a fitted row of tokens, and how well it fits.
+
+    `params` are those of the whole run, `losses` (steps,). The mean losses `before` and `after` are on frames of
+    `measured`: "val", or "fitted" if the sensor has no frames in val. `metadata` is that of the new run.
+    """
 
     config: Config
     params: Params
@@ -47,7 +49,7 @@ class Adapted(NamedTuple):
     before: float
     after: float
     measured: str
-    about: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 def adapt(
@@ -62,50 +64,47 @@ def adapt(
     seed: int = 0,
     log: Log = print,
 ) -> Adapted:
-    """Give `sensor` tokens of its own in the model of `run`, from `frames` of its stills in split train.
+    """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
 
-    They start as the universal tokens and with 0 frames stay so. Without `labels` they are fitted by masked
-    reconstruction (Eq. 1) through the run's decoder. With `labels`, a column, each frame's embedding is drawn to its
-    class: the mean embedding of the known sensors' frames of that class in `manifest`. Raises UserError.
+    The tokens start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the
+    prototype of its class in the column `labels`: the mean embedding of the known sensors' frames of that class. Raises
+    UserError.
     """
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
-    params, text, about = checkpoint.load_params(run)
-    config, params, row = _with_row(from_json(text), params, about, sensor, run, log)
-    seen = {"seen": [*about["seen"], sensor]} if "seen" in about else {}
-    kept: dict[str, Any] = {name: about[name] for name in ("preprocessing", "data") if name in about}
+    if frames and labels is None:
+        raise UserError("the tokens are fitted to classes; name a column with --labels, or copy with --frames 0")
+    params, text, stored = checkpoint.load_params(run)
+    config, params, row = _with_row(from_json(text), params, stored, sensor, run, log)
     source = {"run": str(run), "sensor": sensor, "frames": frames, "labels": labels, "manifest": manifest.content_hash}
-    about = {**kept, "sensors": list(config.model.sensors), **seen, "source": source}
-    if not frames:
-        return Adapted(config, params, (), float("nan"), float("nan"), "fitted", about)
-    if config.stage == 2 and not (config.objective.reconstruct or labels):
-        log(
-            "this stage 2 did not train the decoder, through which the tokens are fitted: they may be worse than the "
-            "universal ones; take a stage-1 run, or fit with --labels"
-        )
+    metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
+    metadata |= {"sensors": list(config.model.sensors), "source": source}
+    metadata |= {"seen": [*stored["seen"], sensor]} if "seen" in stored else {}
+    if labels is None or not frames:
+        return Adapted(config, params, (), float("nan"), float("nan"), "fitted", metadata)
     classes, prototypes = _classes(run, manifest, sensor, labels, log)
-    fitted = choose(manifest, sensor, "train", frames, classes, seed)
-    clip, target = _read(manifest, config, fitted), classes[fitted]
-    shown, on = _measured(manifest, sensor, classes, seed, fitted)
-    core = replace(config, model=replace(config.model, image=None, text=None, match_head="none", lora_rank=0))
-    loss = _loss(build(usable(core.model)), core, row, prototypes)
-    small: Params = {name: params[name] for name in ("touch", "decoder", "force") if name in params}
-    measure = partial(_mean, loss, clip=_read(manifest, config, shown), target=classes[shown])
-    tokens, history = _fit(loss, small, row, clip, target, steps=steps, rate=rate, seed=seed)
-    new = _put(params, row, tokens)
-    after = measure(_put(small, row, tokens))
-    return Adapted(config, new, history, measure(small), after, on, about)
+    fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
+    rows, measured = _measured_rows(manifest, sensor, classes, seed, fitted)
+    net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
+    loss, touch = _class_loss(net, row, prototypes), {"touch": params["touch"]}
+    measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
+    clip = _read(manifest, config, fitted)
+    tokens, history = _fit(loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed)
+    before, after = float(measure(touch)), float(measure(_put(touch, row, tokens)))
+    return Adapted(config, _put(params, row, tokens), history, before, after, measured, metadata)
 
 
 def check_empty(out: Path) -> None:
-    """Raise UserError when the folder of a new run holds something already."""
+    """Raise UserError if the folder of a new run has files already."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out} is not empty; give another --out")
 
 
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
-    """Write a run folder that embed, probe and retrieve read. Raises UserError when `out` holds something already, and
-    when the disk has no room for it."""
+    """Write a run folder for embed, probe and retrieve, whole or not at all.
+
+    Raises UserError if `out` is not empty, and if the disk has no room.
+    """
     out = Path(out)
     check_empty(out)
     disk = next(folder for folder in out.absolute().parents if folder.is_dir())
@@ -119,74 +118,68 @@ def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
 def _save(adapted: Adapted, run: Path, out: Path) -> None:
     text = to_json(adapted.config)
     atomic_write(out / "config.json", text + "\n")
-    tokenizer = run / "tokenizer.json"
-    if tokenizer.exists():
-        shutil.copyfile(tokenizer, out / "tokenizer.json")
-    record = Record(out, 0)
-    for step, loss in enumerate(adapted.losses):
-        record.write(step, {"loss": loss})
-    record.close()
+    if (run / "tokenizer.json").exists():
+        shutil.copyfile(run / "tokenizer.json", out / "tokenizer.json")
+    lines = (json.dumps({"step": step, "loss": loss}) + "\n" for step, loss in enumerate(adapted.losses))
+    atomic_write(out / "metrics.jsonl", "".join(lines))
     touch = {name: leaf for name, leaf in adapted.params["touch"].items() if name != "sensor_tokens"}
     state = {
         "trainable": {"touch": {"sensor_tokens": adapted.params["touch"]["sensor_tokens"]}},
         "frozen": adapted.params | {"touch": touch},
     }
-    checkpoints = checkpoint.Checkpoints(
-        out / "checkpoints", keep=1, config_json=text, metadata=adapted.about
-    )  # fmt: skip
+    checkpoints = checkpoint.Checkpoints(out / "checkpoints", keep=1, config_json=text, metadata=adapted.metadata)
     try:
         checkpoints.save(len(adapted.losses), state, {"loss": adapted.after})
     finally:
         checkpoints.close()
 
 
-def choose(
+def choose_frames(
     manifest: Manifest, sensor: str, split: str, count: int, classes: np.ndarray | None = None, seed: int = 0
 ) -> np.ndarray:
-    """`count` rows i64 of a sensor in a split, drawn from as many sequences as there are, in order.
+    """Return `count` rows i64 of a sensor in a split, from as many sequences as possible, in order.
 
-    `classes` i32 (rows of the manifest,): only rows of a class (not -1). Raises UserError when there are too few.
+    With `classes` i32 (rows of the manifest,) only rows that have a class (not -1). Raises UserError for too few rows.
     """
-    here = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == split)
+    usable_rows = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == split)
     if classes is not None:
-        here &= classes >= 0
-    rows = np.flatnonzero(here)
+        usable_rows &= classes >= 0
+    rows = np.flatnonzero(usable_rows)
     if count < 0:
         raise UserError(f"{count} frames cannot be chosen; 0 or more")
     if len(rows) < count:
         known = ", ".join(sorted(set(text_column(manifest, "sensor"))))
         raise UserError(
-            f"{count} frames of {sensor} are wanted, but split {split!r} has {len(rows)} that can be used "
-            f"(sensors there: {known})"
+            f"split {split!r} has {len(rows)} usable frames of {sensor}, not {count}; ask for fewer, or name another "
+            f"sensor ({known})"
         )
     rows = np.random.default_rng([seed % 2**63, 77]).permutation(rows)
     sequence = manifest.codes("sequence", own=True)[rows]
     order = np.argsort(sequence, kind="stable")
     first = np.searchsorted(sequence[order], sequence[order])
     turn = np.empty(len(rows), np.int64)
-    turn[order] = np.arange(len(rows)) - first  # how many rows of its sequence come before a row
+    turn[order] = np.arange(len(rows)) - first  # rows of the same sequence before a row
     return np.sort(rows[np.argsort(turn, kind="stable")[:count]])
 
 
 def _with_row(
-    config: Config, params: Params, about: dict[str, Any], sensor: str, run: str | Path, log: Log
+    config: Config, params: Params, metadata: dict[str, Any], sensor: str, run: str | Path, log: Log
 ) -> tuple[Config, Params, int]:
-    """The model with a row for `sensor`, as the universal tokens are."""
-    model = config.model
+    """Return the model with a row for `sensor` that equals the universal tokens, and the row."""
+    model, trained = config.model, metadata.get("seen", ())
     if sensor in FIELD_SENSORS or sensor == UNIVERSAL:
-        raise UserError(f"{sensor!r} has no tokens to fit: {'they serve all' if sensor == UNIVERSAL else 'no images'}")
-    if "touch" not in params or "decoder" not in params:
-        raise UserError(f"{run} holds no touch encoder and decoder; give a stage-1 or stage-2 run")
+        why = "they serve all sensors" if sensor == UNIVERSAL else "it has no images"
+        raise UserError(f"{sensor!r} has no tokens to fit: {why}; name a camera-based sensor")
+    if "touch" not in params:
+        raise UserError(f"{run} has no touch encoder; give a stage-1 or stage-2 run")
     if not model.sensor_tokens or model.patch_encoder == "sensor":
-        raise UserError(f"{run} tells sensors apart by other means than tokens; there is nothing to fit")
-    if sensor in about.get("seen", ()):
-        raise UserError(f"{run} was trained on {sensor}; adapt is for a sensor that it has not seen")
-    if sensor in model.sensors and "seen" not in about:
-        log(
-            f"{run} does not tell on which sensors it was trained: the tokens of {sensor} start from the universal ones"
-        )
+        raise UserError(f"{run} distinguishes sensors without tokens, so none can be fitted; give another run")
+    if sensor in trained:
+        raise UserError(f"{run} was trained on {sensor}; name a new sensor")
+    if sensor in model.sensors and "seen" not in metadata:
+        log(f"{run} does not store its trained sensors: the tokens of {sensor} start from the universal ones")
     drawn = config.objective.universal_start + config.objective.universal_end > 0
-    served = compatible.serve_unseen(params["touch"], model, about.get("seen", ()), universal_drawn=drawn)
+    served = compatible.serve_unseen(params["touch"], model, trained, universal_drawn=drawn)
     start = np.asarray(served["sensor_tokens"])[model.universal_row]
     tokens = np.asarray(params["touch"]["sensor_tokens"])
     if sensor not in model.sensors:
@@ -198,91 +191,78 @@ def _with_row(
 
 
 def _put(params: Params, row: int, tokens: Any) -> Params:
-    """`params` with the tokens (S, D) of one sensor replaced."""
+    """Return `params` with other tokens (S, D) in one row."""
     table = jnp.asarray(params["touch"]["sensor_tokens"]).at[row].set(tokens)
     return params | {"touch": params["touch"] | {"sensor_tokens": table}}
 
 
-def _classes(
-    run: str | Path, manifest: Manifest, sensor: str, labels: str | None, log: Log
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Class i32 (rows of the manifest,) of every row, -1 for none, and unit prototypes f32 (classes, E) of the known
-    sensors; without `labels` all rows are of class 0 and there are no prototypes."""
-    if labels is None:
-        return np.zeros(len(manifest), np.int32), None
-    column = next((c for c in (f"label.{labels}", labels) if c in manifest.table.column_names), None)
+def _classes(run: str | Path, manifest: Manifest, sensor: str, labels: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Return the class i32 of every row, -1 for none, and unit-norm prototypes f32 (classes, E)."""
+    column = next((name for name in (f"label.{labels}", labels) if name in manifest.table.column_names), None)
     if column is None:
-        raise UserError(f"the manifest has no column {labels!r} or 'label.{labels}' for --labels")
+        raise UserError(f"the manifest has no column {labels!r} or 'label.{labels}' for --labels; name another")
     if pa.types.is_floating(manifest.table[column].type):
-        raise UserError(f"--labels {labels} is a column of measurements; name one of classes")
-    value, felt = text_column(manifest, column), text_column(manifest, "sensor")
+        raise UserError(f"--labels {labels} is a column of measurements; name a column of classes")
+    value, sensors = text_column(manifest, column), text_column(manifest, "sensor")
     encoder = load_encoder(run)
-    known = np.isin(felt, encoder.config.model.sensors) & (felt != sensor)
-    usable = known & (value != "") & (text_column(manifest, "split") == "train")
-    rows = np.random.default_rng(0).permutation(np.flatnonzero(usable))[:PROTOTYPE_ROWS]
+    known = np.isin(sensors, encoder.config.model.sensors) & (sensors != sensor)
+    labelled = known & (value != "") & (text_column(manifest, "split") == "train")
+    rows = np.random.default_rng(0).permutation(np.flatnonzero(labelled))[:PROTOTYPE_ROWS]
     if not rows.size:
         raise UserError(f"--labels needs frames of sensors that {run} knows, with a {labels}, in split 'train'")
     rows, values = embed_rows(encoder, manifest, np.sort(rows), log=log)
-    names, of = np.unique(value[rows], return_inverse=True)
+    names, class_ids = np.unique(value[rows], return_inverse=True)
     if len(names) < 2 or len(names) == len(rows):
-        raise UserError(f"--labels {labels} must name classes, of two values or more that frames share")
+        raise UserError(f"--labels {labels} must name classes: two values or more, each of several frames")
     unit = values / np.linalg.norm(values, axis=1, keepdims=True)
-    mean = np.stack([unit[of == one].mean(axis=0) for one in range(len(names))])
+    mean = np.stack([unit[class_ids == number].mean(axis=0) for number in range(len(names))])
     place = np.minimum(np.searchsorted(names, value), len(names) - 1)
     classes = np.where(names[place] == value, place, -1).astype(np.int32)
     return classes, mean / np.linalg.norm(mean, axis=1, keepdims=True)
 
 
-def _measured(
+def _measured_rows(
     manifest: Manifest, sensor: str, classes: np.ndarray, seed: int, fitted: np.ndarray
 ) -> tuple[np.ndarray, str]:
-    """Rows on which to measure: frames of the sensor in split val, or else those that are fitted."""
-    here = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
-    count = min(int(here.sum()), MEASURED)
+    """Return the rows on which to measure, and their name: frames of the sensor in split val, else the fitted ones."""
+    in_val = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
+    count = min(int(in_val.sum()), MEASURED)
     if not count:
         return fitted[:MEASURED], "fitted"
-    return choose(manifest, sensor, "val", count, classes, seed), "val"
+    return choose_frames(manifest, sensor, "val", count, classes, seed), "val"
 
 
 def _read(manifest: Manifest, config: Config, rows: np.ndarray) -> np.ndarray:
-    """Stills u8 (rows, 1, H, W, 3)."""
+    """Return stills u8 (rows, 1, H, W, 3)."""
     config = replace(config, data=replace(config.data, batch_size=min(64, len(rows)), on_bad_sample="error"))
     return np.concatenate([part.clip[: len(ids)] for ids, part in evaluation(manifest, rows, config)])
 
 
-def _loss(net: Net, config: Config, row: int, prototypes: np.ndarray | None) -> Loss:
-    """The mean loss of a batch of stills of the sensor in `row`."""
+def _class_loss(net: Net, row: int, prototypes: np.ndarray) -> Loss:
+    """Return the cross-entropy of stills of the sensor in `row` against the prototypes."""
 
-    def reconstruction(params: Params, clip: jax.Array, target: jax.Array, key: jax.Array) -> jax.Array:
-        noise = jax.random.uniform(key, (clip.shape[0], net.model.patches))
-        sensor, pixels = jnp.full(clip.shape[0], row), objectives.normalise_touch(clip)
-        loss, _ = objectives.stage1_terms(params, pixels, sensor, noise, net=net, config=config)
-        return loss
-
-    def to_class(params: Params, clip: jax.Array, target: jax.Array, key: jax.Array) -> jax.Array:
-        z = net.apply(params, "encode", objectives.normalise_touch(clip), jnp.full(clip.shape[0], row))
+    def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
+        z = net.apply(params, "encode", normalise_touch(clip), jnp.full(clip.shape[0], row))
         logits = losses.normalise(z) @ jnp.asarray(prototypes).T / net.model.temperature
         return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, target))
 
-    return reconstruction if prototypes is None else to_class
+    return loss
 
 
 def _fit(
     loss: Loss, params: Params, row: int, clip: np.ndarray, target: np.ndarray, *, steps: int, rate: float, seed: int
 ) -> tuple[np.ndarray, tuple[float, ...]]:
-    """The tokens (S, D) of the row after `steps` of Adam with a falling rate, and the loss of each step."""
+    """Return the tokens (S, D) of the row after `steps` of Adam with a cosine schedule, and the loss of each step."""
     tx = optax.adam(optax.cosine_decay_schedule(rate, steps))
     arrays = jax.device_put((params, clip, target))
 
     @jax.jit
     def step(tokens: jax.Array, state: Any, key: jax.Array, arrays: Any) -> tuple[jax.Array, Any, jax.Array]:
         params, clip, target = arrays
-        key_rows, key_loss = jax.random.split(key)
-        # All frames in turn would need another shape for every number of frames.
+        key_rows, _ = jax.random.split(key)
+        # Drawn with replacement: epochs would need another shape for every number of frames.
         rows = jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
-        value, grad = jax.value_and_grad(lambda t: loss(_put(params, row, t), clip[rows], target[rows], key_loss))(
-            tokens
-        )
+        value, grad = jax.value_and_grad(lambda t: loss(_put(params, row, t), clip[rows], target[rows]))(tokens)
         updates, state = tx.update(grad, state)
         return optax.apply_updates(tokens, updates), state, value
 
@@ -292,8 +272,3 @@ def _fit(
         tokens, state, value = step(tokens, state, jax.random.fold_in(root, number), arrays)
         history.append(value)
     return np.asarray(tokens), tuple(float(value) for value in history)
-
-
-def _mean(loss: Loss, params: Params, *, clip: np.ndarray, target: np.ndarray) -> float:
-    """The loss on given frames, under masks that are the same each time."""
-    return float(jax.jit(loss)(params, clip, target, jax.random.key(0)))

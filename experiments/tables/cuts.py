@@ -13,7 +13,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
 from anytouch_jax.encoder.embed import text_column
-from anytouch_jax.evaluate.contacts import deepest_rows, numbers
+from anytouch_jax.evaluate.retrieval import deepest_rows, numbers
 
 MADE, WHOLE, STATIC, GRASP = "manifest.parquet", "contact.parquet", "static.parquet", "grasp.parquet"
 SPLITS = ("train", "val", "test")

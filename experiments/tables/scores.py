@@ -21,9 +21,9 @@ from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
-from anytouch_jax.evaluate.contacts import contact_vector
 from anytouch_jax.evaluate.feature_cache import background_difference, encoder_digest
 from anytouch_jax.evaluate.probing import run_tasks
+from anytouch_jax.evaluate.retrieval import contact_vector
 from anytouch_jax.evaluate.tasks import Task
 from anytouch_jax.files import atomic_write
 from experiments.tables import cuts, plan, real

@@ -43,8 +43,8 @@ from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
-from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
+from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
 from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import VERSION

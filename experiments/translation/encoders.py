@@ -16,7 +16,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.evaluate import retrieval
-from anytouch_jax.evaluate.contacts import deepest_rows
+from anytouch_jax.evaluate.retrieval import deepest_rows
 from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.train.progress import silent
 from anytouch_jax.weights.tree import interpolate

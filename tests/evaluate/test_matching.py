@@ -14,8 +14,8 @@ from anytouch_jax.config import to_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import matching
-from anytouch_jax.evaluate.contacts import deepest_rows
 from anytouch_jax.evaluate.matching import MatchScore, auc, best_rule, draw_triples, matcher, score_matching
+from anytouch_jax.evaluate.retrieval import deepest_rows
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.checkpoint import Checkpoints
 

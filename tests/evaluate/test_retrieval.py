@@ -13,10 +13,15 @@ from touch_world import SENSORS, make_touches
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
-from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.feature_cache import background_difference
-from anytouch_jax.evaluate.galleries import draw_galleries, score
-from anytouch_jax.evaluate.retrieval import cross_sensor_retrieval, difference
+from anytouch_jax.evaluate.retrieval import (
+    contact_vector,
+    cross_sensor_retrieval,
+    deepest_rows,
+    difference,
+    draw_galleries,
+    score_galleries,
+)
 from anytouch_jax.evaluate.statistics import mean_interval, plain
 
 Array = np.ndarray[Any, Any]
@@ -92,21 +97,21 @@ def test_a_tie_is_counted_as_a_lot_would_be() -> None:
     """Two kinds of touches: the own kind ties with all of its kind, so that top 5 is 5 of those in the gallery."""
     kind = np.eye(2)[np.arange(COUNT) % 2]
     drawn = draw_galleries(NAMES, NAMES, seeds=1)
-    top1, top5 = score(kind, kind, drawn)
+    top1, top5 = score_galleries(kind, kind, drawn)
     equal = np.sum(kind[drawn.items[0]][:, :, 0] == kind[drawn.queries][:, :1], axis=1)
     np.testing.assert_allclose(top1, 1 / equal)
     np.testing.assert_allclose(top5, 5 / equal)
     worse = np.concatenate([kind[:, 1:], kind[:, :1]], axis=1)  # the own kind is the unlike one
-    assert max(one.max() for one in score(worse, kind, drawn)) == 0
+    assert max(one.max() for one in score_galleries(worse, kind, drawn)) == 0
 
 
 def test_a_score_by_hand() -> None:
     query, gallery = np.array([[1.0, 0.0]]), np.array([[1.0, 1.0], [1.0, 0.1], [0.0, 1.0], [1.0, 0.2], [-1.0, 0.0]])
     drawn = draw_galleries(["a"], ["a", "b", "c", "d", "e"], gallery_size=5)
-    assert [one.tolist() for one in score(query, gallery, drawn)] == [[0.0], [1.0]]
+    assert [one.tolist() for one in score_galleries(query, gallery, drawn)] == [[0.0], [1.0]]
     far = np.array([[5.0, 5.0]])
-    assert score(far, gallery, drawn)[0] == [1.0]  # by angle the first is nearest
-    assert score(np.array([[0.9, 0.2]]), gallery, drawn, metric="euclidean")[0] == [0.0]
+    assert score_galleries(far, gallery, drawn)[0] == [1.0]  # by angle the first is nearest
+    assert score_galleries(np.array([[0.9, 0.2]]), gallery, drawn, metric="euclidean")[0] == [0.0]
 
 
 def test_distractors_by_chance_are_any_touches_and_others_for_each_seed() -> None:
@@ -160,8 +165,8 @@ def test_no_order_of_rows_matters(matched: bool) -> None:
         query[turned], gallery[mixed], names=np.array(NAMES)[turned], others=np.array(NAMES)[mixed],
         things=np.array(THINGS)[turned], match=covariates[mixed] if matched else None,
     )  # fmt: skip
-    np.testing.assert_array_equal(again.found.keys, first.found.keys[turned])
-    np.testing.assert_allclose(again.found.top1, first.found.top1[turned])
+    np.testing.assert_array_equal(again.per_query.keys, first.per_query.keys[turned])
+    np.testing.assert_allclose(again.per_query.top1, first.per_query.top1[turned])
     assert again == first
 
 
@@ -182,7 +187,7 @@ def test_a_units_own_touches_never_enter_its_gallery() -> None:
     assert (units[drawn.items] != units[drawn.queries][None, :, None]).all()
     np.testing.assert_array_equal(names[drawn.items[:, :, 0]], np.broadcast_to(names[drawn.queries], (3, 2 * COUNT)))
     assert (names[drawn.items[:, :, 1:]] != names[drawn.queries][None, :, None]).all()
-    low, high = mean_interval(score(features, features, drawn)[0], names)
+    low, high = mean_interval(score_galleries(features, features, drawn)[0], names)
     assert low <= 0.02 <= high  # its own row would be found at once
     with pytest.raises(UserError, match="share no touch"):
         draw_galleries(NAMES, NAMES, query_unit=["x"] * COUNT, gallery_unit=["x"] * COUNT)
@@ -209,7 +214,7 @@ def test_a_paired_difference_is_narrower_than_two_intervals() -> None:
     assert high - low < weak.high - weak.low
     assert difference(weak, weak) == (0.0, 0.0, 0.0)
     other = ask(base[:100], base, names=NAMES[:100], things=THINGS[:100], name="other")
-    with pytest.raises(UserError, match="'other' did not answer the same queries"):
+    with pytest.raises(UserError, match="'other' have different queries"):
         difference(weak, other)
 
 
@@ -249,7 +254,7 @@ def test_mistakes_in_a_draw_are_one_sentence(options: dict[str, Any], words: str
 )
 def test_mistakes_in_features_are_one_sentence(query: Array, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        score(query, noise(), draw_galleries(NAMES, NAMES))
+        score_galleries(query, noise(), draw_galleries(NAMES, NAMES))
 
 
 # --- manifests ---------------------------------------------------------------------------------------------------
@@ -350,9 +355,9 @@ def test_sensors_that_share_no_touch_are_left_out_aloud(touched: manifests.Manif
     assert {(one.query_sensor, one.gallery_sensor) for one in found[:4]} == {
         ("digit", "gelsight"), ("gelsight", "digit"), ("gelsight", "gelslim"), ("gelslim", "gelsight"),
     }  # fmt: skip
-    assert "digit to gelslim left out: no touch was felt by both" in found[-1].notes
+    assert "digit to gelslim left out: they share no touch" in found[-1].notes
     lock = rows[np.array(sensor)[rows] != "gelsight"]
-    with pytest.raises(UserError, match="no touch was felt by two sensors"):
+    with pytest.raises(UserError, match="two sensors share no touch"):
         cross_sensor_retrieval(touched, {"x": texture_features(touched, lock)}, lock, gallery_size=10)
 
 
@@ -395,7 +400,7 @@ def test_the_vector_of_a_contact(touched: manifests.Manifest) -> None:
     area = [None, *touched.table["label.area"].to_pylist()[1:]]
     with pytest.raises(UserError, match=r"row 0 of .* has no value"):
         contact_vector(with_columns(touched, **{"label.area": area}), np.array([0]))
-    with pytest.raises(UserError, match=r"'label\.area' holds text"):
+    with pytest.raises(UserError, match=r"'label\.area' has text"):
         contact_vector(with_columns(touched, **{"label.area": ["big"] * len(touched)}), rows)
 
 

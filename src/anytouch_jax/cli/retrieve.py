@@ -57,9 +57,9 @@ def run(options: RetrieveOptions) -> int:
     from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import encoder as features
     from anytouch_jax.evaluate import retrieval
-    from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
     from anytouch_jax.evaluate.feature_cache import background_difference
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
+    from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
     from anytouch_jax.evaluate.statistics import markdown_table, plain
     from anytouch_jax.train.mesh import enable_compilation_cache
 

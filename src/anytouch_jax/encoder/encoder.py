@@ -142,7 +142,7 @@ class Encoder:
                 f"{frames.shape}; resize each frame with encoder.preprocess(frame)"
             )
         check_frames(self.config.model, frames.shape[1])
-        rows = sensor_rows(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
+        rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
         count, run = len(frames), self._run(pooling, join)
         if not count:  # the network has no shape for nothing: embed one touch and return none
             frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
@@ -261,7 +261,7 @@ def check_frames(model: ModelConfig, frames: int) -> None:
         raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
 
 
-def sensor_rows(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
+def rows_of_sensors(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
     """Return rows i32 (count,) of one sensor name, of names (count,), or of row numbers below `rows`.
 
     `row` returns the row of a name. Raises UserError for another shape or type.

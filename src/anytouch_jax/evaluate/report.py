@@ -23,8 +23,8 @@ from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, geometry, matching, probe_results, retrieval, statistics
-from anytouch_jax.evaluate.contacts import contact_vector, deepest_rows
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
+from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
 from anytouch_jax.evaluate.sections import (  # fmt: skip
     Section,
     losses_section,

@@ -1,9 +1,9 @@
-"""Cross-sensor retrieval: does the embedding of a touch by one sensor find the same touch felt by another?
+"""Cross-sensor retrieval: recall of the same touch by another sensor, among similar touches.
 
-For each query touch of sensor A a gallery of touches of sensor B holds that touch once, among distractors that are
-nearest to it in position, depth and force, so that the place or the size of a contact does not give it away. What is
-reported is the share of queries whose own touch comes first (top-1) or among the first five, with an interval over
-objects. Equal scores share their places evenly, so features that say nothing score chance and never more.
+For each query touch of sensor A, a gallery of touches of sensor B has that touch once. The distractors are its nearest
+neighbours in position, depth and force, so that the place or the size of a contact does not reveal it. Reported are
+recall@1 and recall@5 with intervals over objects. Equal scores share their ranks evenly, so constant features score
+chance.
 """
 
 from __future__ import annotations
@@ -11,26 +11,33 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.contacts import COVARIATES, deepest_rows, numbers
-from anytouch_jax.evaluate.galleries import GALLERY, Galleries, Metric, draw_galleries, score, texts
 from anytouch_jax.evaluate.statistics import mean_interval
 
 Array = npt.NDArray[Any]
+Metric = Literal["cosine", "euclidean"]
+
 ALL = "all"
+GALLERY = 50  # touches in a gallery, the true one included
+COVARIATES = ("label.x", "label.y", "label.depth", "label.force")  # mm, mm, mm, N
+VECTOR = ("label.area", "label.x", "label.y", "label.force")  # mm2, mm, mm, N
+_TIE = 1e-9
+_CHUNK = 1024  # queries whose scores are in memory at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Query by query: its key, the chance (0..1) that it is found at top 1 and top 5, its group. See `difference`."""
+class QueryScores:
+    """Each query's key, its recall (0..1) at 1 and at 5 as a mean over galleries, and its group. See `difference`."""
 
     keys: Array
     top1: Array
@@ -42,11 +49,10 @@ class Found:
 class Retrieval:
     """Retrieval by one set of features; shares are in 0..1.
 
-    `low`, `high` (and those of top 5): 95 % percentile interval when the groups (objects) are drawn anew with
-    replacement; None with fewer than two. `chance1`, `chance5`: what features that say nothing reach. `matched`: the
-    covariates in which distractors are near, empty where they are drawn by chance; `nearness`: their mean distance to
-    the touch looked for, divided by that of all touches they were taken from (1: the matching chose nothing).
-    `centred`: the mean feature of each sensor was subtracted.
+    `top1`, `top5`: recall@1 and recall@5. `low`, `high` (and those of top 5): 95 % interval under a bootstrap over the
+    groups (objects), None with fewer than two. `chance1`, `chance5`: recall of constant features. `matched`: covariates
+    in which distractors are near, empty for random galleries. `nearness`: mean distance of the distractors to the true
+    touch, divided by that of all candidates (1: no effect). `centred`: the mean feature of each sensor was subtracted.
     """
 
     name: str
@@ -68,7 +74,7 @@ class Retrieval:
     groups: int
     nearness: float | None
     notes: tuple[str, ...] = ()
-    found: Found | None = field(default=None, repr=False, compare=False)
+    per_query: QueryScores | None = field(default=None, repr=False, compare=False)
 
 
 def cross_sensor_retrieval(
@@ -83,93 +89,85 @@ def cross_sensor_retrieval(
     metrics: Mapping[str, Metric] | None = None,
     seeds: int = 5,
 ) -> list[Retrieval]:
-    """Retrieval for each set of features, ordered pair of sensors and kind of centring; pooled over the pairs last.
+    """Return retrieval for each set of features, ordered pair of sensors and kind of centring; pooled results last.
 
-    `features` {name: (len(rows), d)} of manifest `rows`, of which the deepest frame of each touch, sensor and unit
-    counts. `match`: label columns, those that the manifest has are used; None draws galleries by chance. `metrics`
-    {name: metric}, cosine otherwise. Touches without a value in one of the columns are left out, which a note says.
-    Raises UserError when a sensor is paired with itself, no covariate is there, no touch is in common, a gallery would
-    be too small, or features are not finite.
+    `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch, sensor and unit is
+    used. `match` names label columns, of which those in the manifest are used; None draws random galleries. `metrics`
+    {name: metric}, cosine by default. Touches without a value in one of the columns are left out, with a note. Raises
+    UserError for a sensor paired with itself, no covariate, no common touch, a gallery that is too large, or features
+    that are not finite.
     """
     rows = np.asarray(rows)
     for name, values in features.items():
         if len(values) != len(rows):
             raise UserError(f"features {name!r} have {len(values)} rows; they must have one for each of {len(rows)}")
-    kept, place, covariates, notes = _usable(manifest, rows, match)
-    sensors = text_column(manifest, "sensor")[kept]
-    touch, unit = _touches(manifest, kept), _joined(sensors, text_column(manifest, "unit")[kept])
-    things = text_column(manifest, "object")[kept]
-    groups, keys = np.where(things == "", touch, things), _joined(touch, unit)
+    used, place, covariates, notes = _usable(manifest, rows, match)
+    sensors = text_column(manifest, "sensor")[used]
+    touch, unit = _touches(manifest, used), _joined(sensors, text_column(manifest, "unit")[used])
+    objects = text_column(manifest, "object")[used]
+    groups, keys = np.where(objects == "", touch, objects), _joined(touch, unit)
     drawn = {}
     for first, second in _pairs(sensors) if pairs is None else pairs:
-        one, two = _rows_of(sensors, first, second)
-        if pairs is None and not np.isin(touch[one], touch[two]).any():
-            notes += (f"{first} to {second} left out: no touch was felt by both",)
+        query, gallery = _rows_of(sensors, first, second)
+        if pairs is None and not np.isin(touch[query], touch[gallery]).any():
+            notes += (f"{first} to {second} left out: they share no touch",)
             continue
-        near = None if match is None else numbers(manifest, covariates, kept[two])
+        near = None if match is None else numbers(manifest, covariates, used[gallery])
         drawn[first, second] = draw_galleries(
-            touch[one], touch[two], gallery_size=gallery_size, match=near, query_unit=unit[one],
-            gallery_unit=unit[two], seeds=seeds,
+            touch[query], touch[gallery], gallery_size=gallery_size, match=near, query_unit=unit[query],
+            gallery_unit=unit[gallery], seeds=seeds,
         )  # fmt: skip
     if not drawn:
-        raise UserError("no touch was felt by two sensors; `touch` must be equal where the same place was touched")
+        raise UserError("two sensors share no touch; `touch` must be equal for the same place of the same object")
     results = []
     for name, centred in ((name, centred) for name in features for centred in centre):
         metric, values = (metrics or {}).get(name, "cosine"), np.asarray(features[name])[place]
-        about = {"name": name, "metric": metric, "matched": covariates, "centred": centred, "notes": notes}
-        several, tables = [], []
+        common = {"name": name, "metric": metric, "matched": covariates, "centred": centred, "notes": notes}
+        tables = []
         for (first, second), galleries in drawn.items():
-            one, two = _rows_of(sensors, first, second)
-            tops = score(values[one], values[two], galleries, metric=metric, centre=centred)
-            asked = one[galleries.queries]
-            tables.append(Found(_joined(keys[asked], [f"{first} to {second}"] * len(asked)), *tops, groups[asked]))
+            query, gallery = _rows_of(sensors, first, second)
+            tops = score_galleries(values[query], values[gallery], galleries, metric=metric, centre=centred)
+            ids = query[galleries.queries]
+            tables.append(QueryScores(_joined(keys[ids], [f"{first} to {second}"] * len(ids)), *tops, groups[ids]))
             names = {"query_sensor": first, "gallery_sensor": second}
-            several.append(_summary(tables[-1], gallery_size, (galleries,), about | names))
-        results += [*several, _summary(_concatenated(tables), gallery_size, tuple(drawn.values()), about)]
+            results.append(_summary(tables[-1], gallery_size, (galleries,), common | names))
+        columns = ([getattr(table, part.name) for table in tables] for part in dataclasses.fields(QueryScores))
+        pooled = QueryScores(*map(np.concatenate, columns))
+        results.append(_summary(pooled, gallery_size, tuple(drawn.values()), common))
     return results
 
 
 def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None, float | None]:
-    """Top-1 share of `first` minus that of `second`, with its 95 % interval over groups, paired by query.
+    """Return recall@1 of `first` minus that of `second`, and its 95 % interval over groups, paired by query.
 
-    Raises UserError when the two did not answer the same queries.
+    Raises UserError if the two have different queries.
     """
-    a, b = first.found, second.found
+    a, b = first.per_query, second.per_query
     if a is None or b is None or not np.array_equal(a.keys, b.keys) or not np.array_equal(a.groups, b.groups):
-        raise UserError(f"{first.name!r} and {second.name!r} did not answer the same queries; give both the same rows")
+        raise UserError(f"{first.name!r} and {second.name!r} have different queries; give both the same rows")
     change = a.top1 - b.top1
     return float(change.mean()), *mean_interval(change, a.groups)
 
 
-def _summary(found: Found, size: int, drawn: Sequence[Galleries], about: Mapping[str, Any]) -> Retrieval:
-    missing, notes = sum(one.missing for one in drawn), tuple(about.get("notes", ()))
+def _summary(scores: QueryScores, size: int, drawn: Sequence[Galleries], common: Mapping[str, Any]) -> Retrieval:
+    missing, notes = sum(galleries.missing for galleries in drawn), tuple(common["notes"])
     if missing:
-        notes += (f"{missing} queries left out: no other unit of the gallery felt their touch",)
-    weights = [len(one.queries) for one in drawn if one.nearness is not None]
-    near = [one.nearness * len(one.queries) for one in drawn if one.nearness is not None]
+        notes += (f"{missing} queries left out: no other unit in the gallery has their touch",)
+    near = [(part.nearness, len(part.queries)) for part in drawn if part.nearness is not None]
+    nearness = sum(value * count for value, count in near) / sum(count for _, count in near) if near else None
+    (low, high), (low5, high5) = (mean_interval(top, scores.groups) for top in (scores.top1, scores.top5))
     fields: dict[str, Any] = {
-        "query_sensor": ALL, "gallery_sensor": ALL, **about, **_shares(found), "notes": notes,
-        "chance1": 1 / size, "chance5": min(5 / size, 1.0), "gallery": size, "queries": len(found.keys),
-        "groups": len(np.unique(found.groups)), "nearness": sum(near) / sum(weights) if near else None,
+        "query_sensor": ALL, "gallery_sensor": ALL, **common, "notes": notes,
+        "top1": float(scores.top1.mean()), "low": low, "high": high,
+        "top5": float(scores.top5.mean()), "top5_low": low5, "top5_high": high5,
+        "chance1": 1 / size, "chance5": min(5 / size, 1.0), "gallery": size, "queries": len(scores.keys),
+        "groups": len(np.unique(scores.groups)), "nearness": nearness,
     }  # fmt: skip
-    return Retrieval(**fields, found=found)
-
-
-def _shares(found: Found) -> dict[str, Any]:
-    low, high = mean_interval(found.top1, found.groups)
-    low5, high5 = mean_interval(found.top5, found.groups)
-    return {
-        "top1": float(found.top1.mean()), "low": low, "high": high,
-        "top5": float(found.top5.mean()), "top5_low": low5, "top5_high": high5,
-    }  # fmt: skip
-
-
-def _concatenated(tables: Sequence[Found]) -> Found:
-    return Found(*(np.concatenate([getattr(one, part.name) for one in tables]) for part in dataclasses.fields(Found)))
+    return Retrieval(**fields, per_query=scores)
 
 
 def _touches(manifest: Manifest, rows: Array) -> Array:
-    """Names of touches; those of joined manifests are their own."""
+    """Return the names of touches, which are distinct for each joined manifest."""
     names = text_column(manifest, "touch")[rows]
     return names if len(manifest.files) == 1 else _joined(names, manifest.source[rows])
 
@@ -177,41 +175,275 @@ def _touches(manifest: Manifest, rows: Array) -> Array:
 def _usable(
     manifest: Manifest, rows: Array, match: Sequence[str] | None
 ) -> tuple[Array, Array, tuple[str, ...], tuple[str, ...]]:
-    """Rows that take part, their places in `rows`, the covariates that the manifest has, and notes."""
-    kept, notes = deepest_rows(manifest, rows), []
-    fields = np.isin(text_column(manifest, "sensor")[kept], FIELD_SENSORS)
-    kept = kept[~fields]
-    if fields.any():
-        notes.append(f"{int(fields.sum())} touches by force-field sensors, which have no images, left out")
-    covariates = () if match is None else tuple(one for one in match if one in manifest.table.column_names)
+    """Return the rows to use, their places in `rows`, the covariates of the manifest, and notes."""
+    used, notes = deepest_rows(manifest, rows), []
+    is_field = np.isin(text_column(manifest, "sensor")[used], FIELD_SENSORS)
+    used = used[~is_field]
+    if is_field.any():
+        notes.append(f"{int(is_field.sum())} touches by force-field sensors, which have no images, left out")
+    covariates = () if match is None else tuple(name for name in match if name in manifest.table.column_names)
     if match is not None:
         if not covariates:
             raise UserError(
                 f"the manifest has none of {', '.join(match)} to match the gallery in; add one, or draw --by-chance"
             )
-        whole = np.isfinite(numbers(manifest, covariates, kept)).all(axis=1)
+        whole = np.isfinite(numbers(manifest, covariates, used)).all(axis=1)
         if not whole.all():
             notes.append(f"{int(np.sum(~whole))} touches without {' or '.join(covariates)} left out")
-        kept = kept[whole]
+        used = used[whole]
     order = np.argsort(rows)
-    return kept, order[np.searchsorted(rows, kept, sorter=order)], covariates, tuple(notes)
+    return used, order[np.searchsorted(rows, used, sorter=order)], covariates, tuple(notes)
 
 
 def _pairs(sensors: Array) -> list[tuple[str, str]]:
-    names = [str(one) for one in np.unique(sensors)]
+    names = [str(name) for name in np.unique(sensors)]
     if len(names) < 2:
-        raise UserError(f"cross-sensor retrieval needs touches by two sensors, and these are by {names or 'none'}")
-    return [(one, two) for one in names for two in names if one != two]
+        raise UserError(f"cross-sensor retrieval needs touches by two sensors; these are by {names or 'no sensor'}")
+    return [(first, second) for first in names for second in names if first != second]
 
 
 def _rows_of(sensors: Array, first: str, second: str) -> tuple[Array, Array]:
     if first == second:
-        raise UserError(f"query and gallery are both by {first!r}; a sensor is not to be found by itself")
+        raise UserError(f"query and gallery are both by {first!r}; name two sensors")
     for name in (first, second):
         if name not in sensors:
-            raise UserError(f"no touch is by the sensor {name!r}; there are {', '.join(np.unique(sensors))}")
+            raise UserError(f"no touch is by the sensor {name!r}; name one of {', '.join(np.unique(sensors))}")
     return np.flatnonzero(sensors == first), np.flatnonzero(sensors == second)
 
 
 def _joined(first: Any, second: Any) -> Array:
-    return np.array([f"{one}/{two}" for one, two in zip(texts(first), texts(second), strict=True)], dtype=str)
+    return np.array([f"{a}/{b}" for a, b in zip(_texts(first), _texts(second), strict=True)], dtype=str)
+
+
+# Galleries ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Galleries:
+    """Gallery rows of each query, drawn from names and covariates alone.
+
+    `queries` (n,) row numbers. `items` (draws, n, size) gallery rows, the true touch first. `nearness` as in
+    `Retrieval`. `missing` counts queries whose touch no other unit in the gallery has.
+    """
+
+    queries: Array
+    items: Array
+    nearness: float | None
+    missing: int
+
+
+def draw_galleries(
+    query_touch: Any,
+    gallery_touch: Any,
+    *,
+    gallery_size: int = GALLERY,
+    match: Array | None = None,
+    query_unit: Any = None,
+    gallery_unit: Any = None,
+    seeds: int = 5,
+) -> Galleries:
+    """Return galleries that depend on names, covariates and seeds, not on the order of rows.
+
+    Equal names are one touch. `match` (m, k) are covariates of the gallery: the distractors are the nearest to the true
+    touch, each covariate scaled to unit spread. Without it `seeds` random galleries are drawn. Items of the query's
+    own unit are never in its gallery. Raises UserError for covariates that are not finite, too few touches, or no
+    common touch.
+    """
+    if seeds < 1:
+        raise UserError(f"seeds must be at least 1, not {seeds}")
+    if gallery_size < 2:
+        raise UserError(f"gallery_size {gallery_size} is too small: a gallery has the touch and at least one other")
+    query_order, query_touch, query_unit = _sorted(query_touch, query_unit, "query")
+    order, touch, unit = _sorted(gallery_touch, gallery_unit, "gallery")
+    for one, two in pairwise(zip(touch, unit, strict=True)):
+        if one == two:
+            raise UserError(f"the gallery has touch {str(one[0])!r} twice by one unit; keep one frame of each touch")
+    covariates = None if match is None else _unit_spread(match, len(order))[order]
+    draws = seeds if covariates is None else 1  # matched galleries have no randomness
+    ranks, items, sums = [], [], np.zeros(2)
+    for rank in range(len(query_order)):
+        allowed, same = unit != query_unit[rank], touch == query_touch[rank]
+        own, rest = np.flatnonzero(allowed & same), np.flatnonzero(allowed & ~same)
+        if not len(own):
+            continue
+        if len(rest) < gallery_size - 1:
+            raise UserError(
+                f"a gallery of {gallery_size} needs {gallery_size - 1} other touches than "
+                f"{str(query_touch[rank])!r}, and there are {len(rest)}; give more touches or a smaller --gallery"
+            )
+        ranks.append(rank)
+        several = [_draw(own, rest, covariates, gallery_size, np.random.default_rng([s, rank])) for s in range(draws)]
+        items.append([order[chosen] for chosen, _ in several])
+        sums += np.sum([distances for _, distances in several], axis=0)
+    if not ranks:
+        raise UserError("no query touch is in the gallery: the two sensors share no touch")
+    rows = query_order[ranks]
+    back = np.argsort(rows)
+    nearness = float(sums[0] / sums[1]) if sums[1] > 0 else None
+    return Galleries(rows[back], np.asarray(items).transpose(1, 0, 2)[:, back], nearness, len(query_order) - len(rows))
+
+
+def _draw(
+    own: Array, rest: Array, covariates: Array | None, size: int, rng: np.random.Generator
+) -> tuple[Array, tuple[float, float]]:
+    """Return one gallery, the true touch first, and the mean distances of its distractors and of all candidates."""
+    wanted, lot = own[rng.integers(len(own))], rng.random(len(rest))
+    distance = np.zeros(len(rest))
+    if covariates is not None:
+        distance = np.linalg.norm(covariates[rest] - covariates[[wanted]], axis=1)
+    nearest = np.lexsort((lot, distance))[: size - 1]
+    return np.concatenate([[wanted], rest[nearest]]), (float(distance[nearest].mean()), float(distance.mean()))
+
+
+def score_galleries(
+    query: Array, gallery: Array, drawn: Galleries, *, metric: Metric = "cosine", centre: bool = False
+) -> tuple[Array, Array]:
+    """Return recall@1 and recall@5 (n,) of each query as means over galleries; ties share their ranks evenly.
+
+    `query` (q, d), `gallery` (m, d). With `centre` the mean of each side is subtracted first. Raises UserError for
+    values that are not finite, or of different widths.
+    """
+    q, g = _finite(query, "query"), _finite(gallery, "gallery")
+    if q.shape[1] != g.shape[1]:
+        raise UserError(f"query and gallery features have {q.shape[1]} and {g.shape[1]} values; they must be alike")
+    q, g = _prepared(q, metric, centre)[drawn.queries], _prepared(g, metric, centre)
+    if metric == "euclidean":
+        q, g = _comparable(q, g)
+    top1, top5 = np.zeros(len(q)), np.zeros(len(q))
+    for start in range(0, len(q), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        likeness = q[part] @ g.T
+        if metric == "euclidean":
+            likeness = 2 * likeness - np.sum(g * g, axis=1)[None] - np.sum(q[part] ** 2, axis=1, keepdims=True)
+        for items in drawn.items[:, part]:
+            values = np.take_along_axis(likeness, items, axis=1)
+            margin = _TIE * np.maximum(1.0, np.abs(values).max(axis=1, keepdims=True))
+            ahead = values[:, 1:] - values[:, :1]
+            better, equal = np.sum(ahead > margin, axis=1), np.sum(np.abs(ahead) <= margin, axis=1)
+            for k, total in ((1, top1), (5, top5)):
+                total[part] += np.clip((k - better) / (equal + 1), 0, 1) / len(drawn.items)
+    return top1, top5
+
+
+def _prepared(values: Array, metric: Metric, centre: bool) -> Array:
+    """Return rows to compare by their products; the rest of a constant after centring is 0, not noise."""
+    least = _TIE * np.abs(values).max(initial=0.0) if centre else 0.0
+    if centre:
+        values = values - values.mean(axis=0, keepdims=True)
+    if metric == "euclidean":
+        return np.where(np.abs(values) > least, values, 0.0)
+    size = np.linalg.norm(values, axis=1, keepdims=True)
+    return np.where(size > least, values / np.maximum(size, 1e-300), 0.0)
+
+
+def _comparable(q: Array, g: Array) -> tuple[Array, Array]:
+    """Return both sides moved and scaled by the same amount, so that rounding does not reorder distances."""
+    least, middle = _TIE * max(np.abs(q).max(initial=0.0), np.abs(g).max(initial=0.0)), g.mean(axis=0, keepdims=True)
+    q, g = (np.where(np.abs(side - middle) > least, side - middle, 0.0) for side in (q, g))
+    size = max(np.abs(q).max(initial=0.0), np.abs(g).max(initial=0.0))
+    return (q / size, g / size) if size > 0 else (q, g)
+
+
+def _sorted(touch: Any, unit: Any, side: str) -> tuple[Array, Array, Array]:
+    """Return an order of rows that depends on their names alone, and touch and unit names in it."""
+    touch = _texts(touch)
+    unit = _texts([side] * len(touch) if unit is None else unit, len(touch))
+    order = np.lexsort((unit, touch))
+    return order, touch[order], unit[order]
+
+
+def _unit_spread(match: Array, count: int) -> Array:
+    """Return covariates (m, k) with unit spread; a constant one becomes 0."""
+    values = _finite(match, "covariate")
+    if len(values) != count:
+        raise UserError(f"match has {len(values)} rows; it must have one for each of the {count} gallery touches")
+    spread = values.std(axis=0, keepdims=True)
+    return (values - values.mean(axis=0, keepdims=True)) / np.where(spread > 0, spread, 1.0)
+
+
+def _finite(values: Any, kind: str) -> Array:
+    values = np.asarray(values, np.float64)
+    if values.ndim != 2:
+        raise UserError(f"{kind} values must be (n, d), not {values.shape}")
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise UserError(f"{kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others; repair or drop them")
+    return values
+
+
+def _texts(values: Any, count: int | None = None) -> Array:
+    names = np.asarray(values).astype(str)
+    if names.ndim != 1 or count not in (None, len(names)):
+        raise UserError(f"retrieval needs one name for each touch, not {names.shape} names for {count}")
+    return names
+
+
+# Contacts of a manifest ---------------------------------------------------------------------------------------------
+
+
+def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
+    """Return numeric columns as f64 (rows, columns), NaN for an empty cell. Raises UserError for text."""
+    columns = []
+    for name in names:
+        try:
+            column = manifest.column(name).cast(pa.float64())
+        except pa.ArrowException:
+            raise UserError(f"column {name!r} has text; it must have numbers") from None
+        columns.append(column.to_numpy().astype(np.float64))
+    return np.stack(columns, axis=1)[rows] if columns else np.zeros((len(rows), 0))
+
+
+def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:
+    """Return one row for each touch, sensor and unit, in order: that of the largest `label.force`, the first of equals.
+
+    Only `rows` are used, the whole `split` by default; with `frames` > 1 only rows that end a clip of so many. Without
+    forces the largest `label.depth` is used, without both the middle frame. Rows without a touch are left out. Raises
+    UserError if no row is left.
+    """
+    rows = np.unique(manifest.rows_of(split) if rows is None else np.asarray(rows))
+    rows = rows[manifest.present("touch")[rows]]
+    if frames > 1 and len(rows):
+        rows = np.intersect1d(rows, manifest.clips(frames)[:, -1])
+        if not len(rows):
+            raise UserError(f"no touch ends a clip of {frames} frames; take fewer, or 1")
+    if not len(rows):
+        raise UserError("no row has a touch; cross-sensor tasks need the column 'touch', equal for the same place")
+    codes = np.stack([manifest.codes("touch", own=True), manifest.codes("sensor"), manifest.codes("unit", own=True)], 1)
+    _, contact = np.unique(codes[rows], axis=0, return_inverse=True)
+    order = np.lexsort((rows, -_depth(manifest, rows, contact.ravel()), contact.ravel()))
+    first = np.unique(contact.ravel()[order], return_index=True)[1]
+    return np.sort(rows[order[first]])
+
+
+def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
+    """Return the depth of each row (n,) within its contact, by the best column that its file has."""
+    frame = np.asarray(manifest.column("frame_index"))[rows].astype(np.float64)
+    middle = np.array([np.median(frame[contact == number]) for number in range(contact.max() + 1)])
+    depth = -np.abs(frame - middle[contact])
+    for name in ("label.depth", "label.force"):
+        if name in manifest.table.column_names:
+            values, source = numbers(manifest, (name,), rows)[:, 0], manifest.source[rows]
+            measured = np.isin(source, source[np.isfinite(values)])
+            depth[measured] = np.where(np.isfinite(values), values, -np.inf)[measured]
+    return depth
+
+
+def contact_vector(manifest: Manifest, rows: Array) -> Array:
+    """Return area, centroid and force of each contact, as far as the manifest has them, f32 (rows, up to 4).
+
+    Each is scaled to mean 0 and spread 1 within its sensor; compare them by Euclidean distance. Raises UserError if the
+    manifest has none of them, or a row lacks one.
+    """
+    names = [name for name in VECTOR if name in manifest.table.column_names]
+    if not names:
+        raise UserError(f"the manifest has none of the columns {', '.join(VECTOR)}; add one, or leave the control out")
+    values = numbers(manifest, names, rows)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise UserError(f"{manifest.where(int(rows[bad[0]]))} has no value in one of {', '.join(names)}; add it")
+    sensors = text_column(manifest, "sensor")[rows]
+    for sensor in np.unique(sensors):
+        part = values[sensors == sensor]
+        spread = part.std(axis=0, keepdims=True)
+        values[sensors == sensor] = (part - part.mean(axis=0, keepdims=True)) / np.where(spread > 0, spread, 1.0)
+    return values.astype(np.float32)

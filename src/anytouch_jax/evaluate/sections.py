@@ -20,10 +20,10 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.evaluate import matching, plots, probe_results, retrieval, statistics
-from anytouch_jax.evaluate.contacts import deepest_rows
 from anytouch_jax.evaluate.figures import reconstruction_panels, write_png
 from anytouch_jax.evaluate.geometry import Space
 from anytouch_jax.evaluate.reconstruction import pixel_scores
+from anytouch_jax.evaluate.retrieval import deepest_rows
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint

@@ -125,7 +125,7 @@ def plain(value: Any) -> Any:
     """A value as JSON takes it: records as objects without what single rows did, what is not finite as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = dataclasses.fields(value)
-        return {one.name: plain(getattr(value, one.name)) for one in fields if one.name not in ("outcome", "found")}
+        return {one.name: plain(getattr(value, one.name)) for one in fields if one.name not in ("outcome", "per_query")}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

@@ -13,7 +13,7 @@ from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, SEED, in_range
 class AdaptOptions:
     """Fit sensor tokens for a new sensor to a few of its frames. All other parameters stay frozen.
 
-    Example: anytouch adapt --model runs/stage1 --data mine.csv --sensor my_gel --frames 20 --out runs/my_gel
+    Example: anytouch adapt --model runs/stage1 --data mine.csv --sensor my_gel --labels material --out runs/my_gel
     """
 
     model: Path
@@ -27,7 +27,7 @@ class AdaptOptions:
     frames: int = 100
     """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
     labels: str | None = None
-    """Label column to fit to, with examples of its classes by known sensors (default: masked reconstruction)."""
+    """Label column whose classes the frames are fitted to. Known sensors must have examples of them."""
     steps: int = 200
     """Steps of the fit."""
     seed: int = 0

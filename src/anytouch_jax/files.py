@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all (to a name beside their own, then moved over it), and locks on them."""
+"""Atomic writes and file locks."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from typing import IO
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None) -> Iterator[Path]:
-    """The path of a file to write, which takes the place of `path` in one move when the block ends.
+    """Give a path to write to, and move that file to `path` when the block ends.
 
-    On any error, and when the process is killed, `path` stays as it was. Its folder is made. The bytes are on the disk
-    before the name is (`sync`; not worth its time for thousands of files that another file vouches for). `part`: where
-    it is written, by one process alone: what a killed one leaves is written over by the next. Raises OSError, with the
-    file's name.
+    After an error or a kill, `path` is unchanged. Its folder is created. With `sync` the bytes are on the disk before
+    the name is; leave it out for thousands of files that another file vouches for. `part` is the path to write to, for
+    a single process: a leftover of a killed one is overwritten. Raises OSError with the file's name.
     """
     path = Path(path)
-    part = part or path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+    part = part or _part(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
@@ -35,21 +34,20 @@ def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None
             raise
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
-        with contextlib.suppress(OSError):  # there may be no such folder
+        with contextlib.suppress(OSError):  # the folder may not exist
             part.unlink()
 
 
 def atomic_write(path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None) -> None:
-    """Write a file whole or not at all, text as UTF-8. Raises OSError, with the file's name (see `replacing`)."""
+    """Write a whole file or none, text as UTF-8, see `atomic_path`. Raises OSError with the file's name."""
     with atomic_path(path, sync=sync, part=part) as target:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """A folder to fill, which becomes `path`, that is empty or not there, when the block ends; on an error nothing
-    stays."""
-    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+    """Give a folder to fill, and move it to `path` (missing or empty) when the block ends; remove it on an error."""
+    part = _part(path)
     try:
         part.mkdir(parents=True)
         yield part
@@ -60,8 +58,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _opened(path: str | Path) -> IO[bytes]:
-    """A file to be locked: to be written, since a network disk locks no other; else, where that may not be, read."""
+def _part(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+
+
+def _open_for_lock(path: str | Path) -> IO[bytes]:
+    """Open a file for writing, as a network disk locks no other; for reading if writing is not allowed."""
     try:
         return open(path, "ab" if not os.path.exists(path) else "r+b")
     except OSError:
@@ -70,10 +72,10 @@ def _opened(path: str | Path) -> IO[bytes]:
 
 @contextlib.contextmanager
 def lock(path: str | Path) -> Iterator[bool]:
-    """A lock on a file, which is made if need be, that ends with the block or the process; whether it was free.
+    """Lock a file until the block or the process ends; give whether it was free. The file is created if needed.
 
-    The lock is of the file, not of its name: one that takes its place is another. Where the system or the disk knows
-    no locks it always is free.
+    The lock belongs to the file, not to its name: a file that replaces it is not locked. Where the system or the disk
+    has no locks, the file is always free.
     """
     try:
         import fcntl
@@ -81,7 +83,7 @@ def lock(path: str | Path) -> Iterator[bool]:
         yield True
         return
     free = True
-    with _opened(path) as file:
+    with _open_for_lock(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

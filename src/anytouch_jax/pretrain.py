@@ -133,7 +133,8 @@ def _check_start(config: Config, run: Path, init: Any, clip: Any, resumes: bool)
     earlier = begun_with(run)
     if earlier is not None and earlier.stage != config.stage:
         raise UserError(f"{run} has a run of stage {earlier.stage}; choose another --run for stage {config.stage}")
-    if config.towers == "pretrained" and clip is None and not resumes:
+    has_tokenizer = config.model.text is None or (run / TOKENIZER).exists()
+    if config.towers == "pretrained" and clip is None and not (resumes and has_tokenizer):
         raise UserError(
             "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in the "
             "same folder"

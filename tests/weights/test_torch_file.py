@@ -249,3 +249,24 @@ def test_npz_with_objects_is_refused(tmp_path):
     np.savez(path, a=np.array([{"x": 1}], dtype=object))
     with pytest.raises(UserError, match=r"objects\.npz"):
         read_weights(path)
+
+
+def test_many_tensors_over_one_number_are_refused(torch_files):
+    data = np.ones(1, "f4")
+    content = {f"t{row}": torch_files.Tensor(data, (1 << 20,), (0,)) for row in range(500)}
+    with pytest.raises(UserError, match=r"weights\.pth .*larger than the file"):
+        read_torch(torch_files.write(content))
+
+
+@pytest.mark.parametrize("size", [b"\x8d" + b"\xff" * 7 + b"\x3f", b"\x95" + b"\xff" * 7 + b"\x3f"])
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_declared_size_of_2_to_the_62_takes_no_memory(tmp_path, size, legacy):
+    path = tmp_path / "weights.pth"
+    body = b"\x80\x04" + size + b"."
+    if legacy:
+        path.write_bytes(body)
+    else:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("archive/data.pkl", body)
+    with pytest.raises(UserError, match=r"weights\.pth"):
+        read_torch(path)

@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 
 def spline(positions: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """Matrices (n, count) of the cubic B-spline through `count` samples: value, and derivative per sample step.
+    """Return matrices (n, count) of the cubic B-spline of `count` samples: value, and derivative per sample step.
 
-    `positions` (n,) in samples, 0 the middle of the first one; outside, the last sample goes on. Not interpolating:
-    it smooths by 0.58 samples, as a skin does, and never overshoots.
+    `positions` (n,) are in samples, 0 in the middle of the first one. The last sample is repeated outside. The spline
+    does not interpolate. It smooths by 0.58 samples, as a skin does, and never overshoots.
     """
     positions = jnp.clip(positions, 0.0, count - 1.0)
     knots = jnp.arange(-2.0, count + 2.0)
@@ -29,27 +29,27 @@ def spline(positions: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
 
 
 def _fold(matrix: jax.Array) -> jax.Array:
-    """Columns outside the map are moved to its first and last column: the edge is repeated."""
+    """Move columns outside the map to its first and last column, which repeats the edge."""
     inner = matrix[:, 2:-2]
     return inner.at[:, 0].add(matrix[:, 0] + matrix[:, 1]).at[:, -1].add(matrix[:, -2] + matrix[:, -1])
 
 
 def blur(count: int, sigma: float | jax.Array) -> jax.Array:
-    """Gaussian blur (count, count) of `sigma` > 0 samples, which may be traced; rows sum to one."""
+    """Return a Gaussian blur (count, count) of `sigma` > 0 samples, which may be traced. Rows sum to one."""
     place = jnp.arange(count, dtype=jnp.float32)
     kernel = jnp.exp(-0.5 * ((place[:, None] - place[None, :]) / sigma) ** 2)
     return kernel / kernel.sum(1, keepdims=True)
 
 
 def average(count: int, cells: int) -> npt.NDArray[np.float32]:
-    """Mean (cells, count) over `cells` equal parts of `count` samples; a sample on a border is shared out."""
+    """Return the means (cells, count) over `cells` equal parts of `count` samples. Samples on a border are divided."""
     left = np.arange(cells)[:, None] * count / cells
     overlap = np.minimum(left + count / cells, np.arange(count) + 1) - np.maximum(left, np.arange(count))
     return np.asarray(np.maximum(overlap, 0) * cells / count, np.float32)
 
 
 def _cubic_weights(f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Catmull-Rom weights of the four neighbours at the fraction `f`; exactly 0, 1, 0, 0 at 0."""
+    """Return Catmull-Rom weights of the four neighbours at the fraction `f`, exactly 0, 1, 0, 0 at 0."""
     return (
         ((-0.5 * f + 1.0) * f - 0.5) * f,
         (1.5 * f - 2.5) * f * f + 1.0,
@@ -59,16 +59,16 @@ def _cubic_weights(f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.A
 
 
 def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Heights of a centred `raster` (H, W) of `pitch` mm a pixel at `x`, `y` mm, any equal shape; same shape out.
+    """Return values of a centred `raster` (H, W) with `pitch` mm between pixels at `x`, `y` mm of equal shape.
 
-    Cubic (Catmull-Rom): the raster's own values at its pixels, continuous slopes between them. Outside of the
-    raster, and at NaN: the lowest value on its border. For jit and vmap; a point costs sixteen reads.
+    It is cubic (Catmull-Rom): exact at pixels, with continuous slopes between them. Outside of the raster and at NaN it
+    is the lowest value on the border. A point costs sixteen reads.
     """
     rows, columns = raster.shape
     place = (jnp.asarray(y) / pitch + (rows - 1) / 2, jnp.asarray(x) / pitch + (columns - 1) / 2)
     index, weights, inside = [], [], jnp.ones(place[0].shape, bool)
     for at, count in zip(place, (rows, columns), strict=True):
-        slack = 1e-3  # rounding of a place on the border must not throw it out
+        slack = 1e-3  # rounding must not move a place on the border outside
         inside = inside & (at >= -slack) & (at <= count - 1 + slack)
         at = jnp.clip(jnp.nan_to_num(at), 0, count - 1)
         first = jnp.floor(at)

@@ -188,7 +188,7 @@ def test_the_default_size_has_a_short_side_of_224():
 
 
 def test_a_field_sensor_has_no_picture():
-    with pytest.raises(UserError, match="tac3d has no pictures"):
+    with pytest.raises(UserError, match="tac3d has no camera"):
         optics.render(FLAT, None, PITCH, SENSORS["tac3d"], PLAIN, resolution=SIZE)
 
 

@@ -8,13 +8,14 @@ from anytouch_jax.data import tokenizer as text
 from anytouch_jax.sim.world import captions
 from anytouch_jax.sim.world.captions import caption
 from anytouch_jax.sim.world.materials import MATERIALS
-from anytouch_jax.sim.world.objects import NOUNS, catalogue, hardness_of, roughness_of
+from anytouch_jax.sim.world.objects import PRIMITIVE_KINDS, catalogue, hardness_of, roughness_of
 from anytouch_jax.sim.world.primitives import PRIMITIVES
 
 THINGS = catalogue(0, 300)
 # What a caption would give away: kinds of primitive and things, materials, and all about the touch itself.
 SECRET = {
-    *PRIMITIVES, *NOUNS.values(), *MATERIALS, "letters", "bolt", "threaded", "plate", "sheet", "torus", "tip",
+    *PRIMITIVES, *(kind.noun for kind in PRIMITIVE_KINDS.values()), *MATERIALS,
+    "letters", "bolt", "threaded", "plate", "sheet", "torus", "tip",
     "indenter", "probe", "sensor", "gel", "newton", "newtons", "millimetre", "mm",
     "turn", "turned", "clockwise", "left", "right", "up", "down", "upward", "downward", "above", "below",
     "north", "south", "east", "west", "horizontal", "vertical", "diagonal", "direction", "shear", "motion", "moving",

@@ -21,8 +21,8 @@ def test_sixty_four_objects_that_have_names():
     assert len({thing.name for thing in THINGS}) == 64
     for thing in THINGS:
         adjective, material, *noun = thing.name.split()
-        assert adjective == objects.ADJECTIVES[thing.shape.texture] and material == thing.material.name
-        assert noun[0] == objects.NOUNS[thing.shape.primitive]
+        assert adjective == objects.TEXTURE_KINDS[thing.shape.texture].adjective and material == thing.material.name
+        assert noun[0] == objects.PRIMITIVE_KINDS[thing.shape.primitive].noun
         assert noun[1:] == ([thing.shape.letter] if thing.shape.primitive == "letters" else [])
 
 
@@ -65,12 +65,12 @@ def test_every_texture_is_made_of_soft_firm_and_hard_things(texture):
 def test_sizes_suit_a_gel():
     for thing in catalogue(7, 128):
         shape = thing.shape
-        low, high = objects.SIZES[shape.primitive]
+        low, high = objects.PRIMITIVE_KINDS[shape.primitive].size
         assert low <= shape.size <= high
         assert 0.8 <= shape.texture_pitch <= 3.0
         assert 0.1 <= shape.texture_depth <= 0.5 or shape.texture == "smooth"
         if shape.texture != "smooth":
-            slope = objects.SLOPES[shape.texture] * shape.texture_depth / shape.texture_pitch
+            slope = objects.TEXTURE_KINDS[shape.texture].slope * shape.texture_depth / shape.texture_pitch
             assert slope <= 0.51 and (slope >= 0.14 or shape.primitive == "letters" or shape.texture_depth == 0.5)
         assert all(0 < c < 1 for c in thing.colour)
 
@@ -82,7 +82,7 @@ def test_the_slopes_are_those_of_the_height_maps(texture):
     for seed in range(3):
         z = height(Shape("flat", texture, 1e3, 1.0, 1.0, seed=seed), *np.meshgrid(axis, axis))
         found.append(np.sqrt(np.mean(np.square(np.gradient(z, 0.04)).sum(0))))
-    assert np.mean(found) == pytest.approx(objects.SLOPES[texture], rel=0.06)
+    assert np.mean(found) == pytest.approx(objects.TEXTURE_KINDS[texture].slope, rel=0.06)
 
 
 def test_no_two_objects_feel_alike():

@@ -1,7 +1,7 @@
-"""Influence of a load on the surface of an elastic half-space, or of a layer bonded to a rigid plate.
+"""Elastic half-spaces and bonded layers: influence coefficients of a surface load, and their convolution.
 
-Lengths are in pixels and stresses in units of the composite modulus E*: a stress p on one pixel moves the surface at an
-offset of (i, j) pixels by `p / E* * pitch * coefficient(i, j)`. Coefficients are given at offsets >= 0.
+Lengths are in pixels and stresses in units of the composite modulus E*. A stress p on one pixel moves the surface at an
+offset of (i, j) pixels by `p / E* * pitch * coefficient(i, j)`. Coefficients are listed at offsets >= 0.
 """
 
 from __future__ import annotations
@@ -20,19 +20,17 @@ from jax import Array
 
 Host = npt.NDArray[np.float64]
 
-FAR = 12.0  # thicknesses of the layer; beyond, a bonded layer's surface does not move (it decays exponentially)
-
-
-# Up to this many pixels a side four matrix products are faster than two FFTs (measured: twice at 112, on two cores).
+FAR = 12.0  # thicknesses of the layer; the motion of a bonded layer decays exponentially and is zero beyond
+# Up to this side length four matrix products are faster than two FFTs (twice as fast at 112, on two cores).
 MATMUL_LIMIT = 144
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Transforms of (rows, columns) fields, padded so that a convolution does not wrap around.
+    """Fourier transforms of (rows, columns) fields, padded so that a convolution does not wrap around.
 
-    A transform is the usual complex one, or for small even sizes a real (2, 2, KH, KW) array: the cosine and sine sums
-    of the parts even and odd about the centre in x and in y, which a symmetric kernel does not mix.
+    A transform is complex, or for small even sizes a real (2, 2, KH, KW) array. The latter holds the cosine and sine
+    sums of the parts that are even and odd about the centre in x and in y. A symmetric kernel does not mix them.
     """
 
     rows: int
@@ -61,31 +59,31 @@ class Plan:
         return _join(_join(parts, 2), 0)
 
     def even(self, transform: Array, spectrum: Array) -> Array:
-        """The transform of a field's convolution with a kernel that is even in x and in y."""
+        """Return the transform of a field's convolution with a kernel that is even in x and in y."""
         return transform * (_lifted(spectrum) if self.matmul else _unfold(spectrum, self.padded[0], 1, jnp))
 
     def odd(self, transform: Array, spectrum: Array) -> Array:
-        """The transform of a field's convolution with a kernel that is odd in x and in y."""
+        """Return the transform of a field's convolution with a kernel that is odd in x and in y."""
         if not self.matmul:
             return transform * _unfold(spectrum, self.padded[0], -1, jnp)
         sign = jnp.array([[-1, 1], [1, -1]], transform.dtype)[:, :, None, None]  # sin(a - b), twice, and i squared
         return sign * transform[::-1, ::-1] * _lifted(spectrum)
 
     def spectrum(self, quadrant: Any, parity: int = 1, xp: ModuleType = np) -> Any:
-        """Spectrum of a kernel from its (rows, columns) coefficients at offsets >= 0; on the host by default."""
+        """Return the spectrum of a kernel from its (rows, columns) coefficients at offsets >= 0."""
         (high, wide), rows, columns = self.padded, self.rows, self.columns
         half = xp.pad(quadrant, ((0, high // 2 + 1 - rows), (0, wide // 2 + 1 - columns)))
         whole = _unfold(_unfold(half, high, parity, xp).T, wide, parity, xp).T
-        found = xp.fft.rfft2(whole).real[: high // 2 + 1]
+        spectrum = xp.fft.rfft2(whole).real[: high // 2 + 1]
         if not self.matmul:
-            return found
+            return spectrum
         y, x = np.full(high // 2 + 1, 2.0), np.full(wide // 2 + 1, 2.0)
         y[[0, -1]] = x[[0, -1]] = 1.0
-        return found * xp.asarray(np.outer(y, x) / (high * wide), found.dtype)
+        return spectrum * xp.asarray(np.outer(y, x) / (high * wide), spectrum.dtype)
 
 
 def _smooth(least: int) -> int:
-    """The first even size from `least` on whose only factors are 2, 3, 5 and 7."""
+    """Return the first even size from `least` on with no prime factor above 7."""
     size = least + least % 2
     while functools.reduce(_without, (2, 3, 5, 7), size) > 1:
         size += 2
@@ -113,14 +111,14 @@ def _einsum(formula: str, a: Array, b: Array) -> Array:
 
 
 def _split(field: Array, axis: int) -> Array:
-    """Parts even and odd about the centre of `axis`, as functions of the distance to it, stacked in front."""
+    """Return the parts even and odd about the centre of `axis`, by distance from it, stacked in front."""
     left, right = jnp.split(field, 2, axis)
     left = jnp.flip(left, axis)
     return jnp.stack([right + left, right - left])
 
 
 def _join(parts: Array, axis: int) -> Array:
-    """The inverse of `_split` (twice its size): parts (2, ...) -> ..., concatenated along `axis`."""
+    """Invert `_split` up to a factor of two: parts (2, ...) -> ..., concatenated along `axis`."""
     even, odd = parts[0], parts[1]
     return jnp.concatenate([jnp.flip(even - odd, axis), even + odd], axis)
 
@@ -130,17 +128,20 @@ def _lifted(spectrum: Array) -> Array:
 
 
 def _unfold(half: Any, size: int, parity: int, xp: ModuleType) -> Any:
-    """Rows 0 .. size/2 -> all `size` rows in the order of the FFT."""
+    """Return all `size` rows in FFT order from rows 0 .. size/2."""
     return xp.concatenate([half, parity * half[1 : size // 2][::-1]], 0)
 
 
 def normal_coefficients(rows: int, columns: int) -> Host:
-    """Normal displacement by a unit pressure on a pixel: Boussinesq's load over a square (Love 1929; Johnson 3.25)."""
+    """Return the normal displacement by a unit pressure on a pixel.
+
+    Boussinesq's load over a square (Love 1929; Johnson, Contact Mechanics, 3.25).
+    """
     return (_over_pixel(_xx, rows, columns) + _over_pixel(_yy, rows, columns)) / np.pi
 
 
 def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Host, Host, Host]:
-    """Tangential displacement by a unit traction on a pixel: x by x, x by y (odd in x and in y), y by y.
+    """Return the tangential displacement by a unit traction on a pixel: x by x, x by y (odd in x and in y), y by y.
 
     Cerruti's load (Johnson, Contact Mechanics, 3.75) over a square, in units of the normal modulus E*.
     """
@@ -150,7 +151,7 @@ def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Ho
 
 
 def _xx(x: Host, y: Host) -> Host:
-    """Double integral of x^2 / r^3; with its counterpart in y it sums to that of 1 / r."""
+    """Return the double integral of x^2 / r^3. With its counterpart in y it sums to that of 1 / r."""
     return y * np.arcsinh(x / np.abs(y))
 
 
@@ -165,21 +166,21 @@ def _over_pixel(integral: Callable[[Host, Host], Host], rows: int, columns: int)
 
 
 def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
-    """A bonded layer's compliance over the half-space's at `wave` = wave number times thickness.
+    """Return a bonded layer's compliance over the half-space's at `wave` = wave number times thickness.
 
-    For a normal load, a tangential load along the wave, and one across it (Sneddon 1951; Johnson 5.8).
+    The loads are normal, tangential along the wave, and tangential across it (Sneddon 1951; Johnson 5.8).
     """
     k = 3 - 4 * poisson
-    decay = np.exp(-2 * wave)  # everything over exp(2 wave): no overflow
+    decay = np.exp(-2 * wave)  # divided by exp(2 wave), so nothing overflows
     below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
     sinh = k * (1 - decay**2)
     return (sinh - 4 * wave * decay) / below, (sinh + 4 * wave * decay) / below, np.tanh(wave)
 
 
 def sideways_symbol(wave: Host, poisson: float) -> Host:
-    """What a normal load moves a bonded layer's surface toward its crests, over what it moves a half-space's in.
+    """Return a bonded layer's tangential motion toward the load's crests over a half-space's normal motion.
 
-    `wave` as in `layer_symbols`, derived as they are; negative where the layer is squeezed out from under the load.
+    `wave` and the derivation are as in `layer_symbols`. It is negative where the layer is squeezed out.
     """
     k = 3 - 4 * poisson
     decay = np.exp(-2 * wave)
@@ -189,7 +190,7 @@ def sideways_symbol(wave: Host, poisson: float) -> Host:
 
 @functools.lru_cache(maxsize=1)
 def _hankel() -> tuple[Host, Host, Host, Host, Host]:
-    """Waves and their quadrature weights, distances, and J0 and J2 of the one times the other (distances, waves)."""
+    """Return waves, quadrature weights, distances, and J0 and J2 of distance times wave (distances, waves)."""
     nodes, weights = np.polynomial.legendre.leggauss(128)
     wave, weights = 7.0 * (nodes + 1), 7.0 * weights
     distance = np.linspace(0, FAR, 513)
@@ -200,25 +201,26 @@ def _hankel() -> tuple[Host, Host, Host, Host, Host]:
 
 @functools.lru_cache(maxsize=8)
 def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
-    """Distance over thickness, and there: what the half-space's point load moves more than the layer's.
+    """Return distances over thickness, and the motions of a half-space minus those of a layer by a point load there.
 
-    Normal, tangential (mean over directions), tangential (amplitude of cos 2 phi); units of P / (pi E* thickness).
+    The motions are normal, tangential (mean over directions) and tangential (amplitude of cos 2 phi), in units of
+    P / (pi E* thickness).
     """
     wave, weights, distance, bessel0, bessel2 = _hankel()
-    normal, along, across = (1 - one for one in layer_symbols(wave, poisson))
+    normal, along, across = (1 - symbol for symbol in layer_symbols(wave, poisson))
     across = across / (1 - poisson)
     twofold = -bessel2 @ (weights * (along - across) / 2)
     return distance, bessel0 @ (weights * normal), bessel0 @ (weights * (along + across) / 2), twofold
 
 
 def is_infinite(value: Any) -> bool:
-    """Whether a thickness or a modulus is known, before anything is traced, to be infinite."""
+    """Return whether a thickness or a modulus is a number, not traced, and infinite."""
     return isinstance(value, float | int) and bool(np.isinf(value))
 
 
 @functools.lru_cache(maxsize=8)
 def sideways_table(poisson: float) -> tuple[Host, Host, float]:
-    """Distance over thickness, there the smooth part of `sideways_kernel`, and the factor of the rest, asinh(2 / d)."""
+    """Return distances d over thickness, the smooth part of `sideways_kernel` there, and the factor of asinh(2 / d)."""
     wave, weights, distance, bessel0, _ = _hankel()
     rest = (1 - 2 * poisson) / (2 * (1 - poisson))  # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
     smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
@@ -226,8 +228,10 @@ def sideways_table(poisson: float) -> tuple[Host, Host, float]:
 
 
 def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Array:
-    """(H, W) at offsets >= 0: the potential whose gradient is the sideways motion of a layer's surface by a load on a
-    pixel, in units of P / (pi E*). Beyond FAR thicknesses nothing moves."""
+    """Return the potential (H, W) at offsets >= 0, in units of P / (pi E*).
+
+    Its gradient is the sideways motion of a layer's surface by a load on a pixel.
+    """
     distance, table, rest = sideways_table(poisson)
     radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))  # at 0 the mean of log r over a pixel
     far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
@@ -241,7 +245,7 @@ def _looked_up(far: Array, distance: Host, table: Host, limit: float) -> Array:
 
 
 def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
-    """Spectrum of the normal coefficients; `share` (E* over the gel's own modulus) of the motion is the layer's."""
+    """Return the spectrum of the normal coefficients. `share` (E* over the gel's modulus) is the layer's motion."""
     deep = jnp.asarray(_normal_host(plan), dtype)
     if is_infinite(thickness):
         return deep
@@ -252,7 +256,7 @@ def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, shar
 
 
 def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
-    """(3, KH, KW) spectra of the tangential coefficients xx, xy, yy; `share` as in `normal_spectrum`."""
+    """Return (3, KH, KW) spectra of the tangential coefficients xx, xy, yy. `share` is as in `normal_spectrum`."""
     deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
     if is_infinite(thickness):
         return deep
@@ -262,9 +266,9 @@ def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, s
     ratio = poisson / (1 - poisson)
     mean_at = share * scale / np.pi * _looked_up(radius, distance, mean, 1 + ratio / 2)
     twofold_at = share * scale / np.pi * _looked_up(radius, distance, twofold, ratio / 2)
-    cosine, sine = (jnp.asarray(one, dtype) for one in _twice_the_angle(plan))
+    cosine, sine = (jnp.asarray(table, dtype) for table in _twice_the_angle(plan))
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)
-    return deep - jnp.stack([plan.spectrum(one, p, jnp) for one, p in zip(parts, (1, -1, 1), strict=True)])
+    return deep - jnp.stack([plan.spectrum(part, p, jnp) for part, p in zip(parts, (1, -1, 1), strict=True)])
 
 
 @functools.lru_cache(maxsize=64)
@@ -275,7 +279,7 @@ def _normal_host(plan: Plan) -> Host:
 @functools.lru_cache(maxsize=64)
 def _tangential_host(plan: Plan, poisson: float) -> Host:
     parts = tangential_coefficients(plan.rows, plan.columns, poisson)
-    return np.stack([plan.spectrum(one, p) for one, p in zip(parts, (1, -1, 1), strict=True)])
+    return np.stack([plan.spectrum(part, p) for part, p in zip(parts, (1, -1, 1), strict=True)])
 
 
 def _radius(plan: Plan) -> Host:

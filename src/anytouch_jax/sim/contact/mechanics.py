@@ -1,8 +1,8 @@
-"""Frictionless normal contact of a gel with an object pressed in to a given depth: pressure, displacement, force.
+"""Normal contact of a gel with an object pressed to a depth: pressure, displacement, force, without friction.
 
-mm, kPa, N. The gel is a linear elastic half-space, or a layer bonded to a rigid plate where its thickness is finite;
-friction does not change the pressure (exact for an incompressible half-space under a rigid object). `sideways` is what
-pressing moves to the sides before friction holds it back (`shear`).
+Units are mm, kPa and N. The gel is a linear elastic half-space, or, with a finite thickness, a layer bonded to a rigid
+plate. Friction does not change the pressure, which is exact for an incompressible half-space under a rigid object.
+`sideways` is the tangential motion by pressing before friction resists it (`shear`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ COARSEST = 24  # pixels; a coarser grid saves no time
 
 @dataclass(frozen=True)
 class Gel:
-    """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm (infinite: a half-space).
+    """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm. An infinite thickness is a half-space.
 
     `modulus` and `thickness` may be traced arrays.
     """
@@ -54,11 +54,11 @@ jax.tree_util.register_dataclass(Gel, data_fields=["modulus", "thickness"], meta
 
 
 class Contact(NamedTuple):
-    """What a press gives: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface, force N.
+    """The result of a press: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface, force N.
 
-    A displacement is positive away from the object; it is negative where a bonded layer bulges around the contact.
-    `residual`: the largest gap where they touch, or overlap where they do not, over the largest penetration;
-    `converged`: whether it is below the tolerance; `iterations` used.
+    A displacement is positive away from the object, and negative where a bonded layer bulges around the contact.
+    `residual` is the largest gap in contact, or overlap outside of it, over the largest penetration. `converged` is
+    whether it is below the tolerance.
     """
 
     pressure: Array
@@ -82,13 +82,12 @@ def press(
 ) -> Contact:
     """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the flat gel.
 
-    `pitch` mm per pixel; `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf is no object. `exact`:
-    conjugate gradients on the contact set (Polonsky and Keer 1999) to `tolerance`, at most `iterations` (300). `fast`:
-    `iterations` (2) projected gradients on this grid, after twice and four times as many on coarser ones, and the
-    object where the gel still cuts it, as Taxim (Si and Yuan 2022) keeps its contact. For a batch, `jax.vmap`.
-    Raises UserError where the values are known and make no sense: a negative depth, a surface of NaN, moduli that are
-    not above 0, a gel thinner than a pixel (with `fast`: than one and a half of its coarsest grid's), whose response
-    the grid cannot hold.
+    `pitch` is mm per pixel. `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf is no object. With
+    "exact", conjugate gradients on the contact set (Polonsky and Keer 1999) reach `tolerance` in at most `iterations`
+    (300). With "fast", `iterations` (2) projected gradients on this grid follow twice and four times as many on coarser
+    grids. Where the gel still cuts the object, it takes the object's surface, as in Taxim (Si and Yuan 2022). Use
+    `jax.vmap` for a batch. Raises UserError for untraced values that make no sense: a negative depth, a surface of NaN,
+    moduli of 0 or less, a gel thinner than a pixel (with "fast": than one and a half pixels of the coarsest grid).
     """
     _check(surface, depth, pitch, fidelity)
     _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)
@@ -106,12 +105,12 @@ def press(
     plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
     compliances = [_compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)]
     solve, most = (_fast, 2) if fidelity == "fast" else (_exact, 300)
-    found, load, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
-    moved = moved - _of_object(plans[0], load, share, modulus_object)  # both moved: the gel's part is the rest
-    pressure = found.x * (scale * plane * share / pitch)
+    solution, load, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
+    moved = moved - _of_object(plans[0], load, share, modulus_object)  # both move: the gel's part is the rest
+    pressure = solution.x * (scale * plane * share / pitch)
     force = jnp.sum(pressure) * pitch**2 * KPA_MM2
-    converged = found.residual <= tolerance
-    return Contact(pressure, moved * scale, force, converged, found.iterations, found.residual)
+    converged = solution.residual <= tolerance
+    return Contact(pressure, moved * scale, force, converged, solution.iterations, solution.residual)
 
 
 def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
@@ -141,7 +140,7 @@ def _check_elastic(shape: tuple[int, ...], gel: Gel, pitch: Any, fidelity: str, 
 
 
 def grids(shape: tuple[int, ...]) -> list[Plan]:
-    """The grid of `shape` and two coarser ones, each half of the one before, as far as they divide."""
+    """Return the grid of `shape` and up to two coarser ones, each half of the one before."""
     plans = [Plan(shape[0], shape[1])]
     while len(plans) < 3 and all(n % 2 == 0 and n // 2 >= COARSEST for n in (plans[-1].rows, plans[-1].columns)):
         plans.append(Plan(plans[-1].rows // 2, plans[-1].columns // 2))
@@ -154,7 +153,7 @@ def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) ->
 
 
 def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
-    """The object's part of the displacement by a pressure, in the units of `cut`: a half-space whatever the gel is."""
+    """Return the object's part of the displacement by a pressure, in units of `cut`. The object is a half-space."""
     if is_infinite(modulus_object):
         return 0.0
     deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
@@ -164,18 +163,18 @@ def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -
 def _exact(
     compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
 ) -> tuple[Solution, Array, Array]:
-    """The solution, the pressure that moves the surface, and that displacement."""
+    """Return the solution, the pressure that moves the surface, and that displacement."""
     (apply,) = compliances
     start = jnp.maximum(cut, 0)
     start = start * scaled(start, apply(start), cut)
-    found = conjugate_gradients(apply, cut, start, tolerance, iterations)
-    return found, found.x, found.excess + cut
+    solution = conjugate_gradients(apply, cut, start, tolerance, iterations)
+    return solution, solution.x, solution.excess + cut
 
 
 def _fast(
     compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
 ) -> tuple[Solution, Array, Array]:
-    """As `_exact`, from coarse to fine, `iterations` on the finest grid and twice as many on each coarser one."""
+    """Solve from coarse to fine, with `iterations` on the finest grid and twice as many on each coarser one."""
     cuts = [cut]
     for _ in compliances[1:]:
         cuts.append(halved(cuts[-1]))
@@ -183,38 +182,38 @@ def _fast(
     for level in range(len(cuts) - 1, -1, -1):
         apply, here = compliances[level], cuts[level]
         pressure = jnp.where(here > 0, pressure, 0)  # a flat gel never bulges to touch what is above it
-        found = _descended(apply, here, pressure, iterations * 2**level)
-        pressure = doubled(found.x) if level else found.x
-    moved = jnp.maximum(found.excess, 0) + cut
-    return found._replace(x=_sharpened(found)), found.x, moved
+        solution = _descended(apply, here, pressure, iterations * 2**level)
+        pressure = doubled(solution.x) if level else solution.x
+    moved = jnp.maximum(solution.excess, 0) + cut
+    return solution._replace(x=_sharpened(solution)), solution.x, moved
 
 
-def _sharpened(found: Solution) -> Array:
-    """One more local step without a convolution, the load kept: it ends the pressure where there is a gap."""
-    local = jnp.maximum(found.x - found.excess / OWN, 0)
+def _sharpened(solution: Solution) -> Array:
+    """Take one local step without a convolution and with the same load, which removes pressure from gaps."""
+    local = jnp.maximum(solution.x - solution.excess / OWN, 0)
     total = jnp.sum(local)
-    return jnp.where(total > 0, local * (jnp.sum(found.x) / jnp.where(total > 0, total, 1)), found.x)
+    return jnp.where(total > 0, local * (jnp.sum(solution.x) / jnp.where(total > 0, total, 1)), solution.x)
 
 
 def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) -> Solution:
-    """Projected gradients from `pressure` at its best scale, and their end brought to its best scale."""
+    """Run projected gradients from `pressure` at its best scale, and scale the result to its best."""
     moved = apply(pressure)
     factor = scaled(pressure, moved, cut)
-    found = descent(apply, lambda p: jnp.maximum(p, 0), cut, factor * pressure, iterations, moved=factor * moved)
-    factor = scaled(found.x, found.excess + cut, cut)
-    excess = factor * (found.excess + cut) - cut
-    return Solution(factor * found.x, excess, complementarity(factor * found.x, excess), found.iterations)
+    end = descent(apply, lambda p: jnp.maximum(p, 0), cut, factor * pressure, iterations, moved=factor * moved)
+    factor = scaled(end.x, end.excess + cut, cut)
+    excess = factor * (end.excess + cut) - cut
+    return Solution(factor * end.x, excess, complementarity(factor * end.x, excess), end.iterations)
 
 
 def sideways(pressure: Array, gel: Gel, pitch: Any) -> Array:
-    """(H, W, 2) mm along x and y that `pressure` (H, W) kPa alone moves the surface of a bonded layer, frictionless.
+    """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W) kPa alone.
 
-    A nearly incompressible layer gives way to the sides, by up to a fifth of the dent of a ball and more by a wide
-    block; a compressible one is also drawn toward the load. `shear_step` tells what friction leaves of it. By central
-    differences of a potential. Raises UserError for a gel without a thickness.
+    A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more under a wide block.
+    A compressible one is also drawn toward the load. Friction reduces the motion (`shear_step`). Raises UserError for a
+    gel without a thickness.
     """
     if is_infinite(gel.thickness):
-        raise UserError("what pressing moves sideways is that of a bonded layer: give the gel a thickness")
+        raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
     plan, pitch = Plan(*pressure.shape), jnp.asarray(pitch, pressure.dtype)
     spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype), 1, jnp)
     potential = plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)  # mm
@@ -223,30 +222,30 @@ def sideways(pressure: Array, gel: Gel, pitch: Any) -> Array:
 
 
 def halved(field: Array) -> Array:
-    """Means over 2 x 2 pixels of (H, W)."""
+    """Return means over 2 x 2 pixels of (H, W)."""
     rows, columns = field.shape
     return jnp.mean(field.reshape(rows // 2, 2, columns // 2, 2), (1, 3))
 
 
 def doubled(field: Array) -> Array:
-    """Linear interpolation of (H, W) to twice the size."""
+    """Interpolate (H, W) linearly to twice the size."""
     return jax.image.resize(field, (2 * field.shape[0], 2 * field.shape[1]), "linear")
 
 
 def positions(shape: tuple[int, int], pitch: Any) -> tuple[Array, Array]:
-    """x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre, each (H, W)."""
+    """Return x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre, each (H, W)."""
     pitch = jnp.asarray(pitch)
     y, x = (pitch * (jnp.arange(n, dtype=pitch.dtype) - (n - 1) / 2) for n in shape)
     return jnp.broadcast_to(x[None, :], shape), jnp.broadcast_to(y[:, None], shape)
 
 
 def area(pressure: Array, pitch: Any) -> Array:
-    """The contact's area in mm^2."""
+    """Return the contact's area in mm^2."""
     return jnp.sum(pressure > 0, (-2, -1)) * jnp.asarray(pitch, pressure.dtype) ** 2
 
 
 def centroid(pressure: Array, pitch: Any) -> Array:
-    """The centre of pressure (H, W), (x, y) in mm from the field's centre; (0, 0) without contact."""
+    """Return the centre of a pressure (H, W), (x, y) in mm from the field's centre, (0, 0) without contact."""
     x, y = positions((pressure.shape[0], pressure.shape[1]), jnp.asarray(pitch, pressure.dtype))
     total = jnp.sum(pressure)
     moments = jnp.stack([jnp.sum(x * pressure), jnp.sum(y * pressure)])

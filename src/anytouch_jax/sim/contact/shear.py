@@ -1,8 +1,8 @@
 """Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial slip, full slip).
 
-The pressure is given, and friction does not change it. What pressing alone moves sideways is left out, as in
-Cattaneo's and Mindlin's solutions (on an incompressible half-space it is zero), unless it is given: a bonded layer is
-squeezed out, and the object holds it back. mm, kPa, N, rad; x to the right, y down, twist positive from x to y.
+Friction does not change the pressure. The sideways motion by pressing alone is an optional input. It is zero on an
+incompressible half-space, and Cattaneo's and Mindlin's solutions omit it. A bonded layer is squeezed out, and the
+object resists. Units are mm, kPa, N and rad. x points right, y down, and twist is positive from x to y.
 """
 
 from __future__ import annotations
@@ -23,26 +23,21 @@ SLIPPING = 0.999  # of the friction limit
 
 
 class Shear(NamedTuple):
-    """State of the tangential contact, carried from frame to frame.
+    """State of the tangential contact, carried from frame to frame."""
 
-    traction (H, W, 2) kPa on the gel, along the object's motion; displacement (H, W, 2) mm of the gel's surface;
-    slipping (H, W); slip_fraction of the contact's area; force (2,) N on the gel; twist_torque N mm on the gel about
-    the centroid of the pressure. `residual`: the error of the surface's motion over the object's in this step.
-    """
-
-    traction: Array
-    displacement: Array
-    slipping: Array
-    slip_fraction: Array
-    force: Array
-    twist_torque: Array
+    traction: Array  # (H, W, 2) kPa on the gel, along the object's motion
+    displacement: Array  # (H, W, 2) mm of the gel's surface
+    slipping: Array  # (H, W)
+    slip_fraction: Array  # of the contact's area
+    force: Array  # (2,) N on the gel
+    twist_torque: Array  # N mm on the gel about the centre of pressure
     converged: Array
     iterations: Array
-    residual: Array
+    residual: Array  # error of the surface's motion over the object's motion in this step
 
 
 def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
-    """The state before any tangential motion, on a grid of `shape`."""
+    """Return the state before any tangential motion, on a grid of `shape`."""
     field, zero = jnp.zeros((*shape, 2), dtype), jnp.zeros((), dtype)
     none, yes = jnp.zeros(shape, bool), jnp.ones((), bool)
     return Shear(field, field, none, zero, jnp.zeros(2, dtype), zero, yes, jnp.zeros((), jnp.int32), zero)
@@ -65,13 +60,13 @@ def shear_step(
 ) -> Shear:
     """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure of `contact`.
 
-    `state` is that of the frame before (None: at rest); the traction starts from there, so a reversal of the motion
-    leaves a locked-in shear. `friction` is Coulomb's coefficient. `exact`: projected gradients with the full tangential
-    influence coefficients on the grid of the pressure to `tolerance`, at most `iterations` (400). `fast`: an elastic
-    predictor, return to the friction cone, and `iterations` (6) corrections on a coarser grid. For a batch, `jax.vmap`.
-    `squeezed` (H, W, 2) mm: what this step's change of pressure moves sideways (of `mechanics.sideways`); the traction
-    is then that which also holds it back, and `displacement` that of the traction alone.
-    Raises UserError on a negative friction, where its value is known.
+    `state` is that of the previous frame, or None at rest. The traction starts from it, so a reversed motion leaves a
+    locked-in shear. `friction` is Coulomb's coefficient. With "exact", projected gradients with all tangential
+    coefficients on the grid of the pressure reach `tolerance` in at most `iterations` (400). With "fast", an elastic
+    predictor and the return to the friction cone are followed by `iterations` (6) corrections on a coarser grid.
+    `squeezed` (H, W, 2) mm is the sideways motion by this step's change of pressure (from `mechanics.sideways`). The
+    traction then also resists it, and `displacement` is that of the traction alone. Use `jax.vmap` for a batch. Raises
+    UserError for a negative untraced friction.
     """
     _check(contact, pitch, friction, fidelity)
     pressure = contact.pressure
@@ -97,11 +92,11 @@ def shear_step(
     scale = jnp.max(jnp.abs(moved)) + jnp.max(jnp.abs(within(jnp.zeros_like(moved))))
     scale = jnp.where(scale > 0, scale, 1)
     most = iterations or (6 if fidelity == "fast" else 400)
-    # In steps, not in totals: a small step is not lost in the rounding of a large traction.
-    found = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
-    total = jnp.where((limit > 0)[..., None], before + found.x, 0)  # without pressure exactly nothing
+    # Solved for the step, not the total: rounding of a large traction would lose a small step.
+    solution = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
+    total = jnp.where((limit > 0)[..., None], before + solution.x, 0)  # exactly zero without pressure
     displacement = apply(total)
-    if not is_infinite(modulus_object):  # less the object's own part
+    if not is_infinite(modulus_object):  # minus the object's part
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
         displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
     if times > 1:
@@ -110,10 +105,10 @@ def shear_step(
     traction = _repeated(per_pressure, times) * pressure[..., None]
     sliding = _length(total) >= SLIPPING * limit
     slipping = _repeated(sliding, times) & (pressure > 0)
-    residual = found.residual / scale
+    residual = solution.residual / scale
     force, torque, fraction = _totals(traction, slipping, pressure, pitch)
     return Shear(
-        traction, displacement, slipping, fraction, force, torque, residual <= tolerance, found.iterations, residual
+        traction, displacement, slipping, fraction, force, torque, residual <= tolerance, solution.iterations, residual
     )
 
 
@@ -140,7 +135,7 @@ def _compliance(plan: Plan, spectra: Array) -> Compliance:
 
 
 def _rigid(plan: Plan, pitch: Array, motion: Array, centre: Array) -> Array:
-    """(H, W, 2) mm of displacement by `motion` (dx, dy, dtheta)."""
+    """Return the displacement (H, W, 2) mm by `motion` (dx, dy, dtheta)."""
     x, y = positions((plan.rows, plan.columns), pitch)
     return jnp.stack([motion[0] - motion[2] * (y - centre[1]), motion[1] + motion[2] * (x - centre[0])], -1)
 
@@ -150,19 +145,19 @@ def _length(field: Array) -> Array:
 
 
 def _returned(traction: Array, limit: Array) -> Array:
-    """The nearest traction within Coulomb's limit: radial return."""
+    """Return the nearest traction within Coulomb's limit (radial return)."""
     length = _length(traction)
     return traction * jnp.where(length > limit, limit / jnp.where(length > 0, length, 1), 1)[..., None]
 
 
 def _stiffness(touching: Array, poisson: float) -> Array:
-    """Mean traction per rigid motion of a sticking circle of the same area (Mindlin 1949), dimensionless."""
+    """Return the mean traction per rigid motion of a sticking circle of the same area (Mindlin 1949), dimensionless."""
     radius = jnp.sqrt(jnp.maximum(jnp.sum(touching), 1) / jnp.pi)
     return 4 * (1 - poisson) / (2 - poisson) / (jnp.pi * radius)
 
 
 def _pooled(field: Array, times: int) -> Array:
-    """Means over blocks of `times` x `times` pixels of (H, W, ...)."""
+    """Return means over blocks of `times` x `times` pixels of (H, W, ...)."""
     if times == 1:
         return field
     rows, columns, *rest = field.shape
@@ -174,7 +169,7 @@ def _repeated(field: Array, times: int) -> Array:
 
 
 def _totals(traction: Array, slipping: Array, pressure: Array, pitch: Array) -> tuple[Array, Array, Array]:
-    """Force (2,) N, torque N mm about the centroid of the pressure, slipping share of the contact's area."""
+    """Return force (2,) N, torque N mm about the centre of pressure, and the slipping share of the contact's area."""
     x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
     middle = centroid(pressure, pitch)
     area = pitch**2 * KPA_MM2

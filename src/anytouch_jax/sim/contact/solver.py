@@ -1,7 +1,7 @@
-"""Quadratic programs of contact: least energy under pressure >= 0, or under a traction within the friction limit.
+"""Quadratic programs of contact: least energy with pressure >= 0, or with a traction within the friction limit.
 
-Both minimise `x . K x / 2 - x . target` for a compliance K, given as a function; everything is dimensionless or in one
-length. `excess` is K x - target: the gap for pressures, minus the slip for tractions.
+Both minimise `x . K x / 2 - x . target` for a compliance K, which is a function. Everything is dimensionless or in one
+length unit. `excess` is K x - target: the gap for pressures, minus the slip for tractions.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jax import Array
 Compliance = Callable[[Array], Array]
 Projection = Callable[[Array], Array]
 
-OWN = 1.122  # coefficient of a pixel on itself, 4 ln(1 + sqrt 2) / pi: the compliance of the shortest waves
+OWN = 1.122  # coefficient of a pixel on itself, 4 ln(1 + sqrt 2) / pi, the compliance of the shortest waves
 
 
 class Solution(NamedTuple):
-    """Of a quadratic program: the load `x`, `excess` = K x - target, the residual in units of target, iterations."""
+    """A load `x`, its `excess` K x - target, the residual in units of target, and the number of iterations."""
 
     x: Array
     excess: Array
@@ -41,9 +41,9 @@ class _Conjugate(NamedTuple):
 def conjugate_gradients(
     apply: Compliance, target: Array, start: Array, tolerance: float | Array, iterations: int
 ) -> Solution:
-    """Pressures >= 0 by conjugate gradients on the contact set (Polonsky and Keer, Wear 231, 1999), for a given depth.
+    """Solve for pressures >= 0 by conjugate gradients on the contact set (Polonsky and Keer, Wear 231, 1999).
 
-    Ends at a gap (where they touch) or overlap (where they do not) of `tolerance`, or after `iterations`.
+    It stops after `iterations`, or if no gap in contact and no overlap outside exceeds `tolerance`.
     """
     excess = apply(start) - target
     zero = jnp.zeros((), target.dtype)
@@ -57,7 +57,7 @@ def conjugate_gradients(
 
 
 def complementarity(pressure: Array, excess: Array) -> Array:
-    """The largest gap where they touch, or overlap where they do not."""
+    """Return the largest gap in contact or overlap outside of it."""
     return jnp.max(jnp.where(pressure > 0, jnp.abs(excess), -excess), initial=0)
 
 
@@ -95,10 +95,10 @@ def descent(
     tolerance: float | Array | None = None,
     moved: Array | None = None,
 ) -> Solution:
-    """Loads in a convex set by projected gradients with Barzilai-Borwein steps (Birgin et al. 2000), never uphill.
+    """Solve for loads in a convex set by projected gradients with Barzilai-Borwein steps (Birgin et al. 2000).
 
-    One product with K an iteration, `iterations` of them, fewer where the projected gradient is below `tolerance`.
-    `moved` is K of `start`, where it is known.
+    Energy never rises. There is one product with K an iteration. It stops after `iterations`, or at a projected
+    gradient below `tolerance`. `moved` is K of `start`, if known.
     """
 
     def residual(x: Array, excess: Array) -> Array:
@@ -118,7 +118,7 @@ def descent(
     step = jnp.asarray(1 / OWN, target.dtype)
     state = _Descent(start, excess, step, residual(start, excess), jnp.zeros((), jnp.int32))
     if tolerance is None:
-        # A loop, although its length is known: unrolled, a press and a shear took twice as long to compile.
+        # Not unrolled: a press and a shear took twice as long to compile.
         state = jax.lax.fori_loop(0, iterations, lambda _, s: advance(s), state)
         state = state._replace(residual=residual(state.x, state.excess))
     else:
@@ -127,7 +127,7 @@ def descent(
 
 
 def scaled(start: Array, moved: Array, target: Array) -> Array:
-    """The factor on `start`, K of which is `moved`, of least energy."""
+    """Return the factor on `start` of least energy. `moved` is K of `start`."""
     return _ratio(jnp.sum(start * target), jnp.sum(start * moved), 0.0)
 
 

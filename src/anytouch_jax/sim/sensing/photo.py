@@ -1,4 +1,4 @@
-"""Photographs of the touched place: a shaded height map on a table, under a drawn view, light and background."""
+"""Photographs of the touched place: a shaded height map on a table, with random view, light and background."""
 
 from __future__ import annotations
 
@@ -17,26 +17,25 @@ from anytouch_jax.sim.world.primitives import floor
 from anytouch_jax.sim.world.shapes import Shape, base, layers, unroll
 
 Image = npt.NDArray[np.float32]  # (H, W) or (H, W, 3)
-Planes = tuple[Image, Image, Image]  # x, y, z or red, green, blue apart: work over a last axis of three is slow
-EXTENT = (30.0, 40.0)  # mm across the picture
+Planes = tuple[Image, Image, Image]  # x, y, z or red, green, blue: separate planes are faster than a last axis of 3
+EXTENT = (30.0, 40.0)  # mm across the image
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera and a lamp: the eye (3,) mm above the place, unit axes (3, 3) right, down, ahead, the picture's extent
-    in mm at the place, the unit vector (3,) to the lamp."""
+    """A camera and a lamp."""
 
-    eye: npt.NDArray[np.float64]
-    axes: npt.NDArray[np.float64]
-    extent: float
-    light: npt.NDArray[np.float64]
+    eye: npt.NDArray[np.float64]  # (3,) mm from the place
+    axes: npt.NDArray[np.float64]  # (3, 3) unit vectors right, down, ahead
+    extent: float  # mm across the image at the place
+    light: npt.NDArray[np.float64]  # (3,) unit vector to the lamp
 
 
 def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224) -> np.ndarray:
-    """An RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its frame.
+    """Return an RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its frame.
 
-    The place is in the middle; the picture is 30 to 40 mm across. Every draw of `rng` is another view, light and
-    background. Raises UserError unless the place is two finite numbers and the size at least 8.
+    The place is in the middle of 30 to 40 mm. `rng` draws view, light and background. Raises UserError unless the place
+    is two finite numbers and the size at least 8.
     """
     place = np.asarray(place_mm, np.float64)
     if place.shape != (2,) or not np.isfinite(place).all() or size < 8:
@@ -61,7 +60,7 @@ def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int
         colour = np.where(on_table, ground, skin * np.float32(thing.colour[i]))
         planes.append(
             colour * colour * (sky * ambient + (sun * lamp[i]) * lit) + tint[i] * shine
-        )  # colours are as seen
+        )  # colours are gamma-encoded
     return _develop(planes, rng)
 
 
@@ -75,7 +74,7 @@ def _draw_view(rng: np.random.Generator) -> CameraView:
     lamp_turn, lamp_height = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(28, 55))
     flat = math.cos(lamp_height)
     light = np.asarray([flat * math.cos(lamp_turn), flat * math.sin(lamp_turn), math.sin(lamp_height)])
-    # Image rows go down and y goes down: seen from above, (right, down, ahead) has the hand of (x, y, -z).
+    # Rows and y both point down: from above, (right, down, ahead) has the handedness of (x, y, -z).
     return CameraView(-away * ahead, np.stack([right, np.cross(right, ahead), ahead]), extent, light)
 
 
@@ -92,7 +91,7 @@ def _dot(a: Planes, b: Any) -> Image:
 
 
 def _trace(shape: Shape, place: Any, view: CameraView, size: int) -> tuple[Image, Image, Image, Planes]:
-    """Where the ray of each pixel meets the bare form: x, y mm in the object's frame, z mm, and the unit rays."""
+    """Return where the ray of each pixel meets the bare primitive (x, y, z mm in the object's frame), and unit rays."""
     axis = ((np.arange(size) + 0.5) / size - 0.5).astype(np.float32)
     focal = float(np.linalg.norm(view.eye)) / view.extent
     right, down, ahead = view.axes
@@ -108,7 +107,7 @@ def _trace(shape: Shape, place: Any, view: CameraView, size: int) -> tuple[Image
     y0 = np.float32(place[1] + view.eye[1]) - lean_y * np.float32(view.eye[2] + top)
 
     def step(z: Image, every: int, share: float) -> Image:
-        """A fixed point of z = base(ray at z), damped for steep sides."""
+        """Return one step to the fixed point of z = base(ray at z), damped for steep sides."""
         rough = [a[::every, ::every] for a in (x0, y0, lean_x, lean_y)]
         return (1 - share) * z + share * base(shape, rough[0] + rough[2] * z, rough[1] + rough[3] * z)
 
@@ -122,20 +121,20 @@ def _trace(shape: Shape, place: Any, view: CameraView, size: int) -> tuple[Image
 
 
 def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tuple[Image, Image]:
-    """Texture and grain at x, y, and 1 outside of `where`, by a raster of the unrolled surface."""
+    """Return texture and grain at x, y, and 1 outside of `where`, from a raster of the unrolled surface."""
     ones = np.ones_like(x)
     plain = shape.texture == "smooth" and shape.grain == "none"
     if plain or not where.any():
         return ones, ones
     u, v = unroll(shape, x, y)
     finest = min(shape.grain_pitch if shape.grain != "none" else math.inf, shape.texture_pitch)
-    step = float(np.clip(finest / 6, 0.15, 0.25))  # mm; a pixel of a photograph of 224 has as much
+    step = float(np.clip(finest / 6, 0.15, 0.25))  # mm, about one pixel of a photograph of 224
     axes, places = [], []
     for at in (u, v):
         low, high = (max(-80.0, min(80.0, float(end))) for end in (at[where].min(), at[where].max()))
         axes.append((low - step + step * np.arange(math.ceil((high - low) / step) + 3)).astype(np.float32))
         places.append((at - np.float32(low - step)) / np.float32(step))
-    rows = range(0, len(axes[1]), 32)  # in strips that stay in the cache: twice as fast
+    rows = range(0, len(axes[1]), 32)  # strips fit the cache: twice as fast
     strips = [layers(shape, axes[0][None, :], axes[1][row : row + 32, None]) for row in rows]
     texture, grain = (
         np.where(where, _remap(np.concatenate(layer), places[0], places[1]), ones)
@@ -145,12 +144,12 @@ def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tup
 
 
 def _slope(plane: Image, right: int, down: int) -> Image:
-    # Replicated borders halve all three parts alike, so the normal keeps its direction there.
+    # Replicated borders halve all three components, so the normal keeps its direction there.
     return np.asarray(cv2.Scharr(plane, cv2.CV_32F, right, down, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _normals(x: Image, y: Image, z: Image) -> Planes:
-    """Unit normals of the surface (x, y, z) over the picture's pixels, facing up."""
+    """Return unit normals of the surface (x, y, z) over the pixels, facing up."""
     ax, ay, az = (_slope(p, 1, 0) for p in (x, y, z))
     bx, by, bz = (_slope(p, 0, 1) for p in (x, y, z))
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -159,7 +158,7 @@ def _normals(x: Image, y: Image, z: Image) -> Planes:
 
 
 def _shadow(shape: Shape, x: Image, y: Image, z: Image, light: Any) -> Image:
-    """0 in the light to 1 in the shade, by steps toward the lamp over the bare form at half the resolution."""
+    """Return 0 in the light to 1 in the shade, by steps toward the lamp over the primitive at half resolution."""
     half = [np.ascontiguousarray(a[::2, ::2]) for a in (x, y, z)]
     dark = np.zeros_like(half[0])
     lamp = light.astype(np.float32)
@@ -171,19 +170,19 @@ def _shadow(shape: Shape, x: Image, y: Image, z: Image, light: Any) -> Image:
 
 
 def _noise(rng: np.random.Generator, size: int, cells: int) -> Image:
-    """Smooth noise (size, size) of about -1 to 1, `cells` blobs across."""
+    """Return smooth noise (size, size) of about -1 to 1, with `cells` blobs across."""
     coarse = rng.standard_normal((cells, cells), dtype=np.float32) * 0.5
     return np.asarray(cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def _skin(thing: Object, texture: Image, grain: Image, blotch: Image) -> Image:
-    """How much lighter or darker than its colour the surface is before light, around 1."""
+    """Return the brightness of the surface relative to its colour before lighting, around 1."""
     mottle = thing.material.mottle
     return np.asarray(1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture), np.float32)
 
 
 def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -> Image:
-    """Highlights: the lamp's, and on glossy things the brighter and darker sides of the room."""
+    """Return highlights: those of the lamp, and on glossy objects the bright and dark sides of the room."""
     gloss, metallic = thing.material.gloss, thing.material.metallic
     if gloss < 0.03:
         return np.zeros_like(lit)
@@ -197,7 +196,7 @@ def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -
 
 
 def _table(rng: np.random.Generator, x: Image, y: Image, place: Any) -> Planes:
-    """The colour, red, green and blue, of what the object lies on: planks, cloth or paper with clutter."""
+    """Return red, green and blue of the table: planks, cloth or paper with clutter."""
     side, span = 160, 110.0  # pixels, mm
     colour = rng.uniform(0.12, 0.85) * (1 + rng.uniform(-0.2, 0.2, 3))
     canvas = np.ones((side, side, 3), np.float32) * colour.astype(np.float32)
@@ -223,14 +222,14 @@ def _table(rng: np.random.Generator, x: Image, y: Image, place: Any) -> Planes:
 
 
 def _develop(planes: Sequence[Image], rng: np.random.Generator) -> np.ndarray:
-    """Exposure, falling-off toward the corners, a little blur and noise, gamma; red, green, blue to u8 (H, W, 3)."""
+    """Apply exposure, vignette, blur, noise and gamma to red, green and blue. Returns u8 (H, W, 3)."""
     size = planes[0].shape[0]
     axis: Image = np.linspace(-1, 1, size, dtype=np.float32) ** 2
     exposure = np.float32(rng.uniform(0.85, 1.15)) * (1 - np.float32(rng.uniform(0, 0.12)) * (axis[:, None] + axis))
     noise = np.float32(255 * rng.uniform(0.004, 0.012)) * rng.standard_normal((size, size), dtype=np.float32)
-    done = []
+    channels = []
     for plane in planes:
         light = np.clip(_blur(plane * exposure, max(0.3, 0.6 * size / 224)), 0, None)
-        seen = np.sqrt(light / (np.float32(0.75) + np.float32(0.35) * light))  # gamma, with a soft shoulder
-        done.append(np.clip(255 * seen + noise + np.float32(0.5), 0, 255).astype(np.uint8))
-    return np.asarray(cv2.merge(done), np.uint8)
+        encoded = np.sqrt(light / (np.float32(0.75) + np.float32(0.35) * light))  # gamma, with a soft shoulder
+        channels.append(np.clip(255 * encoded + noise + np.float32(0.5), 0, 255).astype(np.uint8))
+    return np.asarray(cv2.merge(channels), np.uint8)

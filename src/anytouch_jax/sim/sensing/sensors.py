@@ -1,8 +1,8 @@
-"""The sensors: one frozen record each. A new one is a new entry of `SENSORS`, not new code.
+"""Simulated sensors, one frozen record each. A new sensor is a new entry of `SENSORS`.
 
-GelSight and GelSight Mini look like the units whose real frames come with the package `taxim`. The other cameras are a
-handful of lights each, set by eye after published pictures of their family; sizes, gels and moduli are round numbers
-near published ones. Tac3D measures a field and has no picture.
+GelSight and GelSight Mini look like the units whose real frames are in the package `taxim`. The other cameras are a few
+lights each, set by eye after published images of their family. Sizes, gels and moduli are round numbers near published
+ones. Tac3D measures a field and has no image.
 """
 
 from __future__ import annotations
@@ -25,68 +25,59 @@ RGB = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Light:
-    """One light: `place` in the image (columns, rows, -1..1 is the field), its colour, the `reach` of its glow in
-    half fields, its `height` over the surface against its distance (low lights shade strongly), and how strongly
-    tilted (`contrast`) and flat (`flat`) paint answers."""
+    """One light of a camera sensor."""
 
-    place: tuple[float, float]
+    place: tuple[float, float]  # in the image (columns, rows); -1..1 is the field
     colour: RGB
-    reach: float = 1.0
-    height: float = 0.6
-    contrast: float = 1.0
-    flat: float = 1.0
+    reach: float = 1.0  # of its glow, in half fields
+    height: float = 0.6  # over the surface, relative to its distance; low lights shade strongly
+    contrast: float = 1.0  # brightness of tilted paint
+    flat: float = 1.0  # brightness of flat paint
 
 
 @dataclass(frozen=True)
 class Lights:
-    """A camera sensor made of lights: `ambient` colour of the untouched skin where no light reaches; `shadow`: how
-    strongly the far side of a whole dent darkens, against the shading of its surface."""
+    """The look of a camera sensor made of lights."""
 
-    ambient: RGB
+    ambient: RGB  # colour of the untouched skin where no light reaches
     lights: tuple[Light, ...]
-    shadow: float = 0.3
+    shadow: float = 0.3  # how strongly the far side of a whole dent darkens, relative to surface shading
 
 
 @dataclass(frozen=True)
 class Markers:
-    """A lattice of ink spots in the skin: `pitch` mm, `radius` mm, spots `aspect` times as wide as high, `share` of
-    the units that carry them, darkness of the ink. `bend`: a lens's barrel, by which the lattice shrinks outwards, from
-    `pitch` / (1 - bend) in the middle."""
+    """A lattice of ink spots in the skin."""
 
-    pitch: float
-    radius: float
-    aspect: float = 1.0
-    share: float = 1.0
+    pitch: float  # mm
+    radius: float  # mm
+    aspect: float = 1.0  # width over height of a spot
+    share: float = 1.0  # of the units with markers
     ink: RGB = (0.08, 0.08, 0.08)
-    bend: float = 0.0
+    bend: float = 0.0  # lens distortion: the lattice shrinks outwards from pitch / (1 - bend) in the middle
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """One family of tactile sensors. `field` mm and `resolution` pixels are (height, width).
-
-    `look`: the name of a real calibration, or `Lights`; None for kind "field", whose `resolution` counts the points.
-    `skin` mm: smallest detail that the coating passes. `vignette`: loss of light from the middle to the corners.
-    `halo` mm: width of the soft shadow. `noise`: standard deviation of a pixel, 0..255, or of a field's displacement,
-    mm (0.01 for Tac3D: a third of a pixel of a camera of 640 columns).
-    """
+    """One family of tactile sensors."""
 
     name: str
-    field: tuple[float, float]
-    resolution: tuple[int, int]
+    field: tuple[float, float]  # mm (height, width)
+    resolution: tuple[int, int]  # pixels (height, width), or points for kind "field"
     gel: Gel
-    look: str | Lights | None
+    look: str | Lights | None  # name of a real calibration, or lights; None for kind "field"
     markers: Markers | None = None
     kind: Literal["image", "field"] = "image"
-    skin: float = 0.0
-    vignette: float = 0.0
-    halo: float = 1.0
+    skin: float = 0.0  # mm, smallest detail that the coating passes
+    vignette: float = 0.0  # loss of light from the middle to the corners
+    halo: float = 1.0  # mm, width of the soft shadow
+    # Standard deviation of a pixel (0 to 255), or of a field's displacement in mm. 0.01 mm is a third of a pixel of
+    # Tac3D's camera with 640 columns.
     noise: float = 1.0
 
 
 class Look(NamedTuple):
-    """What the renderer needs of a sensor: `base` f32 (h, w, 3), its untouched image over the whole field in 0..1, and
-    its photometric models with and without the soft shadow."""
+    """The untouched image `base` f32 (h, w, 3) in 0..1 of the whole field, and photometric models with and without the
+    soft shadow."""
 
     base: Array
     photometry: shading.Photometry
@@ -184,7 +175,7 @@ SENSORS: dict[str, Sensor] = {
 
 
 def find_sensor(name: str) -> Sensor:
-    """The sensor called `name`; raises UserError that lists the known ones."""
+    """Return the sensor with this name. Raises UserError that lists the known ones."""
     if name not in SENSORS:
         raise UserError(f"there is no simulated sensor {name!r}; known are {', '.join(SENSORS)}")
     return SENSORS[name]
@@ -192,12 +183,12 @@ def find_sensor(name: str) -> Sensor:
 
 @lru_cache(maxsize=16)
 def look(sensor: Sensor) -> Look:
-    """Base image and photometric model of a camera sensor; reads and fits real data on first use (a few seconds).
+    """Return the look of a camera sensor. The first use fits real data, which takes a few seconds.
 
-    Raises UserError for a sensor without pictures, or when the package with the real ones is missing.
+    Raises UserError for a field sensor, or if the package with the real frames is missing.
     """
     if sensor.kind != "image" or sensor.look is None:
-        raise UserError(f"{sensor.name} has no pictures; it measures a field: use optics.measure_field")
+        raise UserError(f"{sensor.name} has no camera: use optics.measure_field")
     height, width = (round(120 * side / min(sensor.field)) for side in sensor.field)
     if isinstance(sensor.look, str):
         frame = calibration.read_background(sensor.look).astype(np.float32) / 255
@@ -211,7 +202,7 @@ def look(sensor: Sensor) -> Look:
 
 
 def _soft_shadow(lights: Lights) -> Array:
-    """Halo coefficients (3, 3, 3): a slope of the whole dent that turns away from a light loses its colour."""
+    """Return halo coefficients (3, 3, 3): a slope of the whole dent that faces away from a light loses its colour."""
     halo = np.zeros((shading.HALO, len(shading.HALO_PLACES), 3), np.float32)
     for light in lights.lights:
         toward = np.asarray(light.place) / np.hypot(*light.place)
@@ -220,11 +211,11 @@ def _soft_shadow(lights: Lights) -> Array:
 
 
 def shade(lights: Lights, nx: Array, ny: Array, u: Array, v: Array, *, flat_only: bool = False) -> Array:
-    """Light (N, 3) that paint with tilt (nx, ny) (slope over length of the normal) sends back at places (u, v).
+    """Return the light (N, 3) from paint with tilt (nx, ny) (slope over length of the normal) at places (u, v).
 
-    Lambert's law for each light. A light is a bar of lamps along an edge: over the image its direction turns by a third
-    of what a point's would, and its glow is a Gaussian of the distance to its middle, wider on flanks than on flat
-    skin. `flat_only` weighs the lights as the untouched image does.
+    Each light follows Lambert's law. A light is a bar of lamps along an edge, so its direction turns over the image by
+    a third of that of a point light. Its glow is a Gaussian of the distance to its middle, wider on flanks than on flat
+    skin. `flat_only` weights the lights as in the untouched image.
     """
     nz = np.sqrt(np.maximum(1 - nx**2 - ny**2, 0))
     total = np.zeros((len(nx), 3))
@@ -233,7 +224,7 @@ def shade(lights: Lights, nx: Array, ny: Array, u: Array, v: Array, *, flat_only
         reach = light.reach * (1.0 if flat_only else 1.6)
         glow = np.exp(-(distance**2) / (2 * reach**2))
         x, y, z = light.place[0] - u / 3, light.place[1] - v / 3, 1.2 * light.height
-        # The dent bulges toward the camera: its normal is (-slope, 1), and the side that faces a light is bright.
+        # The dent bulges toward the camera: its normal is (-slope, 1), and the side facing a light is bright.
         facing = (nz * z - nx * x - ny * y) / np.sqrt(x**2 + y**2 + z**2)
         weight = light.flat if flat_only else light.contrast * np.maximum(facing, 0)
         total += (glow * weight)[:, None] * np.asarray(light.colour)

@@ -1,9 +1,8 @@
-"""The photometric model of every camera sensor: a colour change as a polynomial in surface normal and image position.
+"""Photometric model of camera sensors: a colour change as a polynomial in surface normal and image position.
 
-A membrane of diffuse paint under a few fixed lights answers a tilt of its surface with a low-order polynomial of the
-normal (the argument of spherical harmonics, Basri and Jacobs 2003), whose coefficients drift slowly over the image.
-So a few hundred numbers a sensor replace a table over gradient bins (Taxim, Si and Yuan 2022): cheap to fit, smooth,
-bounded, and exactly zero where nothing is touched.
+The colour of diffuse paint under a few fixed lights is a low-order polynomial of its normal (spherical harmonics, Basri
+and Jacobs 2003). Its coefficients drift slowly over the image. So a few hundred numbers for a sensor replace a table
+over gradient bins (Taxim, Si and Yuan 2022). They are cheap to fit, smooth, bounded, and exactly zero without contact.
 """
 
 from __future__ import annotations
@@ -26,32 +25,26 @@ HALO = 3  # features of the halo: its slope along x, along y, and its depth
 
 
 class Photometry(NamedTuple):
-    """How one sensor's image changes with the tilt of its surface; colours are 0..1, RGB.
+    """The change of one sensor's image with the tilt of its surface. Colours are RGB in 0..1."""
 
-    `normal` (20, 6, 3): for every power of the normal (`POWERS`) and of the position (`PLACES`) a colour.
-    `halo` (3, 3, 3): the soft shadow and light bleed round a dent, on slope and depth (1/mm) of the blurred dent.
-    `steepest`: largest sine of the tilt that the fit has seen; steeper surfaces look like this one. `widest` (3,): the
-    same for the features of the halo: a gel pressed deeply all over is darker than a ball's dent, but not black.
-    """
-
-    normal: jax.Array | Array
-    halo: jax.Array | Array
-    steepest: float | jax.Array
-    widest: jax.Array | Array
+    normal: jax.Array | Array  # (20, 6, 3), a colour for every power of the normal and of the position
+    halo: jax.Array | Array  # (3, 3, 3), soft shadow and light bleed, on slope and depth (1/mm) of the blurred dent
+    steepest: float | jax.Array  # largest sine of the tilt in the fit; steeper surfaces look like this one
+    widest: jax.Array | Array  # (3,), the same for the halo: a deep press all over is dark, but not black
 
 
 def tilt(slope_x: jax.Array, slope_y: jax.Array, steepest: float | jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Slopes (mm/mm) over the length of the normal they belong to, i.e. sines of the tilt; cut to length `steepest`."""
+    """Return slopes (mm/mm) over the length of their normal, which are sines of the tilt, cut to length `steepest`."""
     square = slope_x**2 + slope_y**2
     scale = jnp.minimum(jax.lax.rsqrt(1.0 + square), steepest * jax.lax.rsqrt(jnp.maximum(square, 1e-12)))
     return slope_x * scale, slope_y * scale
 
 
 def colour_change(normal: jax.Array, nx: jax.Array, ny: jax.Array, u: jax.Array, v: jax.Array) -> jax.Array:
-    """Change (H, W) of one colour channel, 0..1, of a surface with `tilt` (nx, ny) (H, W).
+    """Return the change (H, W) of one colour channel, 0..1, of a surface with `tilt` (nx, ny) (H, W).
 
-    `normal` (20, 6) is that channel of `Photometry.normal`; `u` (W,) and `v` (H,) are places in -1..1. Horner's scheme
-    in nx over Horner's scheme in ny; every coefficient is a quadric of the place.
+    `normal` (20, 6) is that channel of `Photometry.normal`, and `u` (W,) and `v` (H,) are places in -1..1. It is
+    Horner's scheme in nx over Horner's scheme in ny. Every coefficient is a quadric of the place.
     """
     index, u, v = {power: k for k, power in enumerate(POWERS)}, u[None, :], v[:, None]
 
@@ -69,7 +62,7 @@ def colour_change(normal: jax.Array, nx: jax.Array, ny: jax.Array, u: jax.Array,
 
 
 def halo_change(halo: jax.Array, features: tuple[jax.Array, ...], u: jax.Array, v: jax.Array) -> jax.Array:
-    """Change (H, W) of one channel from slope x, slope y and depth (each (H, W)) of the blurred dent.
+    """Return the change (H, W) of one channel from slope x, slope y and depth (each (H, W)) of the blurred dent.
 
     `halo` (3, 3) is that channel of `Photometry.halo`.
     """
@@ -80,7 +73,7 @@ def halo_change(halo: jax.Array, features: tuple[jax.Array, ...], u: jax.Array, 
 
 
 def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array | None = None) -> Array:
-    """The rows of the least squares problem, f64 (N, 120) or (N, 129) with halo features (N, 3); all inputs (N,)."""
+    """Return the rows of the least squares problem, f64 (N, 120), or (N, 129) with halo features (N, 3)."""
     normal = np.stack([nx**i * ny**j for i, j in POWERS], -1)
     place = np.stack([u**i * v**j for i, j in PLACES], -1)
     columns = (normal[:, :, None] * place[:, None, :]).reshape(len(nx), -1)
@@ -90,10 +83,10 @@ def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array | None = None) 
 
 
 def ridge(rows: Array, colours: Array, penalty: float = 1e-6, halo_penalty: float = 1e-2) -> Array:
-    """Coefficients (columns, 3) of `design` rows: least mean square error plus a penalty on scaled coefficients.
+    """Return the ridge coefficients (columns, 3) of `design` rows, with a penalty on scaled coefficients.
 
-    The halo's penalty is the stronger one: inside a dent it is nearly a copy of the normal's linear terms, and the two
-    must not grow against each other.
+    The halo's penalty is stronger. Inside a dent it nearly copies the normal's linear terms, and the two must not grow
+    against each other.
     """
     gram = rows.T @ rows / len(rows)
     scale = np.sqrt(np.diag(gram)) + 1e-12
@@ -104,7 +97,7 @@ def ridge(rows: Array, colours: Array, penalty: float = 1e-6, halo_penalty: floa
 
 
 def assemble(coefficients: Array, steepest: float, widest: Array | None = None) -> Photometry:
-    """A `Photometry` from the columns of `design`; without halo columns its halo is zero. Rounded to f32."""
+    """Return a `Photometry` f32 from the coefficients of `design`. Without halo columns its halo is zero."""
     count = len(POWERS) * len(PLACES)
     normal = coefficients[:count].reshape(len(POWERS), len(PLACES), 3)
     halo = np.zeros((HALO, len(HALO_PLACES), 3))
@@ -115,7 +108,7 @@ def assemble(coefficients: Array, steepest: float, widest: Array | None = None) 
 
 
 def fit_shading(shading: Callable[[Array, Array, Array, Array], Array]) -> Photometry:
-    """The polynomial nearest to `shading(nx, ny, u, v) -> (N, 3)`, on a grid of normals and places, minus flat."""
+    """Fit the polynomial to `shading(nx, ny, u, v) -> (N, 3)` minus its flat value, on a grid of normals and places."""
     steepest = 0.95
     side = np.linspace(-steepest, steepest, 21)
     place = np.linspace(-1, 1, 7)

@@ -1,9 +1,8 @@
-"""Sentences about how an object feels, in the manner of the annotations of AnyTouch (its appendix on GPT-4o).
+"""Captions of simulated objects, in the style of AnyTouch's annotations (its appendix on GPT-4o).
 
-They tell hardness, roughness, texture, warmth and grip: what a hand knows. They never name the object or its material
-(though most words for warmth and grip go with one material), and no word stands for its form, the indenter, or
-for the touch itself (force, motion, direction), so that labels of these are not given away. What they do tell of the
-form: cones, rings and letters carry finer textures than the others, so wide spacing is seldom said of them.
+They describe hardness, roughness, texture, warmth and grip. They never name the object, its material, its form or the
+touch (force, motion, direction), so they do not reveal those labels. Two hints remain. Most words for warmth and grip
+belong to one material. Cones, rings and letters have finer textures, so wide spacing is rare for them.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ ROUGHNESS: dict[str, tuple[str, ...]] = {
     "textured": ("lightly textured", "slightly rough", "moderately rough", "mildly uneven", "gently textured"),
     "rough": ("rough", "coarse", "strongly textured", "bumpy", "very rough"),
 }
-# {s} is how closely the pattern repeats.
+# {s} is a word for the spacing.
 PATTERN: dict[str, tuple[str, ...]] = {
     "smooth": ("no noticeable pattern", "a uniform, unbroken finish", "hardly any surface detail",
                "no bumps or grooves", "a consistent finish"),
@@ -47,7 +46,7 @@ SPACING: dict[str, tuple[str, ...]] = {
     "fine": ("fine", "closely spaced", "tight", "dense", "small-scale"),
     "wide": ("broad", "widely spaced", "large-scale", "spread-out", "big"),
 }
-WIDE = 1.85  # mm of pitch from which a pattern is called wide
+WIDE = 1.85  # mm; from this pitch on a pattern is called wide
 
 FIRST = (
     "The surface feels {hard} and {rough}, with {pattern}.",
@@ -71,21 +70,21 @@ SECOND = (
 
 
 def caption(thing: Object, rng: np.random.Generator) -> str:
-    """One or two sentences about how the object feels, drawn by `rng`: other words each time, the same facts."""
+    """Return one or two sentences about the object's feel. `rng` draws the words. The facts stay the same."""
     shape = thing.shape
 
-    def one(options: tuple[str, ...]) -> str:
+    def pick(options: tuple[str, ...]) -> str:
         return options[int(rng.integers(len(options)))]
 
     spacing = "wide" if shape.texture_pitch >= WIDE else "fine"
     words = {
-        "hard": one(HARDNESS[hardness_of(thing)]),
-        "rough": one(ROUGHNESS[roughness_of(thing)]),
-        "pattern": one(PATTERN[shape.texture]).format(s=one(SPACING[spacing])),
-        "feel": one(thing.material.feel),
+        "hard": pick(HARDNESS[hardness_of(thing)]),
+        "rough": pick(ROUGHNESS[roughness_of(thing)]),
+        "pattern": pick(PATTERN[shape.texture]).format(s=pick(SPACING[spacing])),
+        "feel": pick(thing.material.feel),
     }
     words |= {"Hard": words["hard"].capitalize(), "Rough": words["rough"].capitalize()}
-    text = one(FIRST).format(**words)
+    text = pick(FIRST).format(**words)
     if rng.random() < 0.75:
-        text += " " + one(SECOND).format(**words)
+        text += " " + pick(SECOND).format(**words)
     return re.sub(r"\b([Aa]) (?=[aeiou](?!ni))", r"\1n ", text)  # "an even", but "a uniform"

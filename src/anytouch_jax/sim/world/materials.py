@@ -1,38 +1,31 @@
-"""What objects are made of: how they give way, rub, look, and the words for how they feel."""
+"""Materials of objects: mechanics, look, and words for their feel."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-# In kPa: below the first a finger dents it, above the second nothing a hand does shows.
+# In kPa: a finger dents softer materials, and a hand cannot deform harder ones.
 SOFT, HARD = 400.0, 50_000.0
 
 
 @dataclass(frozen=True)
 class Material:
-    """A material: mechanics, look, and words.
-
-    `modulus` kPa (a skin-deep effective one); `friction` against a silicone gel; `colour` RGB 0..1, `tints` other
-    usual colours; `gloss` 0..1 the strength of highlights, `metallic` whether they take its colour, `mottle` 0..1 how
-    uneven the colour is; `grain`, `grain_pitch` and `grain_depth` mm its fine structure; `irregularity` how far
-    patterns in it stray, in pitches; `textures` the ones that it is made with; `surface` the feel of a plain piece;
-    `feel` phrases for warmth and grip.
-    """
+    """A material: mechanics, look, and words."""
 
     name: str
-    modulus: float
-    friction: float
-    colour: tuple[float, float, float]
-    gloss: float
-    grain: str
-    grain_pitch: float
-    grain_depth: float
-    irregularity: float
-    textures: tuple[str, ...]
-    feel: tuple[str, ...]
-    tints: tuple[tuple[float, float, float], ...] = ()
-    metallic: bool = False
-    mottle: float = 0.1
+    modulus: float  # kPa, effective near the surface
+    friction: float  # against a silicone gel
+    colour: tuple[float, float, float]  # RGB 0..1
+    gloss: float  # strength of highlights, 0..1
+    grain: str  # fine structure
+    grain_pitch: float  # mm
+    grain_depth: float  # mm
+    irregularity: float  # of its patterns, in pitches
+    textures: tuple[str, ...]  # that objects of it have
+    feel: tuple[str, ...]  # phrases for warmth and grip
+    tints: tuple[tuple[float, float, float], ...] = ()  # other usual colours
+    metallic: bool = False  # highlights have its colour
+    mottle: float = 0.1  # unevenness of its colour, 0..1
 
 
 MATERIALS: dict[str, Material] = {
@@ -90,5 +83,5 @@ MATERIALS: dict[str, Material] = {
 
 
 def hardness_class(modulus: float) -> str:
-    """ "soft", "firm" or "hard" for a modulus in kPa."""
+    """Return "soft", "firm" or "hard" for a modulus in kPa."""
     return "soft" if modulus < SOFT else "firm" if modulus < HARD else "hard"

@@ -1,7 +1,7 @@
-"""The bare forms of objects as height maps: highest at 0 mm, no texture, rims rounded so that slopes stay finite.
+"""Primitives: the untextured forms of objects as height maps.
 
-A primitive takes (form, x, y): `x`, `y` mm in the object's frame, of equal shape, the touched side up; it gives
-heights z <= 0 in mm, never below `floor(form)`, where the table is.
+A primitive takes its parameters and `x`, `y` mm of equal shape in the object's frame, touched side up. It returns
+heights z in mm between 0 and `floor(form)`, where the table is. Rims are rounded, so slopes stay finite.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Protocol
 from anytouch_jax.sim.world.textures import Array, namespace
 
 PLATE = 5.0  # mm, the thickness of flat parts
-STROKE_RISE = 0.8  # mm, how far letters stand out of their plate
-TIP = 0.25  # mm, how far from the tip a cone starts to be round
-_STEEP = 2.5  # the steepest side that a height map of 0.1 mm shows without steps
+STROKE_RISE = 0.8  # mm, height of letters over their plate
+TIP = 0.25  # mm, radius within which a cone is round
+_STEEP = 2.5  # steepest slope that a height map of 0.1 mm shows without steps
 
 
 class PrimitiveParameters(Protocol):
-    """What a primitive reads of a shape."""
+    """The fields of a shape that primitives read."""
 
     @property
     def primitive(self) -> str: ...
@@ -31,7 +31,7 @@ class PrimitiveParameters(Protocol):
 
 
 def _round_rim(t: Array, radius: float) -> Array:
-    """The fall over a rim of `radius`: 0 up to t = 0, a quarter circle, then a straight steep side."""
+    """Return the drop over a rim of `radius`: 0 up to t = 0, a quarter circle, then a straight steep side."""
     xp = namespace(t)
     end = radius * _STEEP / math.hypot(1, _STEEP)
     inner = xp.clip(t, 0, end)
@@ -81,7 +81,7 @@ def _flat(form: PrimitiveParameters, x: Array, y: Array) -> Array:
 
 
 def thread_pitch(size: float) -> float:
-    """The thread's pitch in mm of a screw of radius `size`, as on coarse metric screws."""
+    """Return the pitch in mm of a screw of radius `size`, as on coarse metric screws."""
     return min(max(0.32 * size, 0.9), 2.4)
 
 
@@ -98,7 +98,7 @@ _Line = tuple[_Point, ...]
 
 
 def _arc(centre: _Point, radius: _Point, start: float, stop: float, pieces: int) -> _Line:
-    """A polygon along an ellipse; angles in degrees, 0 to the right, growing downwards."""
+    """Return a polygon along an ellipse. Angles are in degrees, 0 to the right and growing downwards."""
     angles = [math.radians(start + (stop - start) * i / pieces) for i in range(pieces + 1)]
     return tuple((centre[0] + radius[0] * math.cos(a), centre[1] + radius[1] * math.sin(a)) for a in angles)
 
@@ -158,6 +158,6 @@ PRIMITIVES: dict[str, Callable[[PrimitiveParameters, Array, Array], Array]] = {
 
 
 def floor(form: PrimitiveParameters) -> float:
-    """The height of the table in mm below the highest place."""
+    """Return the height of the table in mm, relative to the highest place."""
     drop = {"sphere": form.size, "cylinder": form.size, "screw": form.size, "ring": 0.3 * form.size, "cone": 4.0}
     return -drop.get(form.primitive, PLATE)

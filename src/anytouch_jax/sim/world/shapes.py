@@ -1,4 +1,4 @@
-"""Surfaces of objects in millimetres: a primitive, a texture that rides on it, and the fine grain of its material."""
+"""Surfaces of objects in millimetres: a primitive, a texture on it, and the fine grain of its material."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from anytouch_jax.sim.world.textures import GRAINS, TEXTURES, Array, namespace, 
 
 @dataclass(frozen=True)
 class Shape:
-    """A touchable surface; lengths in mm, angles in radians.
+    """A touchable surface. Lengths are in mm, angles in radians.
 
     `size` is the radius of a sphere, cylinder, screw, ring, flat face or cone's base, the rim's radius of an edge or
-    corner, the height of a letter. The texture lies between 0 and -`texture_depth` under the primitive, turned by
-    `texture_angle`; `irregularity` bends a repeating texture by this share of its pitch. The `grain` is a second,
-    finer texture of `grain_depth` and `grain_pitch`. Raises UserError on an unknown name, a size or pitch that is not
-    positive, or a negative depth.
+    corner, or the height of a letter. The texture is between 0 and -`texture_depth` under the primitive, rotated by
+    `texture_angle`. `irregularity` bends a repeating texture by this share of its pitch. The `grain` is a second, finer
+    texture. Raises UserError for an unknown name, a size or pitch of 0 or less, or a negative depth.
     """
 
     primitive: str
@@ -38,13 +37,10 @@ class Shape:
     letter: str = "A"
 
     def __post_init__(self) -> None:
-        tables: dict[str, Collection[str]] = {
-            "primitive": PRIMITIVES,
-            "texture": TEXTURES,
-            "grain": GRAINS,
-            "letter": STROKES,
-        }
-        for field, table in tables.items():
+        tables: tuple[tuple[str, Collection[str]], ...] = (
+            ("primitive", PRIMITIVES), ("texture", TEXTURES), ("grain", GRAINS), ("letter", STROKES),
+        )  # fmt: skip
+        for field, table in tables:
             name = getattr(self, field)
             if name not in table:
                 raise UserError(f"there is no {field} {name!r}; choose one of {', '.join(table)}")
@@ -64,12 +60,12 @@ class Shape:
 
 
 def base(shape: Shape, x: Array, y: Array) -> Array:
-    """Heights in mm of the bare primitive at `x`, `y` mm; 0 at its highest place, the table at the lowest."""
+    """Return heights in mm of the primitive at `x`, `y` mm, from 0 at its highest place down to the table."""
     return namespace(x).clip(PRIMITIVES[shape.primitive](shape, x, y), floor(shape), 0)
 
 
 def unroll(shape: Shape, x: Array, y: Array) -> tuple[Array, Array]:
-    """Places (u, v) in mm on the surface laid flat, turned into the frame of the texture."""
+    """Return places (u, v) in mm on the flattened surface, in the frame of the texture."""
     xp, r = namespace(x), shape.size
     if shape.primitive in ("cylinder", "screw"):
         x = r * xp.arcsin(xp.clip(x / r, -1, 1))
@@ -82,7 +78,7 @@ def unroll(shape: Shape, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
-    """Texture and grain at the unrolled places `u`, `v` mm, each from 0 (low) to 1 (high)."""
+    """Return texture and grain at the unrolled places `u`, `v` mm, each from 0 (low) to 1 (high)."""
     if shape.texture in ("bark", "sand"):
         s, t = u, v  # random already
     else:
@@ -92,10 +88,10 @@ def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def height(shape: Shape, x: Array, y: Array) -> Array:
-    """Heights z in mm toward the gel at `x`, `y` mm in the object's frame (arrays of one shape, numpy's or JAX's).
+    """Return heights z mm toward the gel at `x`, `y` mm in the object's frame, numpy or JAX arrays of one shape.
 
-    0 at the highest place of the primitive; texture and grain only take away. Float32, or float64 when the inputs
-    are. Raises UserError when the shapes of `x` and `y` differ.
+    The highest place of the primitive is 0, and texture and grain only lower it. Float32, or float64 for such inputs.
+    Raises UserError if the shapes of `x` and `y` differ.
     """
     x, y = _floating(x), _floating(y)
     if x.shape != y.shape:
@@ -117,9 +113,9 @@ def _floating(x: Array) -> Array:
 
 
 def relief(shape: Shape, pixels: int, pitch: float) -> np.ndarray:
-    """The heights as a raster (pixels, pixels) f32 mm of `pitch` mm a pixel, the object's origin in its centre.
+    """Return heights (pixels, pixels) f32 mm with `pitch` mm between pixels. The object's origin is in the centre.
 
-    Raises UserError when there is no pixel or the pitch is not positive.
+    Raises UserError without pixels, or for a pitch of 0 or less.
     """
     if pixels < 1 or not (math.isfinite(pitch) and pitch > 0):
         raise UserError(f"a raster needs at least one pixel and a pitch above 0 mm, not {pixels} and {pitch}")

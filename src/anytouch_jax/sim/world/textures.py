@@ -1,9 +1,8 @@
 """Surface textures as analytic functions of a place: repeating patterns, and random fields with stated statistics.
 
-A texture takes (u, v, pitch, seed) and gives heights from 0 (the lowest place) to 1 (the highest). `u`, `v` are mm on
-the unrolled surface, of equal shape or an open grid of (1, W) and (H, 1); `pitch` mm is the repeat (for random
-textures the size of a bump); `seed` draws the random ones and shifts the repeating ones. The arrays may be numpy's or
-JAX's; the result is of the same library and width.
+A texture takes (u, v, pitch, seed) and returns heights from 0 (lowest) to 1 (highest). `u`, `v` are mm on the unrolled
+surface, of equal shape or an open grid of (1, W) and (H, 1). `pitch` mm is the repeat, or the size of a bump in a
+random texture. `seed` draws random textures and shifts repeating ones. Numpy arrays return numpy, JAX arrays JAX.
 """
 
 from __future__ import annotations
@@ -18,26 +17,26 @@ import numpy as np
 Array = Any  # numpy's or JAX's
 Texture = Callable[[Array, Array, float, int], Array]
 
-SAND_LENGTH = 0.35  # pitches, where the autocorrelation has fallen to 1/e
+SAND_LENGTH = 0.35  # pitches, at which the autocorrelation is 1/e
 # The autocorrelation of normal_cdf of a Gaussian field is 6/pi asin(rho/2); with rho = exp(-r^2/l^2) it is 1/e here.
 _FALL = math.sqrt(-math.log(2 * math.sin(math.pi / (6 * math.e))))
 
 
 def namespace(x: Array) -> ModuleType:
-    """numpy or jax.numpy, whichever made `x`."""
-    found: ModuleType = x.__array_namespace__()
-    return found
+    """Return the array library of `x`, numpy or jax.numpy."""
+    library: ModuleType = x.__array_namespace__()
+    return library
 
 
 def gaussian_field(u: Array, v: Array, length: tuple[float, float], seed: int, terms: int = 40) -> Array:
-    """A random field of mean 0 and deviation 1 with autocorrelation exp(-(du/l_u)^2 - (dv/l_v)^2), a sum of cosines.
+    """Return a random field of mean 0 and deviation 1 with autocorrelation exp(-(du/l_u)^2 - (dv/l_v)^2).
 
-    `u`, `v` and `length` mm. The radii of the wave vectors are quantiles, so that few terms follow the spectrum; no
-    wave is shorter than 1.6 lengths. An open grid costs one matrix product.
+    `u`, `v` and `length` are in mm. The field is a sum of cosines. The radii of their wave vectors are quantiles, so
+    few terms follow the spectrum, and no wave is shorter than 1.6 lengths. An open grid costs one matrix product.
     """
     rng = np.random.default_rng([seed, terms])
     radius = np.sqrt(-2 * np.log1p(-(np.arange(terms) + 0.5) / terms))
-    # Angles in even steps, dealt at random: otherwise chance makes a field of few terms lean to one side.
+    # Angles in even steps, permuted: independent angles would give few terms a preferred direction.
     angle = math.pi * (rng.permutation(terms) + rng.random(terms)) / terms
     ku = radius * np.cos(angle) * math.sqrt(2) / length[0]
     kv = radius * np.sin(angle) * math.sqrt(2) / length[1]
@@ -54,12 +53,12 @@ def gaussian_field(u: Array, v: Array, length: tuple[float, float], seed: int, t
 
 
 def normal_cdf(n: Array) -> Array:
-    """The normal distribution function to 3e-4: it makes a Gaussian field uniform in 0 to 1."""
+    """Return the normal distribution function to 3e-4, which makes a Gaussian field uniform in 0 to 1."""
     return 0.5 + 0.5 * namespace(n).tanh(0.7978845608 * (n + 0.044715 * n * n * n))
 
 
 def warp(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Array, Array]:
-    """Push the places about by `amount` pitches (RMS) over some five pitches, as no made pattern is quite regular."""
+    """Displace the places by `amount` pitches (RMS) over some five pitches: no real pattern is quite regular."""
     if amount == 0:
         return u, v
     length = (5 * pitch, 5 * pitch)
@@ -69,19 +68,19 @@ def warp(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Ar
 
 
 def _shift(u: Array, v: Array, pitch: float, seed: int) -> tuple[Array, Array]:
-    """Places in pitches, with a drawn phase."""
+    """Return places in pitches, with a random phase."""
     du, dv = np.random.default_rng(seed).random(2).tolist()
     return u / pitch + du, v / pitch + dv
 
 
 def _bump(square: Array) -> Array:
-    """A smooth bump over a squared distance: 1 at 0, 0 from 1 on."""
+    """Return a smooth bump over a squared distance: 1 at 0, 0 from 1 on."""
     rest = namespace(square).clip(1 - square, 0, 1)
     return rest * rest
 
 
 def _larger(a: Array, b: Array, soft: float) -> Array:
-    """The maximum with its crease rounded over `soft`."""
+    """Return the maximum with its crease rounded over `soft`."""
     return 0.5 * (a + b + namespace(a).sqrt((a - b) ** 2 + soft * soft))
 
 
@@ -147,7 +146,7 @@ def _knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
 def _bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Bark-like: plates along v, parted by winding furrows.
 
-    RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and v; all three are measured.
+    Measured: RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and v.
     """
     n = gaussian_field(u, v, (0.55 * pitch, 2.2 * pitch), seed + 3, terms=28)
     plate = gaussian_field(u, v, (0.8 * pitch, 1.6 * pitch), seed + 4, terms=16)
@@ -162,15 +161,9 @@ def _sand(u: Array, v: Array, pitch: float, seed: int) -> Array:
 
 
 TEXTURES: dict[str, Texture] = {
-    "smooth": _smooth,
-    "weave": _weave,
-    "knit": _knit,
-    "ridges": _ridges,
-    "grid": _grid,
-    "dots": _dots,
-    "bark": _bark,
+    "smooth": _smooth, "weave": _weave, "knit": _knit, "ridges": _ridges, "grid": _grid, "dots": _dots, "bark": _bark,
     "sand": _sand,
-}
+}  # fmt: skip
 
 
 def _streaks(u: Array, v: Array, pitch: float, seed: int) -> Array:

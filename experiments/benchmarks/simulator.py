@@ -29,7 +29,7 @@ from jax import Array
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown_table
-from anytouch_jax.sim.contact.mechanics import Contact, Fidelity, Gel, press
+from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult, press
 from anytouch_jax.sim.contact.shear import Shear, shear_step
 from anytouch_jax.sim.recorder import Recorder
 from anytouch_jax.sim.scene import Scenes, draw_recording, draw_touch, objects_and_splits
@@ -168,7 +168,7 @@ def _heights(setting: PressSetting, surface: Surface, grid: int) -> Fields:
 def _references(setting: PressSetting, surfaces: Iterable[Surface], grid: int) -> list[Solution]:
     pitch, gel, friction, found = setting.size / grid, setting.gel, setting.friction, []
 
-    def solve(heights: Array) -> tuple[Contact, Shear]:
+    def solve(heights: Array) -> tuple[PressResult, Shear]:
         contact = press(heights, setting.depth, gel, pitch, tolerance=1e-6, iterations=1000)
         slid = shear_step(None, contact, setting.motion, gel, pitch, friction, tolerance=1e-4, iterations=1000)
         return contact, slid
@@ -186,16 +186,16 @@ def _references(setting: PressSetting, surfaces: Iterable[Surface], grid: int) -
 
 def _solvers(
     setting: PressSetting, variant: SolverVariant, scenes: Mapping[str, Surface]
-) -> tuple[Callable[[], Contact], Callable[[], Shear]]:
+) -> tuple[Callable[[], PressResult], Callable[[], Shear]]:
     pitch, gel = setting.size / variant.grid, setting.gel
     fidelity, iterations = variant.fidelity, variant.iterations
     heights = np.stack([_heights(setting, surface, variant.grid) for surface in scenes.values()])
     surfaces = jnp.asarray(heights, jnp.float32)
 
-    def push(heights: Array) -> Contact:
+    def push(heights: Array) -> PressResult:
         return press(heights, setting.depth, gel, pitch, fidelity=fidelity, iterations=iterations)
 
-    def slide(contact: Contact) -> Shear:
+    def slide(contact: PressResult) -> Shear:
         most = None if iterations is None else 3 * iterations  # as in the fidelities' own numbers for `fast`
         friction, motion = setting.friction, setting.motion
         return shear_step(None, contact, motion, gel, pitch, friction, fidelity=fidelity, iterations=most)
@@ -210,7 +210,7 @@ def _row(
     setting: PressSetting,
     milliseconds: Fields,
     names: list[str],
-    contact: Contact,
+    contact: PressResult,
     slid: Shear,
     right: list[Solution],
 ) -> FidelityRow:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from anytouch_jax.sim.contact import mechanics, shear
-from anytouch_jax.sim.contact.mechanics import Contact, Gel
+from anytouch_jax.sim.contact.mechanics import Gel, PressResult
 from anytouch_jax.sim.sensing import optics
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
 from anytouch_jax.sim.sensing.units import gel_to_object, unit_gel
@@ -52,7 +52,7 @@ def surface(setup: Setup) -> Array:
     return z - jnp.max(z)
 
 
-def hold(setup: Setup, side: int) -> tuple[Grasp, Contact]:
+def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
     """The gel's answers in one run, for pictures of `side` pixels, and the contact under the grip."""
     gel, z = unit_gel(SENSOR, setup.unit), surface(setup)
     press = jax.vmap(partial(mechanics.press, gel=gel, pitch=PITCH, iterations=40), in_axes=(None, 0))
@@ -68,7 +68,7 @@ def hold(setup: Setup, side: int) -> tuple[Grasp, Contact]:
     return Grasp(found.displacement, found.force, moves, jnp.sqrt(area / jnp.pi), behind), middle
 
 
-def unit_moves(contact: Contact, gel: Gel) -> Array:
+def unit_moves(contact: PressResult, gel: Gel) -> Array:
     """The skin's displacement (3, h, w, 2) mm for 1 N along x, 1 N along y, 1 N mm about the centre of pressure."""
     centre = mechanics.centroid(contact.pressure, PITCH)
     motions = jnp.diag(jnp.array([0.1, 0.1, 0.02]))

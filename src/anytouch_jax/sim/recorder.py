@@ -16,7 +16,7 @@ from jax import Array
 
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact import mechanics, shear
-from anytouch_jax.sim.contact.mechanics import Contact, Fidelity, Gel
+from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
 from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, look
@@ -138,11 +138,11 @@ def simulate_clip(
 
 
 def _sheared(
-    clip: ClipInput, contact: Contact, squeezed: Array | None, gel: Gel, pitch: float, fidelity: Fidelity
+    clip: ClipInput, contact: PressResult, squeezed: Array | None, gel: Gel, pitch: float, fidelity: Fidelity
 ) -> shear.Shear:
     """Return the tangential state of every frame, computed from the previous one."""
 
-    def step(state: shear.Shear, frame: tuple[Contact, Array, Array | None]) -> tuple[shear.Shear, shear.Shear]:
+    def step(state: shear.Shear, frame: tuple[PressResult, Array, Array | None]) -> tuple[shear.Shear, shear.Shear]:
         state = shear.shear_step(
             state,
             frame[0],
@@ -162,13 +162,13 @@ def _sheared(
     return jax.lax.scan(step, start, (contact, gel_motion(clip), change))[1]
 
 
-def _unsheared(contact: Contact) -> shear.Shear:
+def _unsheared(contact: PressResult) -> shear.Shear:
     frames, rows, columns = contact.pressure.shape
     still = shear.at_rest((rows, columns), contact.pressure.dtype)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape)), still)
 
 
-def _labels(clip: ClipInput, contact: Contact, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
+def _labels(clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
     centre = jax.vmap(lambda p: jnp.asarray(mechanics.centroid(p, pitch)))(contact.pressure)
     shown = (centre - clip.unit.window[None]) * clip.unit.mirror[None]
     return {
@@ -190,7 +190,7 @@ def _depth(clip: ClipInput, relief: Array) -> Array:
 
 
 def _fields(
-    names: tuple[str, ...], contact: Contact, sheared: shear.Shear, onto_picture: Callable[..., Array]
+    names: tuple[str, ...], contact: PressResult, sheared: shear.Shear, onto_picture: Callable[..., Array]
 ) -> Array | None:
     """Return the fields `names` at the image's pixels as channels: displacement mm, pressure kPa, shear (2) mm."""
     compute = {

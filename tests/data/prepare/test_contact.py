@@ -78,8 +78,8 @@ def test_the_background_is_found_among_presses_at_changing_places():
     stack = np.stack([c.scale_and_close(one) for one in frames])
     found = c.estimate_background(stack)
     clean = c.scale_and_close(gel())
-    assert c.difference(found, clean).max() < 4
-    assert min(c.difference(one, clean).max() for one in stack[:8]) > 20
+    assert c.gel_difference(found, clean).max() < 4
+    assert min(c.gel_difference(one, clean).max() for one in stack[:8]) > 20
 
 
 @pytest.fixture

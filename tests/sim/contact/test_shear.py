@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.contact.mechanics import Contact, Gel, press, sideways
+from anytouch_jax.sim.contact.mechanics import Gel, PressResult, press, sideways
 from anytouch_jax.sim.contact.shear import at_rest, shear_step
 
 N, MU = 48, 0.5
@@ -31,7 +31,7 @@ def hertz(depth=DEPTH):
     pressure = 2 * plane * a / (np.pi * RADIUS) * np.sqrt(np.maximum(1 - (R / a) ** 2, 0))
     pressure = jnp.asarray(pressure, jnp.float32)
     nothing = jnp.zeros_like(pressure)
-    return Contact(pressure, nothing, jnp.sum(pressure) * PITCH**2 * 1e-3, True, 0, 0.0)
+    return PressResult(pressure, nothing, jnp.sum(pressure) * PITCH**2 * 1e-3, True, 0, 0.0)
 
 
 CONTACT = hertz()
@@ -96,7 +96,7 @@ def test_a_sticking_circle_has_mindlins_stiffness():
     """No slip: Q = 8 a G* d, T = 16 / 3 G a^3 theta; this sees every tangential coefficient, x by y too."""
     inside = np.hypot(X, Y) <= 0.85 * A
     a = np.sqrt(inside.sum() * PITCH**2 / np.pi)
-    punch = Contact(jnp.asarray(inside, jnp.float32), jnp.zeros((N, N)), 1.0, True, 0, 0.0)
+    punch = PressResult(jnp.asarray(inside, jnp.float32), jnp.zeros((N, N)), 1.0, True, 0, 0.0)
     pushed, turned = (
         exact(at_rest((N, N)), punch, jnp.array(motion), 1e6) for motion in ((0.1, 0.0, 0.0), (0.0, 0.0, 0.1))
     )

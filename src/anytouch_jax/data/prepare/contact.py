@@ -131,7 +131,7 @@ def scale_and_close(image: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(scaled, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_DOT, _DOT)))
 
 
-def difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+def gel_difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Return the colour difference f32 (h, w) of two images from `scale_and_close`, without tint and noise."""
     change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
     change -= np.median(change[::2, ::2], axis=(0, 1))  # every other pixel is enough for a median
@@ -145,7 +145,7 @@ def _score(frame: np.ndarray, background: np.ndarray) -> float:
         raise ValueError("its background has other proportions")
     if frame.shape != background.shape:
         background = cv2.resize(background, frame.shape[1::-1])
-    inner = difference(frame, background)[_EDGE:-_EDGE, _EDGE:-_EDGE]
+    inner = gel_difference(frame, background)[_EDGE:-_EDGE, _EDGE:-_EDGE]
     if not inner.size:
         raise ValueError("it is too thin a strip")
     return float(np.percentile(inner, _PERCENTILE))

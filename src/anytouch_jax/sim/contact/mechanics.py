@@ -53,7 +53,7 @@ class Gel:
 jax.tree_util.register_dataclass(Gel, data_fields=["modulus", "thickness"], meta_fields=["poisson"])
 
 
-class Contact(NamedTuple):
+class PressResult(NamedTuple):
     """The result of a press: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface, force N.
 
     A displacement is positive away from the object, and negative where a bonded layer bulges around the contact.
@@ -79,7 +79,7 @@ def press(
     modulus_object: Any = float("inf"),
     tolerance: float = 1e-4,
     iterations: int | None = None,
-) -> Contact:
+) -> PressResult:
     """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the flat gel.
 
     `pitch` is mm per pixel. `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf is no object. With
@@ -110,7 +110,7 @@ def press(
     pressure = solution.x * (scale * plane * share / pitch)
     force = jnp.sum(pressure) * pitch**2 * KPA_MM2
     converged = solution.residual <= tolerance
-    return Contact(pressure, moved * scale, force, converged, solution.iterations, solution.residual)
+    return PressResult(pressure, moved * scale, force, converged, solution.iterations, solution.residual)
 
 
 def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:

@@ -16,7 +16,7 @@ from jax import Array
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.elastic import Plan, is_infinite, tangential_spectra
-from anytouch_jax.sim.contact.mechanics import KPA_MM2, Contact, Fidelity, Gel, centroid, grids, positions
+from anytouch_jax.sim.contact.mechanics import KPA_MM2, Fidelity, Gel, PressResult, centroid, grids, positions
 from anytouch_jax.sim.contact.solver import Compliance, descent
 
 SLIPPING = 0.999  # of the friction limit
@@ -45,7 +45,7 @@ def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
 
 def shear_step(
     state: Shear | None,
-    contact: Contact,
+    contact: PressResult,
     motion: Any,
     gel: Gel,
     pitch: Any,
@@ -112,7 +112,7 @@ def shear_step(
     )
 
 
-def _check(contact: Contact, pitch: Any, friction: Any, fidelity: str) -> None:
+def _check(contact: PressResult, pitch: Any, friction: Any, fidelity: str) -> None:
     if fidelity not in ("exact", "fast"):
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if jnp.ndim(contact.pressure) != 2:

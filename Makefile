@@ -71,14 +71,14 @@ help: ## list the targets
 setup: $(STAMP) ## make .venv with the pinned versions
 
 demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2, DEMO_STEPS1=400, of stage 1]
-	$(ANYTOUCH) simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
-	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
+	$(ANYTOUCH) data simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
+	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) data contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO1)
 	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2$(DEMO_LONGER) --init $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO2)
 	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1$(DEMO_LONGER1) --stage2 $(DEMO)/stage2$(DEMO_LONGER) --out $(DEMO)/report$(DEMO_LONGER)
 
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
-	$(ANYTOUCH) simulate --out $(SCENES)
+	$(ANYTOUCH) data simulate --out $(SCENES)
 
 train-stage1: $(STAMP) $(scenes) ## masked and next-frame pre-training: [DATA= RUN= PRESET= STEPS= STOP_AFTER= SAVE= ARGS=]
 	$(ANYTOUCH) train --stage 1 --data $(DATA) $(OPTIONS) $(ARGS)
@@ -87,7 +87,7 @@ train-stage2: $(STAMP) $(scenes) ## alignment and matching on top of INIT: [DATA
 	$(ANYTOUCH) train --stage 2 --data $(DATA) $(OPTIONS) --init $(INIT) $(ARGS)
 
 probe: $(STAMP) $(scenes) ## linear and kNN probes of a run on a label column: [DATA= LABEL= RUN=]
-	$(ANYTOUCH) probe --run $(RUN) --data $(DATA) --label $(LABEL)
+	$(ANYTOUCH) probe label --model $(RUN) --data $(DATA) --label $(LABEL)
 
 parity: $(STAMP) ## compare with recorded outputs of the authors' code: [GOLDEN=]
 	$(PY) -m tests.parity.run $(GOLDEN)
@@ -146,7 +146,7 @@ clean: ## remove .venv, builds and caches; runs stay
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES)/manifest.parquet: | $(STAMP)
-	$(ANYTOUCH) simulate --out $(SCENES)
+	$(ANYTOUCH) data simulate --out $(SCENES)
 
 $(TORCH)/.made: experiments/benchmarks/pytorch/requirements.txt
 	$(PYTHON) -m venv $(TORCH)

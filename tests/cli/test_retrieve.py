@@ -6,7 +6,7 @@ import pytest
 from touch_world import make_touches
 
 from anytouch_jax.cli.app import main
-from anytouch_jax.encoder import encoder
+from anytouch_jax.encoder import embed
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
     ],
 )
 def test_a_mistake_is_one_sentence(touches, capsys, monkeypatch, words, sentence):
-    monkeypatch.setattr(encoder, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
+    monkeypatch.setattr(embed, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
     assert main(["retrieve", "--data", str(touches), *words]) == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith("anytouch retrieve: ") and sentence in said and said.count("\n") == 0

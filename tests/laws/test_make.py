@@ -1,15 +1,19 @@
-"""What a user types after `make`: the commands it would run, its help, its one sentence on a mistake."""
+"""The targets of the Makefile: the commands that they would run, and the help."""
 
 from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from places import ROOT
+
+from anytouch_jax.cli.app import COMMANDS, GROUPS
 
 NAMES = (
     "DATA",
@@ -28,6 +32,7 @@ NAMES = (
     "PYTHON",
     "MAKEFLAGS",
 )
+TARGETS = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
 
 
 def make(*words: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -37,47 +42,44 @@ def make(*words: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["make", *words], cwd=folder, env=clean, capture_output=True, text=True, check=False)
 
 
-def planned(*words: str) -> str:
-    """The last command that make would run, without its interpreter."""
+def planned(*words: str) -> list[list[str]]:
+    """Return the words of every `anytouch` command that make would run, without the interpreter."""
     done = make("-n", *words)
     assert done.returncode == 0, done.stderr
-    return done.stdout.strip().splitlines()[-1].removeprefix(".venv/bin/python -m ")
+    commands = [line.partition("-m anytouch_jax ")[2] for line in done.stdout.splitlines()]
+    return [shlex.split(command) for command in commands if command]
 
 
-@pytest.mark.parametrize(
-    ("words", "command"),
-    [
-        (
-            ["train-stage1", "DATA=mine/manifest.csv"],
-            "anytouch_jax train --stage 1 --data mine/manifest.csv --run runs/stage1 --preset tiny",
-        ),
-        (
-            ["train-stage1", "DATA=a.parquet b.csv", "RUN=r", "PRESET=large", "STEPS=4", "STOP_AFTER=2", "SAVE=1"],
-            "anytouch_jax train --stage 1 --data a.parquet b.csv --run r --preset large"
-            " --steps 4 --stop-after 2 --save-every 1",
-        ),
-        (
-            ["train-stage2", "DATA=a.csv"],
-            "anytouch_jax train --stage 2 --data a.csv --run runs/stage2 --preset tiny --init runs/stage1",
-        ),
-        (
-            ["train-stage2", "DATA=a.csv", "INIT=w.pth", "RUN=r"],
-            "anytouch_jax train --stage 2 --data a.csv --run r --preset tiny --init w.pth",
-        ),
-        (
-            ["probe", "DATA=a.csv", "RUN=r", "LABEL=slip"],
-            "anytouch_jax probe --run r --data a.csv --label slip",
-        ),
-        (
-            ["train-stage1", "DATA='my folder/a.parquet' b.csv", "RUN='my runs/one'"],
-            "anytouch_jax train --stage 1 --data 'my folder/a.parquet' b.csv --run 'my runs/one' --preset tiny",
-        ),
-        (["parity"], "anytouch_jax parity tests/parity/golden"),
-        (["parity", "GOLDEN=g"], "anytouch_jax parity g"),
-    ],
-)
-def test_targets_run_the_command_line(words: list[str], command: str) -> None:
-    assert planned(*words) == command
+def parsed(words: list[str]) -> Any:
+    """Return the options of an `anytouch` command, which must be understood."""
+    name, rest = (" ".join(words[:2]), words[2:]) if words[0] in GROUPS else (words[0], words[1:])
+    command = COMMANDS[name]
+    return command.parse(command.options, name, rest)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_can_be_planned(target: str) -> None:
+    done = make("-n", target)
+    assert done.returncode == 0, done.stderr
+
+
+def test_variables_reach_the_options_of_training() -> None:
+    words = ["DATA=a.parquet b.csv", "RUN=r", "PRESET=large", "STEPS=4", "STOP_AFTER=2", "SAVE=1", "BATCH=3"]
+    options, config = parsed(planned("train-stage1", *words, "ARGS=--data.flip 0")[-1])
+    assert (options.stage, options.data, options.run) == (1, (Path("a.parquet"), Path("b.csv")), Path("r"))
+    assert (options.preset, config.run.steps, options.stop_after, config.run.save_every) == ("large", 4, 2, 1)
+    assert config.data.batch_size == 3 and config.data.flip == 0
+    spaces = parsed(planned("train-stage1", "DATA='my folder/a.parquet' b.csv", "RUN='my runs/one'")[-1]).options
+    assert spaces.data == (Path("my folder/a.parquet"), Path("b.csv")) and spaces.run == Path("my runs/one")
+    for init in ("runs/stage1", "w.pth"):
+        given = [] if init == "runs/stage1" else [f"INIT={init}"]
+        options = parsed(planned("train-stage2", "DATA=a.csv", *given)[-1]).options
+        assert (options.stage, options.init, options.run) == (2, Path(init), Path("runs/stage2"))
+
+
+def test_variables_reach_the_options_of_probes() -> None:
+    options = parsed(planned("probe", "DATA=a.csv", "RUN=r", "LABEL=slip")[-1])
+    assert (options.model, options.data, options.label) == ((Path("r"),), (Path("a.csv"),), "slip")
 
 
 def test_what_targets_take_by_default_is_in_the_repository() -> None:
@@ -87,65 +89,58 @@ def test_what_targets_take_by_default_is_in_the_repository() -> None:
 
 
 def test_quick_and_whole_test_run() -> None:
-    assert planned("test").endswith('-m "not slow"')
-    assert "not slow" not in planned("test-all")
+    assert "not slow" in make("-n", "test").stdout
+    assert "not slow" not in make("-n", "test-all").stdout
 
 
 def test_every_target_makes_the_environment_first() -> None:
     text = (ROOT / "Makefile").read_text()
-    targets = re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE).group(1).split()
-    for target in set(targets) - {"help", "clean", "bench-gpu"}:  # which runs where nothing may be installed
+    for target in set(TARGETS) - {"help", "clean", "bench-gpu"}:  # which runs where nothing may be installed
         assert re.search(rf"^{target}: \$\(STAMP\)( \$\(scenes\))? ## \S", text, re.MULTILINE), target
 
 
 def test_plain_make_lists_every_target() -> None:
     done = make()
-    targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
     assert done.returncode == 0
-    assert [line.split()[0] for line in done.stdout.splitlines() if re.match(r"  [a-z]", line)] == targets
+    assert [line.split()[0] for line in done.stdout.splitlines() if re.match(r"  [a-z]", line)] == TARGETS
     assert """DATA="'my folder/a.parquet' b.csv\"\n""" in done.stdout  # as the test above has it
 
 
 @pytest.mark.parametrize("target", ["train-stage1", "train-stage2", "probe"])
 def test_without_data_the_simulated_scenes_are_made_first(target: str, tmp_path: Path) -> None:
     scenes = tmp_path / "scenes"
-    done = make("-n", target, f"SCENES={scenes}")
-    assert done.returncode == 0
-    simulate, use = [line for line in done.stdout.splitlines() if "anytouch_jax" in line and "pip" not in line]
-    assert simulate.endswith(f"anytouch_jax simulate --out {scenes}") and f"--data {scenes}/manifest.parquet" in use
+    simulate, use = planned(target, f"SCENES={scenes}")
+    assert simulate[:2] == ["data", "simulate"] and parsed(simulate).out == scenes
+    assert f"{scenes}/manifest.parquet" in use
     scenes.mkdir()
     (scenes / "manifest.parquet").write_bytes(b"")
-    assert "anytouch_jax simulate" not in make("-n", target, f"SCENES={scenes}").stdout
-    assert "anytouch_jax simulate" not in make("-n", target, "DATA=a.csv").stdout
+    assert len(planned(target, f"SCENES={scenes}")) == len(planned(target, "DATA=a.csv")) == 1
 
 
 def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
-    done = make("-n", "demo", "DEMO=d")
-    steps = [line for line in done.stdout.splitlines() if "anytouch_jax " in line and "pip" not in line]
-    words = [line.split("anytouch_jax ")[1].split()[0] for line in steps]
-    assert words == ["simulate", "contact", "train", "train", "report"]
-    assert steps[1].startswith("test -e d/scenes/contact.parquet || ")  # a second run does not mark again
-    assert "--stage 1" in steps[2] and "--stage 2" in steps[3] and "--init d/stage1" in steps[3]
-    for step in steps[2:4]:
-        assert "--data d/scenes/contact.parquet" in step and "--loader.contact-only" in step
+    commands = planned("demo", "DEMO=d")
+    simulate, contact, stage1, stage2, report = map(parsed, commands)
+    assert simulate.out == Path("d/scenes") and contact.out == Path("d/scenes/contact.parquet")
+    assert "test -e d/scenes/contact.parquet || " in make("-n", "demo", "DEMO=d").stdout  # marked once only
+    for stage, (options, config) in enumerate((stage1, stage2), 1):
+        assert options.stage == config.stage == stage and options.data == (contact.out,)
+        assert config.data.contact_only and config.data.background == "subtract"
+    assert stage2.options.init == stage1.options.run == report.stage1 == Path("d/stage1")
+    assert report.stage2 == stage2.options.run and report.data == contact.out
 
 
-def test_a_longer_demo_goes_on_from_the_scenes_and_stage_1_of_the_plain_one() -> None:
-    plain, longer = (make("-n", "demo", "DEMO=d", *words).stdout.splitlines() for words in ((), ("DEMO_STEPS=600",)))
-    assert plain[:-2] == longer[:-2]
-    assert "--run d/stage2-600 --init d/stage1 " in longer[-2] and "--steps 600" in longer[-2]
-    assert longer[-1].endswith("--stage2 d/stage2-600 --out d/report-600")
-    assert plain[-1].endswith("--stage2 d/stage2 --out d/report")
-    longest = make("-n", "demo", "DEMO=d", "DEMO_STEPS1=3000", "DEMO_STEPS=600").stdout.splitlines()
-    assert plain[:-3] == longest[:-3]
-    assert "--run d/stage1-3000 " in longest[-3] and "--steps 3000" in longest[-3]
-    assert "--run d/stage2-3000-600 --init d/stage1-3000 " in longest[-2]
-    assert longest[-1].endswith("--stage1 d/stage1-3000 --stage2 d/stage2-3000-600 --out d/report-3000-600")
-
-
-def test_notebooks_run_in_their_own_folder_and_find_their_helpers() -> None:
-    done = make("-n", "notebooks", "PAGES=q2_space")
-    assert done.returncode == 0 and f"PYTHONPATH={ROOT}/experiments " in done.stdout
+def test_a_longer_demo_continues_from_the_scenes_and_stage_1_of_the_plain_one() -> None:
+    plain, longer = planned("demo", "DEMO=d"), planned("demo", "DEMO=d", "DEMO_STEPS=600")
+    longest = planned("demo", "DEMO=d", "DEMO_STEPS1=3000", "DEMO_STEPS=600")
+    assert plain[:-2] == longer[:-2] and plain[:-3] == longest[:-3]
+    options, config = parsed(longer[-2])
+    assert (options.run, options.init, config.run.steps) == (Path("d/stage2-600"), Path("d/stage1"), 600)
+    assert (parsed(longer[-1]).stage2, parsed(longer[-1]).out) == (Path("d/stage2-600"), Path("d/report-600"))
+    options, config = parsed(longest[-3])
+    assert (options.run, config.run.steps) == (Path("d/stage1-3000"), 3000)
+    options, report = parsed(longest[-2]).options, parsed(longest[-1])
+    assert (options.run, options.init) == (Path("d/stage2-3000-600"), Path("d/stage1-3000"))
+    assert (report.stage1, report.out) == (Path("d/stage1-3000"), Path("d/report-3000-600"))
 
 
 def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
-from anytouch_jax.encoder.export import describes
 from anytouch_jax.errors import UserError
 
 _TABLES = (".csv", ".parquet")
@@ -29,9 +28,9 @@ class InfoOptions:
 
 
 def run(options: InfoOptions) -> int:
-    """Print some lines on every path."""
+    """Print some lines about every path."""
     if not options.paths:
-        raise UserError("name a file or a folder")
+        raise UserError("There is nothing to describe. Name a file or a folder.")
     for number, path in enumerate(options.paths):
         print("\n" * bool(number) + "\n".join(_lines(path)))
     return 0
@@ -42,30 +41,30 @@ def _lines(path: Path) -> list[str]:
         raise UserError(f"there is no {path}")
     if path.is_dir():
         return _folder(path)
-    if describes(path).is_file():
-        return [f"{path}: an exported encoder; how to call it", describes(path).read_text("utf-8").strip()]
+    description = path.with_name(f"{path.name}.json")  # `export.describes`, without its import of jax
+    if description.is_file():
+        return [f"{path}: an exported encoder", description.read_text("utf-8").strip()]
     if path.suffix.lower() in _TABLES:
         return _manifest(path)
-    if path.suffix == ".npz" and (found := _features(path)):
-        return found
-    if path.suffix == ".npz" and (head := _head(path)):
-        return head
+    if path.suffix == ".npz" and (lines := _features(path) or _head(path)):
+        return lines
     if path.suffix in _WEIGHTS:
         return _weights(path)
-    raise UserError(f"{path} is none of a run, weights ({', '.join(_WEIGHTS)}), a manifest (.csv, .parquet), features")
+    known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
+    raise UserError(f"{path} has no known format. Known are {known}.")
 
 
 def _folder(path: Path) -> list[str]:
-    """A run, else the manifest that is meant: by its name, or the only one."""
+    """Return lines about a run, or about the manifest in the folder: that called manifest, or the first."""
     from anytouch_jax.data.manifest.schema import is_manifest
     from anytouch_jax.weights.checkpoint import steps
 
-    found = [one for one in sorted(path.iterdir()) if one.suffix.lower() in _TABLES and is_manifest(one)]
-    named = [one for one in found if one.stem == "manifest"] or found
-    if steps(path / "checkpoints") or not named:
+    tables = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
+    tables.sort(key=lambda file: file.stem != "manifest")
+    if steps(path / "checkpoints") or not tables:
         return _run(path)
-    others = [f"also in this folder: {', '.join(one.name for one in found if one != named[0])}"]
-    return [*_manifest(named[0]), *(others if len(found) > 1 else [])]
+    others = ", ".join(sorted(file.name for file in tables[1:]))
+    return [*_manifest(tables[0]), *([f"other manifests in this folder: {others}"] if others else [])]
 
 
 def _run(path: Path) -> list[str]:
@@ -73,55 +72,50 @@ def _run(path: Path) -> list[str]:
     from anytouch_jax.weights import checkpoint
     from anytouch_jax.weights.checkpoint import CheckpointError, checked, resolve
 
-    about = checkpoint.read_metadata(path)
+    metadata = checkpoint.read_metadata(path)
     try:
         checked(resolve(path, None))
         damage = []
     except CheckpointError as error:
         damage = [str(error)]
-    config: Config = from_json(about["config"])
-    kept = checkpoint.steps(path / "checkpoints")
-    lowest = checkpoint.best_of(path / "checkpoints")
-    best = "" if lowest is None else f" (lowest loss at {lowest})"
-    source = about.get("source") or {}
-    began = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
-    loss = about.get("metrics", {}).get("loss")
+    config: Config = from_json(metadata["config"])
+    source = metadata.get("source") or {}
+    model = [_model(config.model), _sensors(config.model, metadata.get("seen"))]
     if "sensor" in source:
-        return [
-            f"{path}: the run {source['run']}, with tokens of {source['sensor']} fitted to {source['frames']} frames",
-            _model(config.model),
-            _sensors(config.model, about.get("seen")),
-            *damage,
-        ]
+        adapted = f"tokens of {source['sensor']} fitted to {source['frames']} frames"
+        return [f"{path}: the run {source['run']}, with {adapted}", *model, *damage]
+    saved, best = checkpoint.steps(path / "checkpoints"), checkpoint.best_of(path / "checkpoints")
+    checkpoints = f", checkpoints at {', '.join(map(str, saved))}" if saved else ""
+    if best is not None:
+        checkpoints += f" (lowest loss at {best})"
+    starts = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
+    loss = metadata.get("metrics", {}).get("loss")
+    content = f" (content {metadata['data'][:12]})" if metadata.get("data") else ""
     return [
-        f"{path}: a run of stage {config.stage}, step {about['step']} of {config.run.steps}"
-        + (f"; checkpoints at {', '.join(map(str, kept))}{best}" if kept else ""),
+        f"{path}: a run of stage {config.stage}, step {metadata['step']} of {config.run.steps}{checkpoints}",
         f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
-        _model(config.model),
-        _sensors(config.model, about.get("seen")),
-        f"touches are seen {'less the untouched gel' if config.data.background == 'subtract' else 'as they are'}",
-        f"began from {', '.join(began)}" if began else "began from nothing trained",
-        f"data: {', '.join(config.data.manifests) or 'none named'}"
-        + (f" (content {about['data'][:12]})" if about.get("data") else ""),
-        *([f"loss {loss:.4g}, the mean since the checkpoint before"] if loss is not None else []),
+        *model,
+        f"background: {config.data.background}",
+        f"started from {', '.join(starts) or 'random weights'}",
+        f"data: {', '.join(config.data.manifests) or 'unknown'}{content}",
+        *([f"loss {loss:.4g}, the mean since the previous checkpoint"] if loss is not None else []),
         *damage,
     ]
 
 
 def _model(model: ModelConfig) -> str:
     touch = model.touch
-    read = {"shared": "", "sensor": ", each sensor by its own", "convolutional": ", read by convolutions"}
     return (
-        f"touch encoder of width {touch.width}, depth {touch.depth}, {touch.heads} heads; pictures of "
-        f"{model.image_size} pixels in patches of {model.patch}{read[model.patch_encoder]}; features of {model.embed}"
+        f"touch encoder: width {touch.width}, depth {touch.depth}, {touch.heads} heads, images of {model.image_size} "
+        f"pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} features"
     )
 
 
-def _sensors(model: ModelConfig, seen: Sequence[str] | None) -> str:
-    named = [name for name in model.sensors if name != UNIVERSAL]
-    if seen is None:
-        return f"sensors: {', '.join(named)}; which of them it was trained on is not told"
-    return f"sensors trained on: {', '.join(seen) or 'none'}; every other one counts as never seen"
+def _sensors(model: ModelConfig, trained: Sequence[str] | None) -> str:
+    if trained is None:
+        names = ", ".join(name for name in model.sensors if name != UNIVERSAL)
+        return f"sensors: {names}. It is unknown which of them were trained."
+    return f"trained sensors: {', '.join(trained) or 'none'}. All others get the universal tokens."
 
 
 def _weights(path: Path) -> list[str]:
@@ -131,17 +125,17 @@ def _weights(path: Path) -> list[str]:
     from anytouch_jax.weights.convert import detect_layout
 
     weights, metadata = load.read_weights(path), safetensors.read_file_metadata(path)
-    names = {"own": "our own", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
+    owners = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
     layout = detect_layout(weights)
+    names = owners.get(layout, f"the authors' ({layout})")
     model = load.model_of_file(path, weights)
-    trained = load.trained_sensors(metadata, model)
     count = sum(array.size for array in weights.values())
     finite = all(np.isfinite(array).all() for array in weights.values() if array.dtype.kind == "f")
     return [
-        f"{path}: {len(weights)} arrays of {count:,} numbers by {names.get(layout, f'the authors ({layout})')} names",
+        f"{path}: {len(weights)} arrays of {count:,} numbers, with {names} names",
         _model(model),
-        *([] if layout in ("clip", "openclip") else [_sensors(model, trained)]),
-        *([] if finite else ["some of them are not finite: nothing can be embedded with them"]),
+        *([] if layout in ("clip", "openclip") else [_sensors(model, load.trained_sensors(metadata, model))]),
+        *([] if finite else ["Some of them are not finite, so that they cannot embed anything."]),
     ]
 
 
@@ -151,27 +145,28 @@ def _manifest(path: Path) -> list[str]:
     from anytouch_jax.data.manifest import manifest as manifests
 
     table = manifests.read(path)
-    count = {name: Counter(table.column(name).to_pylist()) for name in ("split", "sensor")}
-    listed = {
-        name: ", ".join(f"{key} {number:,}" for key, number in sorted(one.items())) for name, one in count.items()
-    }
     columns = table.table.column_names
+
+    def counts(name: str) -> str:
+        counter = Counter(table.column(name).to_pylist())
+        return ", ".join(f"{value} {count:,}" for value, count in sorted(counter.items()))
+
     optional = ("image_path", "text", "background_path", "touch", "object", "field_path")
-    there = [f"{name} {int(table.present(name).sum()):,}" for name in optional if name in columns]
+    filled = [f"{name} {int(table.present(name).sum()):,}" for name in optional if name in columns]
     labels = [name.removeprefix("label.") for name in columns if name.startswith("label.")]
     return [
         f"{path}: a manifest of {len(table):,} rows in {int(table.codes('sequence').max()) + 1:,} recordings, "
         f"{len(table.clips(3)):,} clips of three frames",
-        f"splits: {listed['split']}",
-        f"sensors: {listed['sensor']}",
-        f"rows with {', '.join(there) or 'nothing optional'}",
+        f"splits: {counts('split')}",
+        f"sensors: {counts('sensor')}",
+        f"rows with {', '.join(filled) or 'no optional column'}",
         f"labels: {', '.join(labels) or 'none'}",
         f"content {table.content_hash[:12]}",
     ]
 
 
 def _features(path: Path) -> list[str]:
-    """What `anytouch embed` wrote; [] for another .npz."""
+    """Return lines about features of `anytouch embed`; [] for another .npz."""
     import numpy as np
 
     try:
@@ -183,19 +178,23 @@ def _features(path: Path) -> list[str]:
         return []
     values = arrays["features"]
     keys = [name.removeprefix("key/") for name in arrays if name.startswith("key/")]
-    told = [f"{name.removeprefix('about/')}: {arrays[name]}" for name in arrays if name.startswith("about/")]
-    return [f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}", *told]
+    metadata = [f"{name.removeprefix('about/')}: {arrays[name]}" for name in arrays if name.startswith("about/")]
+    return [
+        f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}",
+        *metadata,
+    ]
 
 
 def _head(path: Path) -> list[str]:
-    """What `anytouch probe --save` wrote; [] for another .npz."""
+    """Return lines about a head of `anytouch probe label --save`; [] for another .npz."""
     from anytouch_jax.evaluate.heads import load_head
 
     try:
         head = load_head(path)
     except UserError:
         return []
+    options = f"--pooling {head.pooling} --frames {head.frames}"
     return [
-        f"{path}: the linear head of a probe for {head.label}: {', '.join(head.classes)}",
-        f"of features of {len(head.mean)}: --pooling {head.pooling} --frames {head.frames}, encoder {head.fingerprint}",
+        f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
+        f"for features of {len(head.mean)} with {options}, encoder {head.fingerprint}",
     ]

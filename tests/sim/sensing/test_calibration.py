@@ -123,7 +123,7 @@ def test_the_gel_settles_round_the_object():
 
 
 def test_the_fit_is_finite_small_where_unseen_and_zero_at_rest():
-    model, plain = calibration.fit("gelsight_mini")
+    model, plain = calibration.fit_photometry("gelsight_mini")
     assert np.isfinite(model.normal).all() and np.isfinite(model.halo).all()
     assert not plain.halo.any() and model.halo.any()
     assert 0.3 < model.steepest < 0.7

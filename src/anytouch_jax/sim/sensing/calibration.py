@@ -183,7 +183,7 @@ def _features(
 
 
 @lru_cache(maxsize=4)
-def fit(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photometry]:
+def fit_photometry(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photometry]:
     """Return photometric models of a real sensor with and without halo, by ridge regression on the even presses.
 
     It uses every `stride`-th pixel within two radii of each press. Raises UserError as `read_background`.

@@ -192,7 +192,7 @@ def look(sensor: Sensor) -> Look:
     height, width = (round(120 * side / min(sensor.field)) for side in sensor.field)
     if isinstance(sensor.look, str):
         frame = calibration.read_background(sensor.look).astype(np.float32) / 255
-        return Look(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), *calibration.fit(sensor.look))
+        return Look(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), *calibration.fit_photometry(sensor.look))
     lights, u, v = sensor.look, *np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     flat = np.zeros_like(u).ravel()
     base = np.asarray(lights.ambient) + shade(lights, flat, flat, u.ravel(), v.ravel(), flat_only=True)

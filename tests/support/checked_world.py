@@ -1,0 +1,38 @@
+"""Small manifests for checks and repairs."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+
+def finding_rows(report):
+    """The rows of each finding by its kind."""
+    return {finding.kind: finding.rows.tolist() for finding in report.findings}
+
+
+def plain_rows(count=6, **extra):
+    """`count` rows of one dataset, in sequences of three frames."""
+    return [{"sequence": f"s{i // 3}", "frame_index": i % 3, "dataset": "d", **extra} for i in range(count)]
+
+
+def image_pairs(tmp_path, make, *, swap, witness, count=24):
+    """Touch: a gel's colours with a faint dent. Vision: anything. Rows where `swap` have the two exchanged."""
+    rng = np.random.default_rng(3)
+    gel = cv2.resize(rng.integers(60, 190, (3, 4, 3), np.uint8), (32, 24), interpolation=cv2.INTER_CUBIC)
+    rows = [{"path": f"touch{i}.png", "image_path": f"see{i}.png", "dataset": "tvl", "sequence": "s", "frame_index": i}
+            for i in range(count)]  # fmt: skip
+    if witness:
+        rows.append({"path": "ground.png", "split": "background", "dataset": "tvl", "sequence": "b"})
+    loose = make(rows)
+    for i in range(count):
+        dent = np.zeros((24, 32), np.int16)
+        cv2.circle(dent, (int(rng.integers(32)), int(rng.integers(24))), 5, 40, -1)
+        touch = np.clip(gel + dent[..., None] + rng.integers(-3, 4, gel.shape), 0, 255).astype(np.uint8)
+        see = cv2.resize(rng.integers(0, 256, (3, 4, 3), np.uint8), (40, 30), interpolation=cv2.INTER_CUBIC)
+        first, second = (see, touch) if swap(i) else (touch, see)
+        cv2.imwrite(str(tmp_path / f"touch{i}.png"), first)
+        cv2.imwrite(str(tmp_path / f"see{i}.png"), second)
+    if witness:
+        cv2.imwrite(str(tmp_path / "ground.png"), gel)
+    return loose

@@ -22,7 +22,7 @@ from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_enco
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
 from anytouch_jax.evaluate.feature_cache import background_difference, encoder_digest
-from anytouch_jax.evaluate.probing import run_tasks
+from anytouch_jax.evaluate.probing import score_tasks
 from anytouch_jax.evaluate.retrieval import contact_vector
 from anytouch_jax.evaluate.tasks import Task
 from anytouch_jax.files import atomic_write
@@ -76,12 +76,12 @@ def quiet(_: str) -> None:
 def _probes(
     leaf: Leaf, work: Places, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
-    """Rows of `run_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
+    """Rows of `score_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
     table = manifests.read(work.folder / dataset / file)
     shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows, "cache": work.folder / "cache"}
     shared |= options
-    return [{"view": view} | one for one in run_tasks(encoder, table, tasks, **shared)]
+    return [{"view": view} | one for one in score_tasks(encoder, table, tasks, **shared)]
 
 
 def _four_columns(leaf: Leaf, work: Places, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:

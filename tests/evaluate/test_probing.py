@@ -31,7 +31,7 @@ from anytouch_jax.evaluate.probing import (
     probe_benchmark,
     probe_label,
     probe_tasks,
-    run_tasks,
+    score_tasks,
 )
 from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, find_benchmark, label_task, select
 
@@ -63,7 +63,7 @@ def noise(rows: Any) -> np.ndarray:
 @pytest.mark.parametrize("head", ["linear", "knn"])
 def test_a_label_in_the_features_is_found(task, head):
     store = planted(telling(MANY, task, 0.02))
-    (one,) = run_tasks(store, MANY, [task], seeds=3, head_names=(head,))
+    (one,) = score_tasks(store, MANY, [task], seeds=3, head_names=(head,))
     assert one["mean"] > 0.98 and one["high"] == 1.0
     assert one["chance"] < 0.75 and len(one["values"]) == 3
     assert (one["task"], one["head"], one["protocol"], one["metric"]) == (task, head, "honest", "accuracy")
@@ -73,7 +73,7 @@ def test_a_label_in_the_features_is_found(task, head):
 @pytest.mark.parametrize("task", ["material", "twist", "slide"])
 def test_noise_is_chance_within_its_interval(monkeypatch, task):
     store = planted(noise)
-    (one,) = run_tasks(store, MANY, [task], seeds=5)
+    (one,) = score_tasks(store, MANY, [task], seeds=5)
     assert one["low"] <= 1 / len(one["classes"]) <= one["high"]
     assert one["high"] - one["low"] < 0.4
 
@@ -81,7 +81,7 @@ def test_noise_is_chance_within_its_interval(monkeypatch, task):
 def test_the_optimism_of_the_published_protocol_shows_on_noise(monkeypatch):
     store = planted(noise)
     recipe = heads.GradientRecipe(epochs=30, batch=32, rate=0.03)
-    found = run_tasks(store, MANY, ["material", "twist"], seeds=5, protocols=("published", "honest"),
+    found = score_tasks(store, MANY, ["material", "twist"], seeds=5, protocols=("published", "honest"),
                         head_names=("linear", "knn", "gradient"), recipe=recipe)  # fmt: skip
     scores = {(one["task"], one["head"], one["protocol"]): one["mean"] for one in found}
     gains = [scores[t, h, "published"] - scores[t, h, "honest"] for t, h, p in scores if p == "honest"]
@@ -91,7 +91,7 @@ def test_the_optimism_of_the_published_protocol_shows_on_noise(monkeypatch):
 
 def test_a_number_in_the_features_is_found(monkeypatch):
     store = planted(telling(MANY, "force", 0.05))
-    (one,) = run_tasks(store, MANY, ["force"], seeds=2)
+    (one,) = score_tasks(store, MANY, ["force"], seeds=2)
     assert one["metric"] == "r2" and one["unit"] == "N" and one["classes"] == []
     assert 0.97 < one["low"] <= one["mean"] <= one["high"] < 1
     assert one["mae_low"] <= one["mae"] <= one["mae_high"] < 0.2 < one["chance_mae"]
@@ -100,13 +100,13 @@ def test_a_number_in_the_features_is_found(monkeypatch):
 
 def test_a_number_that_is_not_there_has_no_r2(monkeypatch):
     store = planted(noise)
-    (one,) = run_tasks(store, MANY, ["force"], seeds=2)
+    (one,) = score_tasks(store, MANY, ["force"], seeds=2)
     assert one["mean"] < 0.05 and one["mae"] == pytest.approx(one["chance_mae"], rel=0.1)
 
 
 def test_objects_never_trained_on_are_told_apart_by_other_touches(monkeypatch):
     store = planted(telling(MANY, "object", 0.01))
-    (one,) = run_tasks(store, MANY, ["object"], seeds=2)
+    (one,) = score_tasks(store, MANY, ["object"], seeds=2)
     assert one["test"] == 15 * 4 * 2 and one["groups"] == 60  # objects of the test split, both sensors; touches
     assert len(one["classes"]) == 15
     assert any("folds" in note for note in one["notes"])
@@ -117,7 +117,7 @@ def test_a_split_that_shares_objects_is_not_honest(monkeypatch):
     shared = simulated(objects=40, each=4, shared=True)
     names = shared.codes("object")
     store = planted(lambda rows: np.eye(40)[names[rows]])
-    found = run_tasks(store, shared, ["material"], seeds=2, protocols=("honest", "published"))
+    found = score_tasks(store, shared, ["material"], seeds=2, protocols=("honest", "published"))
     honest, published = found
     assert published["mean"] == 1.0 and honest["mean"] < 0.5
     assert any("groups" in note for note in honest["notes"])
@@ -135,12 +135,12 @@ def test_sensors_and_units_learned_from_and_tested(monkeypatch):
         return fitted._replace(predict=lambda rows: fits.append((x, rows)) or fitted.predict(rows))
 
     monkeypatch.setattr(heads, "fit_head", watched)
-    (one,) = run_tasks(store, MANY, ["material"], seeds=1, train_sensors=["digit"], test_sensors=["duragel"])
+    (one,) = score_tasks(store, MANY, ["material"], seeds=1, train_sensors=["digit"], test_sensors=["duragel"])
     (x, val), (_, test) = fits
     assert len(set(x[:, -1])) == len(set(test[:, -1])) == 1
     assert set(x[:, -1]) == set(val[:, -1]) != set(test[:, -1])
     assert one["test"] == 15 * 4
-    (one,) = run_tasks(store, MANY, ["material"], seeds=1, train_units=["*_0"], test_units=["digit_1"])
+    (one,) = score_tasks(store, MANY, ["material"], seeds=1, train_units=["*_0"], test_units=["digit_1"])
     assert one["test"] == 15 * 2
     assert any("*_0" in note for note in one["notes"])
 
@@ -157,16 +157,16 @@ def test_two_fingers_are_joined_row_by_row(monkeypatch):
                             label__success=int(b)))  # fmt: skip
     # A finger says its own bit in a place of its own: features (bit, is B); success is the bit of finger B.
     store = planted(lambda rows: np.array([[felt[one][1], felt[one][0]] for one in rows], float))
-    (one,) = run_tasks(store, table(rows), ["grasp"], seeds=1)
+    (one,) = score_tasks(store, table(rows), ["grasp"], seeds=1)
     assert one["mean"] == 1.0 and one["train"] == 80 and one["test"] == 100
     store = planted(lambda rows: np.array([[felt[one][1] * (not felt[one][0]), 0] for one in rows], float))
-    (blind,) = run_tasks(store, table(rows), ["grasp"], seeds=1)
+    (blind,) = score_tasks(store, table(rows), ["grasp"], seeds=1)
     assert blind["mean"] < 0.7
 
 
 def test_max_rows_is_a_fixed_chance(monkeypatch):
     store = planted(noise)
-    first, again = (run_tasks(store, MANY, ["material"], seeds=1, max_rows=200)[0] for _ in range(2))
+    first, again = (score_tasks(store, MANY, ["material"], seeds=1, max_rows=200)[0] for _ in range(2))
     assert first == again and 100 < first["train"] + first["test"] <= 200
 
 
@@ -185,10 +185,10 @@ def test_what_cannot_be_probed_is_refused():
         ("cam0_", WORLD, "material", {"test_units": ["cam0_*"]}),
     ):
         with pytest.raises(UserError) as error:
-            run_tasks(planted(noise), world, [task], **{"seeds": 1} | options)
+            score_tasks(planted(noise), world, [task], **{"seeds": 1} | options)
         assert word in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(UserError, match="material"):
-        run_tasks(planted(lambda rows: np.full((len(rows), 3), np.nan)), WORLD, ["material"])
+        score_tasks(planted(lambda rows: np.full((len(rows), 3), np.nan)), WORLD, ["material"])
 
 
 # Real pictures and a real, untrained encoder.
@@ -223,21 +223,21 @@ def counted(monkeypatch) -> list[int]:
 
 def test_nothing_is_encoded_twice(monkeypatch, encoder, pictures, tmp_path):
     passes = counted(monkeypatch)
-    first = run_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
+    first = score_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
     assert passes == [32]  # one pass for both tasks: they take the same rows
-    again = run_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
+    again = score_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
     assert passes == [32] and first == again
-    run_tasks(encoder, pictures, ["material", "force"], cache=tmp_path, seeds=1, frames=1)
+    score_tasks(encoder, pictures, ["material", "force"], cache=tmp_path, seeds=1, frames=1)
     new = np.setdiff1d(select(pictures, TASKS["force"]).rows, select(pictures, TASKS["material"]).rows)
     assert passes == [32, len(new)]  # what is known is not read again
     assert len(list(tmp_path.iterdir())) == 1
-    run_tasks(encoder, pictures, ["force"], cache=tmp_path, seeds=1)
+    score_tasks(encoder, pictures, ["force"], cache=tmp_path, seeds=1)
     assert len(passes) == 3 and len(list(tmp_path.iterdir())) == 2  # clips are something else
 
 
 def test_a_sensor_that_training_never_saw_is_noted(encoder, pictures):
     some = replace(encoder, trained_sensors=("digit",))  # the table of the model has it
-    (found,) = run_tasks(some, pictures, ["material"], seeds=1)
+    (found,) = score_tasks(some, pictures, ["material"], seeds=1)
     assert any("duragel" in note for note in found["notes"])
 
 
@@ -248,18 +248,18 @@ def test_classes_that_were_never_learned_are_told(monkeypatch):
             label__material="ab"[i % 2] if i < 40 else "ac"[i % 2])
         for i in range(60)
     ]  # fmt: skip
-    (found,) = run_tasks(store, table(rows), ["material"], seeds=1)
+    (found,) = score_tasks(store, table(rows), ["material"], seeds=1)
     assert any("10 test rows" in note and note.endswith("c") for note in found["notes"])
 
 
 def test_raw_pixels_see_the_force_and_their_own_cache(pictures, tmp_path):
-    (one,) = run_tasks(None, pictures, ["force"], seeds=1, cache=tmp_path)
+    (one,) = score_tasks(None, pictures, ["force"], seeds=1, cache=tmp_path)
     assert one["mean"] > 0.9 and one["frames"] == 3
     (file,) = tmp_path.iterdir()
     stamp = file.stat().st_mtime_ns
-    assert run_tasks(None, pictures, ["force"], seeds=1, cache=tmp_path) == [one]
+    assert score_tasks(None, pictures, ["force"], seeds=1, cache=tmp_path) == [one]
     assert file.stat().st_mtime_ns == stamp
-    (still,) = run_tasks(None, pictures, ["force"], seeds=1, frames=1)
+    (still,) = score_tasks(None, pictures, ["force"], seeds=1, frames=1)
     assert (still["frames"], still["test"]) == (1, one["test"])
     store = feature_cache.pixel_features(pictures)
     assert store.get(np.array([[2]]), 1).shape == (1, 2 * 2304) and store.get(np.array([[2]]), 3).shape == (1, 4 * 2304)
@@ -408,10 +408,10 @@ def test_a_task_that_cannot_be_probed_leaves_the_others(tmp_path):
 
 def test_a_fit_that_does_not_converge_is_told_of(monkeypatch):
     store = planted(telling(MANY, "material", noise=1.0))
-    (one,) = run_tasks(store, MANY, ["material"], seeds=2)
+    (one,) = score_tasks(store, MANY, ["material"], seeds=2)
     assert not any("converge" in note for note in one["notes"])
     monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 1)
-    (one,) = run_tasks(store, MANY, ["material"], seeds=2)
+    (one,) = score_tasks(store, MANY, ["material"], seeds=2)
     assert one["notes"][-1].endswith("fits did not converge")
 
 

@@ -119,13 +119,13 @@ def encoder_features(
 
 def pixel_features(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> FeatureStore:
     """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
-    backgrounds: dict[Path, Array] = {}
+    backgrounds: dict[Path, Any] = {}
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
         windows = reorder_frames(clips[np.searchsorted(clips[:, -1], rows)], rows, order)
         single, places = np.unique(windows, return_inverse=True)
-        pixels = np.stack([_row_pixels(table, int(row), backgrounds) for row in single])
+        pixels = np.stack([raw_pixels(*_read_pair(table, int(row), _same_size, backgrounds)) for row in single])
         last, differences = np.split(pixels, 2, axis=1)
         places = places.reshape(windows.shape)
         return np.concatenate([last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1)
@@ -240,17 +240,19 @@ def raw_pixels(frame: Array, background: Array | None, size: Size = SMALL) -> Ar
     return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background, size)])
 
 
-def _row_pixels(table: Manifest, row: int, backgrounds: dict[Path, Array]) -> Array:
-    """Return `raw_pixels` of a manifest row; `backgrounds` caches what many rows share."""
-    frame, background = _same_size(read_image(table, row)), None
-    if table.value(row, "background_path") is not None:
-        file = table.file(row, "background_path")
-        if file not in backgrounds:
-            if len(backgrounds) >= 256:  # 230 kB each
-                backgrounds.clear()
-            backgrounds[file] = _same_size(read_image(table, row, "background_path"))
-        background = backgrounds[file]
-    return raw_pixels(frame, background)
+def _read_pair(
+    table: Manifest, row: int, prepare: Callable[[Array], Any], backgrounds: dict[Path, Any]
+) -> tuple[Any, Any]:
+    """Return a row's prepared frame and background (None without one); `backgrounds` caches what many rows share."""
+    frame = prepare(read_image(table, row))
+    if table.value(row, "background_path") is None:
+        return frame, None
+    file = table.file(row, "background_path")
+    if file not in backgrounds:
+        if len(backgrounds) >= 256:  # 230 kB each
+            backgrounds.clear()
+        backgrounds[file] = prepare(read_image(table, row, "background_path"))
+    return frame, backgrounds[file]
 
 
 def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> Array:
@@ -258,19 +260,19 @@ def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> A
 
     Raises UserError that names a row without a background, or whose background has other proportions.
     """
-    backgrounds: dict[Path, tuple[Array, float]] = {}
+    backgrounds: dict[Path, Any] = {}
     values = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
+
+    def prepare(image: Array) -> tuple[Array, float]:
+        return _small(image, size), image.shape[1] / image.shape[0]
+
     for place, row in enumerate(map(int, rows)):
-        if table.value(row, "background_path") is None:
+        (frame, proportion), background = _read_pair(table, row, prepare, backgrounds)
+        if background is None:
             raise UserError(f"{table.where(row)} has no background_path. Add one, or leave this baseline out.")
-        file = table.file(row, "background_path")
-        if file not in backgrounds:
-            background = read_image(table, row, "background_path")
-            backgrounds[file] = _small(background, size), background.shape[1] / background.shape[0]
-        frame, (small, proportion) = read_image(table, row), backgrounds[file]
-        if abs(frame.shape[1] / frame.shape[0] / proportion - 1) > 0.05:
+        if abs(proportion / background[1] - 1) > 0.05:
             raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame.")
-        values[place] = _small(frame, size) - small
+        values[place] = frame - background[0]
     return values
 
 

@@ -206,7 +206,7 @@ def probe_benchmark(
     return _report(table, data, sources, plans, settings, sides, {}, setting.paper, out, log)
 
 
-def run_tasks(
+def score_tasks(
     encoder: Encoder | FeatureStore | None, table: Manifest, names: Sequence[str | Task], *, cache: Path | None = None,
     seeds: int = 5, frames: int | None = None, pooling: Pooling = "class", join: Join = "mean",
     protocols: Sequence[Protocol] = ("honest",), order: Order = "right", head_names: Sequence[HeadName] = ("linear",),

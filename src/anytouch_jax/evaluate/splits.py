@@ -14,7 +14,7 @@ from anytouch_jax.evaluate.statistics import Protocol
 Array = npt.NDArray[Any]
 
 FOLDS = 5
-SELECT_ROWS = 20_000  # a penalty (or k, or an epoch) is selected on so many rows; the reported fit has all rows
+SELECT_ROWS = 20_000  # a penalty or k is selected on so many rows; the reported fit has all rows
 
 
 class Split(NamedTuple):

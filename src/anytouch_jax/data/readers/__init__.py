@@ -40,7 +40,7 @@ __all__ = ["READERS", "DatasetError", "DatasetIndex", "DatasetReader", "IndexOpt
 
 _MODULES = (touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel, objectfolder,
             real_touch, taxim_presses, recordings)  # fmt: skip
-READERS: dict[str, DatasetReader] = {module.READER.name: module.READER for module in _MODULES}
+READERS: dict[str, DatasetReader] = {module.__name__.rpartition(".")[2]: module.READER for module in _MODULES}
 _INDEX_KEY = b"anytouch.index"  # in the schema of a Parquet file: the content hash with which `index` wrote it
 _OTHER_OUT = "name another file with --out, in a folder that contains the data"
 _FROM_FILES = ("path", "sequence", "frame_index", "stride")  # columns that come from the files, never from the user
@@ -80,7 +80,7 @@ class IndexReport:
             "sensors: " + ", ".join(f"{name} {count:,}" for name, count in self.sensors.items()),
             f"touch frames {self.frames:,}; {paper}",
             f"with photograph {self.with_image:,}, with text {self.with_text:,}, in a touch pair {self.with_touch:,}",
-            f"licence: {reader.license}; {use}",
+            f"licence: {reader.license}; {use}" + (f" ({reader.url})" if reader.url else ""),
             f"to be cited: {reader.citation}",
             *(f"left out or noted, {reason}: {count:,} (first: {example})"
               for reason, (count, example) in self.skipped.items()),
@@ -100,8 +100,8 @@ def index(
     """Read the dataset `name` in the folder `root` and write its manifest to `out` (default: ROOT/<name>.parquet).
 
     `out` must be in `root` or above it, because a manifest's paths may not leave its folder. With `keep` an edited
-    manifest at `out` keeps its columns and values. Raises UserError for a folder that is not the dataset, an option
-    that the reader does not use, a manifest that cannot be written, and an edited manifest that would be lost.
+    manifest at `out` keeps its columns and values. Raises UserError for a folder that is not the dataset and for an
+    option that the reader does not use. It also does so if the manifest cannot be written, or if edits would be lost.
     """
     reader, options = _reader_of(name), options or IndexOptions()
     base = Path(root).expanduser().resolve()
@@ -124,7 +124,7 @@ def index(
     if not size:
         reasons = "; ".join(f"{reason}: {count} (first: {first})" for reason, (count, first) in rows.skipped.items())
         raise DatasetError(f"{base} has no frame of {name} that could be used. Left out: {reasons or 'nothing'}")
-    constant = {"dataset": reader.name, "license": reader.license, "commercial": reader.commercial}
+    constant = {"dataset": name, "license": reader.license, "commercial": reader.commercial}
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
     manifest = manifests.from_columns(_below(columns, base, target.parent), target)
     manifest.clips(2)  # raises for a repeated frame
@@ -237,7 +237,7 @@ def _carry_over(new: Manifest, target: Path, notes: list[str], *, keep: bool, gr
 
 
 def _is_as_written(old: Manifest, target: Path) -> bool:
-    """Whether nobody edited a Parquet file since `index` wrote it."""
+    """Return whether a Parquet file is unedited since `index` wrote it."""
     if target.suffix.lower() != ".parquet":
         return False
     return (pa.parquet.read_schema(target).metadata or {}).get(_INDEX_KEY) == old.content_hash.encode()

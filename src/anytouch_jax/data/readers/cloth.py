@@ -58,10 +58,7 @@ def _labels(values: object, table: Path | None, cloth: str) -> dict[str, int]:
 
 
 READER = DatasetReader(
-    name="cloth",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="http://data.csail.mit.edu/active_clothing/Data_ICRA18.tar",
     citation="Yuan et al., Active Clothing Material Perception using Tactile Sensing and Deep Learning, ICRA 2018",
     uses=("val", "test", "lists"),

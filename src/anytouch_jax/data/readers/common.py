@@ -57,19 +57,22 @@ class IndexOptions:
 class DatasetReader:
     """A dataset: how to read it, and facts about it.
 
-    `read` adds the rows of a `DatasetIndex`. `commercial` is False if no licence is stated. `paper` is the number of
-    contact frames in the paper's dataset table, None if it is not there.
+    `read` adds the rows of a `DatasetIndex`. `paper` is the number of contact frames in the paper's dataset table, None
+    if it is not there.
     """
 
-    name: str
     read: Callable[[DatasetIndex], None]
-    license: str
-    commercial: bool
     citation: str
+    license: str = "not stated"
     url: str = ""
     uses: tuple[str, ...] = ("val", "test")
     paper: int | None = None
     paper_note: str = ""
+
+    @property
+    def commercial(self) -> bool:
+        """Whether the licence allows commercial use."""
+        return self.license in ("MIT", "CC-BY-4.0")
 
 
 class DatasetIndex:

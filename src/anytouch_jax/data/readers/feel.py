@@ -214,10 +214,7 @@ def _write_grasp(folder: Path, number: int, grasp: Any) -> None:
 
 
 READER = DatasetReader(
-    name="feel",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="https://sites.google.com/view/the-feeling-of-success",
     citation="Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, CoRL 2017",
     uses=("val", "test", "lists", "fold", "export"),

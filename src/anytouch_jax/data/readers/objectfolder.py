@@ -77,10 +77,8 @@ def _lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple[int, int], s
 
 
 READER = DatasetReader(
-    name="objectfolder",
-    read=read,
+    read,
     license="CC-BY-4.0",
-    commercial=True,
     url="https://github.com/rhgao/ObjectFolder",
     citation="Gao et al., ObjectFolder, CoRL 2021; ObjectFolder 2.0, CVPR 2022",
     uses=("lists",),

@@ -78,10 +78,8 @@ def _views(
 
 
 READER = DatasetReader(
-    name="objectfolder_real",
-    read=read,
+    read,
     license="CC-BY-4.0",
-    commercial=True,
     url="https://objectfolder.stanford.edu/objectfolder-real-download",
     citation="Gao et al., The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, CVPR 2023",
     uses=("val", "test", "lists"),

@@ -60,10 +60,7 @@ def _published_splits(index: DatasetIndex, base: Path) -> dict[str, str]:
 
 
 READER = DatasetReader(
-    name="octopi",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="https://github.com/clear-nus/octopi",
     citation="Yu et al., Octopi: Object Property Reasoning with Large Tactile-Language Models, RSS 2024",
     uses=("val", "test", "lists"),

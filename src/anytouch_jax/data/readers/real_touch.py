@@ -33,10 +33,8 @@ def read(index: DatasetIndex) -> None:
 
 
 READER = DatasetReader(
-    name="real_touch",
-    read=read,
+    read,
     license="by row",
-    commercial=False,
     citation="the sources named in the pack's read-me",
     uses=(),
 )

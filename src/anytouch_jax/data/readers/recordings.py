@@ -239,10 +239,8 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
 
 
 READER = DatasetReader(
-    name="recordings",
-    read=read,
+    read,
     license="as their owner says",
-    commercial=False,
     citation="nothing, unless their owner asks for it",
     uses=("val", "test", "split_by", "sensor", "labels", "export"),
 )

@@ -56,10 +56,7 @@ def _tables(index: DatasetIndex, base: Path) -> tuple[set[str], dict[str, str]]:
 
 
 READER = DatasetReader(
-    name="ssvtp",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="https://sites.google.com/berkeley.edu/ssvtp",
     citation="Kerr et al., Self-Supervised Visuo-Tactile Pretraining to Locate and Follow Garment Features, RSS 2023",
     paper=4_500,

@@ -106,10 +106,7 @@ def _photos(index: DatasetIndex, folder: str, numbers: list[int]) -> list[str | 
 
 
 READER = DatasetReader(
-    name="tacquad",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="https://huggingface.co/datasets/xxuan01/TacQuad",
     citation="Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple Visuo-tactile "
     "Sensors, ICLR 2025",

@@ -20,7 +20,7 @@ import numpy as np
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 from anytouch_jax.files import atomic_write
 
-FOLDER = "taxim_presses"
+FOLDER = "taxim_presses"  # in ROOT
 
 
 def read(index: DatasetIndex) -> None:
@@ -71,10 +71,8 @@ def _save(path: Path, image: np.ndarray) -> None:
 
 
 READER = DatasetReader(
-    name=FOLDER,
-    read=read,
+    read,
     license="MIT",
-    commercial=True,
     url="https://pypi.org/project/taxim",
     citation="Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L 2022",
     uses=("val", "test", "lists"),

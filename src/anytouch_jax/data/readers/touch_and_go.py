@@ -140,10 +140,7 @@ def _runs(numbers: list[int], together: Callable[[int, int], bool]) -> list[list
 
 
 READER = DatasetReader(
-    name="touch_and_go",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="https://touch-and-go.github.io",
     citation="Yang et al., Touch and Go: Learning from Human-Collected Vision and Touch, NeurIPS 2022",
     uses=("lists", "task"),

@@ -201,10 +201,7 @@ def _thumb(picture: np.ndarray) -> np.ndarray:
 
 
 READER = DatasetReader(
-    name="tvl",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="https://huggingface.co/datasets/mlfu7/Touch-Vision-Language-Dataset",
     citation="Fu et al., A Touch, Vision, and Language Dataset for Multimodal Alignment, ICML 2024",
     paper=39_000,

@@ -48,10 +48,7 @@ def _add_recording(index: DatasetIndex, place: str, inside: str, files: list[str
 
 
 READER = DatasetReader(
-    name="visgel",
-    read=read,
-    license="not stated",
-    commercial=False,
+    read,
     url="http://visgel.csail.mit.edu",
     citation="Li et al., Connecting Touch and Vision via Cross-Modal Prediction, CVPR 2019",
     uses=("val", "test", "lists"),

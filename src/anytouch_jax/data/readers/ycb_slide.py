@@ -34,10 +34,8 @@ def read(index: DatasetIndex) -> None:
 
 
 READER = DatasetReader(
-    name="ycb_slide",
-    read=read,
+    read,
     license="MIT",
-    commercial=True,
     url="https://github.com/rpl-cmu/YCB-Slide",
     citation="Suresh et al., MidasTouch: Monte-Carlo inference over distributions across sliding touch, CoRL 2022",
     paper=183_000,

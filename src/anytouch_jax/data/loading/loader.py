@@ -52,9 +52,13 @@ class Loader:
             raise UserError(f"devices must be 1 or more, not {devices}")
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
         size, groups = config.data.batch_size, config.objective.groups
+        self._seed, self._match_size = config.run.seed % 2**63, size
+        if config.data.split_steps:
+            self._match_size = max(1, size // 2)
+        self._in_batch_negatives = config.model.match_head == "cosine"  # instead of a third touch
         if config.stage == 2 and size % groups:
             raise UserError(f"a batch of {size} does not divide by --objective.groups {groups}")
-        if config.stage == 2 and config.model.match_head == "cosine" and self._match_size % groups:
+        if config.stage == 2 and self._in_batch_negatives and self._match_size % groups:
             raise UserError(f"{self._match_size} touches to match do not divide by --objective.groups {groups}")
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
@@ -62,6 +66,11 @@ class Loader:
         self._pools, self._match_pools, self._sensor, self.tokenizer, self.notes = find_pools(
             manifest, config, tokenizer, devices
         )
+        # Batches are drawn from these pools: of stills and clips, or of clips only.
+        clips_only = len(self._pools) > 1 and config.data.clip_share == 1
+        self._drawn = self._pools[1:] if clips_only else self._pools
+        still, clip = self._match_pools
+        self._drawn_matches = [pool for pool in ((clip,) if clip and clips_only else (still, clip)) if pool]
         self._text_length = self._caption_length()
         self._align_share = self._share_of_align_steps()
         self._align, self._match = StepSchedule(self._align_kinds), StepSchedule(self._match_kinds)
@@ -99,27 +108,6 @@ class Loader:
         """
         return prefetch_batches(self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch)
 
-    # The schedule: which kind of batch a step takes -----------------------------------------------------------------
-
-    @property
-    def _drawn(self) -> tuple[Pool, ...]:
-        return self._pools[1:] if self._clips_only else self._pools
-
-    @property
-    def _drawn_matches(self) -> list[MatchPool]:
-        still, clip = self._match_pools
-        chosen = (clip,) if clip is not None and self._clips_only else (still, clip)
-        return [pool for pool in chosen if pool is not None]
-
-    @property
-    def _clips_only(self) -> bool:
-        return len(self._pools) > 1 and self.config.data.clip_share == 1
-
-    @property
-    def _match_size(self) -> int:
-        size = self.config.data.batch_size
-        return max(1, size // 2) if self.config.data.split_steps else size
-
     def _share_of_align_steps(self) -> float:
         """Return 1, or in separate steps (release) the share of align batches among all batches of an epoch."""
         pools = self._drawn_matches
@@ -134,21 +122,18 @@ class Loader:
             return (np.floor((steps + 1) * share) > np.floor(steps * share)).astype(np.int8)
         return (uniform_per_step(self.config.run.seed, _KIND, steps) < share).astype(np.int8)
 
-    def _aligns(self, steps: np.ndarray) -> np.ndarray:
-        return uniform_per_step(self.config.run.seed, _PART, steps) < self._align_share
-
     def _align_kinds(self, steps: np.ndarray) -> np.ndarray:
-        return np.where(self._aligns(steps), self._kinds(steps), _NONE)
+        aligns = uniform_per_step(self.config.run.seed, _PART, steps) < self._align_share
+        return np.where(aligns, self._kinds(steps), _NONE)
 
     def _match_kinds(self, steps: np.ndarray) -> np.ndarray:
         if self._match_pools[STILL] is None:
             return np.full(len(steps), _NONE)
         kinds = self._kinds(steps) if self._match_pools[CLIP] is not None else np.full(len(steps), STILL)
-        return np.where(self._aligns(steps), _NONE, kinds) if self.config.data.split_steps else kinds
-
-    # The plan: an empty batch, and a job for each slot --------------------------------------------------------------
+        return np.where(self._align_kinds(steps) == _NONE, kinds, _NONE) if self.config.data.split_steps else kinds
 
     def _plan(self, step: int) -> BatchJobs[Batch]:
+        """Return an empty batch, and a job for each slot that reads and writes one sample."""
         align_kind, align_rank = self._align.at(step)
         match_kind, match_rank = self._match.at(step)
         align = self._plan_align(step, self._pools[align_kind], align_rank) if align_kind != _NONE else None
@@ -212,15 +197,6 @@ class Loader:
             jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch))
         return BatchJobs(batch, jobs)
 
-    @property
-    def _seed(self) -> int:
-        return self.config.run.seed % 2**63
-
-    @property
-    def _in_batch_negatives(self) -> bool:
-        """Whether the other pairs of the batch are the negatives, so that no third touch is read."""
-        return self.config.model.match_head == "cosine"
-
     def _gallery_sensor(self, step: int, pool: MatchPool) -> int | None:
         """Return the one sensor of all positives of a step, for in-batch negatives of the positive's sensor.
 
@@ -261,8 +237,6 @@ class Loader:
         else:
             text, mask = self.tokenizer.encode([""] * len(text_row), length)
         return image, image_row, text, mask, text_row
-
-    # The jobs: one sample into its slot -----------------------------------------------------------------------------
 
     def _write_align(self, batch: AlignBatch, pool: Pool, stratum: int, slot: Slots, index: int, epoch: int) -> None:
         rows = pool.windows[pool.members[stratum][index]]

@@ -115,8 +115,13 @@ def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, 
         notes += note
         if match[STILL] and match[CLIP] is None and len(touch) > 1:
             notes.append("no two clips share a touch: matching uses stills only")
-    if config.stage == 2:
-        _check_signal(config, touch, match)
+    has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
+    if config.stage == 2 and not (has_modality or any(match) or config.objective.reconstruct):
+        raise UserError(
+            f"stage 2 has nothing to learn from split {data.split!r}: it needs photographs (image_path), captions "
+            "(text), or places touched by two sensors (touch), with the tower or head for them; add one, or train "
+            "stage 1"
+        )
     return Pools(touch, match, usable.sensor, tokenizer, notes)
 
 
@@ -178,30 +183,8 @@ def _match_pools(
     return (still, clip), notes
 
 
-def _check_signal(config: Config, touch: tuple[Pool, ...], match: tuple[MatchPool | None, ...]) -> None:
-    """Raise UserError if the loss of stage 2 would be 0 at every step."""
-    has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
-    if not has_modality and not any(match) and not config.objective.reconstruct:
-        raise UserError(
-            f"stage 2 has nothing to learn from split {config.data.split!r}: it needs photographs (image_path), "
-            "captions (text), or places touched by two sensors (touch), with the tower or head for them; add one, or "
-            "train stage 1"
-        )
-
-
 def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]]:
-    rows, sensor, notes = _known_rows(manifest, config)
-    weights, note = _weights(manifest, config, rows)
-    notes += note
-    if weights is not None:
-        rows = rows[weights[rows] > 0]
-        sensor = np.where(weights > 0, sensor, -1)
-    rows, ends, note = _required(manifest, config, rows)
-    return _Usable(sensor, rows, weights, ends, *_modalities(manifest, config)), notes + note
-
-
-def _known_rows(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the rows of the split with images of a known sensor, the sensor-table row of every row, and notes."""
+    """Return the rows of the split with images of a known sensor, a weight, and all that is required; and notes."""
     split, on_bad = config.data.split, config.data.on_bad_sample
     rows = manifest.rows_of(split)
     sensor, notes = sensor_rows(manifest, config.model, rows, unknown=on_bad)
@@ -221,7 +204,17 @@ def _known_rows(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndar
             sensor = sensor.copy()
             sensor[missing] = -1
             rows = rows[sensor[rows] >= 0]
-    return rows, sensor, notes
+    weights, note = _weights(manifest, config, rows)
+    notes += note
+    if weights is not None:
+        rows, sensor = rows[weights[rows] > 0], np.where(weights > 0, sensor, -1)
+    rows, ends, note = _required(manifest, config, rows)
+    text = manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
+    model, none = config.model, np.zeros(len(manifest), bool)
+    has_image = manifest.present("image_path") if config.stage == 2 and model.image else none
+    return _Usable(
+        sensor, rows, weights, ends, has_image, text if config.stage == 2 and model.text else none
+    ), notes + note
 
 
 def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
@@ -270,17 +263,6 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
         raise UserError(f"--data.weights leaves out every row of split {split!r}")
     counts = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
     return weights, [f"an epoch draws {counts}, other datasets once"]
-
-
-def _modalities(manifest: Manifest, config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """Return which rows of the manifest have a photograph and a caption that the model has a tower for."""
-    model, none = config.model, np.zeros(len(manifest), bool)
-    if config.stage == 1:
-        return none, none
-    image = manifest.present("image_path") if model.image else none
-    if not model.text:
-        return image, none
-    return image, manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
 
 
 def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:

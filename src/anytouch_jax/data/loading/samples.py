@@ -49,7 +49,12 @@ class SampleReader:
         frames = [read_image(self.manifest, row, load=load) for row in rows]
         background = None
         if data.background == "subtract":
-            background = self._background(int(rows[-1]), load or self._decode_background)
+            if self.manifest.value(rows[-1], "background_path") is None:
+                raise SampleError(
+                    f"{self.manifest.where(rows[-1])} has no background_path, which --data.background subtract "
+                    "requires; add one, or pass --data.background keep"
+                )
+            background = read_image(self.manifest, rows[-1], "background_path", load or self._decode_background)
         if epoch is None or plain:
             return transforms.touch_evaluation(
                 frames if background is None else transforms.subtract_background(frames, background), size, out
@@ -87,14 +92,6 @@ class SampleReader:
             if (len(self._cache) + 1) * image.nbytes <= self.config.data.cache * 1_000_000:
                 self._cache[file] = image
         return image
-
-    def _background(self, row: int, load: Callable[[Path], np.ndarray]) -> np.ndarray:
-        if self.manifest.value(row, "background_path") is None:
-            raise SampleError(
-                f"{self.manifest.where(row)} has no background_path, which --data.background subtract requires; "
-                "add one, or pass --data.background keep"
-            )
-        return read_image(self.manifest, row, "background_path", load)
 
 
 def read_image(

@@ -199,15 +199,12 @@ def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
         raise ImageError(f"there is no video {path}")
     video = _open_video(path)
     try:
-        count = 0
-        while True:
-            success, frame = video.read()
-            if not success:
-                break
-            count += 1
-            yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-        if not count:
+        success, frame = video.read()
+        if not success:
             raise ImageError(f"{path} is not a video that can be read, or has no frame")
+        while success:
+            yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+            success, frame = video.read()
     finally:
         video.release()
 
@@ -258,7 +255,7 @@ def _suggestion(folder: Path) -> str:
 def frame_numbers(names: Sequence[str]) -> list[int]:
     """Return the numbers of frames in order.
 
-    They are the numbers at the end of the names if these count frames (a third of the steps or more are 1), so that a
+    They are the numbers at the end of the names if these count frames: a third of the steps or more are 1. Then a
     missing frame is a gap. Otherwise (time stamps) they are 0, 1, 2, ...
     """
     ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]

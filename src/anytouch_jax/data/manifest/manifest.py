@@ -380,9 +380,6 @@ def _real_folder(root: str, head: str) -> str:
     return "" if folder == "/" else folder
 
 
-# Edits ---------------------------------------------------------------------------------------------------------------
-
-
 def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
     """Return the manifest of `rows` (ids i64) in the order given; errors still name the rows of the original files."""
     rows = np.asarray(rows, np.int64)

@@ -16,7 +16,7 @@ import pyarrow.parquet
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
-from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest
+from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest, table_suffix
 from anytouch_jax.data.readers import (
     cloth,
     feel,
@@ -33,7 +33,7 @@ from anytouch_jax.data.readers import (
     visgel,
     ycb_slide,
 )
-from anytouch_jax.data.readers.common import Columns, DatasetError, DatasetIndex, DatasetReader, IndexOptions
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, IndexOptions
 from anytouch_jax.errors import UserError
 
 __all__ = ["READERS", "DatasetError", "DatasetIndex", "DatasetReader", "IndexOptions", "IndexReport", "index"]
@@ -48,38 +48,48 @@ _FROM_FILES = ("path", "sequence", "frame_index", "stride")  # columns that come
 
 @dataclass(frozen=True)
 class IndexReport:
-    """Counts of one run of `index`, the skipped files (reason -> count, example), and sentences for the user."""
+    """One run of `index`: its manifest `out`, the skipped files (reason -> count, example), sentences for the user."""
 
     reader: DatasetReader
     out: Path
-    rows: int
-    sequences: int
-    splits: dict[str, int]
-    sensors: dict[str, int]
-    with_image: int
-    with_text: int
-    with_touch: int
+    manifest: Manifest
     skipped: dict[str, tuple[int, str]]
     notes: list[str]
-    content_hash: str
+
+    @property
+    def splits(self) -> dict[str, int]:
+        """Rows of each split."""
+        counts = Counter(self.manifest.table["split"].to_pylist())
+        return {split: counts[split] for split in SPLITS if counts[split]}
+
+    @property
+    def sensors(self) -> dict[str, int]:
+        """Rows of each sensor."""
+        return dict(sorted(Counter(self.manifest.table["sensor"].to_pylist()).items()))
 
     @property
     def frames(self) -> int:
         """Touch frames: rows that are neither background nor unused."""
-        return self.rows - self.splits.get("background", 0) - self.splits.get("unused", 0)
+        return sum(count for split, count in self.splits.items() if split not in ("background", "unused"))
+
+    @property
+    def content_hash(self) -> str:
+        """The content hash of the manifest."""
+        return self.manifest.content_hash
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        reader = self.reader
-        counts = ", ".join(f"{name} {count:,}" for name, count in self.splits.items())
+        reader, manifest = self.reader, self.manifest
+        splits = ", ".join(f"{name} {count:,}" for name, count in self.splits.items())
+        image, text, touch = (int(manifest.present(name).sum()) for name in ("image_path", "text", "touch"))
         share = f" ({reader.paper_note})" if reader.paper_note else ""
         paper = f"{reader.paper:,} in the paper{share}" if reader.paper else "no count in the paper"
         use = "commercial use allowed" if reader.commercial else "no commercial use unless its owner allows it"
         return [
-            f"{self.out}: {self.rows:,} rows of {self.sequences:,} sequences ({counts})",
+            f"{self.out}: {len(manifest):,} rows of {manifest.codes('sequence').max() + 1:,} sequences ({splits})",
             "sensors: " + ", ".join(f"{name} {count:,}" for name, count in self.sensors.items()),
             f"touch frames {self.frames:,}; {paper}",
-            f"with photograph {self.with_image:,}, with text {self.with_text:,}, in a touch pair {self.with_touch:,}",
+            f"with photograph {image:,}, with text {text:,}, in a touch pair {touch:,}",
             f"licence: {reader.license}; {use}" + (f" ({reader.url})" if reader.url else ""),
             f"to be cited: {reader.citation}",
             *(f"left out or noted, {reason}: {count:,} (first: {example})"
@@ -103,7 +113,11 @@ def index(
     manifest at `out` keeps its columns and values. Raises UserError for a folder that is not the dataset and for an
     option that the reader does not use. It also does so if the manifest cannot be written, or if edits would be lost.
     """
-    reader, options = _reader_of(name), options or IndexOptions()
+    if name not in READERS:
+        near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
+        guess = f"; did you mean {near[0]}?" if near else ""
+        raise UserError(f"no reader is called {name!r}{guess} There are: {', '.join(READERS)}")
+    reader, options = READERS[name], options or IndexOptions()
     base = Path(root).expanduser().resolve()
     if not base.is_dir():
         problem = f"{base} is a file" if base.exists() else f"there is no folder {base}"
@@ -126,7 +140,10 @@ def index(
         raise DatasetError(f"{base} has no frame of {name} that could be used. Left out: {reasons or 'nothing'}")
     constant = {"dataset": name, "license": reader.license, "commercial": reader.commercial}
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
-    manifest = manifests.from_columns(_below(columns, base, target.parent), target)
+    above = base.relative_to(target.parent)
+    for column in set(PATHS) & columns.keys() if above != Path() else ():
+        columns[column] = [path and f"{above.as_posix()}/{path}" for path in columns[column]]
+    manifest = manifests.from_columns(columns, target)
     manifest.clips(2)  # raises for a repeated frame
     _check_links(manifest, base)
     groups = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
@@ -137,39 +154,12 @@ def index(
     except OSError as error:
         raise UserError(f"the manifest {target} cannot be written: {error.strerror}; {_OTHER_OUT}") from None
     rows.notes += [sentence for _, sentence, _ in manifests.misspelt_sensors(manifest)]
-    return _report(reader, target, manifest, rows)
-
-
-def _reader_of(name: str) -> DatasetReader:
-    if name not in READERS:
-        near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
-        guess = f"; did you mean {near[0]}?" if near else ""
-        raise UserError(f"no reader is called {name!r}{guess} There are: {', '.join(READERS)}")
-    return READERS[name]
-
-
-def _report(reader: DatasetReader, target: Path, manifest: Manifest, rows: DatasetIndex) -> IndexReport:
-    splits = Counter(manifest.table["split"].to_pylist())
-    return IndexReport(
-        reader=reader,
-        out=target,
-        rows=len(manifest),
-        sequences=int(manifest.codes("sequence").max()) + 1,
-        splits={split: splits[split] for split in SPLITS if splits[split]},
-        sensors=dict(sorted(Counter(manifest.table["sensor"].to_pylist()).items())),
-        with_image=int(manifest.present("image_path").sum()),
-        with_text=int(manifest.present("text").sum()),
-        with_touch=int(manifest.present("touch").sum()),
-        skipped=dict(sorted(rows.skipped.items())),
-        notes=rows.notes,
-        content_hash=manifest.content_hash,
-    )
+    return IndexReport(reader, target, manifest, dict(sorted(rows.skipped.items())), rows.notes)
 
 
 def _target(base: Path, name: str, out: str | Path | None) -> Path:
     target = Path(out).expanduser().resolve() if out is not None else base / f"{name}.parquet"
-    if target.suffix.lower() not in (".csv", ".parquet"):
-        raise UserError(f"{target}: a manifest ends in .csv or .parquet")
+    table_suffix(target)
     if not base.is_relative_to(target.parent):
         raise UserError(
             f"the manifest {target} must lie in {base} or in a folder above it, because its paths may not leave its "
@@ -184,15 +174,6 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
     return target
 
 
-def _below(columns: Columns, base: Path, folder: Path) -> Columns:
-    """Return columns with paths relative to `folder`, which is `base` or above it."""
-    prefix = base.relative_to(folder).as_posix()
-    if prefix == ".":
-        return columns
-    paths = {name: [path and f"{prefix}/{path}" for path in columns[name]] for name in PATHS if name in columns}
-    return columns | paths
-
-
 def _check_links(manifest: Manifest, base: Path) -> None:
     """Raise UserError for a folder that is a link out of ROOT, because none of its rows could be read."""
     root = manifest.files[0].parent
@@ -201,9 +182,6 @@ def _check_links(manifest: Manifest, base: Path) -> None:
         place = (root / folder).resolve()
         if not place.is_relative_to(root.resolve()):
             raise UserError(f"{root / folder} leads out of {base}, to {place}; give the folder that really holds it")
-
-
-# Edited manifests ----------------------------------------------------------------------------------------------------
 
 
 def _carry_over(new: Manifest, target: Path, notes: list[str], *, keep: bool, groups: Collection[str]) -> Manifest:

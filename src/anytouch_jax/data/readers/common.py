@@ -96,8 +96,6 @@ class DatasetIndex:
             before, first = self.skipped.get(reason, (0, example))
             self.skipped[reason] = before + count, first
 
-    # Folders and files -----------------------------------------------------------------------------------------------
-
     def find_folder(self, *choices: str, inside: Sequence[str] = ()) -> Path:
         """Return the first of the folders `choices` under the root that exists and holds one of `inside` (if any).
 
@@ -166,8 +164,6 @@ class DatasetIndex:
             else:
                 frames[int(parts[1])] = name
         return sorted(frames.items())
-
-    # Rows ------------------------------------------------------------------------------------------------------------
 
     def split_of(self, group: str) -> str:
         """Return the hash split of a group (an object or a recording) of this dataset."""

@@ -144,9 +144,6 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Fr
     }
 
 
-# Videos --------------------------------------------------------------------------------------------------------------
-
-
 def _is_video(name: str) -> bool:
     return Path(name).suffix.lower() in VIDEOS
 
@@ -180,9 +177,6 @@ def _write_frames(index: DatasetIndex, video: Path) -> None:
             count += 1
     if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
         index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
-
-
-# Labels --------------------------------------------------------------------------------------------------------------
 
 
 def _join_labels(index: DatasetIndex, path: Path) -> None:

@@ -184,15 +184,6 @@ def _import_openai() -> Any:
     return openai
 
 
-class _Answer(NamedTuple):
-    """The text of an answer, the finish reason, and the tokens that the server counted (0 if it does not say)."""
-
-    text: str
-    finish: str
-    tokens_in: int
-    tokens_out: int
-
-
 class _Client:
     """The openai client for one endpoint. The key is read once and removed from every message."""
 
@@ -208,8 +199,11 @@ class _Client:
         )  # fmt: skip
         return client
 
-    async def ask(self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]) -> _Answer:
-        """Return the answer to a chat. Raises _QuestionError, BadAnswer, or EndpointError if no try can help."""
+    async def ask(self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]) -> tuple[str, str, int, int]:
+        """Return an answer's text without the key, its finish reason, and the tokens in and out (0 if unknown).
+
+        Raises _QuestionError, BadAnswer, or EndpointError if no try can help.
+        """
         end = self.endpoint
         body: dict[str, Any] = {"model": end.model, "messages": messages, end.token_field: end.max_tokens}
         if end.temperature is not None:
@@ -226,10 +220,11 @@ class _Client:
             reason = f"the endpoint cannot be reached: {error.__cause__ or error}"
         except self._openai.APIStatusError as error:
             reason = self._judge(error)
-        except (ValueError, RecursionError):  # not JSON
-            return _parse_reply(None)
+        except (ValueError, RecursionError):
+            raise BadAnswer("not JSON") from None
         else:
-            return _parse_reply(reply)
+            text, finish, tokens_in, tokens_out = _parse_reply(reply)
+            return self.redact(text), finish, tokens_in, tokens_out
         raise _QuestionError(f"{self.redact(reason)} (at most {end.tries} tries)")
 
     def redact(self, text: str) -> str:
@@ -248,7 +243,7 @@ class _Client:
         return reason
 
 
-def _parse_reply(reply: Any) -> _Answer:
+def _parse_reply(reply: Any) -> tuple[str, str, int, int]:
     try:
         choice = reply["choices"][0]
         message, usage = choice["message"], reply.get("usage") or {}
@@ -256,8 +251,8 @@ def _parse_reply(reply: Any) -> _Answer:
         if isinstance(text, list):  # some servers answer in parts
             text = "".join(str(part.get("text", "")) for part in text)
         finish = "refusal" if refusal else str(choice.get("finish_reason") or "")
-        tokens = [int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")]
-        return _Answer(str(refusal or text or ""), finish, *tokens)
+        tokens_in, tokens_out = (int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens"))
+        return str(refusal or text or ""), finish, tokens_in, tokens_out
     except (ValueError, KeyError, IndexError, TypeError, AttributeError):
         raise BadAnswer("not a chat completion") from None
 
@@ -427,11 +422,10 @@ class _Run:
         for _ in range(_BAD_ANSWER_TRIES):
             text = ""
             try:
-                answer = await client.ask(connection, job.prompt.messages(jpegs))
-                text = client.redact(answer.text)
+                text, finish, *tokens = await client.ask(connection, job.prompt.messages(jpegs))
                 self.asked += 1
-                self.tokens = [self.tokens[0] + answer.tokens_in, self.tokens[1] + answer.tokens_out]
-                caption, named = parse_caption(text, answer.finish)
+                self.tokens = [self.tokens[0] + tokens[0], self.tokens[1] + tokens[1]]
+                caption, named = parse_caption(text, finish)
             except _QuestionError as error:
                 return str(error)
             except BadAnswer as error:
@@ -439,7 +433,7 @@ class _Run:
                 continue
             self.store.add(key, {
                 "model": self.endpoint.model, "prompt": job.prompt.fingerprint(), "family": job.prompt.family,
-                "caption": caption, "object": named, "tokens_in": answer.tokens_in, "tokens_out": answer.tokens_out,
+                "caption": caption, "object": named, "tokens_in": tokens[0], "tokens_out": tokens[1],
             })  # fmt: skip
             return ""
         return f"{reason} ({_BAD_ANSWER_TRIES} times)"

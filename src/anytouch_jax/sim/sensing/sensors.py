@@ -87,91 +87,40 @@ class Look(NamedTuple):
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor
     for sensor in (
-        Sensor(
-            "gelsight",
-            field=(14.16, 18.88),
-            resolution=(480, 640),
-            gel=Gel(modulus=150.0, poisson=0.48, thickness=4.0),
-            look="gelsight",
-            halo=calibration.INDENTERS["gelsight"].halo,
-            markers=Markers(pitch=1.6, radius=0.22, share=0.4),
-        ),
-        Sensor(
-            "gelsight_mini",
-            field=(14.16, 18.88),
-            resolution=(480, 640),
-            gel=Gel(modulus=180.0, poisson=0.48, thickness=4.25),
-            look="gelsight_mini",
-            halo=calibration.INDENTERS["gelsight_mini"].halo,
-            markers=Markers(pitch=1.9, radius=0.36, share=0.5, ink=(0.13, 0.15, 0.16)),
-        ),
-        Sensor(
-            "gelslim",
-            field=(15.0, 20.0),
-            resolution=(320, 427),
-            gel=Gel(modulus=220.0, poisson=0.48, thickness=2.0),
-            look=Lights(
-                ambient=(0.20, 0.32, 0.38),
-                lights=(
-                    Light((-0.70, 0.35), (0.08, 0.48, 0.24), reach=0.6, height=0.3, contrast=2.6),
-                    Light((0.25, -0.85), (0.02, 0.16, 0.54), reach=0.7, height=0.3, contrast=2.6),
-                    Light((0.35, 0.95), (0.66, 0.10, 0.22), reach=0.6, height=0.3, contrast=2.8),
-                    Light((1.10, 0.20), (0.16, 0.10, 0.20), reach=0.8, height=0.3, contrast=2.6, flat=0.0),
-                ),
-            ),
-            markers=Markers(pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12),
-            vignette=0.35,
-            halo=0.8,
-            noise=1.5,
-        ),
-        Sensor(
-            "digit",
-            field=(19.0, 14.25),
-            resolution=(320, 240),
-            gel=Gel(modulus=120.0, poisson=0.48, thickness=2.5),
-            look=Lights(
-                ambient=(0.16, 0.24, 0.24),
-                lights=(
-                    Light((-1.10, -0.20), (0.66, 0.10, 0.20), reach=0.7, height=0.5, contrast=1.5),
-                    Light((1.00, -0.10), (0.02, 0.34, 0.06), reach=0.75, height=0.5, contrast=1.4),
-                    Light((0.0, 1.10), (0.02, 0.12, 0.40), reach=1.1, height=0.4, contrast=2.6, flat=0.25),
-                    Light((0.10, -0.70), (0.36, 0.18, 0.02), reach=0.6, height=0.5, contrast=1.8, flat=0.4),
-                    Light((0.10, -1.20), (0.02, 0.08, 0.20), reach=0.5, height=0.5, contrast=0.5, flat=0.8),
-                ),
-            ),
-            vignette=0.25,
-            skin=0.12,
-            noise=2.0,
-        ),
-        Sensor(
-            "duragel",
-            field=(14.0, 18.7),
-            resolution=(480, 640),
-            gel=Gel(modulus=350.0, poisson=0.48, thickness=3.0),
-            look=Lights(
-                ambient=(0.20, 0.17, 0.24),
-                lights=(
-                    Light((-1.05, 0.0), (0.40, 0.12, 0.30), reach=1.0, height=0.5, contrast=1.8),
-                    Light((1.05, -0.1), (0.06, 0.32, 0.36), reach=1.0, height=0.5, contrast=1.8),
-                    Light((0.0, 1.05), (0.36, 0.30, 0.06), reach=0.9, height=0.5, contrast=1.8),
-                ),
-            ),
-            markers=Markers(pitch=2.2, radius=0.3, share=0.3),
-            vignette=0.2,
-            skin=0.14,
-            noise=1.2,
-        ),
-        Sensor(
-            "tac3d",
-            field=(17.0, 17.0),
-            resolution=(20, 20),
-            gel=Gel(modulus=200.0, poisson=0.48, thickness=3.0),
-            look=None,
-            kind="field",
-            noise=0.01,
-        ),
+        Sensor("gelsight", (14.16, 18.88), (480, 640), Gel(modulus=150.0, poisson=0.48, thickness=4.0), "gelsight",
+               Markers(pitch=1.6, radius=0.22, share=0.4), halo=calibration.INDENTERS["gelsight"].halo),
+        Sensor("gelsight_mini", (14.16, 18.88), (480, 640), Gel(modulus=180.0, poisson=0.48, thickness=4.25),
+               "gelsight_mini", Markers(pitch=1.9, radius=0.36, share=0.5, ink=(0.13, 0.15, 0.16)),
+               halo=calibration.INDENTERS["gelsight_mini"].halo),
+        Sensor("gelslim", (15.0, 20.0), (320, 427), Gel(modulus=220.0, poisson=0.48, thickness=2.0),
+               Lights((0.20, 0.32, 0.38), (
+                   Light((-0.70, 0.35), (0.08, 0.48, 0.24), reach=0.6, height=0.3, contrast=2.6),
+                   Light((0.25, -0.85), (0.02, 0.16, 0.54), reach=0.7, height=0.3, contrast=2.6),
+                   Light((0.35, 0.95), (0.66, 0.10, 0.22), reach=0.6, height=0.3, contrast=2.8),
+                   Light((1.10, 0.20), (0.16, 0.10, 0.20), reach=0.8, height=0.3, contrast=2.6, flat=0.0),
+               )),
+               Markers(pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12),
+               vignette=0.35, halo=0.8, noise=1.5),
+        Sensor("digit", (19.0, 14.25), (320, 240), Gel(modulus=120.0, poisson=0.48, thickness=2.5),
+               Lights((0.16, 0.24, 0.24), (
+                   Light((-1.10, -0.20), (0.66, 0.10, 0.20), reach=0.7, height=0.5, contrast=1.5),
+                   Light((1.00, -0.10), (0.02, 0.34, 0.06), reach=0.75, height=0.5, contrast=1.4),
+                   Light((0.0, 1.10), (0.02, 0.12, 0.40), reach=1.1, height=0.4, contrast=2.6, flat=0.25),
+                   Light((0.10, -0.70), (0.36, 0.18, 0.02), reach=0.6, height=0.5, contrast=1.8, flat=0.4),
+                   Light((0.10, -1.20), (0.02, 0.08, 0.20), reach=0.5, height=0.5, contrast=0.5, flat=0.8),
+               )),
+               vignette=0.25, skin=0.12, noise=2.0),
+        Sensor("duragel", (14.0, 18.7), (480, 640), Gel(modulus=350.0, poisson=0.48, thickness=3.0),
+               Lights((0.20, 0.17, 0.24), (
+                   Light((-1.05, 0.0), (0.40, 0.12, 0.30), reach=1.0, height=0.5, contrast=1.8),
+                   Light((1.05, -0.1), (0.06, 0.32, 0.36), reach=1.0, height=0.5, contrast=1.8),
+                   Light((0.0, 1.05), (0.36, 0.30, 0.06), reach=0.9, height=0.5, contrast=1.8),
+               )),
+               Markers(pitch=2.2, radius=0.3, share=0.3), vignette=0.2, skin=0.14, noise=1.2),
+        Sensor("tac3d", (17.0, 17.0), (20, 20), Gel(modulus=200.0, poisson=0.48, thickness=3.0), None, kind="field",
+               noise=0.01),
     )
-}
+}  # fmt: skip
 
 
 def find_sensor(name: str) -> Sensor:
@@ -192,7 +141,8 @@ def look(sensor: Sensor) -> Look:
     height, width = (round(120 * side / min(sensor.field)) for side in sensor.field)
     if isinstance(sensor.look, str):
         frame = calibration.read_background(sensor.look).astype(np.float32) / 255
-        return Look(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), *calibration.fit_photometry(sensor.look))
+        base = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+        return Look(base, *calibration.fit_photometry(sensor.look))
     lights, u, v = sensor.look, *np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     flat = np.zeros_like(u).ravel()
     base = np.asarray(lights.ambient) + shade(lights, flat, flat, u.ravel(), v.ravel(), flat_only=True)

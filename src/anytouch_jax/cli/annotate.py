@@ -183,7 +183,7 @@ def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
 
 
 def _print_summary(annotated: CaptionResult) -> None:
-    print(f"{annotated.asked:,} questions, {annotated.tokens_in:,} tokens in, {annotated.tokens_out:,} tokens out")
+    print(f"{annotated.requests:,} questions, {annotated.tokens_in:,} tokens in, {annotated.tokens_out:,} tokens out")
     for reason, count in annotated.left_out.items():
         print(f"left out, {reason}: {count:,} rows")
     for failure in annotated.failures[:5]:

@@ -76,7 +76,7 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
     with serve() as server:
         done = _run(loose, server, tmp_path / "answers", threads=3)
     assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
-    assert len(server.asked) == 3 and done.asked == 3 and (done.tokens_in, done.tokens_out) == (300, 60)
+    assert len(server.asked) == 3 and done.requests == 3 and (done.tokens_in, done.tokens_out) == (300, 60)
     for body, (path, headers) in zip(server.asked, server.heads, strict=True):
         assert path == "/v1/chat/completions" and headers["Authorization"] == f"Bearer {KEY}"
         assert body["model"] == "gpt-4o" and body["response_format"] == {"type": "json_object"}
@@ -96,7 +96,7 @@ def test_one_photograph_of_an_object_is_asked_about_once(make, tmp_path):
     told = []
     with serve() as server:
         done = _run(loose, server, tmp_path / "answers", confirm=lambda estimate: told.append(estimate) or True)
-    assert len(server.asked) == done.asked == told[0].questions == 1
+    assert len(server.asked) == done.requests == told[0].questions == 1
     assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
 
 
@@ -173,7 +173,7 @@ def test_a_packed_manifest_is_annotated_like_a_loose_one(make, tmp_path):
     with serve() as server:
         _run(loose, server, tmp_path / "answers")
         done = _run(again, server, tmp_path / "answers")
-    assert len(server.asked) == 2 and done.asked == 0  # the same pictures: answered before
+    assert len(server.asked) == 2 and done.requests == 0  # the same pictures: answered before
     assert done.manifest.present("text").all()
 
 
@@ -202,7 +202,7 @@ def test_an_answer_is_paid_for_once(make, tmp_path):
     with serve() as server:
         first = _run(loose, server, tmp_path / "answers")
         again = _run(loose, server, tmp_path / "answers", confirm=lambda estimate: estimate.questions == 0)
-        assert len(server.asked) == 4 and again.asked == 0
+        assert len(server.asked) == 4 and again.requests == 0
         assert again.manifest.table.equals(first.manifest.table)
         cv2.imwrite(str(loose.file(1, "image_path")), np.full((9, 9, 3), 7, np.uint8))
         _run(loose, server, tmp_path / "answers")
@@ -305,7 +305,7 @@ def test_bad_answers_are_asked_again_then_counted_and_listed(make, tmp_path):
 
     with serve(behave) as server:
         done = _run(loose, server, tmp_path / "answers", threads=2)
-    assert len(server.asked) == 3 + 2 and len(done.captions) == 2 and done.asked == 5
+    assert len(server.asked) == 3 + 2 and len(done.captions) == 2 and done.requests == 5
     (failure,) = done.failures
     assert failure.rows == 3 and failure.where == loose.where(0) and "bad answer" in failure.reason
     assert "(3 times)" in failure.reason

@@ -90,13 +90,13 @@ class CaptionFailure(NamedTuple):
 
 
 class CaptionResult(NamedTuple):
-    """The manifest with its captions, the failures, rows left out by reason, and the questions and tokens used."""
+    """The manifest with its captions, the failures, rows left out by reason, and the requests and tokens used."""
 
     manifest: Manifest
     captions: tuple[Caption, ...]
     failures: tuple[CaptionFailure, ...]
     left_out: dict[str, int]
-    asked: int
+    requests: int
     tokens_in: int
     tokens_out: int
 
@@ -326,7 +326,7 @@ def annotate(
         if key in store.answers
     )
     annotated = _attach(manifest, captions)
-    return CaptionResult(annotated, captions, tuple(run.failures), left_out, run.asked, *run.tokens)
+    return CaptionResult(annotated, captions, tuple(run.failures), left_out, run.requests, *run.tokens)
 
 
 def _run_async(coroutine: Any) -> None:
@@ -357,7 +357,7 @@ class _Run:
     ) -> None:
         self.manifest, self.endpoint, self.store, self.side, self.log = manifest, endpoint, store, side, log
         self.failures: list[CaptionFailure] = []
-        self.asked, self.tokens = 0, [0, 0]
+        self.requests, self.tokens = 0, [0, 0]
         self.done = self.streak = 0
 
     def keys(self, jobs: list[CaptionJob], threads: int) -> list[str]:
@@ -423,7 +423,7 @@ class _Run:
             text = ""
             try:
                 text, finish, *tokens = await client.ask(connection, job.prompt.messages(jpegs))
-                self.asked += 1
+                self.requests += 1
                 self.tokens = [self.tokens[0] + tokens[0], self.tokens[1] + tokens[1]]
                 caption, named = parse_caption(text, finish)
             except _QuestionError as error:

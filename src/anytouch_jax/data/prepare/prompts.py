@@ -195,25 +195,25 @@ def _rows_to_ask(
     """Return the row ids i64 to ask for, the family of every row, and the number of other rows by reason."""
     left_out: Counter[str] = Counter()
     splits = np.asarray(manifest.table["split"].to_pylist())
-    asked = np.isin(splits, [name for name in SPLITS if name != "background"])
+    selected = np.isin(splits, [name for name in SPLITS if name != "background"])
     if split is not None:
-        asked = np.zeros(len(manifest), bool)
-        asked[manifest.rows_of(split)] = True
-    left_out["background frame, or another split"] = int((~asked).sum())
+        selected = np.zeros(len(manifest), bool)
+        selected[manifest.rows_of(split)] = True
+    left_out["background frame, or another split"] = int((~selected).sum())
     family = np.full(len(manifest), None, object)
     dataset = manifest.codes("dataset")
     for code in np.unique(dataset):
         rows = np.flatnonzero(dataset == code)
         name = manifest.value(rows[0], "dataset")
         family[rows] = chosen = family_of(name, families)
-        if chosen is None and asked[rows].any():
+        if chosen is None and selected[rows].any():
             known, remedy = "", "the manifest has no column dataset that names it"
             if name is not None:
                 remedy = f"give it one, such as --family {shlex.quote(name)} photograph"
             if not any("has no prompt" in reason for reason in left_out):
                 known = f"; known: {', '.join(FAMILIES)}"
-            left_out[f"dataset {name!r} has no prompt: {remedy}{known}"] = int(asked[rows].sum())
-    asked &= family != None  # noqa: E711 - elementwise
+            left_out[f"dataset {name!r} has no prompt: {remedy}{known}"] = int(selected[rows].sum())
+    selected &= family != None  # noqa: E711 - elementwise
     has_text, expanded = manifest.present("text"), np.zeros(len(manifest), bool)
     if PHRASE in manifest.table.column_names:
         expanded = manifest.present(PHRASE)
@@ -223,9 +223,9 @@ def _rows_to_ask(
         ("expanded before", is_phrase & expanded & (not overwrite)),
         ("has a caption", ~is_phrase & has_text & (not overwrite)),
     ):
-        left_out[reason] += int((asked & excluded).sum())
-        asked &= ~excluded
-    return np.flatnonzero(asked), family, +left_out
+        left_out[reason] += int((selected & excluded).sum())
+        selected &= ~excluded
+    return np.flatnonzero(selected), family, +left_out
 
 
 def _group_rows(manifest: Manifest, rows: np.ndarray, family: np.ndarray) -> list[np.ndarray]:

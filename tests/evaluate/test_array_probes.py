@@ -210,13 +210,13 @@ def test_rows_outside_the_splits_and_order_of_rows_do_not_matter(probe: Any) -> 
 def test_kinds_of_labels(kind: str) -> None:
     features, labels, groups, split = table()
     numbers = np.unique(labels, return_inverse=True)[1]
-    given = {
+    values = {
         "text": labels,
         "int": numbers,
         "float": numbers.astype(float),
         "object": np.array([None if i in (0, 1) else int(n) for i, n in enumerate(numbers)], object),
     }[kind]
-    result = linear_probe(features, given, groups, split)
+    result = linear_probe(features, values, groups, split)
     assert result.accuracy == 1.0
     assert result.classes == (("ball", "cube", "ring") if kind == "text" else ("0", "1", "2"))
     assert result.n_train == (163 if kind == "object" else 165)

@@ -71,7 +71,7 @@ def test_packs_of_one_table_with_other_gels_share_no_features(tmp_path, subtract
     first, second = (encoder_features(subtracting, table, folder=tmp_path) for table in (one, two))
     assert np.abs(first.get(ROWS, 1) - second.get(ROWS, 1)).max() > 1e-3
     before = image_digest(one)
-    os.utime(shards[0], ns=(2, 2))  # a pack that was written anew
+    os.utime(shards[0], ns=(2, 2))  # a pack that was written again
     assert image_digest(one) != before
 
 
@@ -133,7 +133,7 @@ def test_the_cache_goes_by_content(monkeypatch, encoder, pictures, tmp_path):
     rewritten = encoder_features(encoder, moved, **plain).file(1)
     assert rewritten != store.file(1)
     (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
-    assert encoder_features(encoder, moved, **plain).file(1) != rewritten  # an equal table beside other pictures
+    assert encoder_features(encoder, moved, **plain).file(1) != rewritten  # an equal table of other pictures
     before = encoder_features(encoder, moved, **plain).file(1)
     cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))  # another photograph of the gel
     assert encoder_features(encoder, moved, **plain).file(1) != before
@@ -194,13 +194,13 @@ def test_pixels_are_block_means_in_colour() -> None:
     frames, backgrounds = noise(3), noise(3, seed=1)
     features = raw_pixels(frames, backgrounds)
     assert features.shape == (3, 2 * 24 * 32 * 3)
-    seen, behind = (
+    pixels, behind = (
         (one / 255).reshape(3, 24, 2, 32, 2, 3).mean((2, 4)).reshape(3, -1) for one in (frames, backgrounds)
     )
-    np.testing.assert_allclose(features[:, :HALF], seen, atol=1e-6)
-    np.testing.assert_allclose(features[:, HALF:], seen - behind, atol=1e-6)
+    np.testing.assert_allclose(features[:, :HALF], pixels, atol=1e-6)
+    np.testing.assert_allclose(features[:, HALF:], pixels - behind, atol=1e-6)
     turned = raw_pixels(frames[..., ::-1], backgrounds)
-    assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, "a colour tells a slope: it is not lost"
+    assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, "colour depends on slope and must be used"
 
 
 @pytest.mark.parametrize("shape", [(320, 240), (50, 77), (30, 33)])

@@ -24,9 +24,9 @@ def test_the_optimum_is_scikit_learns(classes, penalty):
     theirs = log_loss(y, model.predict_proba(x), labels=range(classes)) + penalty / 2 * np.sum(model.coef_**2)
     assert ours.finished
     assert abs(ours.loss - theirs) < 1e-4
-    said, weights = x @ ours.weights + ours.bias, ours.weights
-    exact = np.mean(np.logaddexp(0, -np.where(y == 1, 1, -1) * said[:, 0])) if classes == 2 else np.mean(
-        np.log(np.exp(said).sum(1)) - said[np.arange(len(y)), y])  # fmt: skip
+    logits, weights = x @ ours.weights + ours.bias, ours.weights
+    exact = np.mean(np.logaddexp(0, -np.where(y == 1, 1, -1) * logits[:, 0])) if classes == 2 else np.mean(
+        np.log(np.exp(logits).sum(1)) - logits[np.arange(len(y)), y])  # fmt: skip
     assert exact + penalty / 2 * np.sum(weights**2) == pytest.approx(ours.loss, abs=1e-5)
     assert np.mean(ours(x) == model.predict(x)) > 0.99
 
@@ -45,15 +45,15 @@ def test_a_start_saves_steps_and_changes_nothing(monkeypatch):
 
 def test_more_features_than_rows_is_no_obstacle():
     x, y = blobs(n=30, d=80, classes=3, apart=3.0)
-    found = next(logistic.path(x, y, 3, [0.01]))
-    assert np.isfinite(found.loss) and np.mean(found(x) == y) == 1.0
+    fit = next(logistic.path(x, y, 3, [0.01]))
+    assert np.isfinite(fit.loss) and np.mean(fit(x) == y) == 1.0
     constant = np.concatenate([x, np.zeros((30, 4), np.float32)], 1)
-    assert next(logistic.path(constant, y, 3, [0.01])).loss == pytest.approx(found.loss, abs=1e-4)
+    assert next(logistic.path(constant, y, 3, [0.01])).loss == pytest.approx(fit.loss, abs=1e-4)
 
 
 def test_threads_are_limited_for_small_fits_only(monkeypatch):
-    asked = []
-    monkeypatch.setattr(logistic, "_libraries", lambda: SimpleNamespace(limit=lambda limits: asked.append(limits)))
+    limits_set = []
+    monkeypatch.setattr(logistic, "_libraries", lambda: SimpleNamespace(limit=lambda limits: limits_set.append(limits)))
     for size in (1e3, 1e9):
         partial(logistic.threads, size)()
-    assert asked == [1, None]
+    assert limits_set == [1, None]

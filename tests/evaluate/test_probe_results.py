@@ -39,7 +39,7 @@ ONE = ProbeResult(
     n_test=40,
     test_groups=8,
     classes=("ball", "cube"),
-    parts=(SubsetResult("with photo", 0.6, 0.5, 0.7, 20), SubsetResult("nobody", float("nan"), None, None, 0)),
+    parts=(SubsetResult("with photo", 0.6, 0.5, 0.7, 20), SubsetResult("empty", float("nan"), None, None, 0)),
     notes=("3 rows without this label left out",),
 )
 TWO = RegressionResult(

@@ -46,11 +46,15 @@ def planted(values: Any) -> FeatureStore:
 
 def telling(world: Manifest, task: str, noise: float = 0.3) -> Any:
     """Features that say the label of the task, in a linear code under noise."""
-    found = select(world, TASKS[task])
-    code = found.labels[:, None] if found.labels.dtype.kind == "f" else found.labels[:, None] == np.unique(found.labels)
+    results = select(world, TASKS[task])
+    code = (
+        results.labels[:, None]
+        if results.labels.dtype.kind == "f"
+        else results.labels[:, None] == np.unique(results.labels)
+    )
     rng = np.random.default_rng(0)
     values = np.zeros((len(world), max(12, code.shape[1])))
-    values[found.rows[:, 0], : code.shape[1]] = code
+    values[rows.rows[:, 0], : code.shape[1]] = code
     values = values @ np.linalg.qr(rng.normal(size=values.shape[1:] * 2))[0] + noise * rng.normal(size=values.shape)
     return lambda rows: values[rows]
 
@@ -81,9 +85,9 @@ def test_noise_is_chance_within_its_interval(monkeypatch, task):
 def test_the_optimism_of_the_published_protocol_shows_on_noise(monkeypatch):
     store = planted(noise)
     recipe = heads.GradientRecipe(epochs=30, batch=32, rate=0.03)
-    found = score_tasks(store, MANY, ["material", "twist"], seeds=5, protocols=("published", "honest"),
+    results = score_tasks(store, MANY, ["material", "twist"], seeds=5, protocols=("published", "honest"),
                         head_names=("linear", "knn", "gradient"), recipe=recipe)  # fmt: skip
-    scores = {(one["task"], one["head"], one["protocol"]): one["mean"] for one in found}
+    scores = {(one["task"], one["head"], one["protocol"]): one["mean"] for one in results}
     gains = [scores[t, h, "published"] - scores[t, h, "honest"] for t, h, p in scores if p == "honest"]
     assert np.mean(gains) > 0.02
     assert min(scores[t, "gradient", "published"] - scores[t, "gradient", "honest"] for t in ("material", "twist")) > 0
@@ -117,8 +121,8 @@ def test_a_split_that_shares_objects_is_not_honest(monkeypatch):
     shared = simulated(objects=40, each=4, shared=True)
     names = shared.codes("object")
     store = planted(lambda rows: np.eye(40)[names[rows]])
-    found = score_tasks(store, shared, ["material"], seeds=2, protocols=("honest", "published"))
-    honest, published = found
+    results = score_tasks(store, shared, ["material"], seeds=2, protocols=("honest", "published"))
+    honest, published = results
     assert published["mean"] == 1.0 and honest["mean"] < 0.5
     assert any("groups" in note for note in honest["notes"])
     assert honest["test"] == 40 * 4 * 2 and published["test"] == 40 * 2
@@ -237,8 +241,8 @@ def test_nothing_is_encoded_twice(monkeypatch, encoder, pictures, tmp_path):
 
 def test_a_sensor_that_training_never_saw_is_noted(encoder, pictures):
     some = replace(encoder, trained_sensors=("digit",))  # the table of the model has it
-    (found,) = score_tasks(some, pictures, ["material"], seeds=1)
-    assert any("duragel" in note for note in found["notes"])
+    (results,) = score_tasks(some, pictures, ["material"], seeds=1)
+    assert any("duragel" in note for note in results["notes"])
 
 
 def test_classes_that_were_never_learned_are_told(monkeypatch):
@@ -248,8 +252,8 @@ def test_classes_that_were_never_learned_are_told(monkeypatch):
             label__material="ab"[i % 2] if i < 40 else "ac"[i % 2])
         for i in range(60)
     ]  # fmt: skip
-    (found,) = score_tasks(store, table(rows), ["material"], seeds=1)
-    assert any("10 test rows" in note and note.endswith("c") for note in found["notes"])
+    (results,) = score_tasks(store, table(rows), ["material"], seeds=1)
+    assert any("10 test rows" in note and note.endswith("c") for note in results["notes"])
 
 
 def test_raw_pixels_see_the_force_and_their_own_cache(pictures, tmp_path):
@@ -326,13 +330,13 @@ SIZES = {  # (train, test) of the authors' own split
 
 @pytest.fixture(scope="module")
 def trees(tmp_path_factory) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+    results: dict[str, Path] = {}
     for name, (make, options) in MAKERS.items():
         root = tmp_path_factory.mktemp(name)
         make(root)
         paint(root)
-        found[name] = index(name, root, None, options=options).out
-    return found
+        results[name] = index(name, root, None, options=options).out
+    return results
 
 
 def source_of(benchmark: str) -> str:
@@ -360,8 +364,8 @@ def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
 
 @pytest.mark.parametrize("name", list(BENCHMARKS))
 def test_honest_parts_videos_and_objects(name, trees):
-    found = select(manifests.read(trees[source_of(name)]), find_benchmark(name).task)
-    kinds = {one.split(" ")[0] for one in found.groups}
+    results = select(manifests.read(trees[source_of(name)]), find_benchmark(name).task)
+    kinds = {one.split(" ")[0] for one in results.groups}
     assert kinds == ({"recording"} if "touch_and_go" in name else {"object"})
 
 
@@ -398,8 +402,8 @@ def test_a_task_that_cannot_be_probed_leaves_the_others(tmp_path):
     manifests.write(manifests.from_columns(columns, data), data)
     np.savez(features, features=noise(np.arange(len(WORLD))), rows=np.arange(len(WORLD)))
     shared: dict[str, Any] = {"features": [features], "seeds": 1, "controls": False, "log": lines.append}
-    found = probe_tasks([], [data], ("material", "slide"), frames=1, **shared)
-    assert {one["task"] for one in found["results"]} == {"material"} and list(found["left_out"]) == ["slide"]
+    results = probe_tasks([], [data], ("material", "slide"), frames=1, **shared)
+    assert {one["task"] for one in results["results"]} == {"material"} and list(results["left_out"]) == ["slide"]
     assert any("slide" in line for line in lines)
     assert "grasp" in probe_tasks([], [data], "all", frames=1, **shared)["left_out"]
     with pytest.raises(UserError, match="slide"):

@@ -24,68 +24,68 @@ def rows(kind: str = "apart", **changes) -> RowRoles:
 @pytest.mark.parametrize("kind", ["apart", "shared", "new"])
 @pytest.mark.parametrize("seed", range(4))
 def test_no_group_is_ever_on_two_sides(kind, seed):
-    given = rows(kind)
+    roles = rows(kind)
     tested = []
-    for cut in seeded_splits(given, seed, "honest"):
-        sides = [set(given.groups[part]) for part in cut]
+    for cut in seeded_splits(roles, seed, "honest"):
+        sides = [set(roles.groups[part]) for part in cut]
         assert all(sides) and not sides[0] & sides[1] and not sides[0] & sides[2] and not sides[1] & sides[2]
         tested += cut.test.tolist()
-    wanted = np.flatnonzero(given.test) if kind != "shared" else np.arange(N)
+    wanted = np.flatnonzero(roles.test) if kind != "shared" else np.arange(N)
     assert sorted(tested) == wanted.tolist()  # every row once
 
 
 def test_a_split_that_parts_the_groups_is_kept():
-    given = rows()
-    (cut,) = seeded_splits(given, 0, "honest")
-    assert split_scheme(given)[0] == "split"
-    np.testing.assert_array_equal(cut.test, np.flatnonzero(given.test))
-    assert sorted([*cut.fit, *cut.val]) == np.flatnonzero(given.train).tolist()
-    assert len(cut.val) == len(np.flatnonzero(given.train)) // FOLDS
+    roles = rows()
+    (cut,) = seeded_splits(roles, 0, "honest")
+    assert split_scheme(roles)[0] == "split"
+    np.testing.assert_array_equal(cut.test, np.flatnonzero(roles.test))
+    assert sorted([*cut.fit, *cut.val]) == np.flatnonzero(roles.train).tolist()
+    assert len(cut.val) == len(np.flatnonzero(roles.train)) // FOLDS
 
 
 def test_objects_left_out_are_dealt_within_the_test_rows():
-    given = rows("new")
-    how, used, _ = split_scheme(given)
+    roles = rows("new")
+    how, used, _ = split_scheme(roles)
     assert how == "folds"
-    np.testing.assert_array_equal(used, given.test)
+    np.testing.assert_array_equal(used, roles.test)
     for protocol in ("honest", "published"):
-        found = seeded_splits(given, 0, protocol)
-        assert len(found) == FOLDS
-        assert all(given.test[one].all() for cut in found for one in cut)
+        cuts = seeded_splits(roles, 0, protocol)
+        assert len(cuts) == FOLDS
+        assert all(roles.test[one].all() for cut in cuts for one in cut)
 
 
 @pytest.mark.parametrize("protocol", ["honest", "published"])
 def test_what_only_test_has_is_dealt_within_test(protocol):
     """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its class has."""
-    given = rows()
-    given = given._replace(y=np.linspace(0, 1, N), measured=True, may_fit=given.test, may_test=given.test)
-    how, used, _ = split_scheme(given)
+    roles = rows()
+    roles = roles._replace(y=np.linspace(0, 1, N), measured=True, may_fit=roles.test, may_test=roles.test)
+    how, used, _ = split_scheme(roles)
     assert how == "folds"
-    np.testing.assert_array_equal(used, given.test)
-    found = seeded_splits(given, 0, protocol)
-    assert len(found) == FOLDS and all(len(cut.fit) and given.test[one].all() for cut in found for one in cut)
+    np.testing.assert_array_equal(used, roles.test)
+    cuts = seeded_splits(roles, 0, protocol)
+    assert len(cuts) == FOLDS and all(len(cut.fit) and roles.test[one].all() for cut in cuts for one in cut)
 
 
 def test_every_class_is_learned_in_every_fold():
-    given = rows("shared")
+    roles = rows("shared")
     for seed in range(5):
-        for cut in seeded_splits(given, seed, "honest"):
-            assert set(given.y[cut.fit]) == set(given.y[cut.test]) == {0, 1, 2}
+        for cut in seeded_splits(roles, seed, "honest"):
+            assert set(roles.y[cut.fit]) == set(roles.y[cut.test]) == {0, 1, 2}
 
 
 def test_seeds_deal_anew_and_equal_seeds_equally():
-    given = rows()
-    first, again, other = (seeded_splits(given, seed, "honest")[0].val for seed in (0, 0, 1))
+    roles = rows()
+    first, again, other = (seeded_splits(roles, seed, "honest")[0].val for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert set(first) != set(other)
 
 
 @pytest.mark.parametrize("kind", ["apart", "shared"])
 def test_published_keeps_the_manifests_split_whatever_it_shares(kind):
-    given = rows(kind)
-    (cut,) = seeded_splits(given, 3, "published")
-    np.testing.assert_array_equal(cut.fit, np.flatnonzero(given.train))
-    np.testing.assert_array_equal(cut.test, np.flatnonzero(given.test))
+    roles = rows(kind)
+    (cut,) = seeded_splits(roles, 3, "published")
+    np.testing.assert_array_equal(cut.fit, np.flatnonzero(roles.train))
+    np.testing.assert_array_equal(cut.test, np.flatnonzero(roles.test))
     assert not len(cut.val)
 
 
@@ -93,15 +93,15 @@ def test_published_keeps_the_manifests_split_whatever_it_shares(kind):
 @pytest.mark.parametrize("protocol", ["honest", "published"])
 def test_sensors_and_units_teach_and_are_tested_apart(kind, protocol):
     finger = np.arange(N) // 2 % 2 == 0
-    given = rows(kind, may_fit=finger, may_test=~finger)
-    for cut in seeded_splits(given, 0, protocol):
+    roles = rows(kind, may_fit=finger, may_test=~finger)
+    for cut in seeded_splits(roles, 0, protocol):
         assert finger[cut.fit].all() and finger[cut.val].all() and not finger[cut.test].any()
         assert len(cut.fit) and len(cut.test)
 
 
 def test_numbers_are_dealt_by_chance():
-    given = rows()._replace(y=np.linspace(0, 1, N), measured=True)
-    parts = {tuple(seeded_splits(given, seed, "honest")[0].val) for seed in range(3)}
+    roles = rows()._replace(y=np.linspace(0, 1, N), measured=True)
+    parts = {tuple(seeded_splits(roles, seed, "honest")[0].val) for seed in range(3)}
     assert len(parts) == 3
 
 

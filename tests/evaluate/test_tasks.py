@@ -18,37 +18,37 @@ WORLD = simulated()
 FRAME = np.asarray(WORLD.column("frame_index"))
 
 
-def cells(found: tasks.TaskRows, name: str) -> list:
-    return [WORLD.value(int(one), name) for one in found.rows[:, 0]]
+def cells(selected: tasks.TaskRows, name: str) -> list:
+    return [WORLD.value(int(one), name) for one in selected.rows[:, 0]]
 
 
 def test_a_press_is_the_deepest_frame_of_each_recording():
-    found = select(WORLD, TASKS["material"])
-    assert found.rows.shape == (24 * 2 * 2, 1)
-    assert len(set(cells(found, "sequence"))) == 96 and set(FRAME[found.rows[:, 0]]) == {2}
-    np.testing.assert_array_equal(found.labels, cells(found, "label.material"))
-    np.testing.assert_array_equal(found.groups, [f"object {name}" for name in cells(found, "object")])
-    np.testing.assert_array_equal(found.split, cells(found, "split"))
+    selected = select(WORLD, TASKS["material"])
+    assert selected.rows.shape == (24 * 2 * 2, 1)
+    assert len(set(cells(selected, "sequence"))) == 96 and set(FRAME[selected.rows[:, 0]]) == {2}
+    np.testing.assert_array_equal(selected.labels, cells(selected, "label.material"))
+    np.testing.assert_array_equal(selected.groups, [f"object {name}" for name in cells(selected, "object")])
+    np.testing.assert_array_equal(selected.split, cells(selected, "split"))
 
 
 def test_contact_is_what_presses_and_ends_a_clip():
-    found = select(WORLD, TASKS["force"])
-    assert set(FRAME[found.rows[:, 0]]) == {2, 3, 4}  # frame 0 does not press, 0 and 1 end no clip of three
-    assert found.labels.dtype == np.float64
-    np.testing.assert_allclose(found.labels, cells(found, "label.force"))
+    selected = select(WORLD, TASKS["force"])
+    assert set(FRAME[selected.rows[:, 0]]) == {2, 3, 4}  # frame 0 does not press, 0 and 1 end no clip of three
+    assert selected.labels.dtype == np.float64
+    np.testing.assert_allclose(selected.labels, cells(selected, "label.force"))
     few = select(WORLD, Task("f", "label.force", "regression", which="contact"))
     assert set(FRAME[few.rows[:, 0]]) == {1, 2, 3, 4}
 
 
 def test_moving_is_the_frame_that_slips_most_else_at_two_thirds():
-    found = select(WORLD, TASKS["twist"])
-    twist = cells(found, "label.twist")
-    np.testing.assert_array_equal(found.labels, twist)
+    selected = select(WORLD, TASKS["twist"])
+    twist = cells(selected, "label.twist")
+    np.testing.assert_array_equal(selected.labels, twist)
     assert set(twist) == {"clockwise", "counterclockwise"}  # "none" takes no part
-    still = [WORLD.value(int(r), "label.slip") == 0 for r in found.rows[:, 0]]
+    still = [WORLD.value(int(r), "label.slip") == 0 for r in selected.rows[:, 0]]
     assert any(still) and not all(still)
-    assert set(FRAME[found.rows[:, 0]]) == {3}  # 2/3 of 4 is 2.67
-    assert len(found.rows) == len(set(cells(found, "sequence"))) == 64
+    assert set(FRAME[selected.rows[:, 0]]) == {3}  # 2/3 of 4 is 2.67
+    assert len(selected.rows) == len(set(cells(selected, "sequence"))) == 64
 
 
 @pytest.mark.parametrize("name", ["slip", "force", "twist", "slide"])
@@ -60,16 +60,16 @@ def test_stills_and_clips_of_a_dynamic_task_take_the_same_rows(name):
 
 
 def test_slip_is_a_share_above_a_half_or_a_mark():
-    found = select(WORLD, TASKS["slip"])
-    np.testing.assert_array_equal(found.labels == "yes", np.array(cells(found, "label.slip")) > 0.5)
+    selected = select(WORLD, TASKS["slip"])
+    np.testing.assert_array_equal(selected.labels == "yes", np.array(cells(selected, "label.slip")) > 0.5)
     marked = table([row(sequence="a", frame_index=i, label__slip=1, label__contact_score=9.0) for i in range(3)])
     assert select(marked, TASKS["slip"]).labels.tolist() == ["yes"]
 
 
 def test_force_tells_contact_before_a_score():
-    told = ((0.2, 1.0), (0.0, 9.0), (3.0, None))  # soft: it touches and hardly shows
+    cases = ((0.2, 1.0), (0.0, 9.0), (3.0, None))  # soft: it touches and hardly shows
     rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__force=f, label__contact_score=s)
-            for i, (f, s) in enumerate(told)]  # fmt: skip
+            for i, (f, s) in enumerate(cases)]  # fmt: skip
     assert select(table(rows), TASKS["object"]).rows.tolist() == [[0], [2]]
 
 
@@ -104,8 +104,8 @@ def test_groups_fall_back_to_the_recording():
 
 def test_without_objects_the_touches_of_a_video_are_one_group():
     rows = [row(sequence=f"{video}/{first}", label__material="wood") for video in "vw" for first in (0, 40)]
-    found = select(table(rows), TASKS["material"])
-    assert found.groups.tolist() == ["recording v"] * 2 + ["recording w"] * 2
+    selected = select(table(rows), TASKS["material"])
+    assert selected.groups.tolist() == ["recording v"] * 2 + ["recording w"] * 2
 
 
 def test_recordings_of_joined_files_are_never_one_group(tmp_path):
@@ -120,9 +120,9 @@ def test_recordings_of_joined_files_are_never_one_group(tmp_path):
         manifests.write(manifests.from_columns(columns, file), file)
     both = manifests.read(files)
     for groups, count in ((("grasp_group", "touch"), 6), (("recording",), 4), (("object",), 1), ((), 6)):
-        found = select(both, Task("x", "label.object", groups=groups)).groups
-        assert len(set(found)) == count, groups  # an object's name is the same thing everywhere
-        assert len(set(found[:3]) & set(found[3:])) == (groups == ("object",))
+        selected = select(both, Task("x", "label.object", groups=groups)).groups
+        assert len(set(selected)) == count, groups  # an object's name is the same thing everywhere
+        assert len(set(selected[:3]) & set(selected[3:])) == (groups == ("object",))
 
 
 def test_what_cannot_be_selected_is_refused():
@@ -147,8 +147,8 @@ def test_the_authors_lists_decide_whichever_manifest_it_is():
     tests = ("material", "rough", "material+rough", None)
     rows = [row(path=f"{i}.png", sequence=f"v/{i}", split="train", label__rough=i % 2, downstream_test=t)
             for i, t in enumerate(tests)]  # fmt: skip
-    found = select(table(rows), Task("r", "label.rough", which="all", test_list="rough"))
-    assert found.split.tolist() == ["train", "test", "test", "train"]
+    selected = select(table(rows), Task("r", "label.rough", which="all", test_list="rough"))
+    assert selected.split.tolist() == ["train", "test", "test", "train"]
 
 
 def grasps() -> list[dict]:
@@ -167,11 +167,11 @@ def grasps() -> list[dict]:
 
 def test_two_fingers_of_a_grasp_stand_side_by_side():
     world = table(grasps())
-    found = select(world, TASKS["grasp"])
-    names = [[world.value(int(one), "sequence") for one in pair] for pair in found.rows]
+    selected = select(world, TASKS["grasp"])
+    names = [[world.value(int(one), "sequence") for one in pair] for pair in selected.rows]
     assert sorted(names) == [["mug/0/during/A", "mug/0/during/B"], ["pan/0/during/A", "pan/0/during/B"]]
-    assert len(found.notes) == 1 and "1 grasps" in found.notes[0]
-    assert sorted(found.groups) == ["object mug", "object pan"]
+    assert len(selected.notes) == 1 and "1 grasps" in selected.notes[0]
+    assert sorted(selected.groups) == ["object mug", "object pan"]
     one = table([grasps()[0]])
     with pytest.raises(UserError, match="grasp"):
         select(one, TASKS["grasp"])
@@ -179,17 +179,17 @@ def test_two_fingers_of_a_grasp_stand_side_by_side():
 
 def test_frames_after_the_grasp_keep_the_label_and_split_of_it():
     world = table(grasps())
-    found = select(world, TASKS["grasp_after"])
-    assert [[world.value(int(one), "sequence") for one in pair] for pair in found.rows] == [
+    selected = select(world, TASKS["grasp_after"])
+    assert [[world.value(int(one), "sequence") for one in pair] for pair in selected.rows] == [
         ["mug/0/after/A", "mug/0/after/B"]
     ]
-    assert (found.labels.tolist(), found.split.tolist()) == (["1"], ["train"])
-    assert any("after" in note for note in found.notes)
+    assert (selected.labels.tolist(), selected.split.tolist()) == (["1"], ["train"])
+    assert any("after" in note for note in selected.notes)
 
 
 def test_available_tasks_have_a_label():
     assert available_tasks(WORLD) == ("material", "object", "slip", "force", "twist", "slide")
-    assert available_tasks(table(grasps())) == ("grasp", "grasp_after", "object")  # told by the column of that name
+    assert available_tasks(table(grasps())) == ("grasp", "grasp_after", "object")  # from the column of that name
 
 
 @pytest.mark.parametrize("label", ["label.twist", "label.slide"])
@@ -267,15 +267,15 @@ def rows_of(manifest, label, group="", **options) -> tasks.TaskRows:
 
 
 def subsets_of(manifest, label, column, **options) -> tuple[tasks.TaskRows, dict]:
-    found = rows_of(manifest, label, column, **options)
-    return found, tasks.described_subsets(manifests.read(manifest), column or label, found.rows[:, 0], "things")
+    selected = rows_of(manifest, label, column, **options)
+    return selected, tasks.described_subsets(manifests.read(manifest), column or label, selected.rows[:, 0], "things")
 
 
 def test_classes_that_were_described_in_train_stand_apart(manifest):
-    found, (named, others) = (lambda rows, masks: (rows, masks.values()))(*subsets_of(manifest, "object", ""))
-    assert set(found.labels[named]) == {"object 0", "object 1"}
+    selected, (named, others) = (lambda rows, masks: (rows, masks.values()))(*subsets_of(manifest, "object", ""))
+    assert set(selected.labels[named]) == {"object 0", "object 1"}
     np.testing.assert_array_equal(others, ~named)
-    assert len(np.unique(found.groups)) == COUNT // 2  # recordings
+    assert len(np.unique(selected.groups)) == COUNT // 2  # recordings
     held_out, (named, _) = (lambda rows, masks: (rows, masks.values()))(
         *subsets_of(manifest, "slip", "object", where=("score", 3)))  # fmt: skip
     assert len(held_out.rows) == COUNT - 4 and len(np.unique(held_out.groups)) == 5
@@ -322,8 +322,8 @@ def test_labels_never_stand_for_the_columns_of_a_manifest(manifest):
     odd = manifests.read(manifest).table.to_pydict()
     odd |= {"label.sensor": ["gelslim"] * COUNT, "label.split": ["train"] * COUNT, "label.sequence": ["one"] * COUNT}
     manifests.write(manifests.from_columns(odd, manifest), manifest)
-    found = rows_of(manifest, "object", sensor="digit")
-    assert set(found.split) == {"train", "test"} and len(np.unique(found.groups)) == COUNT // 2
+    selected = rows_of(manifest, "object", sensor="digit")
+    assert set(selected.split) == {"train", "test"} and len(np.unique(selected.groups)) == COUNT // 2
 
 
 def test_rows_of_force_fields_take_no_part(manifest):

@@ -64,7 +64,7 @@ def table(rows: list[dict[str, Any]]) -> Manifest:
 
 
 def row(**changes: Any) -> dict[str, Any]:
-    """A row that is complete but for what is asked."""
+    """Return a complete row of a manifest with these changes."""
     plain = {"path": "a.png", "sensor": "digit", "sequence": "a", "frame_index": 0, "split": "train"}
     return plain | {name.replace("__", "."): value for name, value in changes.items()}
 

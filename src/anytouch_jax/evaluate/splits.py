@@ -122,31 +122,30 @@ def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]
     """
     check_protocol(protocol)
     rng = np.random.default_rng([11, seed])
+
+    def folds(rows: Array) -> Array:
+        return assign_folds(roles.groups[rows], None if roles.measured else roles.y[rows], rng)
+
+    def split(train: Array, test: Array) -> Split:
+        if protocol == "published":
+            return Split(train, train[:0], test)
+        fold = folds(train)
+        return Split(train[fold != 0], train[fold == 0], test)
+
     scheme, used, _ = split_scheme(roles)
     if scheme == "split" or (protocol == "published" and np.any(used & roles.train)):
-        return [_split(roles, np.flatnonzero(roles.fitted), np.flatnonzero(roles.tested), rng, protocol)]
+        return [split(np.flatnonzero(roles.fitted), np.flatnonzero(roles.tested))]
     rows = np.flatnonzero(used & (roles.may_fit | roles.may_test))
-    fold, splits = _folds(roles, rows, rng), []
+    fold, cuts = folds(rows), []
     for number in range(int(fold.max()) + 1):
         fit = rows[(fold != number) & roles.may_fit[rows]]
         test = rows[(fold == number) & roles.may_test[rows]]
         if len(fit) and len(test):
-            splits.append(_split(roles, fit, test, rng, protocol))
-    return splits
+            cuts.append(split(fit, test))
+    return cuts
 
 
 def check_protocol(protocol: str) -> None:
     """Raise UserError for an unknown protocol."""
     if protocol not in ("honest", "published"):
         raise UserError(f"Unknown protocol {protocol!r}. Choose honest or published.")
-
-
-def _split(roles: RowRoles, train: Array, test: Array, rng: np.random.Generator, protocol: Protocol) -> Split:
-    if protocol == "published":
-        return Split(train, train[:0], test)
-    fold = _folds(roles, train, rng)
-    return Split(train[fold != 0], train[fold == 0], test)
-
-
-def _folds(roles: RowRoles, rows: Array, rng: np.random.Generator) -> Array:
-    return assign_folds(roles.groups[rows], None if roles.measured else roles.y[rows], rng)

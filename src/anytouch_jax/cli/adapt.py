@@ -16,22 +16,16 @@ class AdaptOptions:
     Example: anytouch adapt --model runs/stage1 --data mine.csv --sensor my_gel --labels material --out runs/my_gel
     """
 
-    model: Path
-    """Run folder of stage 1 or stage 2."""
-    data: tuple[Path, ...]
-    """Manifests with frames of the sensor in split train."""
-    sensor: str
-    """Name of the sensor, as in the column sensor of the manifest."""
-    out: Path
-    """Run folder to write, for embed, probe and retrieve."""
+    model: Path  # Run folder of stage 1 or stage 2.
+    data: tuple[Path, ...]  # Manifests with frames of the sensor in split train.
+    sensor: str  # Name of the sensor, as in the column sensor of the manifest.
+    out: Path  # Run folder to write, for embed, probe and retrieve.
     frames: int = 100
     """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
     labels: str | None = None
     """Label column whose classes the frames are fitted to. Known sensors must have examples of them."""
-    steps: int = 200
-    """Steps of the fit."""
-    seed: int = 0
-    """Random seed."""
+    steps: int = 200  # Steps of the fit.
+    seed: int = 0  # Random seed.
 
 
 def run(options: AdaptOptions) -> int:

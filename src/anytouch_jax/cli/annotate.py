@@ -36,60 +36,35 @@ class AnnotateOptions:
     Run the same command again to continue: answers are kept. Exits with 1 if a caption is missing.
     """
 
-    manifest: Positional[Path]
-    """Manifest with photographs or phrases (.csv, .parquet)."""
-    out: Path | None = None
-    """Manifest to write (default: NAME_captions, next to the manifest)."""
-    answers: Path | None = None
-    """Folder that keeps every answer (default: NAME_answers, next to the manifest)."""
-    url: str = "https://api.openai.com/v1"
-    """Base address of an OpenAI-compatible endpoint. A local one needs no key."""
-    vlm: str = "gpt-4o"
-    """Name of the vision-language model."""
-    key_variable: str = "OPENAI_API_KEY"
-    """Environment variable that holds the key."""
-    yes: bool = False
-    """Do not ask for confirmation."""
-    estimate: bool = False
-    """Print the estimate and stop."""
-    price_in: float | None = None
-    """Price of a million input tokens, for the estimate."""
-    price_out: float | None = None
-    """Price of a million output tokens."""
-    limit: int | None = None
-    """Number of captions to ask for, to look at a sample first."""
+    manifest: Positional[Path]  # Manifest with photographs or phrases (.csv, .parquet).
+    out: Path | None = None  # Manifest to write (default: NAME_captions, next to the manifest).
+    answers: Path | None = None  # Folder that keeps every answer (default: NAME_answers, next to the manifest).
+    url: str = "https://api.openai.com/v1"  # Base address of an OpenAI-compatible endpoint. A local one needs no key.
+    vlm: str = "gpt-4o"  # Name of the vision-language model.
+    key_variable: str = "OPENAI_API_KEY"  # Environment variable that holds the key.
+    yes: bool = False  # Do not ask for confirmation.
+    estimate: bool = False  # Print the estimate and stop.
+    price_in: float | None = None  # Price of a million input tokens, for the estimate.
+    price_out: float | None = None  # Price of a million output tokens.
+    limit: int | None = None  # Number of captions to ask for, to look at a sample first.
     captions: Path | None = None
     """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no model."""
-    key: str | None = None
-    """Column that joins --captions and the manifest: caption_id, sequence, object, path, ..."""
-    sheet: Path | None = None
-    """HTML page of captions with their pictures, to check by eye."""
-    sheet_count: int = 40
-    """Captions on that page."""
-    split: str | None = None
-    """Only rows of this split."""
+    key: str | None = None  # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
+    sheet: Path | None = None  # HTML page of captions with their pictures, to check by eye.
+    sheet_count: int = 40  # Captions on that page.
+    split: str | None = None  # Only rows of this split.
     family: tuple[tuple[str, Literal["photograph", "object", "phrase"]], ...] = ()
     """Prompt of your dataset, as in: mydata photograph."""
-    second_image: str = "image2_path"
-    """Column of a second photograph, for the prompt object."""
-    overwrite: bool = False
-    """Also ask for rows that have a caption."""
-    threads: int = 4
-    """Questions at a time."""
-    side: int = 512
-    """Longest side of the pictures that are sent, pixels."""
-    timeout: float = 60.0
-    """Seconds to wait for an answer."""
-    tries: int = 5
-    """Tries for a question."""
-    max_tokens: int = 200
-    """Largest number of tokens of an answer."""
-    token_field: str = "max_tokens"
-    """Name of that limit in the protocol. Newer models need max_completion_tokens."""
-    temperature: float | None = 0.0
-    """Temperature. None is not sent."""
-    json_mode: bool = True
-    """Ask for a JSON object. Use --no-json-mode for servers without it."""
+    second_image: str = "image2_path"  # Column of a second photograph, for the prompt object.
+    overwrite: bool = False  # Also ask for rows that have a caption.
+    threads: int = 4  # Questions at a time.
+    side: int = 512  # Longest side of the pictures that are sent, pixels.
+    timeout: float = 60.0  # Seconds to wait for an answer.
+    tries: int = 5  # Tries for a question.
+    max_tokens: int = 200  # Largest number of tokens of an answer.
+    token_field: str = "max_tokens"  # Name of that limit in the protocol. Newer models need max_completion_tokens.
+    temperature: float | None = 0.0  # Temperature. None is not sent.
+    json_mode: bool = True  # Ask for a JSON object. Use --no-json-mode for servers without it.
 
 
 class _EstimateOnly(Exception):

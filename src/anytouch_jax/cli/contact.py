@@ -29,12 +29,9 @@ class ContactOptions:
     The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown.
     """
 
-    manifest: Positional[Path]
-    """Manifest to mark (.csv, .parquet)."""
-    out: Path | None = None
-    """Manifest to write (default: NAME_contact, next to the manifest)."""
-    drop: bool = False
-    """Drop frames without contact. The split background and unknown frames stay."""
+    manifest: Positional[Path]  # Manifest to mark (.csv, .parquet).
+    out: Path | None = None  # Manifest to write (default: NAME_contact, next to the manifest).
+    drop: bool = False  # Drop frames without contact. The split background and unknown frames stay.
     threshold: tuple[tuple[str, float], ...] = ()
     """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
     share: float = 0.0
@@ -42,14 +39,10 @@ class ContactOptions:
     contact. --picture and --check ignore it."""
     picture: Path | None = None
     """PNG of kept and dropped frames by rising score. Look at it before you trust a threshold."""
-    check: bool = False
-    """Print precision and recall against a reference column. Writes a manifest only with --out."""
-    reference: str | None = None
-    """Column for --check (default: label.force, label.contact or label.contact_score)."""
-    above: float | None = None
-    """Value of the reference column above which a frame is in contact."""
-    threads: int = 2
-    """Threads that read pictures."""
+    check: bool = False  # Print precision and recall against a reference column. Writes a manifest only with --out.
+    reference: str | None = None  # Column for --check (default: label.force, label.contact or label.contact_score).
+    above: float | None = None  # Value of the reference column above which a frame is in contact.
+    threads: int = 2  # Threads that read pictures.
 
 
 def run(options: ContactOptions) -> int:

@@ -24,22 +24,17 @@ if TYPE_CHECKING:
 class FrameOptions:
     """The options that embed and stream share."""
 
-    model: Path
-    """Run folder or weights file (.pth, .safetensors)."""
+    model: Path  # Run folder or weights file (.pth, .safetensors).
     sensor: str | None = None
     """Sensor of the frames. Without it, and for an unknown sensor, the universal tokens are used."""
-    background: Path | None = None
-    """Picture of the untouched gel, for an encoder of background-subtracted touches."""
-    rotate: Literal[0, 90, 180, 270] = 0
-    """Turn the frames clockwise by so many degrees, before anything else."""
+    background: Path | None = None  # Picture of the untouched gel, for an encoder of background-subtracted touches.
+    rotate: Literal[0, 90, 180, 270] = 0  # Turn the frames clockwise by so many degrees, before anything else.
     flip: Literal["none", "across", "down"] = "none"
     """Mirror the frames after that: across exchanges left and right, down exchanges top and bottom."""
-    frames: int = 1
-    """Frames of a touch: 1 for stills, 3 or more for clips (in segments of three)."""
+    frames: int = 1  # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
     pooling: Literal["class", "mean", "both"] | None = None
     """Features: the class token, the mean of the patch tokens, or both (default: that of --head, else class)."""
-    join: Literal["mean", "sum", "concat"] = "mean"
-    """How the segments of a long clip are joined."""
+    join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """Arithmetic: that of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     head: Path | None = None
@@ -53,14 +48,10 @@ class EmbedOptions(FrameOptions):
     Example: anytouch embed --model runs/stage2 --data manifest.csv --split test --out features.npz
     """
 
-    data: tuple[Path, ...]
-    """Manifests (.csv, .parquet), or one folder of frames, picture or video."""
-    out: Path
-    """The .npz to write: features (n, d), rows (n,), key/* (n,)."""
-    split: str | None = None
-    """Only this split of a manifest."""
-    batch: int = 64
-    """Frames at a time."""
+    data: tuple[Path, ...]  # Manifests (.csv, .parquet), or one folder of frames, picture or video.
+    out: Path  # The .npz to write: features (n, d), rows (n,), key/* (n,).
+    split: str | None = None  # Only this split of a manifest.
+    batch: int = 64  # Frames at a time.
     on_bad_sample: Literal["error", "skip"] = "error"
     """Stop at a row or picture that cannot be read, or skip and count it."""
 

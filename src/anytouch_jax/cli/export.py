@@ -24,27 +24,20 @@ class ExportOptions:
     Example: anytouch export --to safetensors --model runs/stage2 --out weights.safetensors
     """
 
-    model: Path
-    """Run folder or weights file (.pth, .safetensors)."""
-    out: Path
-    """The file to write. Weights must end in .safetensors."""
+    model: Path  # Run folder or weights file (.pth, .safetensors).
+    out: Path  # The file to write. Weights must end in .safetensors.
     to: Literal["jax", "safetensors", "release"] = "jax"
     """jax: the touch encoder as a program. safetensors: all weights by this package's names. release: weights by the
     names of the authors' files."""
-    frames: int = 1
-    """jax: frames of a touch. 1 for stills, 3 or more for clips (in segments of three)."""
-    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
-    """jax: the platforms it runs on."""
-    pooling: Literal["class", "mean", "both"] = "class"
-    """jax: the class token, the mean of the patch tokens, or both."""
-    join: Literal["mean", "sum", "concat"] = "mean"
-    """jax: how the segments of a long clip are joined."""
+    frames: int = 1  # jax: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
+    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")  # jax: the platforms it runs on.
+    pooling: Literal["class", "mean", "both"] = "class"  # jax: the class token, the mean of the patch tokens, or both.
+    join: Literal["mean", "sum", "concat"] = "mean"  # jax: how the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     between: Path | None = None
     """Weights: the run or file that MODEL was trained from. Writes an interpolation of the two."""
-    share: float = 0.5
-    """Weights: position from BETWEEN (0) to MODEL (1)."""
+    share: float = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
 
 
 def run(options: ExportOptions) -> int:

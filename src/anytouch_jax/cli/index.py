@@ -20,28 +20,18 @@ class DatasetOptions:
     recording, as OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder above.
     """
 
-    name: Positional[str]
-    """Name of the dataset."""
-    root: Positional[Path]
-    """Folder that holds the unpacked dataset."""
+    name: Positional[str]  # Name of the dataset.
+    root: Positional[Path]  # Folder that holds the unpacked dataset.
     out: Path | None = None
     """Manifest to write, .parquet or .csv, in ROOT or a folder above it (default: ROOT/NAME.parquet)."""
-    keep: bool = False
-    """Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path."""
-    val: float = 0.05
-    """Share of the objects or recordings in split val, for a dataset without splits."""
-    test: float = 0.05
-    """Share of the objects or recordings in split test, for a dataset without splits."""
-    lists: Path | None = None
-    """Folder of the dataset's list files, if they are not in ROOT."""
-    task: Literal["material", "rough"] = "material"
-    """touch_and_go: the task whose lists decide the split."""
-    fold: int = 0
-    """feel: the fold k whose split_<k>.npy decides the split."""
-    export: bool = False
-    """Let the reader write pictures into ROOT, for a dataset of arrays or films."""
-    sensor: str | None = None
-    """recordings: the sensor, by its name in the configuration or a new name."""
+    keep: bool = False  # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
+    val: float = 0.05  # Share of the objects or recordings in split val, for a dataset without splits.
+    test: float = 0.05  # Share of the objects or recordings in split test, for a dataset without splits.
+    lists: Path | None = None  # Folder of the dataset's list files, if they are not in ROOT.
+    task: Literal["material", "rough"] = "material"  # touch_and_go: the task whose lists decide the split.
+    fold: int = 0  # feel: the fold k whose split_<k>.npy decides the split.
+    export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or films.
+    sensor: str | None = None  # recordings: the sensor, by its name in the configuration or a new name.
     split_by: Literal["object", "recording"] = "object"
     """recordings: hold out whole objects, or recordings of each object."""
     labels: Path | None = None
@@ -53,10 +43,8 @@ def run(options: DatasetOptions) -> int:
     """Read the dataset, write its manifest, and print the counts with the paper's."""
     from anytouch_jax.data import readers
 
-    settings = readers.IndexOptions(
-        val=options.val, test=options.test, lists=options.lists, task=options.task, fold=options.fold,
-        export=options.export, sensor=options.sensor, split_by=options.split_by, labels=options.labels,
-    )  # fmt: skip
+    place = ("name", "root", "out", "keep")
+    settings = readers.IndexOptions(**{name: value for name, value in vars(options).items() if name not in place})
     report = readers.index(options.name, options.root, options.out, options=settings, keep=options.keep)
     print("\n".join(report.lines()))
     return 0

@@ -23,8 +23,7 @@ class InfoOptions:
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
     """
 
-    paths: Positional[tuple[Path, ...]]
-    """Files and folders."""
+    paths: Positional[tuple[Path, ...]]  # Files and folders.
 
 
 def run(options: InfoOptions) -> int:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
@@ -76,10 +75,7 @@ def write_new(manifest: Manifest, path: Path) -> Path:
     from anytouch_jax.data.manifest import manifest as manifests
 
     target = check_new(manifest, path)
-    try:
-        manifests.write(manifest, target)
-    except OSError as error:
-        raise UserError(f"{target} cannot be written: {error.strerror or error}") from None
+    manifests.write(manifest, target)
     return target
 
 
@@ -130,13 +126,3 @@ def check_apart(**outputs: Path | None) -> None:
             if place in options:
                 raise UserError(f"{options[place]} and {option} name the same file. Give each another name.")
             options[place] = option
-
-
-def write_text(text: str, path: Path) -> Path:
-    """Write a report atomically to `path` and return its absolute path; its folder is made."""
-    target = path.expanduser().resolve()
-    try:
-        atomic_write(target, text)
-    except OSError as error:
-        raise UserError(f"{target} cannot be written: {error.strerror or error}") from None
-    return target

@@ -8,7 +8,6 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from anytouch_jax.cli.output import default_target, log
-from anytouch_jax.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -20,14 +19,11 @@ class PackOptions:
     Run the same command again to continue after an interruption.
     """
 
-    manifests: Positional[tuple[Path, ...]]
-    """Manifests to pack into one (.csv, .parquet)."""
+    manifests: Positional[tuple[Path, ...]]  # Manifests to pack into one (.csv, .parquet).
     out: Path | None = None
     """Folder for manifest.parquet and the shards (default: NAME_packed, next to the first manifest)."""
-    shard_mb: int = 256
-    """Size of a shard, MiB."""
-    threads: int = 4
-    """Threads that read files."""
+    shard_mb: int = 256  # Size of a shard, MiB.
+    threads: int = 4  # Threads that read files.
 
 
 def run(options: PackOptions) -> int:
@@ -37,10 +33,7 @@ def run(options: PackOptions) -> int:
 
     manifest = manifests.read(options.manifests)
     folder = options.out or default_target(options.manifests[0], "packed", "")
-    try:
-        target = pack(manifest, folder, shard_bytes=options.shard_mb << 20, threads=options.threads, log=log)
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
+    target = pack(manifest, folder, shard_bytes=options.shard_mb << 20, threads=options.threads, log=log)
     print(
         f"{target}: {len(manifest):,} rows. Train on it as on any manifest. Check a copy with sha256sum -c SHA256SUMS."
     )

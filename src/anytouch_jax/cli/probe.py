@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, print_table, refuse_unused
 from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
@@ -15,16 +15,12 @@ from anytouch_jax.errors import UserError
 class ProbeOptions:
     """The options that all probes share."""
 
-    data: tuple[Path, ...]
-    """Manifests to probe on."""
-    model: tuple[Path, ...] = ()
-    """Run folders or weights files to compare."""
+    data: tuple[Path, ...]  # Manifests to probe on.
+    model: tuple[Path, ...] = ()  # Run folders or weights files to compare.
     features: tuple[Path, ...] = ()
     """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed writes it."""
-    controls: bool = True
-    """Also probe raw pixels and a random encoder."""
-    out: Path | None = None
-    """Write the results as JSON."""
+    controls: bool = True  # Also probe raw pixels and a random encoder.
+    out: Path | None = None  # Write the results as JSON.
 
 
 @dataclass(frozen=True)
@@ -44,40 +40,28 @@ class LabelOptions(ProbeOptions):
     the manifest has and that is not the label)."""
     leave_out: str | None = None
     """Leave out each value of this column in turn instead of using the splits, such as object for slip."""
-    where: tuple[str, float] | None = None
-    """Keep rows whose column is above a number."""
-    sensor: str | None = None
-    """Keep rows of this sensor."""
-    frames: int = 1
-    """Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row."""
+    where: tuple[str, float] | None = None  # Keep rows whose column is above a number.
+    sensor: str | None = None  # Keep rows of this sensor.
+    frames: int = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
     pooling: Literal["class", "mean", "both"] = "class"
     """Features: the class token, the mean of the patch tokens, or both."""
-    seeds: int = 5
-    """Bootstrap resamples of the training groups."""
+    seeds: int = 5  # Bootstrap resamples of the training groups.
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says so."""
-    save: Path | None = None
-    """Write the linear head of one --model as .npz, for embed --head and stream --head."""
+    save: Path | None = None  # Write the linear head of one --model as .npz, for embed --head and stream --head.
 
 
 @dataclass(frozen=True)
 class BatteryOptions(ProbeOptions):
     """The options that tasks and benchmarks share."""
 
-    seeds: int = 5
-    """Random splits of the groups."""
-    train_sensors: tuple[str, ...] = ()
-    """Train on these sensors only."""
-    test_sensors: tuple[str, ...] = ()
-    """Test on these sensors only."""
-    train_units: tuple[str, ...] = ()
-    """Train on these units only. Patterns such as cam0_* are allowed."""
-    test_units: tuple[str, ...] = ()
-    """Test on these units only."""
-    max_rows: int | None = None
-    """Largest number of rows per task, drawn with a fixed seed."""
-    cache: Path | None = None
-    """Folder that caches features by content, so that each frame is encoded once."""
+    seeds: int = 5  # Random splits of the groups.
+    train_sensors: tuple[str, ...] = ()  # Train on these sensors only.
+    test_sensors: tuple[str, ...] = ()  # Test on these sensors only.
+    train_units: tuple[str, ...] = ()  # Train on these units only. Patterns such as cam0_* are allowed.
+    test_units: tuple[str, ...] = ()  # Test on these units only.
+    max_rows: int | None = None  # Largest number of rows per task, drawn with a fixed seed.
+    cache: Path | None = None  # Folder that caches features by content, so that each frame is encoded once.
 
 
 @dataclass(frozen=True)
@@ -93,12 +77,10 @@ class TasksOptions(BatteryOptions):
     """Heads. gradient is the authors': one layer trained by AdamW."""
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
-    frames: int | None = None
-    """Frames of a touch (default: those of each task)."""
+    frames: int | None = None  # Frames of a touch (default: those of each task).
     pooling: Literal["class", "mean", "both"] = "class"
     """Features: the class token, the mean of the patch tokens, or both."""
-    join: Literal["mean", "sum", "concat"] = "mean"
-    """How the segments of a clip longer than the model's are joined."""
+    join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a clip longer than the model's are joined.
     order: Literal["right", "shuffled", "repeated"] = "right"
     """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""
 
@@ -129,12 +111,7 @@ def run_label(options: LabelOptions) -> int:
         check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
     _prepare(options, options.seeds)
-    results = probe_label(
-        options.model, options.data, options.label, features=options.features, group=options.group,
-        leave_out=options.leave_out, where=options.where, sensor=options.sensor, frames=options.frames,
-        pooling=options.pooling, seeds=options.seeds, protocol=options.protocol, controls=options.controls,
-        save=options.save, out=options.out, log=log,
-    )  # fmt: skip
+    results = probe_label(options.model, options.data, **_settings(options), log=log)
     print_table(probe_table(results))
     return 0
 
@@ -150,14 +127,8 @@ def run_tasks(options: TasksOptions) -> int:
     if options.frames == 1:
         refuse_unused(options, ("order",), "on stills")
     _prepare(options, options.seeds, options.cache)
-    results = probe_tasks(
-        options.model, options.data, "all" if options.tasks == ("all",) else options.tasks,
-        features=options.features, heads=options.heads, seeds=options.seeds, protocol=options.protocol,
-        frames=options.frames, pooling=options.pooling, join=options.join, order=options.order,
-        train_sensors=options.train_sensors, test_sensors=options.test_sensors, train_units=options.train_units,
-        test_units=options.test_units, max_rows=options.max_rows, controls=options.controls, cache=options.cache,
-        out=options.out, log=log,
-    )  # fmt: skip
+    settings = _settings(options) | {"tasks": "all" if options.tasks == ("all",) else options.tasks}
+    results = probe_tasks(options.model, options.data, **settings, log=log)
     print_table(task_table(results))
     return 0
 
@@ -169,14 +140,14 @@ def run_benchmark(options: BenchmarkOptions) -> int:
 
     in_range("--", options, max_rows=COUNT)
     _prepare(options, options.seeds, options.cache)
-    results = probe_benchmark(
-        options.model, options.data, options.benchmark, features=options.features, seeds=options.seeds,
-        train_sensors=options.train_sensors, test_sensors=options.test_sensors, train_units=options.train_units,
-        test_units=options.test_units, max_rows=options.max_rows, controls=options.controls, cache=options.cache,
-        out=options.out, log=log,
-    )  # fmt: skip
+    results = probe_benchmark(options.model, options.data, **_settings(options), log=log)
     print_table(task_table(results))
     return 0
+
+
+def _settings(options: ProbeOptions) -> dict[str, Any]:
+    """Return all options except models and manifests, which probes take by these names."""
+    return {name: value for name, value in vars(options).items() if name not in ("model", "data")}
 
 
 def _prepare(options: ProbeOptions, seeds: int, cache: Path | None = None) -> None:

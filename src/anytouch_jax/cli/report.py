@@ -17,20 +17,15 @@ class ReportOptions:
     Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2 runs/stage2 --out report
     """
 
-    data: Path
-    """Manifest of simulated scenes, or one with the same columns."""
+    data: Path  # Manifest of simulated scenes, or one with the same columns.
     stage1: Path
     """Run folder of stage 1."""
     stage2: Path
     """Run folder of stage 2."""
-    out: Path
-    """Folder for report.md, report.json and figures/."""
-    touches: int = 200
-    """Touches of the test split to use, and half as many of train and val."""
-    gallery: int = 50
-    """Touches in a retrieval gallery."""
-    seed: int = 0
-    """Random seed."""
+    out: Path  # Folder for report.md, report.json and figures/.
+    touches: int = 200  # Touches of the test split to use, and half as many of train and val.
+    gallery: int = 50  # Touches in a retrieval gallery.
+    seed: int = 0  # Random seed.
 
 
 def run(options: ReportOptions) -> int:

@@ -27,26 +27,18 @@ class RetrieveOptions:
     A gallery holds the true touch once, and the touches most similar to it in position, depth and force.
     """
 
-    data: Path
-    """Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force)."""
-    model: tuple[Path, ...] = ()
-    """Run folders or weights files to compare."""
-    split: str = "test"
-    """Split to retrieve in."""
-    frames: int = 1
-    """Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame."""
+    data: Path  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
+    model: tuple[Path, ...] = ()  # Run folders or weights files to compare.
+    split: str = "test"  # Split to retrieve in.
+    frames: int = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
     pooling: Literal["class", "mean", "both"] = "class"
     """Features: the class token, the mean of the patch tokens, or both."""
-    gallery: int = 50
-    """Touches in a gallery."""
-    by_chance: bool = False
-    """Draw the galleries at random, not by similarity."""
-    seeds: int = 5
-    """Galleries drawn for each query, with --by-chance."""
+    gallery: int = 50  # Touches in a gallery.
+    by_chance: bool = False  # Draw the galleries at random, not by similarity.
+    seeds: int = 5  # Galleries drawn for each query, with --by-chance.
     controls: bool = True
     """Also score a random encoder, background-subtracted pixels, and the contact's area, centroid and force."""
-    out: Path | None = None
-    """Write the results as JSON."""
+    out: Path | None = None  # Write the results as JSON.
 
 
 def run(options: RetrieveOptions) -> int:

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,40 +28,26 @@ class SimulateOptions:
     Run the same command again to continue after an interruption.
     """
 
-    out: Path
-    """Folder for images and manifest.parquet."""
-    touches: int = 400
-    """Number of places to touch. Every sensor feels each place once."""
+    out: Path  # Folder for images and manifest.parquet.
+    touches: int = 400  # Number of places to touch. Every sensor feels each place once.
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
     """Sensors: gelsight, gelsight_mini, gelslim, digit, duragel, tac3d (a force field)."""
-    seed: int = 0
-    """Random seed."""
+    seed: int = 0  # Random seed.
     grade: Literal["fine", "coarse"] = "fine"
     """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
-    fidelity: Literal["fast", "exact"] = "fast"
-    """Solve contact in a few rounds, or to convergence."""
-    frames: int = 10
-    """Frames of a recording. One gesture fills them; 10 are a third of a second at 30 Hz."""
-    objects: int = 200
-    """Number of objects."""
-    depth: tuple[float, float] = (0.3, 1.0)
-    """Range of the deepest press, mm."""
-    vision: float = 0.7
-    """Share of the recordings with a photograph."""
-    text: float = 0.7
-    """Share of the recordings with a caption."""
-    held_out: float = 0.25
-    """Share of the objects in the test split, by pairs of primitive and texture."""
-    first: int = 0
-    """Number of the first touch. Another number gives other touches of the same objects and splits."""
-    fields: tuple[str, ...] = ()
-    """Fields to write as .npy: displacement, pressure, shear."""
-    size: int = 224
-    """Pixels of an image's shorter side. 0 keeps the sensor's resolution."""
+    fidelity: Literal["fast", "exact"] = "fast"  # Solve contact in a few rounds, or to convergence.
+    frames: int = 10  # Frames of a recording. One gesture fills them; 10 are a third of a second at 30 Hz.
+    objects: int = 200  # Number of objects.
+    depth: tuple[float, float] = (0.3, 1.0)  # Range of the deepest press, mm.
+    vision: float = 0.7  # Share of the recordings with a photograph.
+    text: float = 0.7  # Share of the recordings with a caption.
+    held_out: float = 0.25  # Share of the objects in the test split, by pairs of primitive and texture.
+    first: int = 0  # Number of the first touch. Another number gives other touches of the same objects and splits.
+    fields: tuple[str, ...] = ()  # Fields to write as .npy: displacement, pressure, shear.
+    size: int = 224  # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
     units: Literal["each", "one"] = "each"
     """each simulates a new device for every recording; one uses one device of each sensor, mounted straight."""
-    threads: int = 2
-    """Threads that render photographs and write files."""
+    threads: int = 2  # Threads that render photographs and write files.
 
 
 def run(options: SimulateOptions) -> int:
@@ -74,7 +60,7 @@ def run(options: SimulateOptions) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
-    scenes = Scenes(**{name: value for name, value in asdict(options).items() if name not in ("out", "threads")})
+    scenes = Scenes(**{name: value for name, value in vars(options).items() if name not in ("out", "threads")})
     if missing := _missing_splits(scenes):
         log(f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more.")
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()

@@ -26,12 +26,9 @@ class StreamOptions(embed.FrameOptions):
     A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save.
     """
 
-    data: str
-    """Number of a camera, such as 0, or a video file."""
-    out: Path
-    """The .npz to write, or - for one JSON line per frame on standard output."""
-    stride: int = 1
-    """Frames from one frame of a clip to the next, as in the training data."""
+    data: str  # Number of a camera, such as 0, or a video file.
+    out: Path  # The .npz to write, or - for one JSON line per frame on standard output.
+    stride: int = 1  # Frames from one frame of a clip to the next, as in the training data.
 
 
 def run(options: StreamOptions) -> int:

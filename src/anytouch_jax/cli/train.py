@@ -48,38 +48,23 @@ class TrainOptions:
     such as --model.patch 16 or --optim.learning-rate 1e-3. `--help-all` lists them.
     """
 
-    data: tuple[Path, ...]
-    """Manifests (.csv or .parquet) to train on."""
-    run: Path
-    """Run folder: config.json, metrics.jsonl, checkpoints/, figures/."""
-    stage: Literal[1, 2] = 1
-    """1 learns from pixels. 2 aligns touch, vision and text, and matches sensors."""
-    preset: PresetName = "tiny"
-    """Sizes of the network. large is the paper's."""
-    recipe: Literal["paper", "release"] = "paper"
-    """Follow the paper's text, or the authors' released code."""
+    data: tuple[Path, ...]  # Manifests (.csv or .parquet) to train on.
+    run: Path  # Run folder: config.json, metrics.jsonl, checkpoints/, figures/.
+    stage: Literal[1, 2] = 1  # 1 learns from pixels. 2 aligns touch, vision and text, and matches sensors.
+    preset: PresetName = "tiny"  # Sizes of the network. large is the paper's.
+    recipe: Literal["paper", "release"] = "paper"  # Follow the paper's text, or the authors' released code.
     towers: Literal["scratch", "pretrained"] = "scratch"
     """Stage 2: train small image and text towers, or start from CLIP weights (--clip-weights)."""
-    baseline: str = "anytouch"
-    """Train a baseline or an ablation: unitouch, tlv_link, t3, static_only, no_matching, ..."""
-    init: Path | None = None
-    """Start from this stage-1 run or weights file."""
-    clip_weights: Path | None = None
-    """CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json."""
-    steps: int | None = None
-    """Steps of the whole schedule (default: 1000)."""
-    stop_after: int | None = None
-    """Stop after this many steps, without changing the schedule."""
-    save_every: int | None = None
-    """Steps between checkpoints (default: 200)."""
-    batch: int | None = None
-    """Samples per step (default: the preset's)."""
-    seed: int = 0
-    """Random seed."""
-    on_bad_sample: Literal["error", "skip"] = "error"
-    """Stop at a sample that cannot be read, or replace and count it."""
-    tensorboard: bool = False
-    """Also write TensorBoard events."""
+    baseline: str = "anytouch"  # Train a baseline or an ablation: unitouch, tlv_link, t3, static_only, no_matching, ...
+    init: Path | None = None  # Start from this stage-1 run or weights file.
+    clip_weights: Path | None = None  # CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json.
+    steps: int | None = None  # Steps of the whole schedule (default: 1000).
+    stop_after: int | None = None  # Stop after this many steps, without changing the schedule.
+    save_every: int | None = None  # Steps between checkpoints (default: 200).
+    batch: int | None = None  # Samples per step (default: the preset's).
+    seed: int = 0  # Random seed.
+    on_bad_sample: Literal["error", "skip"] = "error"  # Stop at a sample that cannot be read, or replace and count it.
+    tensorboard: bool = False  # Also write TensorBoard events.
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from anytouch_jax.cli.output import check_apart, check_folder, check_new, log, write_new, write_text
+from anytouch_jax.cli.output import check_apart, check_folder, check_new, log, write_new
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
@@ -25,22 +26,17 @@ class VerifyOptions:
     Exits with 1 if there are errors, or errors that --repair could not remove. Ends with the licences of the data.
     """
 
-    manifests: Positional[tuple[Path, ...]]
-    """Manifests to check together (.csv, .parquet)."""
+    manifests: Positional[tuple[Path, ...]]  # Manifests to check together (.csv, .parquet).
     repair: Path | None = None
     """Write a repaired copy: without unusable rows and files and repeated rows, with swapped folders exchanged."""
     commercial_only: Path | None = None
     """Write a copy with the rows that certainly allow commercial use, after any --repair."""
     swap: tuple[str, ...] = ()
     """With --repair: exchange touch image and photograph in these datasets. Look at them first."""
-    decode: bool = True
-    """Decode every picture. --no-decode only checks that the files exist."""
-    objects: bool = False
-    """Report an object in two splits as an error."""
-    threads: int = 4
-    """Threads that read files."""
-    out: Path | None = None
-    """Write the report as JSON too."""
+    decode: bool = True  # Decode every picture. --no-decode only checks that the files exist.
+    objects: bool = False  # Report an object in two splits as an error.
+    threads: int = 4  # Threads that read files.
+    out: Path | None = None  # Write the report as JSON too.
 
 
 def run(options: VerifyOptions) -> int:
@@ -65,7 +61,8 @@ def run(options: VerifyOptions) -> int:
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, log=log)
     print(report.to_markdown(), end="")
     if options.out is not None:
-        log(f"{write_text(report.to_json(), options.out)}: the report")
+        atomic_write(options.out, report.to_json())
+        log(f"{options.out}: the report")
     errors = [finding.sentence for finding in report.findings if finding.level == "error"]
     if options.repair is not None:
         manifest, errors = _repair(manifest, report, options.repair, options.swap, errors)

@@ -1,6 +1,6 @@
 """AnyTouch (ICLR 2025) in JAX: one representation of touch for many camera-based tactile sensors.
 
-The public names, imported when they are first used: `import anytouch_jax` alone costs nothing.
+Public names are imported on first use, so that `import anytouch_jax` is fast.
 """
 
 from __future__ import annotations
@@ -34,10 +34,17 @@ _HOMES = {
     "evaluate.array_probes": ["knn_probe", "leave_groups_out", "linear_probe", "regression_probe"],
     "evaluate.heads": ["load_head"],
     "evaluate.probing": ["probe_benchmark", "probe_label", "probe_tasks"],
+    "data.loading.loader": ["Loader"],
+    "data.manifest.manifest": ["Manifest"],
+    "weights.tree": ["interpolate"],
     "encoder.encoder": ["Encoder", "load_encoder", "random_encoder"],
     "encoder.preprocess": ["Preprocess"],
 }
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_ALIASES = {  # public names that say more outside their module
+    "load_exported": ("encoder.export", "load"),
+    "read_manifest": ("data.manifest.manifest", "read"),
+}
+_HOME = {name: (module, name) for module, names in _HOMES.items() for name in names} | _ALIASES
 
 __all__ = sorted(_HOME)
 __version__ = "0.1.0"
@@ -46,7 +53,8 @@ __version__ = "0.1.0"
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'anytouch_jax' has no attribute {name!r}")
-    return getattr(import_module(f"anytouch_jax.{_HOME[name]}"), name)
+    module, attribute = _HOME[name]
+    return getattr(import_module(f"anytouch_jax.{module}"), attribute)
 
 
 def __dir__() -> list[str]:

@@ -29,9 +29,8 @@ from anytouch_jax.config import (
 from anytouch_jax.errors import UserError
 
 # Fields that one stage alone reads, by section.
-_ALIGNING = ("alpha_tv", "alpha_tl", "alpha_vl", "touch_text_sum", "match_weight", "match_keep")
 _STAGE_2_FIELDS: dict[str, tuple[str, ...]] = {
-    "objective": (*_ALIGNING, "reconstruct", "groups", "centre"),
+    "objective": ("alpha_tv", "alpha_tl", "alpha_vl", "match_weight", "match_keep", "groups", "center_embeddings"),
     "model": ("match_head", "lora_rank", "lora_alpha", "temperature"),
     "data": ("negatives",),
 }

@@ -17,7 +17,7 @@ def test_a_file_is_replaced_in_one_move(tmp_path: Path) -> None:
     with atomic_path(path) as part:
         part.write_bytes(b"second")
         assert path.read_text(encoding="utf-8") == "first ½"
-    assert path.read_bytes() == b"second" and [one.name for one in path.parent.iterdir()] == ["a.json"]
+    assert path.read_bytes() == b"second" and [file.name for file in path.parent.iterdir()] == ["a.json"]
     umask = os.umask(0)
     os.umask(umask)
     assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
@@ -46,14 +46,14 @@ def test_any_other_error_leaves_the_old_file_too(tmp_path):
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_process_left_is_written_over(tmp_path):
+def test_a_leftover_of_a_killed_process_is_overwritten(tmp_path):
     path, part = tmp_path / "a.bin", tmp_path / "a.bin.tmp"
     part.write_bytes(b"much longer than what follows")
     atomic_write(path, b"short", part=part)
     assert path.read_bytes() == b"short" and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_that_is_a_file_is_told(tmp_path):
+def test_a_folder_that_is_a_file_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     for place in ("file/a", "file/deep/a"):
         with pytest.raises(OSError, match="file"):
@@ -72,7 +72,7 @@ def test_a_full_disk_is_one_sentence_of_the_command(tmp_path, monkeypatch, capsy
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_lock_is_had_once_and_ends_with_its_block(tmp_path):
+def test_a_lock_is_exclusive_and_ends_with_its_block(tmp_path):
     path = tmp_path / "config.json"
     path.write_text("kept")
     with lock(path) as first, lock(path) as second:

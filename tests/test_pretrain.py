@@ -64,7 +64,10 @@ def aligned(tmp_path_factory, world, straight):
 
 def assert_equal_results(first, second):
     """Two runs ended with the same arrays, to the bit, the optimiser's too."""
-    wanted, arrays = arrays_of(first), arrays_of(second)
+    assert_equal_arrays(arrays_of(first), arrays_of(second))
+
+
+def assert_equal_arrays(wanted, arrays):
     assert arrays.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in arrays)
     for name, array in wanted.items():
         np.testing.assert_array_equal(arrays[name], array, err_msg=name)
@@ -83,12 +86,12 @@ def test_a_run_folder(straight, world):
     assert ["next_frame" in line for line in lines] == [False, True, False, True]
     assert [line["p_u"] for line in lines] == [0.0, 0.1875, 0.375, 0.5625]
     assert all(line["loss"] > 0 and line["skipped"] == 0 and line["samples"] == 8 for line in lines)
-    told = checkpoint.read_metadata(run)
-    assert told["sensors"] == list(SENSORS) and told["source"] == {"init": None, "clip": None}
-    assert told["preprocessing"]["touch"]["size"] == 28 and told["preprocessing"]["touch"]["channels"] == "RGB"
+    metadata = checkpoint.read_metadata(run)
+    assert metadata["sensors"] == list(SENSORS) and metadata["source"] == {"init": None, "clip": None}
+    assert metadata["preprocessing"]["touch"]["size"] == 28 and metadata["preprocessing"]["touch"]["channels"] == "RGB"
 
 
-def test_stopping_and_going_on_is_bit_for_bit_one_run(straight, world, tmp_path):
+def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
     run, result = straight
     log = []
     config = replace(run_config(world), run=replace(run_config(world).run, figure_every=4))
@@ -107,7 +110,7 @@ def test_stopping_and_going_on_is_bit_for_bit_one_run(straight, world, tmp_path)
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", [1, 2])
 def test_two_steps_and_two_more_are_bit_for_bit_four_as_users_run_them(world, tmp_path, stage):
-    """On one device and with all of XLA's optimisations, unlike this process; each part is a process of its own."""
+    """Each part is its own process, on one device and with all of XLA's optimisations, unlike this process."""
     settings = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
     settings["PYTHONPATH"] = os.pathsep.join([str(TESTS.parent / "src"), str(TESTS), settings.get("PYTHONPATH", "")])
 
@@ -118,15 +121,13 @@ def test_two_steps_and_two_more_are_bit_for_bit_four_as_users_run_them(world, tm
         return done.stdout.split()
 
     assert [part("whole", 4), part("parts", 2), part("parts", 4)] == [["0", "4"], ["0", "2"], ["2", "4"]]
-    wanted, found = (dict(np.load(tmp_path / f"{name}.npz")) for name in ("whole", "parts"))
-    assert found.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in found)
-    for name, array in wanted.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    whole, parts_ = (dict(np.load(tmp_path / f"{name}.npz")) for name in ("whole", "parts"))
+    assert_equal_arrays(whole, parts_)
     assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
 
 
 def refused(config, run, **options):
-    """The one sentence that a mistake is answered with; nothing of the run is touched."""
+    """Return the one sentence of a UserError."""
     with pytest.raises(UserError) as error:
         train(config, run, **options)
     message = str(error.value)
@@ -137,8 +138,8 @@ def refused(config, run, **options):
 def test_another_preset_in_the_same_folder_is_refused(straight, world):
     run, _ = straight
     before = (run / "config.json").read_bytes(), saved_steps(run)
-    told = refused(run_config(world, model={"embed": 16}), run)
-    assert "model.embed was 12 and is now 16" in told and str(run) in told
+    message = refused(run_config(world, model={"embed": 16}), run)
+    assert "model.embed was 12 and is now 16" in message and str(run) in message
     assert "stage" in refused(run_config(world, 2), run)
     assert ((run / "config.json").read_bytes(), saved_steps(run)) == before
 
@@ -189,7 +190,7 @@ def test_stage_two_resumes_bit_for_bit_without_its_stage_one(straight, aligned, 
     assert not [name for name, array in parts(first.params, *learned).items() if np.array_equal(array, after[name])]
 
 
-def test_the_tokenizer_made_of_the_captions_is_no_larger_than_was_asked_for(world, tmp_path):
+def test_a_tokenizer_of_the_captions_has_the_size_of_the_option_at_most(world, tmp_path):
     config = clips_only(run_config(world, 2))
     config = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=262)))
     params = train(config, tmp_path / "r", stop_after=0).params
@@ -256,13 +257,13 @@ def test_a_config_that_is_not_ours_is_replaced_or_named(straight, world, tmp_pat
     (tmp_path / "new" / "config.json").write_bytes(content)
     train(run_config(world), tmp_path / "new", stop_after=0)  # no run was there
     assert from_json((tmp_path / "new" / "config.json").read_text()).run.steps == 4
-    shutil.copytree(straight[0], tmp_path / "begun")
-    (tmp_path / "begun" / "config.json").write_bytes(content)
-    told = refused(run_config(world), tmp_path / "begun")
-    assert f"{tmp_path / 'begun' / 'config.json'} cannot be read" in told
+    shutil.copytree(straight[0], tmp_path / "started")
+    (tmp_path / "started" / "config.json").write_bytes(content)
+    message = refused(run_config(world), tmp_path / "started")
+    assert f"{tmp_path / 'started' / 'config.json'} cannot be read" in message
 
 
-def test_a_run_whose_config_is_lost_goes_on_as_its_checkpoint_says(straight, world, tmp_path):
+def test_a_run_without_its_config_resumes_from_its_checkpoint(straight, world, tmp_path):
     shutil.copytree(straight[0], tmp_path / "r")
     (tmp_path / "r" / "config.json").unlink()
     assert "run.seed was 0 and is now 1" in refused(run_config(world, seed=1), tmp_path / "r")
@@ -270,15 +271,15 @@ def test_a_run_whose_config_is_lost_goes_on_as_its_checkpoint_says(straight, wor
     assert (tmp_path / "r" / "config.json").read_text() == (straight[0] / "config.json").read_text()
 
 
-def test_settings_that_would_do_nothing_are_one_sentence(world, tmp_path):
-    for stage, model, objective, told in (
+def test_settings_without_effect_are_one_sentence(world, tmp_path):
+    for stage, model, objective, words in (
         (1, {"dtype": "float64"}, {}, "needs JAX_ENABLE_X64=1"),
         (2, {}, {"force": 0.1}, "a loss of stage 1"),
         (2, {}, {"differences": 1.0}, "needs --objective.reconstruct"),
     ):
         config = run_config(world, stage, model=model)
         config = replace(config, objective=replace(config.objective, **objective))
-        assert told in refused(config, tmp_path / "r") and not (tmp_path / "r").exists()
+        assert words in refused(config, tmp_path / "r") and not (tmp_path / "r").exists()
     config = run_config(world, 2)
     config = replace(config, optim=replace(config.optim, accumulate=2))
     assert "--optim.accumulate must be 1 in stage 2" in refused(config, tmp_path / "r")
@@ -303,14 +304,14 @@ def test_without_captions_and_photographs_stage_two_still_matches(world, tmp_pat
 
 def test_two_processes_never_train_one_run(straight, world, tmp_path):
     run = tmp_path / "r"
-    for begun in (False, True):
+    for started in (False, True):
         run.mkdir(exist_ok=True)
         with (run / ".lock").open("ab") as held:
             fcntl.flock(held, fcntl.LOCK_EX)  # as another process holds it, from before its first checkpoint
             before = sorted(path.name for path in run.iterdir())
             assert f"another process trains {run}" in refused(clips_only(run_config(world, 2)), run, init=straight[0])
             assert sorted(path.name for path in run.iterdir()) == before  # not even a tokenizer
-        assert begun or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step == 1
+        assert started or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step == 1
 
 
 def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
@@ -322,7 +323,7 @@ def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
         train(run_config(world, steps=steps), run, stop_after=0)  # and goes on by the same command
 
 
-def test_a_run_is_not_gone_on_with_on_other_rows(world, tmp_path):
+def test_a_run_does_not_resume_on_other_rows(world, tmp_path):
     rows, file = [list(row.values()) for row in read_rows(world)], world.parent / "grown.csv"
     write_manifest(file, rows[:-1])
     train(run_config(file), tmp_path / "r", stop_after=1)
@@ -334,7 +335,7 @@ def test_a_run_is_not_gone_on_with_on_other_rows(world, tmp_path):
     assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2
 
 
-def test_a_start_that_failed_leaves_no_tokenizer_behind_that_counts(straight, world, tmp_path):
+def test_the_tokenizer_of_a_failed_start_is_not_used(straight, world, tmp_path):
     run = tmp_path / "r"
     refused(run_config(world, 2), run, init=tmp_path / "mistyped")
     assert not run.exists()

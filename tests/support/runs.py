@@ -79,9 +79,9 @@ def run_config(
     return replace(config, data=data, run=replace(config.run, **settings))
 
 
-def train(config: Config, run: Path, said: list[str] | None = None, **options: Any) -> FitResult:
-    """`pretrain`, quietly: what it says goes to `said`."""
-    return pretrain(config, run, log=(said if said is not None else []).append, **options)
+def train(config: Config, run: Path, notes: list[str] | None = None, **options: Any) -> FitResult:
+    """Run `pretrain` quietly; its log goes to `notes`."""
+    return pretrain(config, run, log=(notes if notes is not None else []).append, **options)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

@@ -79,8 +79,8 @@ def filled(folder: Path, *losses: float, keep: int = 3) -> Checkpoints:
 
 def test_a_loss_of_few_steps_is_never_the_best(tmp_path):
     saver = opened(tmp_path, keep=1)
-    given = ({"loss": 0.1, checkpoint.PARTIAL: 1}, {"loss": 3.0}, {"loss": 2.0}, {"loss": 9.0})
-    for step, metrics in enumerate(given, 1):
+    saved = ({"loss": 0.1, checkpoint.PARTIAL: 1}, {"loss": 3.0}, {"loss": 2.0}, {"loss": 9.0})
+    for step, metrics in enumerate(saved, 1):
         saver.save(step, state_of(step), metrics)
     saver.wait()
     assert checkpoint.steps(tmp_path) == [3, 4] and checkpoint.best_of(tmp_path) == 3
@@ -100,11 +100,11 @@ def test_every_type_comes_back_bit_equal(tmp_path):
 def test_one_thread_saves_while_another_loads(tmp_path):
     """Orbax runs one operation a process: each waits for the other's."""
     filled(tmp_path / "read", 1).close()
-    saver, done, seen = opened(tmp_path / "written", keep=20), [], []
+    saver, done, loaded = opened(tmp_path / "written", keep=20), [], []
 
     def load() -> None:
         while not done:
-            seen.append(load_params(tmp_path / "read")[0]["logit_scale"])
+            loaded.append(load_params(tmp_path / "read")[0]["logit_scale"])
 
     with ThreadPoolExecutor(1) as other:
         loading = other.submit(load)
@@ -118,11 +118,11 @@ def test_one_thread_saves_while_another_loads(tmp_path):
         finally:
             done.append(True)
         loading.result()
-    assert steps(tmp_path / "written") == list(range(1, 11)) and len(seen) > 1
-    assert all(one == state_of(1).trainable["logit_scale"] for one in seen)
+    assert steps(tmp_path / "written") == list(range(1, 11)) and len(loaded) > 1
+    assert all(scale == state_of(1).trainable["logit_scale"] for scale in loaded)
 
 
-def test_a_save_that_failed_or_was_given_up_keeps_nobody_from_reading(tmp_path, monkeypatch):
+def test_a_failed_or_abandoned_save_does_not_block_a_load(tmp_path, monkeypatch):
     saver = filled(tmp_path, 1)
     monkeypatch.setattr(checkpoint.ocp, "save_async", lambda *_: 1 / 0)
     with pytest.raises(CheckpointError, match="division"):
@@ -141,9 +141,9 @@ def test_a_save_that_failed_or_was_given_up_keeps_nobody_from_reading(tmp_path, 
         patch.setattr(checkpoint, "_PATIENCE", 0.1)
         saver.leave(ValueError, ValueError("another process"), None)
     with ThreadPoolExecutor(1) as other:
-        found = other.submit(load_params, tmp_path)
+        loading = other.submit(load_params, tmp_path)
         try:
-            found.result(timeout=60)
+            loading.result(timeout=60)
         finally:
             never.set()
             other.shutdown(wait=False)
@@ -152,7 +152,7 @@ def test_a_save_that_failed_or_was_given_up_keeps_nobody_from_reading(tmp_path, 
 @pytest.mark.parametrize("times", [2, 3])
 @pytest.mark.parametrize("when", ["checked", "_load"])
 def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatch, when, times):
-    """The one after it is read; where that happens again and again the user is told that, not of damage."""
+    """The one after it is read; where that happens again and again the error says so, and not that it is damaged."""
     filled(tmp_path, 1).close()
     real, read = getattr(checkpoint, when), []
 
@@ -221,11 +221,11 @@ def test_the_best_is_remembered_by_the_next_run(tmp_path):
 def test_describes_itself(tmp_path):
     filled(tmp_path / "checkpoints", 2.5, float("nan")).close()
     for folder in (tmp_path, tmp_path / "checkpoints", tmp_path / "checkpoints" / "00000001"):
-        told = read_metadata(folder, 1)
-        assert told == METADATA | {"step": 1, "config": '{"stage": 1}', "metrics": {"loss": 2.5}}
+        metadata = read_metadata(folder, 1)
+        assert metadata == METADATA | {"step": 1, "config": '{"stage": 1}', "metrics": {"loss": 2.5}}
     assert read_metadata(tmp_path)["metrics"] == {"loss": None}
-    tree, config, told = load_params(tmp_path, 2)
-    assert config == '{"stage": 1}' and told["sensors"] == ["digit", "universal"]
+    tree, config, metadata = load_params(tmp_path, 2)
+    assert config == '{"stage": 1}' and metadata["sensors"] == ["digit", "universal"]
     expected = state_of(2)
     assert all(isinstance(leaf, np.ndarray) for leaf in flatten(tree).values())
     touch = expected.trainable["touch"] | expected.frozen["touch"]
@@ -243,9 +243,9 @@ def test_restores_on_another_number_of_devices(tmp_path):
     saver.save(1, {"trainable": {"x": jax.device_put(value, sharding(4, rows))}}, {})
     for count, spec in [(1, rows), (2, rows), (4, PartitionSpec(None, "data")), (4, PartitionSpec())]:
         wanted = jax.ShapeDtypeStruct(value.shape, value.dtype, sharding=sharding(count, spec))
-        found = saver.restore({"trainable": {"x": wanted}})["trainable"]["x"]
-        assert found.sharding == wanted.sharding
-        np.testing.assert_array_equal(found, value)
+        restored = saver.restore({"trainable": {"x": wanted}})["trainable"]["x"]
+        assert restored.sharding == wanted.sharding
+        np.testing.assert_array_equal(restored, value)
     plain = saver.restore({"trainable": {"x": jax.ShapeDtypeStruct(value.shape, value.dtype)}})
     assert len(plain["trainable"]["x"].sharding.device_set) == 1
     assert isinstance(load_params(tmp_path)[0]["x"], np.ndarray)
@@ -295,13 +295,13 @@ def test_nothing_there_is_one_sentence(tmp_path):
 @pytest.mark.parametrize("damage", ["half", "empty", "gone", "flipped"])
 def test_any_damaged_file_is_named_and_the_older_step_is_intact(tmp_path, damage):
     saver = filled(tmp_path / "run", 1, 2)
-    target, kept = tmp_path / "run" / "00000002", tmp_path / "kept"
-    shutil.copytree(target, kept)
+    target, copy = tmp_path / "run" / "00000002", tmp_path / "kept"
+    shutil.copytree(target, copy)
     names = [path.relative_to(target) for path in sorted(target.rglob("*")) if path.is_file() and path.stat().st_size]
     assert len(names) > 5
     for name in names:
         shutil.rmtree(target)
-        shutil.copytree(kept, target)
+        shutil.copytree(copy, target)
         path, content = target / name, (target / name).read_bytes()
         middle = len(content) // 2
         flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
@@ -404,11 +404,11 @@ CHILD = """
         os.kill(os.getpid(), signal.SIGKILL)
 
     def after(function, times):
-        seen = []
+        calls = []
         def wrapped(*args, **kwargs):
             result = function(*args, **kwargs)
-            seen.append(0)
-            return die() if len(seen) == times else result
+            calls.append(0)
+            return die() if len(calls) == times else result
         return wrapped
 
     saver = checkpoint.Checkpoints(folder, keep=1, config_json="{}", metadata={})
@@ -441,9 +441,9 @@ def test_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, where, last):
         timeout=120,
     )
     assert done.returncode == -9, done.stderr
-    found = steps(tmp_path)
-    assert found[-1] == last or (where == "writing" and found[-1] == 3)
-    for step in found:
+    present = steps(tmp_path)
+    assert present[-1] == last or (where == "writing" and present[-1] == 3)
+    for step in present:
         np.testing.assert_array_equal(load_params(tmp_path, step)[0]["x"], np.full((200, 300), step, "f4"))
     saver = Checkpoints(tmp_path, keep=1, config_json="{}", metadata={})
     assert all(path.name.isdigit() for path in tmp_path.iterdir())

@@ -148,7 +148,7 @@ def test_of_many_wrong_keys_a_handful_is_named():
         (STAGE1, replace(STAGE1, embed=13), "other shapes"),
     ],
 )
-def test_a_wrong_model_is_told_which_setting(file, wanted, setting):
+def test_a_wrong_model_names_the_setting(file, wanted, setting):
     with pytest.raises(UserError, match=setting):
         to_params(weights_of(file), wanted)
 
@@ -251,7 +251,7 @@ def test_a_probe_file_gives_encoder_and_classifier():
 def test_detects_the_model(layout):
     model = {"stage1": DECODER_TOKENS, "stage2": STAGE2}.get(layout, STAGE2)
     weights = weights_of(model, layout) if layout != "openclip" else openclip_of(params_of(model), model)
-    found = detect_model(weights, heads=4, decoder_heads=2)
+    detected = detect_model(weights, heads=4, decoder_heads=2)
     decoder = Stack(512, 8, 16, 2048) if layout in ("clip", "openclip", "probe") else model.decoder
     text = replace(model.text, stack=Stack(10, 2, 1, 14)) if model.text else None
     if layout in ("clip", "openclip"):
@@ -260,8 +260,8 @@ def test_detects_the_model(layout):
         expected = replace(STAGE1, decoder=decoder)
     else:
         expected = replace(model, text=text)
-    assert found == expected
-    to_params(weights, found)
+    assert detected == expected
+    to_params(weights, detected)
 
 
 def test_detects_heads_as_clip_and_the_authors_choose_them():

@@ -120,8 +120,8 @@ def test_a_value_from_elsewhere_is_found():
         del info["stage2_from_clip_only"]["logit_scale"]
         info["probe_from_stage1"][key] = "mae:touch_model.pre_layrnorm.weight"
 
-    found = {row.array for row in checked("K_weight_loading_map", parity_weights.loading_map, change) if not row.good}
-    assert found == {
+    wrong = {row.array for row in checked("K_weight_loading_map", parity_weights.loading_map, change) if not row.good}
+    assert wrong == {
         f"stage1_from_clip/{key}", "stage2_from_clip_only/logit_scale", "stage2_from_clip_only/keys",
         "probe_from_stage1/touch/post_norm/scale",
     }  # fmt: skip

@@ -304,7 +304,7 @@ def test_stage2_takes_each_part_from_its_source():
         ({"open_clip_config.json": {"model_cfg": {"quick_gelu": True}}}, "quick_gelu"),
     ],
 )
-def test_the_activation_of_clip_is_what_stands_beside_it(tmp_path, beside, activation):
+def test_the_activation_of_clip_is_read_from_its_folder(tmp_path, beside, activation):
     for name, content in beside.items():
         (tmp_path / name).write_text(json.dumps(content))
     assert model_of_file(tmp_path / "clip.bin", weights_of(STAGE2, "clip")).activation == activation

@@ -140,19 +140,15 @@ def load_init(
 
 def _check_init(loaded: Loaded, config: Config) -> None:
     """Raise UserError if a run or a file cannot start this run."""
-    path, model, params = loaded.path, loaded.config.model, loaded.params
+    path, model = loaded.path, loaded.config.model
     if loaded.from_run:
         compatible.check_preset(path, loaded.config, config)
-        compatible.check_activation(path, model.activation, config)
-        compatible.check_form(path, model, config)
-    else:
-        compatible.check_activation(path, clip_activation(path), config)
-        if "decoder" in params:
-            guessed = MODEL_KEY not in loaded.metadata  # then head counts are guessed
-            extra = () if guessed else compatible.SHAPELESS
-            compatible.check_form(path, model, config, (*compatible.SHAPED, *extra))
-    if "touch" not in params or "decoder" not in params:
+    compatible.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
+    if "touch" not in loaded.params or "decoder" not in loaded.params:
         raise UserError(f"{path} has no touch encoder and decoder; give a stage-1 run or the authors' weights")
+    # The head counts of a file without our metadata are guesses.
+    exact = loaded.from_run or MODEL_KEY in loaded.metadata
+    compatible.check_form(path, model, config, (*compatible.SHAPED, *(compatible.SHAPELESS if exact else ())))
 
 
 def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[str]:
@@ -172,19 +168,15 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
         )
     if dropped := sorted((fresh_parts & set(loaded.params)) - {"touch", "decoder"}):
         notes.append(f"{path} gives the touch encoder and the decoder; {', '.join(dropped)} start untrained")
-    if _rows(loaded.params) != config.model.patches + 1:
+    if loaded.config.model.patches != config.model.patches:
         notes.append(f"the positions of {path} are resized for images of {config.model.image_size} pixels")
     return notes
-
-
-def _rows(params: Params) -> int:
-    return len(params["touch"]["position"])
 
 
 def _fit(loaded: Loaded, config: Config) -> Params:
     """Return the touch encoder and decoder with this run's positions and sensor rows."""
     parts, rows = {name: loaded.params[name] for name in ("touch", "decoder")}, config.model.patches + 1
-    if _rows(parts) != rows:
+    if loaded.config.model.patches + 1 != rows:
         parts = {n: p | {"position": resize_position(np.asarray(p["position"]), rows)} for n, p in parts.items()}
     stored, wanted = loaded.config.model.sensors, config.model.sensors
     touch = map_sensors(parts["touch"], config.model, lambda table: match_sensors(table, stored, wanted))

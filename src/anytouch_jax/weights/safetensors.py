@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,28 +51,28 @@ def export_safetensors(path: str | Path, params: Any, metadata: Mapping[str, str
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return (arrays in their stored types, metadata) of a safetensors file. Raises WeightsError."""
+    with _opened(path) as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+
+
+def read_file_metadata(path: str | Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file without its arrays; {} for a file of another type."""
+    if Path(path).suffix != ".safetensors":
+        return {}
+    with _opened(path) as file:
+        return dict(file.metadata() or {})
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
     import ml_dtypes  # noqa: F401  gives numpy the name bfloat16
     from safetensors import safe_open
 
     path = existing_file(path)
     try:
         with safe_open(path, framework="numpy") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+            yield file
     except Exception as error:  # a foreign file raises any type of error
-        raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
-
-
-def read_file_metadata(path: str | Path) -> dict[str, str]:
-    """Return the metadata of a safetensors file without its arrays; {} for a file of another type."""
-    from safetensors import safe_open
-
-    if Path(path).suffix != ".safetensors":
-        return {}
-    path = existing_file(path)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            return dict(file.metadata() or {})
-    except Exception as error:
         raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
 
 

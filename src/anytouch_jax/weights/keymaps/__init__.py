@@ -26,7 +26,7 @@ PROJECTIONS = ("query", "key", "value", "out")
 
 @dataclass(frozen=True)
 class Conversion:
-    """How an array of the file becomes ours (`read`) and ours becomes theirs (`write`). Both are exact."""
+    """Exact conversions of an array: from the file's layout to ours (`read`), and back (`write`)."""
 
     read: Callable[[np.ndarray], np.ndarray]
     write: Callable[[np.ndarray], np.ndarray]

@@ -76,7 +76,7 @@ def write(line: str = "") -> None:
 
 # %%
 ends = manifest.clips(config.model.frames + 1, "test")[:, -1]  # every four-frame window
-record["pixels"] = pixels = pixel_scores(params, manifest, ends, config)
+record["pixels"] = pixels = pixel_scores(params, manifest, ends, net=build(config.model), config=config)
 write("## Stage 1: pixels of the test recordings\n")
 write("| | stage 1 | guess without a model |\n| --- | --- | --- |")
 write(f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} (mean of visible) |")

@@ -20,7 +20,7 @@ from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import figures
+from anytouch_jax.evaluate import reconstruction
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
@@ -193,5 +193,5 @@ def _draw_reconstructions(step: int, params: Params, batch: Any, *, run: Path, n
     params = {name: params[name] for name in ("touch", "decoder")}
     if jax.process_index():
         return
-    image = figures.reconstruction_panels(params, clip, sensor, net=net, config=config)
-    figures.write_png(run / "figures" / f"reconstruction_{step:06d}.png", image)
+    image = reconstruction.reconstruction_panels(params, clip, sensor, net=net, config=config)
+    reconstruction.write_png(run / "figures" / f"reconstruction_{step:06d}.png", image)

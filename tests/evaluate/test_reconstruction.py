@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -11,11 +12,18 @@ from touch_world import make_touches
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.evaluate.reconstruction import pixel_scores, plain_guess
+from anytouch_jax.evaluate import reconstruction
+from anytouch_jax.evaluate.reconstruction import (
+    pixel_scores,
+    plain_reconstruction,
+    reconstruction_panels,
+    write_png,
+)
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch, stage1_terms
-from anytouch_jax.ops.losses import reconstruction_loss
+from anytouch_jax.ops.losses import normalise_patches, reconstruction_loss
 from anytouch_jax.ops.masking import random_mask
+from anytouch_jax.ops.tokens import patchify
 
 CLIP = np.random.default_rng(0).integers(0, 256, (2, 4, 28, 28, 3), np.uint8)
 
@@ -37,7 +45,7 @@ def test_the_guesses_without_a_model(frames):
         for patch in np.flatnonzero(hidden[sample]):
             guess = target[sample, ~hidden[sample], :shown].mean(axis=0)
             errors.append(((target[sample, patch, :shown] - guess) ** 2).mean())
-    guess = plain_guess(target, hidden, 3)
+    guess = plain_reconstruction(target, hidden, 3)
     found = reconstruction_loss(guess, target, hidden, next_frame=frames == 4)[1]
     assert float(found["reconstruction"]) == pytest.approx(np.mean(errors), rel=1e-5)
     assert set(found) == ({"reconstruction", "next_frame"} if frames == 4 else {"reconstruction"})
@@ -55,7 +63,7 @@ def test_scores_are_means_over_clips(tmp_path, background):
     ends = manifest.clips(4, "test")[:, -1]
     net = build(config.model)
     params = net.init(jax.random.key(0))
-    found = pixel_scores(params, manifest, ends, config)
+    found = pixel_scores(params, manifest, ends, net=net, config=config)
     sums = dict.fromkeys(found, 0.0)
     for start, (ids, batch) in zip((0, 2, 4), evaluation(manifest, ends, config, "clip", frames=4), strict=True):
         noise = jax.random.uniform(jax.random.key(start), (2, config.model.patches))
@@ -64,7 +72,10 @@ def test_scores_are_means_over_clips(tmp_path, background):
             terms = stage1_terms(params, normalise_touch(clip), batch.sensor[i : i + 1], one, net=net, config=config)[1]
             hidden = np.asarray(random_mask(one, config.model.patches // 4)[2])
             target = patches(clip)
-            guesses = {"plain ": plain_guess(target, hidden, 3), "untouched ": patches(np.full_like(clip, 128))}
+            guesses = {
+                "plain ": plain_reconstruction(target, hidden, 3),
+                "untouched ": patches(np.full_like(clip, 128)),
+            }
             errors = {"": terms}
             for kind, guess in guesses.items():
                 errors[kind] = reconstruction_loss(guess, target, hidden, next_frame=True)[1]
@@ -79,7 +90,90 @@ def test_what_cannot_be_scored_is_refused(tmp_path):
     manifest = manifests.read(make_touches(tmp_path, touches={"test": 1}, sensors=("digit",), frames=4, size=28))
     config = tiny_config(1)
     with pytest.raises(ValueError, match="at least one clip"):
-        pixel_scores({}, manifest, np.zeros(0, np.int64), config)
+        pixel_scores({}, manifest, np.zeros(0, np.int64), net=NET, config=config)
     with pytest.raises(ValueError, match="norm_pix_loss"):
         ends = manifest.clips(4, "test")[:, -1]
-        pixel_scores({}, manifest, ends, replace(config, objective=replace(config.objective, norm_pix_loss=True)))
+        relative = replace(config, objective=replace(config.objective, norm_pix_loss=True))
+        pixel_scores({}, manifest, ends, net=NET, config=relative)
+
+
+# Pictures
+
+CONFIG = tiny_config(1)
+NET = build(CONFIG.model)
+PARAMS = NET.init(jax.random.key(0))
+SENSOR = np.asarray([0, 1], np.int32)
+EDGE, TITLE = 4, 16
+
+
+def cells(image):
+    """The tiles of a figure (rows, columns, 28, 28, 3), their white edges checked and cut off."""
+    side, title, image = 28 + EDGE, image[:TITLE], image[TITLE:]
+    assert 0.01 < (title < 128).mean() < 0.5  # dark words on a white strip
+    grid = image.reshape(image.shape[0] // side, side, image.shape[1] // side, side, 3).transpose(0, 2, 1, 3, 4)
+    assert (grid[:, :, 28:] == 255).all() and (grid[:, :, :, 28:] == 255).all()
+    return grid[:, :, :28, :28]
+
+
+def hidden_pixels(clip, seed=0):
+    """Which pixels (B, 28, 28) the figure hides, by the same draw."""
+    noise = jax.random.uniform(jax.random.key(seed), (len(clip), 16))
+    hidden = np.asarray(random_mask(noise, 4)[2]).reshape(-1, 4, 4)
+    return np.repeat(np.repeat(hidden, 7, axis=1), 7, axis=2)
+
+
+def test_a_clip_is_shown_with_its_mask_reconstruction_and_next_frame():
+    grid = cells(reconstruction_panels(PARAMS, CLIP, SENSOR, net=NET, config=CONFIG))
+    assert grid.shape[:2] == (2, 3 + 3 + 3 + 2)
+    hidden = hidden_pixels(CLIP)
+    assert hidden.mean() == 0.75
+    for sample in range(2):
+        original, masked, filled = grid[sample, :3], grid[sample, 3:6], grid[sample, 6:9]
+        np.testing.assert_array_equal(original, CLIP[sample, :3])
+        seen = ~hidden[sample]
+        for panel in (masked, filled):
+            np.testing.assert_array_equal(panel[:, seen], CLIP[sample, :3][:, seen])
+        assert (masked[:, hidden[sample]] == 128).all()
+        assert (filled[:, hidden[sample]] != CLIP[sample, :3][:, hidden[sample]]).mean() > 0.9
+        np.testing.assert_array_equal(grid[sample, 9], CLIP[sample, 3])
+        assert (grid[sample, 10] != CLIP[sample, 3]).mean() > 0.9
+
+
+def test_a_still_has_three_panels_and_the_mask_follows_the_seed():
+    still = CLIP[:, :1]
+    first, second = (
+        cells(reconstruction_panels(PARAMS, still, SENSOR, net=NET, config=CONFIG, seed=seed)) for seed in (0, 5)
+    )
+    assert first.shape[:2] == (2, 3)
+    for grid, seed in ((first, 0), (second, 5)):
+        np.testing.assert_array_equal((grid[:, 1] == 128).all(-1), hidden_pixels(still, seed))
+
+
+def test_normalised_patches_are_brought_back_to_pixels(monkeypatch):
+    """A network that predicts each normalised patch exactly is shown as the original, but for rounding."""
+
+    def perfect(params, clip, sensor, noise, *, net, config):
+        return normalise_patches(patchify(normalise_touch(clip), 7)), random_mask(noise, 4)[2]
+
+    monkeypatch.setattr(reconstruction, "_predict", perfect)
+    config = replace(CONFIG, objective=replace(CONFIG.objective, norm_pix_loss=True))
+    grid = cells(reconstruction_panels(PARAMS, CLIP, SENSOR, net=NET, config=config)).astype(int)
+    assert np.abs(grid[:, 6:9] - CLIP[:, :3].astype(int)).max() <= 1
+    assert np.abs(grid[:, 10] - CLIP[:, 3].astype(int)).max() <= 1
+
+
+def test_a_figure_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "figures" / "a.png"
+    write_png(path, CLIP[0, 0])
+    np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], CLIP[0, 0])
+    before = path.read_bytes()
+
+    def full(self, data):
+        with open(self, "wb") as file:
+            file.write(data[:10])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(OSError, match=r"No space left .*a\.png"):
+        write_png(path, CLIP[0, 1])
+    assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == ["a.png"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,12 +16,17 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.feature_cache import background_difference
 from anytouch_jax.evaluate.retrieval import (
+    NEGATIVES,
+    MatchScore,
+    best_rule,
     contact_vector,
     cross_sensor_retrieval,
     deepest_rows,
     difference,
     draw_galleries,
+    draw_triples,
     score_galleries,
+    score_matching,
 )
 from anytouch_jax.evaluate.statistics import mean_interval, plain
 
@@ -421,3 +427,94 @@ def test_pixels_minus_background(touched: manifests.Manifest) -> None:
     relative = str(narrow.relative_to(touched.files[0].parent))
     with pytest.raises(UserError, match="its background_path has other proportions"):
         background_difference(with_columns(touched, background_path=[relative] * len(touched)), rows)
+
+
+# Matching ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def triads(tmp_path_factory: Any) -> manifests.Manifest:
+    return manifests.read(make_touches(tmp_path_factory.mktemp("triads"), touches={"test": 20}, each=2))
+
+
+@pytest.fixture(scope="module")
+def rows(triads: manifests.Manifest) -> np.ndarray:
+    return deepest_rows(triads, split="test")
+
+
+def column(manifest: manifests.Manifest, rows: np.ndarray, name: str) -> np.ndarray:
+    return np.asarray(manifest.column(name).to_pylist())[rows]
+
+
+def test_the_best_rule_of_a_code() -> None:
+    anchor = np.repeat(np.arange(40), 3)
+    one = np.ones(120, int)
+    assert best_rule(one, 2 * one, anchor) == 1.0
+    assert best_rule(one, one, anchor) == 0.5
+    # Positives are never of code 0, a third of the negatives is: yes unless 0.
+    assert best_rule(np.tile([1, 2, 2], 40), np.tile([0, 1, 2], 40), anchor) == pytest.approx((1 + 1 / 3) / 2, abs=0.1)
+    assert best_rule(np.arange(120), 120 + np.arange(120), anchor) == 0.5  # no code is met twice
+    assert best_rule(one[:3], 2 * one[:3], anchor[:3]) == 0.5  # nobody to learn from
+
+
+def test_a_rule_finds_nothing_in_codes_that_say_nothing() -> None:
+    rng = np.random.default_rng(0)
+    found = [best_rule(*rng.integers(12, size=(2, 50)), np.repeat(np.arange(10), 5)) for _ in range(300)]
+    assert abs(np.mean(found) - 0.5) < 0.01  # 0.63 where it was learned
+
+
+# Triples ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("negatives", NEGATIVES)
+def test_triples_are_of_one_place_and_of_two(triads: Any, rows: np.ndarray, negatives: Any) -> None:
+    anchor, positive, negative = draw_triples(triads, rows, negatives, draws=4, seed=1)
+    touch, sensor, thing = (column(triads, rows, name) for name in ("touch", "sensor", "object"))
+    assert len(anchor) == 4 * 60 and (np.bincount(anchor) == 4).all()  # every touch was felt by all three sensors
+    assert (touch[anchor] == touch[positive]).all() and (sensor[anchor] != sensor[positive]).all()
+    assert (thing[anchor] != thing[negative]).all()
+    same = sensor[positive] == sensor[negative]
+    assert same.all() if negatives == "same_sensor" else 0.1 < same.mean() < 0.6
+    again = draw_triples(triads, rows, negatives, draws=4, seed=1)
+    np.testing.assert_array_equal(again, (anchor, positive, negative))
+    assert not np.array_equal(draw_triples(triads, rows, negatives, draws=4, seed=2)[2], negative)
+
+
+def test_without_pairs_there_is_nothing_to_match(triads: Any, rows: np.ndarray) -> None:
+    lock = rows[column(triads, rows, "sensor") == "digit"]
+    with pytest.raises(UserError, match="two sensors share no touch in these rows"):
+        draw_triples(triads, lock, "any")
+
+
+# Scores -------------------------------------------------------------------------------------------------------------
+
+
+def scored(table: Any, rows: np.ndarray, features: np.ndarray, logits: Any) -> list[MatchScore]:
+    return score_matching(SimpleNamespace(match=logits), table, rows, features)  # type: ignore[arg-type]
+
+
+def test_features_that_know_the_place_match_perfectly(triads: Any, rows: np.ndarray) -> None:
+    place = np.unique(column(triads, rows, "touch"), return_inverse=True)[1]
+    dot = lambda a, b: (a * b).sum(1) - 0.5  # noqa: E731
+    for one in scored(triads, rows, np.eye(20)[place], dot):
+        assert (one.accuracy, one.auc, one.low, one.high) == (1.0, 1.0, 1.0, 1.0)
+        assert (one.triples, one.anchors) == (300, 60)
+
+
+def test_features_that_say_nothing_are_at_chance(triads: Any, rows: np.ndarray) -> None:
+    noise = np.random.default_rng(0).standard_normal((len(rows), 16))
+    for one in scored(triads, rows, noise, lambda a, b: (a * b).sum(1)):
+        assert abs(one.accuracy - 0.5) < 0.08 and abs(one.auc - 0.5) < 0.08
+        assert one.low is not None and one.high is not None and one.low <= one.accuracy <= one.high
+    always = scored(triads, rows, noise, lambda a, b: np.ones(len(a)))
+    assert [(one.accuracy, one.auc) for one in always] == [(0.5, 0.5)] * 2
+
+
+def test_a_matcher_that_sees_only_the_sensors_is_found_out(triads: Any, rows: np.ndarray) -> None:
+    """It says yes to two different sensors: above chance with any negatives, and not with those of one sensor."""
+    sensor = np.unique(column(triads, rows, "sensor"), return_inverse=True)[1]
+    differ = lambda a, b: 0.5 - (a * b).sum(1)  # noqa: E731
+    free, bound = scored(triads, rows, np.eye(3)[sensor], differ)
+    assert (free.negatives, bound.negatives) == NEGATIVES
+    assert free.accuracy > 0.6 and abs(free.sensors_alone - free.accuracy) < 0.05
+    assert (bound.accuracy, bound.auc, bound.sensors_alone) == (0.5, 0.5, 0.5)

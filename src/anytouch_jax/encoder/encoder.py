@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from anytouch_jax.ops import losses
 from anytouch_jax.weights import load
 
 Params = dict[str, Any]
+_PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matching head", "logit_scale": "temperature"}
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Encoder:
     trained_sensors: tuple[str, ...] | None = None
     universal_drawn: bool = True
     parts: Parts | None = field(default=None, repr=False)
+    metadata: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def net(self) -> Net:
@@ -240,15 +242,20 @@ class Encoder:
 
     def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
         """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
-        parts = self.parts
-        if parts is None or name not in parts.params:
-            part = {"image": "image tower", "text": "text tower", "matcher": "matching head"}.get(name, "alignment")
-            raise UserError(f"{self.source} has no {part}, which {method} needs; give a stage-2 run that has one")
+        params, parts = {name: self.part_params(name)}, self.parts
+        assert parts is not None
         if method not in parts.compiled:
-            params = {key: parts.params[key] for key in (name, *more) if key in parts.params}
+            params |= {key: parts.params[key] for key in more if key in parts.params}
             net = build(usable(parts.model))
             parts.compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
         return parts.compiled[method]
+
+    def part_params(self, name: str) -> Params:
+        """Return the parameters of a part: image, text, decoder, matcher or logit_scale. Raises UserError."""
+        if self.parts is None or name not in self.parts.params:
+            part = _PART_NAMES.get(name, name)
+            raise UserError(f"{self.source} has no {part}; give a run or a weights file that has one")
+        return dict(self.parts.params)[name]
 
 
 def _unit(values: npt.ArrayLike) -> np.ndarray:
@@ -307,7 +314,7 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     others = {name: part for name, part in loaded.params.items() if name != "touch"}
     return Encoder(
         _touch_only(loaded.config), {"touch": loaded.params["touch"]}, str(path), loaded.trained_sensors,
-        loaded.universal_drawn, Parts(loaded.config.model, others, _tokenizer_file(path)),
+        loaded.universal_drawn, Parts(loaded.config.model, others, _tokenizer_file(path)), loaded.metadata,
     )  # fmt: skip
 
 

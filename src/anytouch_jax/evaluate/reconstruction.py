@@ -1,70 +1,136 @@
-"""How well stage 1 tells pixels that it is not shown, beside guesses without a model."""
+"""Reconstruction errors of stage 1 on masked pixels, baselines without a model, and pictures of reconstructions."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.config import Config
+from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import UNTOUCHED
-from anytouch_jax.nn.attention import usable
-from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
 
+if TYPE_CHECKING:
+    from anytouch_jax.nn.functional import Net
 
-def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, config: Config) -> dict[str, float]:
-    """Mean squared error of normalised pixels (Eq. 1, 2) over the clips that end at rows `ends`, without augmentation.
+_GREY, _GAP = 128, 4
 
-    "reconstruction" (hidden patches) and "next_frame" of stage 1; on the same masks the same of `plain_guess`
-    ("plain reconstruction", "plain next_frame"), and with the background subtracted of a gel that nothing touches
-    ("untouched reconstruction", ...). A window is the model's frames and, if it predicts one, the next; the universal
-    tokens serve a sensor that the table lacks. Raises ValueError for no rows, and for `norm_pix_loss`, whose errors
-    have the unit of each patch's spread.
+
+def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config) -> dict[str, float]:
+    """Return the mean squared errors of normalised pixels (Eq. 1, 2) of the clips that end at rows `ends`.
+
+    "reconstruction" (masked patches) and "next_frame" are those of stage 1. "plain ..." are those of
+    `plain_reconstruction` on the same masks, and "untouched ..." those of an untouched gel if the background is
+    subtracted. A clip has the model's frames and, if it predicts one, the next frame. Sensors outside the table get the
+    universal tokens. Raises ValueError without rows, and for `norm_pix_loss`, whose errors are relative to each patch.
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")
-    net, sums, count = build(usable(config.model)), dict[str, float](), 0
+    sums, count = dict[str, float](), 0
     frames = config.model.frames + config.objective.next_frame
     for ids, batch in evaluation(manifest, ends, config, "clip", frames=frames, unknown="universal"):
         n = len(ids)  # the rest of the last batch repeats its last row
         noise = jax.random.uniform(jax.random.key(count), (len(batch.sensor), config.model.patches))
-        found = _scores(params, batch.clip[:n], batch.sensor[:n], noise[:n], net=net, config=config)
-        sums = {name: sums.get(name, 0.0) + float(value) * n for name, value in found.items()}
+        errors = _errors(params, batch.clip[:n], batch.sensor[:n], noise[:n], net=net, config=config)
+        sums = {name: sums.get(name, 0.0) + float(value) * n for name, value in errors.items()}
         count += n
     return {name: value / count for name, value in sums.items()}
 
 
 @partial(jax.jit, static_argnames=("net", "config"))
-def _scores(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> dict[str, Any]:
+def _errors(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> dict[str, Any]:
     clip = normalise_touch(clip)
     pixels, _, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config)
     target = tokens.patchify(clip, net.model.patch)
-    guesses = {"": pixels, "plain ": plain_guess(target, hidden, net.model.frames)}
+    predictions = {"": pixels, "plain ": plain_reconstruction(target, hidden, net.model.frames)}
     if config.data.background == "subtract":
         gel = normalise_touch(jnp.full(clip.shape, UNTOUCHED, jnp.uint8))
-        guesses["untouched "] = tokens.patchify(gel, net.model.patch)
-    following = clip.shape[1] > net.model.frames
+        predictions["untouched "] = tokens.patchify(gel, net.model.patch)
+    has_next = clip.shape[1] > net.model.frames
     return {
         kind + term: value
-        for kind, guess in guesses.items()
-        for term, value in losses.reconstruction_loss(guess, target, hidden, next_frame=following)[1].items()
+        for kind, prediction in predictions.items()
+        for term, value in losses.reconstruction_loss(prediction, target, hidden, next_frame=has_next)[1].items()
     }
 
 
-def plain_guess(target: Any, hidden: Any, frames: int) -> Any:
-    """Patches (B, N, T, C) as a guess without a model has them, `hidden` bool (B, N).
+def plain_reconstruction(target: Any, hidden: Any, frames: int) -> Any:
+    """Return patches (B, N, T, C) predicted without a model, from patches that are not `hidden` bool (B, N).
 
-    Every patch is the mean of the sample's visible ones; a frame beyond the `frames` that the encoder sees is a copy of
-    the last of these.
+    Every patch is the mean of the sample's visible ones. A frame after the encoder's `frames` is a copy of the last of
+    these.
     """
     visible = ~hidden[:, :, None, None]
     mean = (target * visible).sum(axis=1, keepdims=True) / visible.sum(axis=1, keepdims=True)
-    guess = jnp.broadcast_to(mean, target.shape)
-    return jnp.concatenate([guess[:, :, :frames], target[:, :, frames - 1 : target.shape[2] - 1]], axis=2)
+    prediction = jnp.broadcast_to(mean, target.shape)
+    return jnp.concatenate([prediction[:, :, :frames], target[:, :, frames - 1 : target.shape[2] - 1]], axis=2)
+
+
+def reconstruction_panels(
+    params: Any, clip: Any, sensor: Any, *, net: Net, config: Config, seed: int = 0
+) -> np.ndarray:
+    """Return an RGB image u8 with a row per sample: original, masked input, reconstruction, next frame, prediction.
+
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). Visible patches are copied from the input. With `norm_pix_loss` the
+    prediction is scaled back by the true mean and spread of each patch.
+    """
+    noise = jax.random.uniform(jax.random.key(seed), (len(sensor), net.model.patches))
+    pixels, hidden = _predict(params, clip, sensor, noise, net=net, config=config)
+    return _panels(np.asarray(clip), np.asarray(pixels), np.asarray(hidden), net, config)
+
+
+@partial(jax.jit, static_argnames=("net", "config"))
+def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
+    pixels, _, hidden = reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
+    return pixels, hidden
+
+
+def _panels(clip: np.ndarray, pred: np.ndarray, hidden: np.ndarray, net: Net, config: Config) -> np.ndarray:
+    patch, size, frames = net.model.patch, net.model.image_size, net.model.frames
+    if config.objective.norm_pix_loss:
+        target = np.asarray(tokens.patchify(normalise_touch(jnp.asarray(clip)), patch))
+        spread = np.sqrt(target.var(axis=-1, ddof=1, keepdims=True) + 1e-6)
+        pred = pred * spread + target.mean(axis=-1, keepdims=True)
+    predicted = _to_pixels(np.asarray(tokens.unpatchify(jnp.asarray(pred), patch, size)))
+    of_pixels = jnp.asarray(hidden)[:, :, None, None].repeat(patch**2 * 3, 3)
+    cover = np.asarray(tokens.unpatchify(of_pixels, patch, size)) > 0
+    count = min(clip.shape[1], frames)
+    masked = np.where(cover, _GREY, clip[:, :count])
+    filled = np.where(cover, predicted[:, :count], clip[:, :count])
+    blocks = {"original": clip[:, :count], "visible": masked, "reconstructed": filled}
+    if clip.shape[1] > frames:
+        blocks |= {"next frame": clip[:, frames : frames + 1], "predicted": predicted[:, frames : frames + 1]}
+    rows = [np.concatenate([_strip(block[i]) for block in blocks.values()], axis=1) for i in range(len(clip))]
+    titles = [_title(name, block.shape[1] * (size + _GAP)) for name, block in blocks.items()]
+    return np.concatenate([np.concatenate(titles, axis=1), *rows], axis=0)
+
+
+def _title(name: str, width: int) -> np.ndarray:
+    """Return a white strip (16, width, 3) with a word on it."""
+    strip = np.full((16, width, 3), 255, np.uint8)
+    cv2.putText(strip, name, (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+    return strip
+
+
+def _strip(frames: np.ndarray) -> np.ndarray:
+    """Return frames (T, H, W, 3) in a row, with a white edge."""
+    return np.concatenate([np.pad(f, ((0, _GAP), (0, _GAP), (0, 0)), constant_values=255) for f in frames], axis=1)
+
+
+def _to_pixels(normalised: np.ndarray) -> np.ndarray:
+    pixels = (normalised * np.asarray(IMAGENET_STD) + np.asarray(IMAGENET_MEAN)) * 255
+    return np.clip(np.nan_to_num(pixels), 0, 255).astype(np.uint8)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write an RGB image u8 (H, W, 3), whole or not at all. Raises OSError."""
+    atomic_write(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())

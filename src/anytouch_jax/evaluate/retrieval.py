@@ -1,4 +1,4 @@
-"""Cross-sensor retrieval: recall of the same touch by another sensor, among similar touches.
+"""Cross-sensor retrieval and matching: recall of the same touch by another sensor, among similar touches.
 
 For each query touch of sensor A, a gallery of touches of sensor B has that touch once. The distractors are its nearest
 neighbours in position, depth and force, so that the place or the size of a contact does not reveal it. Reported are
@@ -17,10 +17,13 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+from sklearn.metrics import roc_auc_score
 
 from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.data.loading.matching import Matches, MatchKeys
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import text_column
+from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import mean_interval
 
@@ -31,6 +34,9 @@ ALL = "all"
 GALLERY = 50  # touches in a gallery, the true one included
 COVARIATES = ("label.x", "label.y", "label.depth", "label.force")  # mm, mm, mm, N
 VECTOR = ("label.area", "label.x", "label.y", "label.force")  # mm2, mm, mm, N
+Negatives = Literal["any", "same_sensor"]
+NEGATIVES: tuple[Negatives, ...] = ("any", "same_sensor")
+DRAWS = 5  # triples of each anchor
 _TIE = 1e-9
 _CHUNK = 1024  # queries whose scores are in memory at a time
 
@@ -376,6 +382,90 @@ def _texts(values: Any, count: int | None = None) -> Array:
     if names.ndim != 1 or count not in (None, len(names)):
         raise UserError(f"retrieval needs one name for each touch, not {names.shape} names for {count}")
     return names
+
+
+# Matching -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MatchScore:
+    """How a matcher distinguishes positives from `negatives`; shares are in 0..1, chance is 0.5.
+
+    `accuracy`: share of logits on the right side of 0, over positives and negatives. `low`, `high`: its 95 % interval
+    under a bootstrap over the anchors' objects, None with fewer than two. `auc`: chance that a positive's logit is
+    above a negative's. `sensors_alone`: accuracy of the best rule that only knows the two sensors (`best_rule`).
+    """
+
+    negatives: Negatives
+    accuracy: float
+    low: float | None
+    high: float | None
+    auc: float
+    sensors_alone: float
+    triples: int
+    anchors: int
+
+
+def score_matching(encoder: Encoder, manifest: Manifest, rows: Array, features: Array) -> list[MatchScore]:
+    """Return the scores of the encoder's matching head (Eq. 5) with negatives of any sensor, and of the positive's.
+
+    Did two touches, by two sensors, come from the same place? With negatives of any sensor, the sensors alone reveal
+    part of the answer, since a positive never has the anchor's sensor. `features` (n, E) are those of manifest `rows`
+    (n,), pooling class. Raises UserError without a matching head, and if two sensors share no touch.
+    """
+    objects, scores = text_column(manifest, "object")[rows], []
+    encoder.match(features[:1], features[:1])  # raises without a head
+    for negatives in NEGATIVES:
+        anchor, positive, negative = draw_triples(manifest, rows, negatives)
+        right = encoder.match(features[anchor], features[positive])
+        wrong = encoder.match(features[anchor], features[negative])
+        correct = np.mean([right > 0, wrong <= 0], axis=0)
+        sensor = manifest.codes("sensor")[rows]
+        codes = [sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)]
+        low, high = mean_interval(correct, objects[anchor])
+        labels = np.repeat([1, 0], [len(right), len(wrong)])
+        auc = float(roc_auc_score(labels, np.concatenate([right, wrong])))
+        alone, count = best_rule(codes[0], codes[1], anchor), len(np.unique(anchor))
+        scores.append(MatchScore(negatives, float(correct.mean()), low, high, auc, alone, len(anchor), count))
+    return scores
+
+
+def draw_triples(
+    manifest: Manifest, rows: Array, negatives: Negatives, *, draws: int = DRAWS, seed: int = 0
+) -> tuple[Array, Array, Array]:
+    """Return anchors, positives and negatives as places in `rows`, i64 (m,) each: `draws` of every anchor.
+
+    They are drawn as in training. Raises UserError if two sensors share no touch.
+    """
+    names = ("touch", "sensor", "unit", "object", "dataset")
+    keys = MatchKeys(*(manifest.codes(name, own=name == "touch") for name in names))
+    matches = Matches(rows, keys, same_sensor=negatives == "same_sensor", other_object=True)
+    if not matches.anchors.size:
+        which = "" if negatives == "any" else " next to a touch of another place"
+        raise UserError(f"two sensors share no touch{which} in these rows; there is nothing to match")
+    triples = [
+        (int(anchor), *matches.draw(int(anchor), np.random.default_rng([seed, int(anchor), turn])))
+        for anchor in matches.anchors
+        for turn in range(draws)
+    ]
+    anchor, positive, negative = np.asarray(triples, np.int64).T
+    return anchor, positive, negative
+
+
+def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
+    """Return the accuracy of the best rule on codes i64 (n,) of positives and of negatives.
+
+    The rule is learned on half of the anchors (`anchor` i64 (n,)) and scored on the other half, then the reverse. It
+    would overfit random codes if it were scored on its own half. It guesses for unknown codes.
+    """
+    names, place = np.unique(anchor, return_inverse=True)
+    half = (np.random.default_rng(0).permutation(len(names)) % 2)[place]
+    codes, code = np.unique(np.stack([right, wrong]), return_inverse=True)
+    code, yes = code.reshape(2, -1), np.empty((2, len(place)))
+    for side in (0, 1):
+        counts = [np.bincount(part[half != side], minlength=len(codes)) for part in code]
+        yes[:, half == side] = (0.5 + 0.5 * np.sign(counts[0] - counts[1]))[code[:, half == side]]
+    return float((yes[0].mean() + 1 - yes[1].mean()) / 2)
 
 
 # Contacts of a manifest ---------------------------------------------------------------------------------------------

@@ -294,6 +294,14 @@ def test_waits_for_a_server_are_bounded(monkeypatch):
         _ask(server, tries=1)  # the server has stopped
 
 
+def test_an_unusable_endpoint_ends_the_waits_of_other_questions(make, tmp_path):
+    """The first question is told to wait for a minute. The second finds the key refused: the first is not repeated."""
+    behave = lambda number, _: (401, {}, b"") if number else (429, {"Retry-After-Ms": "60000"}, b"")  # noqa: E731
+    with serve(behave) as server, pytest.raises(EndpointError, match="the key is not accepted"):
+        _run(make(_rows(2)), server, tmp_path / "answers", threads=2)
+    assert len(server.asked) == 2
+
+
 def test_bad_answers_are_asked_again_then_counted_and_listed(make, tmp_path):
     answers = ["", "I'm sorry, I can't help with that.", "no JSON", {"caption": "soft"}, {"caption": "word " * 61},
                {"caption": 7}, ["soft and warm"], {"object": "x"}]  # fmt: skip

@@ -34,9 +34,6 @@ Params = dict[str, Any]
 
 _RELEASE_SENSORS = SENSORS[:5]  # the authors' weights were trained on these, and on the universal tokens
 _PATTERNS = ("*.safetensors", "*.bin", "*.pth", "*.pt")
-_NO_CLIP = (
-    "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in its folder"
-)
 
 
 @dataclass(frozen=True)

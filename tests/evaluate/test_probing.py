@@ -46,17 +46,14 @@ def planted(values: Any) -> FeatureStore:
 
 def telling(world: Manifest, task: str, noise: float = 0.3) -> Any:
     """Features that say the label of the task, in a linear code under noise."""
-    results = select(world, TASKS[task])
-    code = (
-        results.labels[:, None]
-        if results.labels.dtype.kind == "f"
-        else results.labels[:, None] == np.unique(results.labels)
-    )
+    rows = select(world, TASKS[task])
+    labels = rows.labels[:, None]
+    code = labels if labels.dtype.kind == "f" else labels == np.unique(labels)
     rng = np.random.default_rng(0)
     values = np.zeros((len(world), max(12, code.shape[1])))
     values[rows.rows[:, 0], : code.shape[1]] = code
     values = values @ np.linalg.qr(rng.normal(size=values.shape[1:] * 2))[0] + noise * rng.normal(size=values.shape)
-    return lambda rows: values[rows]
+    return lambda ids: values[ids]
 
 
 def noise(rows: Any) -> np.ndarray:

@@ -54,7 +54,7 @@ def stage1_terms(config=CONFIG1):
 @jax.jit
 def reconstruct(params, clip):
     def total(clip):
-        pred, _, hidden = objectives.reconstruct(params, clip, SENSOR, NOISE, net=NET1, config=CONFIG1)
+        pred, hidden = objectives.reconstruct(params, clip, SENSOR, NOISE, net=NET1, config=CONFIG1)
         return jnp.sum(pred**2), (pred, hidden)
 
     return jax.value_and_grad(total, has_aux=True)(clip)
@@ -141,7 +141,7 @@ def match_batch():
 
 
 ALIGN, MATCH = align_batch(), match_batch()
-PAPER2 = replace(CONFIG2, objective=replace(CONFIG2.objective, centre=False))  # Eq. 4 as it stands
+PAPER2 = replace(CONFIG2, objective=replace(CONFIG2.objective, center_embeddings=False))  # Eq. 4 as it stands
 FUNCTION2 = partial(objectives.stage2_terms, noise=None, net=NET2, config=PAPER2)
 TERMS2 = jax.jit(jax.value_and_grad(FUNCTION2, has_aux=True))
 
@@ -177,11 +177,11 @@ def test_packed_slots_reach_their_rows():
 
 
 def embed_image():
-    return np.asarray(jax.jit(lambda p, x: NET2.apply(p, "embed_image", x))(PARAMS2, ALIGN.image))
+    return np.asarray(jax.jit(lambda p, x: NET2.encode_image(p, x))(PARAMS2, ALIGN.image))
 
 
 def embed_text():
-    return np.asarray(jax.jit(lambda p, *x: NET2.apply(p, "embed_text", *x))(PARAMS2, ALIGN.text, ALIGN.text_mask))
+    return np.asarray(jax.jit(lambda p, *x: NET2.encode_text(p, *x))(PARAMS2, ALIGN.text, ALIGN.text_mask))
 
 
 def loop(a, b, rows):
@@ -217,7 +217,7 @@ def test_towers_that_nothing_is_shown_to_cost_nothing_and_need_not_exist():
     )  # fmt: skip
     terms = lambda p, b: objectives.stage2_terms(p, Stage2Batch(b, None), None, net=NET2, config=CONFIG2)  # noqa: E731
     touch = {name: PARAMS2[name] for name in ("touch", "logit_scale")}  # no towers, no decoder, no matching head
-    encode = flops(lambda p: NET2.apply(p, "encode", ALIGN.clip, SENSOR), touch)
+    encode = flops(lambda p: NET2.encode_touch(p, ALIGN.clip, SENSOR), touch)
     assert flops(terms, touch, none) < 1.02 * encode
     assert flops(terms, PARAMS2, ALIGN) > 1.3 * encode
     loss, metrics = terms(touch, none)
@@ -247,7 +247,7 @@ def test_the_weights_of_the_sum(recipe):
 
 
 def test_touches_of_one_shape_share_a_pass_and_keep_their_rows():
-    encode = jax.jit(lambda p, c, s: NET2.apply(p, "encode", c, s))
+    encode = jax.jit(lambda p, c, s: NET2.encode_touch(p, c, s))
     embed = jax.jit(partial(objectives.touch_embeddings, net=NET2))
     touches = [*zip(MATCH[:6:2], MATCH[1::2], strict=True), (MATCH.clip[:2], MATCH.sensor[:2])]
     z = embed(PARAMS2, touches)
@@ -260,7 +260,7 @@ def test_touches_of_one_shape_share_a_pass_and_keep_their_rows():
 
 def test_the_matching_loss_is_that_of_the_logits():
     z = objectives.touch_embeddings(PARAMS2, list(zip(MATCH[:6:2], MATCH[1::2], strict=True)), net=NET2)
-    logits = [np.asarray(NET2.apply(PARAMS2, "match", z[0], other)) for other in z[1:]]
+    logits = [np.asarray(NET2.match(PARAMS2, z[0], other)) for other in z[1:]]
     loss = np.log1p(np.exp(-logits[0])).mean() + np.log1p(np.exp(logits[1])).mean()
     (_, metrics), _ = terms2()
     np.testing.assert_allclose(metrics["match"], loss, rtol=1e-5)

@@ -78,7 +78,7 @@ def half(batch, i):
 
 @pytest.mark.parametrize("what", ["align", "match"])
 def test_groups_are_halves_that_do_not_know_of_each_other(what):
-    config = changed(tiny_config(2), {"match_head": "cosine"}, centre=False)
+    config = changed(tiny_config(2), {"match_head": "cosine"}, center_embeddings=False)
     net = build(config.model)
     params = net.init(jax.random.key(1))
     if what == "align":
@@ -109,9 +109,9 @@ def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
     net = build(config.model)
     params = net.init(jax.random.key(1))
     touches = [(floats(5, 1), SENSOR[:5]) for _ in range(3)]  # an odd number: never half of them right
-    z = [np.asarray(net.apply(params, "encode", *touch)) for touch in touches]
+    z = [np.asarray(net.encode_touch(params, *touch)) for touch in touches]
     z = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in z]
-    same, other = (np.asarray(net.apply(params, "match", z[0], x)) for x in z[1:])
+    same, other = (np.asarray(net.match(params, z[0], x)) for x in z[1:])
     match = MatchBatch(*(array for touch in touches for array in touch))
     _, metrics = objectives.stage2_terms(params, Stage2Batch(None, match), None, net=net, config=config)
     right = np.count_nonzero(same > 0) + np.count_nonzero(other < 0)

@@ -274,8 +274,7 @@ def test_a_run_without_its_config_resumes_from_its_checkpoint(straight, world, t
 def test_settings_without_effect_are_one_sentence(world, tmp_path):
     for stage, model, objective, words in (
         (1, {"dtype": "float64"}, {}, "needs JAX_ENABLE_X64=1"),
-        (2, {}, {"force": 0.1}, "a loss of stage 1"),
-        (2, {}, {"differences": 1.0}, "needs --objective.reconstruct"),
+        (2, {"match_head": "linear"}, {}, "--recipe release"),
     ):
         config = run_config(world, stage, model=model)
         config = replace(config, objective=replace(config.objective, **objective))

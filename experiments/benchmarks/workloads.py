@@ -171,7 +171,7 @@ def embed_of(config: Config) -> Callable[..., jax.Array]:
     net = build(config.model)
 
     def embed(params: Tree, clip: jax.Array, sensor: jax.Array) -> jax.Array:
-        return net.apply(params, "encode", objectives.normalise_touch(clip), sensor).astype(jnp.float32)
+        return net.encode_touch(params, objectives.normalise_touch(clip), sensor).astype(jnp.float32)
 
     return embed
 
@@ -186,7 +186,7 @@ def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, An
 
     def values(params: Tree, batch: Any, noise: jax.Array) -> dict[str, Any]:
         if not trains:
-            return {"output": net.apply(params, "encode", batch.clip, batch.sensor)}
+            return {"output": net.encode_touch(params, batch.clip, batch.sensor)}
         trained = {name: value for name, value in params.items() if name != "decoder"} | {
             "decoder": {name: value for name, value in params["decoder"].items() if name != "position"}
         }
@@ -203,12 +203,12 @@ def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, An
 
 def _terms(params: Tree, batch: Any, noise: jax.Array, net: Any, config: Config) -> tuple[jax.Array, jax.Array]:
     if config.stage == 1:
-        pred, _, _ = objectives.reconstruct(params, batch.clip, batch.sensor, noise, net=net, config=config)
+        pred, _ = objectives.reconstruct(params, batch.clip, batch.sensor, noise, net=net, config=config)
         value, _ = objectives.stage1_terms(params, batch.clip, batch.sensor, noise, net=net, config=config)
         return value, pred
     value, _ = objectives.stage2_terms(params, batch, noise, net=net, config=config)
     clip, sensor = (batch.align or batch.match)[:2]
-    output = losses.normalise(net.apply(params, "encode", clip[:, : net.model.frames], sensor))
+    output = losses.normalise(net.encode_touch(params, clip[:, : net.model.frames], sensor))
     return value, output
 
 
@@ -313,7 +313,7 @@ def align_flops(config: Config, batch: int, frames: int, images: int, texts: int
     logits = sum(_dense(batch, model.embed, batch) for there in (images, texts, images and texts) if there)
     total = embedding_flops(model, batch, min(frames, model.frames), train=True) + 2 * _TRAINED * logits
     total += image_flops(model, images) + text_flops(model, texts, length)
-    return total + (stage1_flops(config, batch, frames) if config.objective.reconstruct else 0.0)
+    return total + (stage1_flops(config, batch, frames) if config.reconstructs else 0.0)
 
 
 def match_flops(config: Config, batch: int, frames: int) -> float:

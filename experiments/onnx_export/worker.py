@@ -34,7 +34,7 @@ def encoder_of(folder: Path):
     net = build(replace(model, attention="xla"))  # the form that takes any number of touches
 
     def encode(touches: jax.Array, sensor: jax.Array) -> jax.Array:
-        return net.apply(params, "encode", normalise_touch(touches), sensor).astype(jnp.float32)
+        return net.encode_touch(params, normalise_touch(touches), sensor).astype(jnp.float32)
 
     return encode
 

@@ -137,7 +137,7 @@ class Pupil(NamedTuple):
 
 def of_encoder(encoder: Encoder) -> Pupil:
     def features(params: Any, images: Any, sensor: Any) -> Any:
-        z = encoder.net.apply({"touch": params}, "encode", normalise_touch(images[:, None]), sensor)
+        z = encoder.net.encode_touch({"touch": params}, normalise_touch(images[:, None]), sensor)
         return z.astype(jnp.float32)
 
     return Pupil(features, encoder.params["touch"], encoder.config.model.embed)

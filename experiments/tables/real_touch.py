@@ -113,7 +113,7 @@ def labelled_batches(start: int, stop: int) -> Iterator[Any]:
 
 
 def labelled_loss(params: Any, batch: Labelled, key: Any, progress: Any) -> Any:
-    z = net.apply({"touch": params["touch"]}, "encode", normalise_touch(batch.clip), batch.sensor)
+    z = net.encode_touch({"touch": params["touch"]}, normalise_touch(batch.clip), batch.sensor)
     logits = z @ params["head"]["kernel"] + params["head"]["bias"][None]
     loss = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, batch.label))
     return loss, {"accuracy": jnp.mean((jnp.argmax(logits, axis=1) == batch.label).astype(jnp.float32))}

@@ -114,7 +114,7 @@ def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, states:
     model = design.shape.model
     row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
     rows = jnp.full(len(pixels), row, jnp.int32)
-    hidden: Array = build(model).apply(encoder, "touch.states", pixels[:, None], rows, states)
+    hidden: Array = build(model).bind(encoder).touch.states(pixels[:, None], rows, states)
     return hidden.astype(jnp.float32)
 
 

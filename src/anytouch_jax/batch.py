@@ -1,4 +1,4 @@
-"""The batches that travel from the loader to the device: NamedTuples of arrays, nothing static inside.
+"""Batches that travel from the loader to the device: NamedTuples of arrays.
 
 The shape is the data type: T is 1 for stills, 3 for clips, 4 for clips with their next frame. Pixels are uint8,
 channel last (RGB); normalisation happens on the device. B batch, V image slots, L text slots, S text length.
@@ -12,15 +12,10 @@ Array = Any  # a numpy or a jax array
 
 
 class TouchBatch(NamedTuple):
-    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table.
-
-    `force` f32 (B, 2), where the run has a head for it: force at the last frame seen and its change since the first
-    one, in spreads over the data (see `data.labels`), NaN where it is not known.
-    """
+    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table."""
 
     clip: Array
     sensor: Array
-    force: Array | None = None
 
 
 class AlignBatch(NamedTuple):
@@ -42,8 +37,8 @@ class AlignBatch(NamedTuple):
 class MatchBatch(NamedTuple):
     """Stage 2, matching triples: three times (clip u8 (B, T, H, W, 3), sensor i32 (B,)).
 
-    Where the other pairs of the batch are the negatives there is no third touch, but `place` i32 (B,): equal for pairs
-    of one place, which are no negatives of each other.
+    If the other pairs of the batch are the negatives, there is no third touch. Then `place` i32 (B,) is equal for
+    pairs of one place, which are not negatives of each other.
     """
 
     clip: Array

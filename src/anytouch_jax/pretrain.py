@@ -106,7 +106,7 @@ def pretrain(
 
 def _check_settings(config: Config) -> None:
     """Raise UserError for settings that this machine or this stage cannot follow."""
-    model, objective = config.model, config.objective
+    model = config.model
     if model.attention == "cudnn" and jax.default_backend() != "gpu":
         raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
     if model.attention == "cudnn" and model.dtype != "bfloat16":
@@ -118,10 +118,8 @@ def _check_settings(config: Config) -> None:
             "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
             "whole batch; lower --batch instead"
         )
-    if config.stage == 2 and objective.force:
-        raise UserError("--objective.force is a loss of stage 1; leave it out in stage 2")
-    if config.stage == 2 and objective.differences and not objective.reconstruct:
-        raise UserError("--objective.differences needs --objective.reconstruct in stage 2, or leave it out")
+    if model.match_head == "linear" and config.recipe == "paper":
+        raise UserError("--model.match-head linear is the head of the release; add --recipe release, or choose mlp")
 
 
 def _check_start(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> None:
@@ -187,7 +185,7 @@ def _draw_reconstructions(step: int, params: Params, batch: Any, *, run: Path, n
     """Draw the first samples of a batch that has touches to reconstruct."""
     if isinstance(batch, Stage2Batch):
         batch = batch.align
-        if batch is None or not config.objective.reconstruct:
+        if batch is None or not config.reconstructs:
             return
     clip, sensor = (np.asarray(jax.device_get(x[:6])) for x in (batch.clip, batch.sensor))
     params = {name: params[name] for name in ("touch", "decoder")}

@@ -14,7 +14,7 @@ from anytouch_jax.errors import UserError
 
 NAMES = (
     "anytouch", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "no_text", "no_vision", "no_stage1",
-    "no_stage2", "no_matching", "no_dynamic", "no_universal", "no_text_aligned", "frame_differences", "force_heads",
+    "no_stage2", "no_matching", "no_dynamic", "no_universal", "no_text_aligned",
 )  # fmt: skip
 OWN = {"objective.universal_end": 0.0}  # it starts at 0 anyway
 STILLS = {"data.clip_share": 0.0}
@@ -22,7 +22,6 @@ STILLS = {"data.clip_share": 0.0}
 CHANGED = {
     ("anytouch", 1): {}, ("anytouch", 2): {}, ("no_stage2", 1): {}, ("no_stage1", 2): {},
     ("no_text", 1): {}, ("no_vision", 1): {}, ("no_text_aligned", 1): {}, ("no_matching", 1): {},
-    ("frame_differences", 2): {}, ("force_heads", 2): {},
     ("unitouch", 2): {**OWN, **STILLS, "model.text": None, "model.match_head": "none", "data.require": ("image",)},
     ("tlv_link", 2): {
         **OWN, **STILLS, "model.match_head": "none", "model.sensor_tokens": 0, "data.require": ("image", "text"),
@@ -39,8 +38,6 @@ CHANGED = {
     ("no_matching", 2): {"model.match_head": "none"},
     ("no_universal", 1): OWN, ("no_universal", 2): OWN,
     ("no_text_aligned", 2): {"data.aligned_text": False},
-    ("frame_differences", 1): {"objective.differences": 1.0},
-    ("force_heads", 1): {"model.force_head": True, "objective.force": 0.1},
 }  # fmt: skip
 
 
@@ -112,8 +109,7 @@ def test_a_configuration_from_before_these_fields_reads_as_the_paper_model() -> 
     config = preset("tiny", stage=2)
     data = json.loads(to_json(config))
     for section, names in {
-        "model": ("patch_encoder", "force_head"),
-        "objective": ("differences", "force"),
+        "model": ("patch_encoder",),
         "data": ("require", "contact_only", "aligned_text"),
     }.items():
         for name in names:
@@ -154,8 +150,8 @@ def test_train_refuses_a_baseline_that_does_not_fit(capsys: pytest.CaptureFixtur
     assert "--model.temperature has no effect with --clip-weights" in told(*clip, "0.2")
     assert "there is no manifest" in told(*clip, "0.07")
     masked = ("--objective.mask-ratio", "0.5", *init)
-    assert "--objective.mask-ratio has no effect in stage 2 without --objective.reconstruct" in told(*masked)
-    for kept in (("--objective.reconstruct", *masked), ("--recipe", "release", *masked), ("--baseline", "t3")):
+    assert "--objective.mask-ratio has no effect in stage 2 of the paper recipe" in told(*masked)
+    for kept in (("--recipe", "release", *masked), ("--baseline", "t3")):
         assert "there is no manifest" in told(*kept)
     assert "no_stage1 has no stage 1" in told("--baseline", "no_stage1", *init)
     assert "there is no manifest" in told("--baseline", "no_matching", *init)

@@ -69,7 +69,7 @@ def test_what_both_recipes_have_in_common():
         config = preset(name, stage=stage, recipe=recipe, towers=towers)
         o, loss, data = config.optim, config.objective, config.data
         assert (o.beta1, o.beta2, o.weight_decay, o.learning_rate) == (0.9, 0.99, 0.1, 2e-4)
-        assert (o.clip_norm, o.ema, o.accumulate) == (None, None, 1)
+        assert (o.grad_clip, o.accumulate) == (None, 1)
         assert (loss.mask_ratio, loss.alpha_tv, loss.alpha_tl, loss.alpha_vl) == (0.75, 1.0, 1.0, 0.2)
         assert (loss.match_weight, loss.universal_start, loss.universal_end, loss.groups) == (0.1, 0.0, 0.75, 1)
         assert (config.model.temperature, config.model.sensor_tokens, config.model.frames) == (0.07, 5, 3)
@@ -81,17 +81,16 @@ def test_what_both_recipes_have_in_common():
 def test_the_points_on_which_the_recipes_differ():
     paper, release = (preset("large", stage=2, recipe=r, towers="pretrained") for r in ("paper", "release"))
     assert (paper.model.match_head, release.model.match_head) == ("mlp", "linear")
-    assert paper.objective.pair_weights == (0.5, 0.5, 0.1)
-    assert release.objective.pair_weights == (0.5, 1.0, 0.1)  # touch-text: twice the paper's
-    assert (paper.objective.reconstruct, release.objective.reconstruct) == (False, True)
-    assert (paper.data.split_steps, release.data.split_steps) == (False, True)
+    assert paper.pair_weights == (0.5, 0.5, 0.1)
+    assert release.pair_weights == (0.5, 1.0, 0.1)  # touch-text: twice the paper's
+    assert (paper.reconstructs, release.reconstructs) == (False, True)
+    assert (paper.splits_steps, release.splits_steps) == (False, True)
     assert (paper.data.order, release.data.order) == ("alternate", "random")
     assert (paper.optim.decay, release.optim.decay) == ("linear", "cosine")
-    assert (paper.objective.universal_shared, release.objective.universal_shared) == (False, True)
     assert paper.model.lora_rank == release.model.lora_rank == 16 and paper.model.lora_alpha == 16
     assert preset("large", stage=2).model.lora_rank == 0
     one = preset("large", recipe="release")
-    assert not one.objective.reconstruct and not one.data.split_steps and one.optim.decay == "cosine"
+    assert one.reconstructs and not one.splits_steps and one.optim.decay == "cosine"
 
 
 @pytest.mark.parametrize("args", ALL)
@@ -145,9 +144,9 @@ def test_wrong_json_is_an_error_that_names_the_key():
 
 def test_json_takes_whole_numbers_for_floats_and_none_where_it_may_be():
     data = json.loads(to_json(preset("tiny")))
-    data["optim"]["eps"], data["optim"]["clip_norm"] = 1, 2
+    data["optim"]["eps"], data["optim"]["grad_clip"] = 1, 2
     config = from_json(json.dumps(data))
-    assert config.optim.eps == 1.0 and isinstance(config.optim.eps, float) and config.optim.clip_norm == 2.0
+    assert config.optim.eps == 1.0 and isinstance(config.optim.eps, float) and config.optim.grad_clip == 2.0
     assert from_json(json.dumps({"model": data["model"]})) == Config(config.model)  # the rest has defaults
 
 
@@ -180,11 +179,10 @@ def test_impossible_models_are_errors():
         (LossConfig, {"mask_ratio": -0.1}, "--objective.mask-ratio must be 0 to 1, not -0.1"),
         (LossConfig, {"alpha_vl": -0.2}, "--objective.alpha-vl must be 0 or more, not -0.2"),
         (OptimConfig, {"accumulate": 0}, "--optim.accumulate must be 1 or more, not 0"),
-        (OptimConfig, {"clip_norm": -1.0}, "--optim.clip-norm must be above 0, not -1.0"),
-        (OptimConfig, {"ema": 1.0}, "--optim.ema must be 0 or more and below 1, not 1.0"),
+        (OptimConfig, {"grad_clip": -1.0}, "--optim.grad-clip must be above 0, not -1.0"),
         (RunConfig, {"seed": 2**32}, "--run.seed must be 0 to 4294967295, not 4294967296"),
         (RunConfig, {"seed": -1}, "--run.seed must be 0 to 4294967295, not -1"),
-        (OptimConfig, {"clip_norm": 0.0}, "--optim.clip-norm must be above 0, not 0.0"),
+        (OptimConfig, {"grad_clip": 0.0}, "--optim.grad-clip must be above 0, not 0.0"),
         (OptimConfig, {"learning_rate": float("nan")}, "--optim.learning-rate must be 0 or more, not nan"),
         (OptimConfig, {"learning_rate": float("inf")}, "--optim.learning-rate must be 0 or more, not inf"),
         (OptimConfig, {"learning_rate": 1e200}, r"--optim.learning-rate must be 0 or more, not 1e\+200"),
@@ -240,7 +238,7 @@ def test_choices_that_there_are_not_are_errors(kind, options, message):
 
 def test_numbers_that_mean_nothing_of_it_are_not():
     LossConfig(mask_ratio=0.0, universal_end=0.0, match_weight=0.0)
-    OptimConfig(learning_rate=0.0, warmup=0, clip_norm=None, ema=None)
+    OptimConfig(learning_rate=0.0, warmup=0, grad_clip=None)
     DataConfig(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0), rotation=0.0, clip_share=0.0, threads=0, prefetch=0)
     RunConfig(save_every=0, figure_every=0, max_skipped=0)
     replace(preset("tiny").model, sensor_tokens=0, lora_rank=0)
@@ -335,3 +333,48 @@ def test_configs_are_static():
     assert isinstance(hash(config), int)
     assert not any(re.match("jax", name) for name in sys.modules["anytouch_jax.config"].__dict__)
     assert TextTower(Stack(8, 1, 1, 8)).end_token is None
+
+
+OLD = {  # settings of version 0.1, at values that changed nothing
+    "model": {"force_head": False}, "optim": {"ema": None, "clip_norm": 1.5},
+    "objective": {"differences": 0.0, "force": 0.0, "touch_text_sum": False, "reconstruct": False,
+                  "universal_shared": False, "centre": True},
+    "data": {"split_steps": False},
+}  # fmt: skip
+
+
+def old_json(recipe="paper", **changes):
+    """A config.json as version 0.1 wrote it; `changes` are section__name=value."""
+    data = json.loads(to_json(preset("tiny", stage=2, recipe=recipe)))
+    del data["objective"]["center_embeddings"], data["optim"]["grad_clip"]
+    for section, part in OLD.items():
+        data[section] |= part
+    for name, value in changes.items():
+        section, _, field = name.partition("__")
+        data[section][field] = value
+    return json.dumps(data)
+
+
+def test_settings_of_an_older_version_are_read_under_their_new_names():
+    config = from_json(old_json(), allow_retired=False)
+    assert config.objective.center_embeddings and config.optim.grad_clip == 1.5
+    release = {"objective__" + name: True for name in ("touch_text_sum", "reconstruct", "universal_shared")}
+    config = from_json(old_json("release", **release, data__split_steps=True), allow_retired=False)
+    assert config.recipe == "release" and config.splits_steps and config.reconstructs
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"optim__ema": 0.9},
+        {"objective__differences": 1.0},
+        {"model__force_head": True},
+        {"objective__reconstruct": True},
+    ],
+)
+def test_a_retired_setting_with_an_effect_stops_a_run_but_not_an_encoder(change):
+    text = old_json(**change)
+    assert from_json(text).model == preset("tiny", stage=2).model
+    section, _, name = next(iter(change)).partition("__")
+    with pytest.raises(ConfigError, match=f"^the run sets {section}.{name} to .*, which this version no longer has"):
+        from_json(text, allow_retired=False)

@@ -36,7 +36,7 @@ def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
     if rank:  # LoRA as if trained: it must be merged
         params["lora"] = jax.tree.map(lambda x: np.asarray(RNG.standard_normal(x.shape), np.float32), params["lora"])
     encoder = image_tower_encoder(stored(tmp_path, config, params))
-    wanted = net.apply(params, "embed_image", normalise_touch(STILLS))
+    wanted = net.encode_image(params, normalise_touch(STILLS))
     np.testing.assert_allclose(encoder.encode_touch(STILLS, "digit"), wanted, atol=2e-5)
     for sensor in ("universal", "gelsight"):  # it knows no sensors
         np.testing.assert_array_equal(encoder.encode_touch(STILLS, sensor), encoder.encode_touch(STILLS, "digit"))
@@ -58,7 +58,7 @@ def test_the_tower_of_clip_weights(tmp_path):
     keys = convert.release_names(model, "clip")
     file = tmp_path / "clip.safetensors"
     safetensors.write_safetensors(file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)})
-    wanted = build(model).apply(params, "embed_image", normalise_touch(STILLS))
+    wanted = build(model).encode_image(params, normalise_touch(STILLS))
     np.testing.assert_allclose(image_tower_encoder(file).encode_touch(STILLS), wanted, atol=2e-5)
 
 

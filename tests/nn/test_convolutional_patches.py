@@ -30,7 +30,7 @@ SENSOR = jnp.array([0, 3])
 
 
 def encode(clip):
-    return np.asarray(NET.apply(PARAMS, "encode", clip, SENSOR))
+    return np.asarray(NET.encode_touch(PARAMS, clip, SENSOR))
 
 
 @pytest.mark.parametrize("side", [3, 5])
@@ -58,7 +58,7 @@ def test_a_patch_hangs_on_its_own_pixels_alone():
     """Nothing is read over its border: what is masked stays hidden."""
 
     def tokens(clip):
-        return NET.apply(PARAMS, "touch.tokens", clip, SENSOR)[:, 6:]
+        return NET.bind(PARAMS).touch.tokens(clip, SENSOR)[:, 6:]
 
     before = np.asarray(tokens(CLIP))
     after = np.asarray(tokens(CLIP.at[:, :, 7:14, 14:21].add(1.0)))  # the second row's third patch of four by four
@@ -67,7 +67,7 @@ def test_a_patch_hangs_on_its_own_pixels_alone():
 
 
 def test_every_parameter_of_it_learns():
-    grad = jax.grad(lambda params: jnp.sum(NET.apply(params, "encode", CLIP, SENSOR) ** 2))(PARAMS)
+    grad = jax.grad(lambda params: jnp.sum(NET.encode_touch(params, CLIP, SENSOR) ** 2))(PARAMS)
     for name, value in flatten(grad["touch"]["patch"]).items():
         assert np.abs(value).max() > 1e-4, name
 
@@ -75,7 +75,7 @@ def test_every_parameter_of_it_learns():
 def test_tokens_start_at_the_size_of_projected_ones():
     plain = touch_model()
     own, shared = (
-        np.asarray(build(model).apply(build(model).init(jax.random.key(0)), "touch.patch", patches, SENSOR)).std()
+        np.asarray(build(model).bind(build(model).init(jax.random.key(0))).touch.patch(patches, SENSOR)).std()
         for model in (MODEL, plain)
         for patches in [jnp.asarray(RNG.standard_normal((2, 16, 3, 147)), jnp.float32)]
     )

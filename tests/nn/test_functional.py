@@ -37,12 +37,12 @@ def test_parts_left_out_do_not_exist():
     assert set(build(touch_model()).abstract()) == {"touch", "decoder"}
     with pytest.raises(AttributeError):
         net = build(touch_model())
-        net.apply(net.init(jax.random.key(0)), "embed_image", jnp.zeros((1, 28, 28, 3)))
+        net.encode_image(net.init(jax.random.key(0)), jnp.zeros((1, 28, 28, 3)))
 
 
 def test_a_part_of_the_parameters_serves_the_methods_that_read_it():
     net = build(full_model())
     params = net.init(jax.random.key(0))
     clip = jnp.ones((1, 1, 28, 28, 3))
-    lock = net.apply({"touch": params["touch"]}, "encode", clip, jnp.asarray([0]))
-    np.testing.assert_array_equal(lock, net.apply(params, "encode", clip, jnp.asarray([0])))
+    lock = net.encode_touch({"touch": params["touch"]}, clip, jnp.asarray([0]))
+    np.testing.assert_array_equal(lock, net.encode_touch(params, clip, jnp.asarray([0])))

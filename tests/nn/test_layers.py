@@ -63,13 +63,13 @@ def test_the_stack_equals_a_loop_over_plain_blocks():
     net = build(model)
     params = net.init(jax.random.key(1))
     clip, sensor = jax.random.normal(jax.random.key(2), (2, 1, 28, 28, 3)), jnp.asarray([0, 1])
-    x = np.asarray(net.apply(params, "touch.tokens", clip, sensor), np.float64)
+    x = np.asarray(net.bind(params).touch.tokens(clip, sensor), np.float64)
     x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + model.norm_eps)
     for layer in range(STACK.depth):
         x = reference_block(
             x, jax.tree.map(lambda p, i=layer: np.asarray(p[i], np.float64), params["touch"]["blocks"]), 2, 1e-5
         )
-    np.testing.assert_allclose(net.apply(params, "touch.hidden", clip, sensor), x, atol=2e-5)
+    np.testing.assert_allclose(net.bind(params).touch.hidden(clip, sensor), x, atol=2e-5)
 
 
 @pytest.mark.parametrize("remat", [False, True])
@@ -102,15 +102,17 @@ def test_the_last_block_works_for_the_token_that_is_read():
     model = full_model(image_size=56)  # 64 patches
     args = jnp.zeros((2, 1, 56, 56, 3)), jnp.asarray([0, 1])
 
-    def program(depth, method):
+    def program(depth, read):
         net = build(replace(model, touch=replace(STACK, depth=depth)))
-        return jax.jit(lambda p: net.apply(p, method, *args)).lower(net.abstract()), net.abstract()
+        return jax.jit(lambda p: read(net.bind(p))).lower(net.abstract()), net.abstract()
 
-    read, whole = (program(1, method)[0].cost_analysis()["flops"] for method in ("encode", "touch.hidden"))
+    methods = (lambda module: module.encode_touch(*args)), (lambda module: module.touch.hidden(*args))
+
+    read, whole = (program(1, method)[0].cost_analysis()["flops"] for method in methods)
     tokens = 70
     dense = 2 * 2 * tokens * STACK.width * STACK.width  # of two rows
     assert whole - read > 0.9 * (2 * dense + 2 * dense * STACK.mlp / STACK.width) * (1 - 1 / tokens)
-    (read, params), (whole, _) = (program(9, method) for method in ("encode", "touch.hidden"))
+    (read, params), (whole, _) = (program(9, method) for method in methods)
     temporary = [one.compile().memory_analysis().temp_size_in_bytes for one in (read, whole)]
     blocks = sum(leaf.size * 4 for leaf in jax.tree.leaves(params["touch"]["blocks"]))
     assert temporary[0] - temporary[1] < 0.5 * blocks
@@ -120,28 +122,28 @@ def test_rematerialisation_and_bfloat16_change_cost_not_meaning():
     clip, sensor = jax.random.normal(jax.random.key(2), (2, 3, 28, 28, 3)), jnp.asarray([0, 1])
     net = build(touch_model())
     params = net.init(jax.random.key(1))
-    plain = net.apply(params, "encode", clip, sensor)
-    remat = build(touch_model(remat=True)).apply(params, "encode", clip, sensor)
+    plain = net.encode_touch(params, clip, sensor)
+    remat = build(touch_model(remat=True)).encode_touch(params, clip, sensor)
     np.testing.assert_allclose(plain, remat, atol=1e-6)
-    half = build(touch_model(dtype="bfloat16")).apply(params, "encode", clip, sensor)
+    half = build(touch_model(dtype="bfloat16")).encode_touch(params, clip, sensor)
     assert half.dtype == stored("bfloat16")
     error = np.abs(np.asarray(half, np.float32) - np.asarray(plain)).max() / np.abs(np.asarray(plain)).max()
     assert 1e-5 < error < 0.05
 
 
-@pytest.mark.parametrize("method", ["encode", "reconstruct", "embed_image", "embed_text"])
+@pytest.mark.parametrize("method", ["encode_touch", "reconstruct", "encode_image", "encode_text"])
 def test_rematerialised_stacks_give_the_same_gradient_from_work_done_again(method):
     clip, sensor, ids = jax.random.normal(jax.random.key(2), (2, 1, 28, 28, 3)), jnp.asarray([0, 1]), jnp.arange(16)
     args = {
-        "encode": (clip, sensor),
+        "encode_touch": (clip, sensor),
         "reconstruct": (clip, sensor, ids[None, :4].repeat(2, 0), ids[None].repeat(2, 0), 1),
-        "embed_image": (clip[:, 0],),
-        "embed_text": (ids.reshape(2, 8), jnp.ones((2, 8), bool)),
+        "encode_image": (clip[:, 0],),
+        "encode_text": (ids.reshape(2, 8), jnp.ones((2, 8), bool)),
     }[method]
     params, found = build(full_model()).init(jax.random.key(1)), []
     for remat in (False, True):
         net = build(full_model(remat=remat))
-        first = lambda params, net=net: jax.tree.leaves(net.apply(params, method, *args))[0]  # noqa: E731
+        first = lambda params, net=net: getattr(net, method)(params, *args)  # noqa: E731
         slope = jax.grad(lambda params, first=first: jnp.mean(first(params) ** 2))
         again = re.findall(r"\b(?:remat2?|checkpoint)\[", str(jax.make_jaxpr(slope)(params)))
         found.append((jax.jit(slope)(params), len(again)))

@@ -28,7 +28,7 @@ def parameters(model, seed=0):
 
 
 def encode(model, params, clip, sensor):
-    return build(model).apply(params, "encode", clip, jnp.asarray(sensor))
+    return build(model).encode_touch(params, clip, jnp.asarray(sensor))
 
 
 def test_a_batch_of_one_sensor_trains_its_own_patch_encoder_alone():
@@ -75,7 +75,7 @@ def test_each_kernel_starts_at_the_size_of_a_shared_one():
 
 @pytest.mark.parametrize(
     "model",
-    [OWN, replace(OWN, sensor_tokens=0), touch_model(force_head=True), full_model(image=None), full_model(text=None)],
+    [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)],
 )
 def test_the_shapes_written_down_are_those_of_the_network(model):
     wanted = {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
@@ -84,7 +84,7 @@ def test_the_shapes_written_down_are_those_of_the_network(model):
 
 def test_the_default_network_has_the_parameters_it_had():
     names = set(flatten(build(tiny_config(1).model).abstract()))
-    assert names == {n for n in param_shapes(touch_model()) if not n.startswith("force")} and len(names) == 51
+    assert names == set(param_shapes(touch_model())) and len(names) == 51
 
 
 def test_the_authors_files_have_no_place_for_several_patch_encoders():

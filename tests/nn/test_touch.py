@@ -29,14 +29,14 @@ def masks(keep=4, batch=2):
 
 @jax.jit
 def encode(params, clip, sensor):
-    return NET.apply(params, "encode", clip, sensor)
+    return NET.encode_touch(params, clip, sensor)
 
 
 def test_shapes():
     keep_ids, restore_ids, _ = masks()
     assert encode(PARAMS, clips(1), SENSOR).shape == (2, 12)
-    assert NET.apply(PARAMS, "encode_tokens", clips(3), SENSOR, keep_ids).shape == (2, 1 + 5 + 4, 12)
-    pred, _ = NET.apply(PARAMS, "reconstruct", clips(3), SENSOR, keep_ids, restore_ids, 4)
+    assert NET.encode_tokens(PARAMS, clips(3), SENSOR, keep_ids).shape == (2, 1 + 5 + 4, 12)
+    pred = NET.reconstruct(PARAMS, clips(3), SENSOR, keep_ids, restore_ids, 4)
     assert pred.shape == (2, 16, 4, 147)
 
 
@@ -52,7 +52,7 @@ def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
     model = touch_model(touch=Stack(8, 5, 2, 16))
     net, clip = build(model), clips(1)
     params = net.init(jax.random.key(0))
-    found = np.asarray(net.apply(params, "touch.states", clip, SENSOR, 3))
+    found = np.asarray(net.bind(params).touch.states(clip, SENSOR, 3))
     assert found.shape == (2, 1 + 5 + 16, 3 * 8)
     for depth, part in ((0, found[..., :8]), (2, found[..., 8:16]), (5, found[..., 16:])):  # 2.5 is rounded to even
         early = replace(model, touch=replace(model.touch, depth=max(depth, 1)))
@@ -60,10 +60,10 @@ def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
         cut["touch"]["blocks"] = jax.tree.map(lambda x, depth=depth: x[: max(depth, 1)], params["touch"]["blocks"])
         if depth == 0:  # a block that adds nothing
             cut["touch"]["blocks"] = jax.tree.map(jnp.zeros_like, cut["touch"]["blocks"])
-        np.testing.assert_allclose(part, build(early).apply(cut, "touch.hidden", clip, SENSOR), atol=1e-6)
-    last = net.apply(params, "touch.states", clip, SENSOR, 1)
-    np.testing.assert_allclose(last, net.apply(params, "touch.hidden", clip, SENSOR), atol=1e-6)
-    every = net.apply(params, "touch.states", clip, SENSOR, 6)
+        np.testing.assert_allclose(part, build(early).bind(cut).touch.hidden(clip, SENSOR), atol=1e-6)
+    last = net.bind(params).touch.states(clip, SENSOR, 1)
+    np.testing.assert_allclose(last, net.bind(params).touch.hidden(clip, SENSOR), atol=1e-6)
+    every = net.bind(params).touch.states(clip, SENSOR, 6)
     assert every.shape[-1] == 6 * 8
     np.testing.assert_allclose(every[..., :8], found[..., :8], atol=1e-6)
 
@@ -73,7 +73,7 @@ def test_hidden_patches_have_exactly_no_influence():
     clip = clips(3)
 
     def total(clip):
-        return jnp.sum(NET.apply(PARAMS, "reconstruct", clip, SENSOR, keep_ids, restore_ids, 4)[0] ** 2)
+        return jnp.sum(NET.reconstruct(PARAMS, clip, SENSOR, keep_ids, restore_ids, 4) ** 2)
 
     grad = np.asarray(jax.jit(jax.grad(total))(clip))
     cells = grad.reshape(2, 3, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(2, 16, -1)
@@ -102,23 +102,26 @@ def test_nor_is_one_in_the_decoder(outside):
     net = build(touch_model(decoder_sensor_tokens=True))
     keep_ids, restore_ids, _ = masks()
     own = jnp.asarray([9, outside])
-    pred, _ = net.apply(net.init(jax.random.key(0)), "reconstruct", clips(1), SENSOR, keep_ids, restore_ids, 1, own)
+    pred = net.reconstruct(net.init(jax.random.key(0)), clips(1), SENSOR, keep_ids, restore_ids, 1, own)
     assert np.isfinite(pred[0]).all() and np.isnan(pred[1]).all()
 
 
 @pytest.mark.parametrize("frames", [1, 3])
 def test_both_poolings_are_of_one_pass(frames):
     clip = clips(frames)
-    token, patches = NET.apply(PARAMS, "encode_both", clip, SENSOR)
+    token, patches = NET.encode_poolings(PARAMS, clip, SENSOR)
     np.testing.assert_allclose(token, encode(PARAMS, clip, SENSOR), atol=1e-5)
-    every = NET.apply(PARAMS, "encode_tokens", clip, SENSOR)  # class token, five sensor tokens, sixteen patches
+    every = NET.encode_tokens(PARAMS, clip, SENSOR)  # class token, five sensor tokens, sixteen patches
     np.testing.assert_allclose(patches, every[:, 6:].mean(axis=1), atol=1e-5)
     assert every.shape[1] == 22
     cost = {
-        method: jax.jit(lambda p, c, m=method: NET.apply(p, m, c, SENSOR)).lower(PARAMS, clip).cost_analysis()["flops"]
-        for method in ("touch.hidden", "encode_both")
+        name: jax.jit(lambda p, c, read=read: read(NET.bind(p), c)).lower(PARAMS, clip).cost_analysis()["flops"]
+        for name, read in (
+            ("hidden", lambda module, clip: module.touch.hidden(clip, SENSOR)),
+            ("poolings", lambda module, clip: module.encode_poolings(clip, SENSOR)),
+        )
     }
-    assert cost["encode_both"] < 1.05 * cost["touch.hidden"]
+    assert cost["poolings"] < 1.05 * cost["hidden"]
 
 
 @pytest.mark.parametrize("head", ["mlp", "linear"])
@@ -126,7 +129,7 @@ def test_matching_logits_have_all_their_digits(head):
     nets = [build(touch_model(match_head=head, dtype=dtype)) for dtype in ("float32", "bfloat16")]
     params = nets[0].init(jax.random.key(0))
     z = jax.random.normal(jax.random.key(1), (2, 5, 12))
-    first, second = (net.apply(params, "match", *z) for net in nets)
+    first, second = (net.match(params, *z) for net in nets)
     assert second.dtype == jnp.float32
     np.testing.assert_array_equal(first, second)
 
@@ -138,13 +141,13 @@ def test_the_mlp_matches_the_product_scaled_by_its_width():
     up, down = (jax.tree.map(np.asarray, params["matcher"][name]) for name in ("up", "down"))
     hidden = np.asarray(jax.nn.gelu((first * second * 12) @ up["kernel"] + up["bias"], approximate=False))
     wanted = (hidden @ down["kernel"] + down["bias"])[:, 0]
-    np.testing.assert_allclose(net.apply(params, "match", first, second), wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(net.match(params, first, second), wanted, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
 def test_long_clips_are_segments_of_three(join, width):
     clip = clips(8)
-    z = NET.apply(PARAMS, "encode", clip, SENSOR, join)
+    z = NET.encode_touch(PARAMS, clip, SENSOR, join)
     parts = [np.asarray(encode(PARAMS, clip[:, s : s + 3], SENSOR)) for s in (0, 3, 5)]
     expected = {"mean": np.mean(parts, axis=0), "sum": np.sum(parts, axis=0), "concat": np.concatenate(parts, axis=1)}
     assert z.shape == (2, width)
@@ -153,7 +156,7 @@ def test_long_clips_are_segments_of_three(join, width):
 
 def test_only_the_frames_asked_for_are_painted():
     keep_ids, restore_ids, _ = masks()
-    four, three = (NET.apply(PARAMS, "reconstruct", clips_3, SENSOR, keep_ids, restore_ids, t)[0] for t in (4, 3))
+    four, three = (NET.reconstruct(PARAMS, clips_3, SENSOR, keep_ids, restore_ids, t) for t in (4, 3))
     np.testing.assert_allclose(four[:, :, :3], three, rtol=1e-5, atol=1e-6)
 
 
@@ -167,13 +170,13 @@ def flops(function, *args):
 def test_work_follows_what_is_visible():
     clip, sensor = clips(3, 8), jnp.zeros(8, jnp.int32)
     keep_ids = masks(4, 8)[0]
-    encoder = lambda c, k: NET.apply(PARAMS, "touch.hidden", c, sensor, k)  # noqa: E731
+    encoder = lambda c, k: NET.bind(PARAMS).touch.hidden(c, sensor, k)  # noqa: E731
     masked, full = flops(encoder, clip, keep_ids), flops(lambda c: encoder(c, None), clip)
     assert masked < full * (1 + 5 + 4) / (1 + 5 + 16) * 1.15
 
 
 def test_a_still_projects_one_frame():
-    patch = lambda c: NET.apply(PARAMS, "touch.tokens", c, jnp.zeros(8, jnp.int32))  # noqa: E731
+    patch = lambda c: NET.bind(PARAMS).touch.tokens(c, jnp.zeros(8, jnp.int32))  # noqa: E731
     still, clip = flops(patch, clips(1, 8)), flops(patch, clips(3, 8))
     one_frame = 2 * 8 * 16 * 147 * 16
     assert still < one_frame * 1.2
@@ -187,5 +190,5 @@ def test_one_patch_images_and_keeping_everything():
     clip = jnp.ones((1, 1, 7, 7, 3))
     for keep in (0, 1):
         keep_ids, restore_ids, _ = random_mask(jnp.zeros((1, 1)), keep)
-        pred, _ = net.apply(params, "reconstruct", clip, jnp.asarray([0]), keep_ids, restore_ids, 1)
+        pred = net.reconstruct(params, clip, jnp.asarray([0]), keep_ids, restore_ids, 1)
         assert pred.shape == (1, 1, 1, 147) and np.isfinite(np.asarray(pred)).all()

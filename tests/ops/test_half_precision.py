@@ -7,7 +7,7 @@ import pytest
 
 from anytouch_jax.ops.losses import (
     alignment_loss,
-    centred,
+    centered,
     matching_loss,
     normalise,
     normalise_patches,
@@ -24,8 +24,8 @@ def reconstruct(pred, target):
     return reconstruction_loss(pred, target, HIDDEN, next_frame=True)[0]
 
 
-def align(has_image, has_text, centre=False):
-    return lambda *z: alignment_loss(*z, has_image, has_text, jnp.float32(14.0), WEIGHTS, centre=centre)[0]
+def align(has_image, has_text, center=False):
+    return lambda *z: alignment_loss(*z, has_image, has_text, jnp.float32(14.0), WEIGHTS, center=center)[0]
 
 
 def draw(*shape):
@@ -53,9 +53,9 @@ CASES = {
     "normalised vectors, one zero": (normalise, [zero(draw(4, 6))]),
     "matching": (matching_loss, [np.array([1e4, -1e4, 0.3]), np.array([-1e4, 1e4, 0.7])]),
     "alignment": (align(SOME, np.arange(8) < 6), [unit(8, 16) for _ in range(3)]),
-    "alignment, centred": (align(SOME, np.arange(8) < 6, centre=True), [unit(8, 16) for _ in range(3)]),
+    "alignment, centered": (align(SOME, np.arange(8) < 6, center=True), [unit(8, 16) for _ in range(3)]),
     "alignment of disjoint sets": (align(SOME, OTHERS), [unit(8, 16) for _ in range(3)]),
-    "centred": (lambda x: centred(x, SOME), [draw(8, 16)]),
+    "centered": (lambda x: centered(x, SOME), [draw(8, 16)]),
 }
 
 

@@ -144,12 +144,12 @@ def test_centred_embeddings_that_are_all_one_are_nothing_not_noise():
     one = losses.normalise(jax.random.normal(jax.random.key(0), (1, 32)))
     same = jnp.concatenate([jnp.repeat(one, 7, axis=0), jax.random.normal(jax.random.key(1), (57, 32))])
     present = jnp.arange(64) < 7
-    assert float(jnp.abs(losses.centred(same, present)).max()) < 1e-3
+    assert float(jnp.abs(losses.centered(same, present)).max()) < 1e-3
     other = losses.normalise(jax.random.normal(jax.random.key(2), (64, 32)))
-    loss = lambda x: losses.info_nce(losses.centred(x, present), other, jnp.asarray(14.0), present)  # noqa: E731
+    loss = lambda x: losses.info_nce(losses.centered(x, present), other, jnp.asarray(14.0), present)  # noqa: E731
     assert float(jnp.abs(jax.grad(loss)(same)).max()) < 1e4
     spread = losses.normalise(jax.random.normal(jax.random.key(3), (64, 32)))
-    length = jnp.linalg.norm(losses.centred(spread, jnp.ones(64, bool)), axis=1)
+    length = jnp.linalg.norm(losses.centered(spread, jnp.ones(64, bool)), axis=1)
     np.testing.assert_allclose(length, 1.0, atol=1e-5)
 
 

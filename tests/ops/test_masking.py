@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from anytouch_jax.ops.masking import keep, kept, random_mask, restore
+from anytouch_jax.ops.masking import count_visible, keep, random_mask, restore
 
 
 def test_masks_are_drawn_per_row():
@@ -42,8 +42,8 @@ def test_kept_are_the_smallest_noise_in_order_and_restore_is_the_inverse(count):
 
 
 def test_number_of_kept_patches():
-    assert kept(256, 0.25) == 64
-    assert kept(64, 0.25) == 16
-    assert kept(16, 0.0) == 0
-    assert kept(16, 1.0) == 16
-    assert kept(1, 0.25) == 0
+    assert count_visible(256, 0.25) == 64
+    assert count_visible(64, 0.25) == 16
+    assert count_visible(16, 0.0) == 0
+    assert count_visible(16, 1.0) == 16
+    assert count_visible(1, 0.25) == 0

@@ -21,6 +21,7 @@ import optax
 
 from anytouch_jax import objectives
 from anytouch_jax.config import Config
+from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, tokens
 from anytouch_jax.train.optim import learning_rate, moments, optimizer
@@ -91,13 +92,13 @@ def _probe(case: Case) -> None:
             case.compare(f"out/{name}/projected", out)
             head_input = out.reshape(len(images), -1)
         else:
-            out = encode(params, flat, sensor, net=net, method="encode_tokens")
+            out = encode(params, flat, sensor, net=net, read=AnyTouch.encode_tokens)
             case.compare(f"out/{name}/projected", out[:, : case.arrays[f"out/{name}/projected"].shape[1]])
             if feel:  # the reference interleaves the two images' tokens by a plain reshape (golden Q13)
                 out = out.reshape(len(images), out.shape[1], -1)
                 head_input = jnp.mean(out[:, 1 + net.model.sensor_tokens :], axis=1)
             else:
-                head_input = encode(params, flat, sensor, net=net, method="encode_both")[1]
+                head_input = encode(params, flat, sensor, net=net, read=AnyTouch.encode_poolings)[1]
         case.compare(f"out/{name}/head_input", head_input)
         _probe_head(case, name, head_input)
 
@@ -215,9 +216,10 @@ def _positions(case: Case) -> None:
         case.compare(name, table[:: -(-len(table) // len(recorded))])
 
 
-@partial(jax.jit, static_argnames=("net", "method"))
-def _tower(params: Params, *inputs: Any, net: Net, method: str) -> jax.Array:
-    return net.apply(params, method, *inputs)
+@partial(jax.jit, static_argnames=("net", "read"))
+def _tower(params: Params, *inputs: Any, net: Net, read: Callable[..., jax.Array]) -> jax.Array:
+    """Return `read(module, *inputs)` of the network with these parameters."""
+    return read(net.bind(params), *inputs)
 
 
 def _clip(case: Case) -> None:
@@ -238,25 +240,25 @@ def _clip(case: Case) -> None:
         model = replace(config.model, lora_rank=0, match_head="none")
         net, params = build(model), golden_params(case.folder, case.info["params_file"], model)
         for name, (text, mask) in texts.items():
-            for output, method in (
-                ("last_hidden_state", "text.hidden"),
-                ("pooled", "text.pooled"),
-                ("projected", "embed_text"),
+            for output, read in (
+                ("last_hidden_state", lambda module, *text: module.text.hidden(*text)),
+                ("pooled", lambda module, *text: module.text.pooled(*text)),
+                ("projected", AnyTouch.encode_text),
             ):
                 array = f"out/{sub}/text_{output}_{name}"
                 if array in case.arrays:
-                    case.compare(array, _tower(params, text, mask, net=net, method=method))
-        for output, method in (
-            ("last_hidden_state", "image.hidden"),
-            ("pooled", "image.pooled"),
-            ("projected", "embed_image"),
+                    case.compare(array, _tower(params, text, mask, net=net, read=read))
+        for output, read in (
+            ("last_hidden_state", lambda module, image: module.image.hidden(image)),
+            ("pooled", lambda module, image: module.image.pooled(image)),
+            ("projected", AnyTouch.encode_image),
         ):
             array = f"out/{sub}/vision_{output}"
             if array in case.arrays:
-                case.compare(array, _tower(params, pixels, net=net, method=method))
+                case.compare(array, _tower(params, pixels, net=net, read=read))
         if f"out/{sub}/logits_per_image" in case.arrays:
-            z_image = losses.normalise(_tower(params, pixels, net=net, method="embed_image"))
-            z_text = losses.normalise(_tower(params, *texts["pad_eot"], net=net, method="embed_text"))
+            z_image = losses.normalise(_tower(params, pixels, net=net, read=AnyTouch.encode_image))
+            z_text = losses.normalise(_tower(params, *texts["pad_eot"], net=net, read=AnyTouch.encode_text))
             case.compare(f"out/{sub}/logits_per_image", jnp.exp(params["logit_scale"]) * z_image @ z_text.T)
 
 

@@ -156,9 +156,7 @@ def golden_config(info: dict[str, Any], *, stage: int, sensors: int = 10) -> Con
         alpha_tv=args.get("alpha_vt", 1.0),
         alpha_tl=args.get("alpha_lt", 1.0),
         alpha_vl=args.get("alpha_vl", 0.2),
-        touch_text_sum=True,
         match_weight=args.get("cross_alpha", 0.1),
-        reconstruct=stage == 2 and not args.get("no_mae", False),
     )
     return Config(
         model,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
 from anytouch_jax.config import Config
+from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, masking
 from anytouch_jax.train.step import merge, split, used_parameters
@@ -117,18 +117,18 @@ def _stage1_outputs(params: Params, inputs: Any, *, net: Net, config: Config) ->
     """Everything that the cases record of a stage-1 pass, in one program."""
     clip, sensor, noise, target = inputs
     keep_ids, restore_ids, hidden = masking.random_mask(
-        noise, masking.kept(net.model.patches, config.objective.keep_ratio)
+        noise, masking.count_visible(net.model.patches, config.objective.keep_ratio)
     )
     seen = clip[:, : net.model.frames]
-    pred, _, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
+    pred, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
     loss, metrics = objectives.stage1_terms(params, *inputs[:3], net=net, config=config, decoder_sensor=target)
     return {
         "ids_restore": restore_ids,
         "mask": hidden,
-        "embeddings": net.apply(params, "touch.tokens", seen, sensor, keep_ids),
-        "last_hidden_state": net.apply(params, "touch.hidden", seen, sensor, keep_ids),
-        "latent": net.apply(params, "encode_tokens", seen, sensor, keep_ids),
-        "features_unmasked": net.apply(params, "encode", seen, sensor),
+        "embeddings": net.bind(params).touch.tokens(seen, sensor, keep_ids),
+        "last_hidden_state": net.bind(params).touch.hidden(seen, sensor, keep_ids),
+        "latent": net.encode_tokens(params, seen, sensor, keep_ids),
+        "features_unmasked": net.encode_touch(params, seen, sensor),
         "pred": pred,
         "loss": loss,
         "loss_recon": metrics["reconstruction"],
@@ -185,8 +185,8 @@ def _align_all(params: Params, inputs: Any, *, net: Net, config: Config) -> tupl
     total, metrics = objectives.stage2_terms(
         params, Stage2Batch(batch, None), noise, net=net, config=config, decoder_sensor=target
     )
-    hidden = masking.random_mask(noise, masking.kept(net.model.patches, config.objective.keep_ratio))[2]
-    touch = losses.normalise(net.apply(params, "encode", batch.clip[:, : net.model.frames], batch.sensor))
+    hidden = masking.random_mask(noise, masking.count_visible(net.model.patches, config.objective.keep_ratio))[2]
+    touch = losses.normalise(net.encode_touch(params, batch.clip[:, : net.model.frames], batch.sensor))
     return total, metrics, objectives.align_embeddings(params, batch, touch, net=net), hidden
 
 
@@ -244,11 +244,15 @@ def align(case: Case) -> None:
     _align_outputs(case, net, config, params, inputs, "out/")
     _compare_gradients(case, _align_value, params, inputs, exact, net, config)
     if "grad_no_mae_l2" in case.info:
-        _compare_gradients(case, _align_value, params, inputs, exact, net, _without_mae(config), "grad_no_mae")
+        _compare_gradients(
+            case, _align_value, params, _without_mae(inputs), _without_mae(exact), net, config, "grad_no_mae"
+        )
 
 
-def _without_mae(config: Config) -> Config:
-    return replace(config, objective=replace(config.objective, reconstruct=False))
+def _without_mae(inputs: Any) -> Any:
+    """Return inputs without the noise of the masks, so that nothing is reconstructed."""
+    batch, _, target = inputs
+    return batch, None, target
 
 
 def align_edge(case: Case) -> None:
@@ -257,17 +261,20 @@ def align_edge(case: Case) -> None:
     for name, sub in case.info["subcases"].items():
         inputs, exact = _align_inputs(case, net, f"{name}/")
         _align_outputs(case, net, config, params, inputs, f"out/{name}/")
-        for label, recipe in (("with_mae", config), ("without_mae", _without_mae(config))):
-            grads = _gradients(_align_value, params, inputs, exact, net, recipe)
+        variants = {"with_mae": (inputs, exact), "without_mae": (_without_mae(inputs), _without_mae(exact))}
+        for label, both in variants.items():
+            grads = _gradients(_align_value, params, *both, net, config)
             if not sub[f"grad_l2_{label}"]:  # the reference has no graph there: no gradient reaches any parameter
                 grads = {key: None if value is None or not value.any() else value for key, value in grads.items()}
             _compare_norms(case, f"{name}/grad_l2_{label}", grads, sub[f"grad_l2_{label}"])
 
 
-@partial(jax.jit, static_argnames=("net", "method"))
-def encode(params: Params, clip: Any, sensor: Any, *, net: Net, method: str = "encode") -> Any:
-    """A method of the touch encoder, compiled once for all cases of equal shapes."""
-    return net.apply(params, method, clip, sensor)
+@partial(jax.jit, static_argnames=("net", "read"))
+def encode(
+    params: Params, clip: Any, sensor: Any, *, net: Net, read: Callable[..., Any] = AnyTouch.encode_touch
+) -> Any:
+    """Return `read(module, clip, sensor)`, compiled once for all cases of equal shapes."""
+    return read(net.bind(params), clip, sensor)
 
 
 def _match_value(params: Params, inputs: Any, *, net: Net, config: Config) -> jax.Array:
@@ -285,6 +292,6 @@ def match(case: Case) -> None:
     for name, embedding in zip(("touch", "positive", "negative"), z, strict=True):
         case.compare(f"out/{name}_embeds", embedding)
     for name, other in zip(("positive", "negative"), z[1:], strict=True):
-        case.compare(f"out/{name}_sim", net.apply(params, "match", z[0], other))
+        case.compare(f"out/{name}_sim", net.match(params, z[0], other))
     case.compare("out/loss", jax.jit(partial(_match_value, net=net, config=config))(params, batch))
     _compare_gradients(case, _match_value, params, batch, batch, net, config)

@@ -94,8 +94,7 @@ def test_the_callers_parameters_survive(tmp_path, devices, donates):
     assert_same(params, toy_params())
 
 
-@pytest.mark.parametrize("ema", [None, 0.5], ids=["latest", "averaged"])
-def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monkeypatch, donates, ema):
+def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monkeypatch, donates):
     states, seen, compiled = [], [], loop._Loop.compile
 
     def watched(self, state, loss_fn):
@@ -109,7 +108,7 @@ def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monke
 
     monkeypatch.setattr(loop._Loop, "compile", watched)
     said = []
-    result = run(tmp_path, toy_config(figure_every=1, optim={"ema": ema}), on_report=report, said=said, stop_after=3)
+    result = run(tmp_path, toy_config(figure_every=1), on_report=report, said=said, stop_after=3)
     assert not any("no figures" in line for line in said), said
     assert_same(seen[-1], result.params)
     assert not np.array_equal(seen[0]["trunk"]["kernel"], seen[-1]["trunk"]["kernel"])
@@ -139,17 +138,14 @@ def test_a_finished_run_does_nothing(undisturbed, tmp_path):
     assert "nothing to do: 8 of 8 steps are done" in said
 
 
-def test_ema_and_clipping_go_on_too(tmp_path):
-    config = toy_config(steps=4, optim={"ema": 0.5, "clip_norm": 0.1, "accumulate": 2})
+def test_clipping_and_accumulation_go_on_too(tmp_path):
+    config = toy_config(steps=4, optim={"grad_clip": 0.1, "accumulate": 2})
     params = jax.tree.map(jnp.asarray, toy_params())
     whole = run(tmp_path / "whole", config, params=params, batches=clips)
     assert_same(params, toy_params())
     run(tmp_path / "parts", config, batches=clips, stop_after=2)
     parts = run(tmp_path / "parts", config, batches=clips)
     assert_same(parts.state, whole.state)
-    mean = whole.state.opt_state.ema["trunk"]["kernel"]
-    assert not np.array_equal(mean, whole.state.trainable["trunk"]["kernel"])
-    np.testing.assert_array_equal(mean, whole.params["trunk"]["kernel"])  # the average is what is used
 
 
 def test_another_schedule_does_not_go_on(undisturbed):
@@ -328,7 +324,7 @@ def test_nothing_but_the_late_fetch_looks_at_a_result(tmp_path, monkeypatch):
 
     monkeypatch.setattr(jax, "device_get", lambda tree: fetch(show(tree)))
     monkeypatch.setattr(loop._Loop, "compile", hidden)
-    monkeypatch.setattr(loop._Loop, "save", lambda self, done, state, since: self.log() or done)
+    monkeypatch.setattr(loop._Loop, "save", lambda self, done, state, since: self.log_metrics() or done)
     result = run(tmp_path, toy_config(save_every=0), stop_after=4)
     assert [row["step"] for row in rows(tmp_path)] == [0, 1, 2, 3]
     with pytest.raises(TypeError):

@@ -190,7 +190,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(what):
         value, metrics = toy_loss(params, batch, key, progress)
         return value + jnp.sum(jnp.sqrt(jnp.square(params["trunk"]["bias"]) * 0.0)), metrics
 
-    config = toy_config(optim={"warmup": 0, "ema": 0.9})
+    config = toy_config(optim={"warmup": 0})
     state, good_step = build(config)
     bad_step = build(config, loss)[1] if what == "gradient" else good_step
     state, metrics = good_step(state, toy_batch(0), KEY)

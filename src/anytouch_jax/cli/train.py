@@ -172,8 +172,8 @@ def _refuse_other_stage(options: TrainOptions, config: Config) -> None:
     usual = baselines.apply(options.baseline, usual)
     where, unread = "in stage 1", _STAGE_2_FIELDS
     if options.stage == 2:
-        where = "in stage 2 without --objective.reconstruct"
-        unread = {} if config.objective.reconstruct else _RECONSTRUCTION_FIELDS
+        where = "in stage 2 of the paper recipe"
+        unread = {} if config.reconstructs else _RECONSTRUCTION_FIELDS
         if options.clip_weights and config.model.temperature != usual.model.temperature:
             raise UserError("--model.temperature has no effect with --clip-weights, which has its own. Remove it.")
     for section, names in unread.items():

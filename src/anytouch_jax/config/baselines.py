@@ -140,17 +140,5 @@ _ALL = (
     Baseline(
         "no_universal", "without universal tokens: each sensor its own, always", (1, 2), _change(objective=_OWN_TOKENS)
     ),
-    Baseline(
-        "frame_differences",
-        "stage 1 also reconstructs the differences between the frames of a clip",
-        (1, 2),
-        _change((1,), objective={"differences": 1.0}),
-    ),
-    Baseline(
-        "force_heads",
-        "stage 1 also tells force and change of force from the class token (column label.force)",
-        (1, 2),
-        _change((1,), model={"force_head": True}, objective={"force": 0.1}),
-    ),
 )
 BASELINES: dict[str, Baseline] = {baseline.name: baseline for baseline in _ALL}

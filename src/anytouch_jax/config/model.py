@@ -84,7 +84,6 @@ class ModelConfig:
     decoder_norm_eps: float = 1e-12  # of the decoder's
     decoder_sensor_tokens: bool = False  # the decoder gets the sensor tokens themselves, not as encoded
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # one; one a sensor (T3); small CNN (ours)
-    force_head: bool = False  # stage 1 tells force and its change, from labels
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # cosine is ours: `ops.losses.contrast_loss`
     lora_rank: int = 0  # of the image tower's LoRA; 0: none
     lora_alpha: float = 16.0  # LoRA's scale, over its rank

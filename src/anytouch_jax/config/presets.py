@@ -46,16 +46,16 @@ def preset(
     recipe: Recipe = "paper",
     towers: Towers = "scratch",
 ) -> Config:
-    """The configuration called `name` (tiny, small, base, large = the paper's) for a stage and a recipe.
+    """Return the configuration called `name` (tiny, small, base, large) for a stage and a recipe.
 
-    `towers` matters in stage 2 only: "scratch" trains small image and text towers whole, "pretrained" expects
-    CLIP weights, freezes the text tower and adapts the image tower by LoRA. One point of the release hangs on the
-    machine and is set by hand: there negatives stay within a device's 64 rows, `objective.groups` 4 for a batch of 256.
-    Raises ConfigError.
+    `large` is the paper's. `towers` matters in stage 2 only: "scratch" trains small image and text towers whole,
+    "pretrained" expects CLIP weights, freezes the text tower and adapts the image tower by LoRA. One point of the
+    release depends on the machine and is set by hand: negatives stay within a device's 64 rows, so
+    `objective.groups` is 4 for a batch of 256. Raises ConfigError for an unknown name or choice.
     """
     if name not in _PRESETS:
         raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(_PRESETS)}")
-    build(Towers, towers, "towers")  # stage 1 has none, but a slip is a slip
+    build(Towers, towers, "towers")  # stage 1 has none, but a wrong word is refused there too
     full, image, batch = _PRESETS[name]
     config = Config(
         model=replace(full, text=None),
@@ -73,14 +73,8 @@ def preset(
             match_head="linear" if recipe == "release" else "mlp",
             lora_rank=16 if towers == "pretrained" else 0,
         )
-        objective = replace(config.objective, centre=towers == "scratch" and recipe == "paper")
+        objective = replace(config.objective, center_embeddings=towers == "scratch" and recipe == "paper")
         config = replace(config, model=model, towers=towers, objective=objective)
     if recipe == "release":
-        shared = {"reconstruct": stage == 2, "universal_shared": stage == 2}
-        config = replace(
-            config,
-            objective=replace(config.objective, touch_text_sum=True, **shared),
-            optim=replace(config.optim, decay="cosine"),
-            data=replace(config.data, order="random", split_steps=stage == 2),
-        )
+        config = replace(config, optim=replace(config.optim, decay="cosine"), data=replace(config.data, order="random"))
     return config

@@ -242,7 +242,7 @@ def _class_loss(net: Net, row: int, prototypes: np.ndarray) -> Loss:
     """Return the cross-entropy of stills of the sensor in `row` against the prototypes."""
 
     def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
-        z = net.apply(params, "encode", normalise_touch(clip), jnp.full(clip.shape[0], row))
+        z = net.encode_touch(params, normalise_touch(clip), jnp.full(clip.shape[0], row))
         logits = losses.normalise(z) @ jnp.asarray(prototypes).T / net.model.temperature
         return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, target))
 

@@ -172,7 +172,7 @@ class Encoder:
         """
 
         def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
-            return net.apply(params, "embed_image", normalise_image(pixels)).astype(jnp.float32)
+            return net.encode_image(params, normalise_image(pixels)).astype(jnp.float32)
 
         tower, size = self._part("encode_image", run, "image", "lora"), self.config.model.image_size
         images = [images] if getattr(images, "ndim", 0) == 3 else images
@@ -186,7 +186,7 @@ class Encoder:
         """
 
         def run(net: Net, params: Params, batch: tuple[jax.Array, jax.Array]) -> jax.Array:
-            return net.apply(params, "embed_text", *batch).astype(jnp.float32)
+            return net.encode_text(params, *batch).astype(jnp.float32)
 
         tower = self._part("encode_text", run, "text")
         assert self.parts is not None and self.parts.model.text is not None
@@ -215,7 +215,7 @@ class Encoder:
         """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
 
         With `probabilities`, return their softmax over the texts with the learned temperature: a zero-shot classifier.
-        Raises UserError without a text tower. With `objective.centre`, training subtracted the batch mean first.
+        Raises UserError without a text tower. Training with `center_embeddings` subtracted the batch mean first.
         """
         embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
         z_touch, z_text = _unit(touch), _unit(embeddings)
@@ -225,7 +225,7 @@ class Encoder:
         cosine = z_touch @ z_text.T
         if not probabilities:
             return np.asarray(np.clip(cosine, -1, 1))
-        scale = self._part("scale", lambda net, params: net.apply(params, "scale"), "logit_scale")
+        scale = self._part("scale", lambda net, params: net.scale(params), "logit_scale")
         return np.asarray(jax.nn.softmax(scale() * cosine, axis=1))
 
     def match(self, first: npt.ArrayLike, second: npt.ArrayLike) -> np.ndarray:
@@ -235,7 +235,7 @@ class Encoder:
         """
 
         def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
-            return net.apply(params, "match", losses.normalise(first), losses.normalise(second))
+            return net.match(params, losses.normalise(first), losses.normalise(second))
 
         head = self._part("match", run, "matcher")
         return np.asarray(head(np.asarray(first, np.float32), np.asarray(second, np.float32)))
@@ -292,8 +292,8 @@ def touch_features(
             raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
     clips = normalise_touch(clips)
     if pooling == "class":
-        return net.apply(params, "encode", clips, sensor, join).astype(jnp.float32)
-    both = net.apply(params, "encode_both", clips, sensor, join)  # an unused half is not computed
+        return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)
+    both = net.encode_poolings(params, clips, sensor, join)  # an unused half is not computed
     return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
 
 
@@ -361,7 +361,7 @@ def image_tower_encoder(path: str | Path) -> Encoder:
 
 def _bare(model: ModelConfig) -> ModelConfig:
     """Return a model without towers and heads."""
-    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0, force_head=False)
+    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0)
 
 
 def _touch_only(config: Config) -> Config:

@@ -49,7 +49,7 @@ def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net,
 @partial(jax.jit, static_argnames=("net", "config"))
 def _errors(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> dict[str, Any]:
     clip = normalise_touch(clip)
-    pixels, _, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config)
+    pixels, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config)
     target = tokens.patchify(clip, net.model.patch)
     predictions = {"": pixels, "plain ": plain_reconstruction(target, hidden, net.model.frames)}
     if config.data.background == "subtract":

@@ -1,8 +1,7 @@
-"""The one file that turns Flax modules into pure functions: build(config) -> Net(init, apply, abstract)."""
+"""Networks as pure functions of their parameters: `build(config) -> Net`. Flax modules stay behind this file."""
 
 from __future__ import annotations
 
-import operator
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,45 +24,81 @@ Params = dict[str, Any]
 
 @dataclass(frozen=True)
 class Net:
-    """A network as functions of its parameters, a plain nested dict of arrays."""
+    """The network of a model configuration, as functions of a plain nested dict of arrays."""
 
     model: ModelConfig
 
     def init(self, key: Array) -> Params:
-        """Fresh float32 parameters, drawn on the host from a PRNG key: the same on every device and version."""
+        """Return fresh float32 parameters, drawn on the host from a PRNG key: equal on every device and version."""
         return _drawn(self.abstract(), self.model, key)
 
     def abstract(self) -> Params:
-        """The tree of jax.ShapeDtypeStruct that `init` would return; allocates nothing."""
+        """Return the tree of jax.ShapeDtypeStruct of `init`, without allocating."""
         return nnx.to_pure_dict(_skeleton(AnyTouch, self.model)[1])
 
-    def apply(self, params: Params, method: str, *args: Any, **kwargs: Any) -> Any:
-        """Call a method of `AnyTouch` (encode, embed_image, match, ...) or, by a dotted name, of a part (text.hidden).
+    def bind(self, params: Params) -> AnyTouch:
+        """Return the module with these parameters, for parts without a method here (`net.bind(params).touch`).
 
-        A "lora" entry is merged into the image tower on the way in.
+        A "lora" entry is merged into the image tower.
         """
         params = merge_lora(jax.tree.map(jnp.asarray, params), self.model.lora_alpha)
-        module = _with(params, *_skeleton(AnyTouch, replace(self.model, lora_rank=0)))
-        return operator.attrgetter(method)(module)(*args, **kwargs)
+        return _with(params, *_skeleton(AnyTouch, replace(self.model, lora_rank=0)))
+
+    def encode_touch(
+        self, params: Params, clip: Array, sensor: Array, join: str = "mean", keep_ids: Array | None = None
+    ) -> Array:
+        """Return touch embeddings (B, E) of normalised clips (B, T, H, W, 3), from the class token; not unit-norm.
+
+        See `AnyTouch.encode_touch`.
+        """
+        return self.bind(params).encode_touch(clip, sensor, join, keep_ids)
+
+    def encode_poolings(self, params: Params, clip: Array, sensor: Array, join: str = "mean") -> tuple[Array, Array]:
+        """Return both poolings (B, E) in one pass: the class token and the mean over patch tokens."""
+        return self.bind(params).encode_poolings(clip, sensor, join)
+
+    def encode_tokens(self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        """Return the projected sequence (B, 1 + S + K, E) of class, sensor and patch tokens: the decoder's input."""
+        return self.bind(params).encode_tokens(clip, sensor, keep_ids)
+
+    def reconstruct(
+        self, params: Params, clip: Array, sensor: Array, keep_ids: Array, restore_ids: Array, frames: int,
+        decoder_sensor: Array | None = None,
+    ) -> Array:  # fmt: skip
+        """Return pixels (B, N, frames, P*P*3) of every position from the visible patches `keep_ids` (B, K)."""
+        return self.bind(params).reconstruct(clip, sensor, keep_ids, restore_ids, frames, decoder_sensor)
+
+    def encode_image(self, params: Params, image: Array) -> Array:
+        """Return image embeddings (V, E) of normalised photographs (V, H, W, 3); not unit-norm."""
+        return self.bind(params).encode_image(image)
+
+    def encode_text(self, params: Params, ids: Array, mask: Array | None = None) -> Array:
+        """Return text embeddings (L, E) of token ids (L, S); not unit-norm."""
+        return self.bind(params).encode_text(ids, mask)
+
+    def match(self, params: Params, z_first: Array, z_second: Array) -> Array:
+        """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5)."""
+        return self.bind(params).match(z_first, z_second)
+
+    def scale(self, params: Params) -> Array:
+        """Return 1 / tau, the learned factor on cosine similarities."""
+        return self.bind(params).scale()
 
 
 def build(model: ModelConfig) -> Net:
-    """The network of a model configuration."""
+    """Return the network of a model configuration."""
     return Net(model)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A module beside `AnyTouch` as functions of its parameters; `kind(options)` makes it (see `translation`).
-
-    `options` is a frozen dataclass with a `model`.
-    """
+    """Any other module as functions of its parameters. `kind(options)` makes it; `options.model` is a ModelConfig."""
 
     kind: Callable[[Any], Any]
     options: Any
 
     def init(self, key: Array) -> Params:
-        """Fresh float32 parameters, by the rules of `Net.init`."""
+        """Return fresh float32 parameters, by the rules of `Net.init`."""
         return _drawn(nnx.to_pure_dict(_skeleton(self.kind, self.options)[1]), self.options.model, key)
 
     def apply(self, params: Params, *args: Any) -> Any:
@@ -73,12 +108,12 @@ class Part:
 
 @lru_cache(maxsize=24)
 def _skeleton(kind: Callable[[Any], Any], options: Any) -> tuple[Any, Any]:
-    """Graph and abstract state of a module."""
+    """Return graph and abstract state of a module."""
     return nnx.split(nnx.eval_shape(lambda: kind(options)))
 
 
 def _with(params: Params, graph: Any, state: Any) -> Any:
-    """The module of a skeleton with these parameters."""
+    """Return the module of a skeleton with these parameters."""
     state = jax.tree.map(lambda leaf: leaf, state)  # a copy: the skeleton is shared between traces
     nnx.replace_by_pure_dict(state, params)
     return nnx.merge(graph, state)
@@ -90,7 +125,7 @@ def _drawn(abstract: Params, model: ModelConfig, key: Array) -> Params:
 
 
 def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, seed: list[int]) -> Array:
-    """The initial value of the parameter at `path`: every rule of initialisation in one place."""
+    """Return the initial value of the parameter at `path`: every rule of initialisation is here."""
     name, shape = "/".join(entry.key for entry in path), leaf.shape
     last = name.rsplit("/", 1)[-1]
     rng = np.random.default_rng([*seed, zlib.crc32(name.encode())])

@@ -1,11 +1,9 @@
-"""The paper's losses as pure functions. All arithmetic is in float32 or wider, whatever comes in.
+"""Losses of the paper as pure functions. All arithmetic is in float32 or wider, whatever the inputs are.
 
 B batch, N positions, T frames, C values of a patch, E embedding width.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +17,13 @@ def _wide(x: Array) -> Array:
 
 
 def normalise(x: Array, eps: float = 1e-12) -> Array:
-    """Scale the last axis to unit length; the gradient at exactly zero is finite."""
+    """Scale the last axis to unit length. The gradient at exactly zero is finite."""
     x = _wide(x)
     return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), eps))
 
 
 def normalise_patches(patches: Array) -> Array:
-    """Each patch of each frame (..., C) to zero mean and unit *unbiased* variance (`norm_pix_loss`, golden Q6)."""
+    """Bring each patch (..., C) to zero mean and unit *unbiased* variance (`norm_pix_loss`, golden Q6)."""
     patches = _wide(patches)
     centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
@@ -33,16 +31,16 @@ def normalise_patches(patches: Array) -> Array:
 
 
 def reconstruction_loss(pred: Array, target: Array, hidden: Array, *, next_frame: bool) -> tuple[Array, Metrics]:
-    """Masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in Eq. 8.
+    """Return the loss of masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in Eq. 8.
 
     `pred`, `target` (B, N, T, C); `hidden` (B, N) True on masked positions. With `next_frame` the last of the T
     frames is the future one: it counts on every position, the others on the hidden positions only.
-    Returns the sum and {"reconstruction", "next_frame"}; a batch with nothing hidden reconstructs at no cost.
+    Returns the sum and {"reconstruction", "next_frame"}. A batch with nothing hidden has a reconstruction loss of 0.
     """
     error = jnp.mean((_wide(pred) - _wide(target)) ** 2, axis=-1)  # (B, N, T)
-    shown, future = (error[..., :-1], error[..., -1]) if next_frame else (error, None)
+    present, future = (error[..., :-1], error[..., -1]) if next_frame else (error, None)
     weight = hidden.astype(error.dtype)
-    loss = jnp.sum(jnp.mean(shown, axis=-1) * weight) / jnp.maximum(jnp.sum(weight), 1)
+    loss = jnp.sum(jnp.mean(present, axis=-1) * weight) / jnp.maximum(jnp.sum(weight), 1)
     metrics = {"reconstruction": loss}
     if future is not None:
         metrics["next_frame"] = jnp.mean(future)
@@ -50,37 +48,18 @@ def reconstruction_loss(pred: Array, target: Array, hidden: Array, *, next_frame
     return loss, metrics
 
 
-def difference_loss(pred: Array, target: Array, hidden: Array) -> Array:
-    """Mean squared error of the differences between consecutive frames on the hidden positions, a scalar.
-
-    `pred`, `target` (B, N, T, C) with T at least 2; `hidden` (B, N) as in `reconstruction_loss`.
-    """
-    error = jnp.mean(jnp.diff(_wide(pred) - _wide(target), axis=2) ** 2, axis=(2, 3))
-    weight = hidden.astype(error.dtype)
-    return jnp.sum(error * weight) / jnp.maximum(jnp.sum(weight), 1)
-
-
-def force_loss(pred: Array, target: Array) -> tuple[Array, Metrics]:
-    """Mean squared error of force and of its change, `pred` and `target` (B, 2), each over the rows that know it (not
-    NaN), summed; and {"force", "force_change"}. What no row knows costs nothing."""
-    known = jnp.isfinite(target)
-    error = jnp.where(known, _wide(pred) - jnp.where(known, _wide(target), 0.0), 0.0)
-    force, change = jnp.sum(error * error, axis=0) / jnp.maximum(jnp.sum(known, axis=0), 1)
-    return force + change, {"force": force, "force_change": change}
-
-
 def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 1, place: Array | None = None) -> Array:
-    """InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
+    """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
     `scale` is 1 / tau. Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair
-    gives 0. With `groups` > 1 the batch is cut in that many shares, negatives come from a row's own share, and the mean
+    gives 0. With `groups` > 1 the batch is cut in that many shares, negatives come from a row's share, and the mean
     is over all shares, as over the devices of the release. Rows of one `place` i32 (B,) are no negatives of each other.
     """
     e = a.shape[-1]
     present = present.reshape(groups, -1)
     a = jnp.where(present[..., None], _wide(a).reshape(groups, -1, e), 0.0)
     b = jnp.where(present[..., None], _wide(b).reshape(groups, -1, e), 0.0)
-    # Multiplied by up to 100: the shorter products that accelerators take by default would show in the loss.
+    # The factor is up to 100: the reduced precision that accelerators use by default would show in the loss.
     logits = _wide(scale) * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
     rivals = present[:, None, :]
     if place is not None:
@@ -93,11 +72,11 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     return jnp.mean(jnp.sum(loss, axis=1) / jnp.maximum(pairs, 1))
 
 
-def centred(x: Array, present: Array) -> Array:
-    """Unit vectors (B, E) from `x` less its mean over the rows that are `present` (B,)."""
+def centered(x: Array, present: Array) -> Array:
+    """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,), scaled to length 1."""
     x = jnp.where(present[:, None], _wide(x), 0.0)
     mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present), 1)
-    return normalise(jnp.where(present[:, None], x - mean, 0.0), eps=1e-6)  # what spreads less than 1e-3 is rounding
+    return normalise(jnp.where(present[:, None], x - mean, 0.0), eps=1e-6)  # a spread below 1e-3 is rounding
 
 
 def alignment_loss(
@@ -110,15 +89,15 @@ def alignment_loss(
     weights: tuple[float, float, float],
     *,
     groups: int = 1,
-    centre: bool = False,
+    center: bool = False,
 ) -> tuple[Array, Metrics]:
-    """The joint alignment of touch, vision and text with missing modalities (Eq. 4).
+    """Return the loss of joint alignment of touch, vision and text with missing modalities (Eq. 4).
 
     `touch`, `image`, `text` (B, E) of unit length; `has_image`, `has_text` (B,) bool; `weights` are the factors of
     the pairs (touch-vision, touch-text, vision-text) on the sum of both directions. A modality that is None is
-    absent from the whole batch. With `centre` each modality's mean over the batch is taken off first: untrained towers
-    share one large direction, and the loss is first lowered by growing it until all embeddings are equal (see
-    `config.Objective`). Returns the loss, its six terms and the number of pairs of each kind.
+    absent from the whole batch. `center` subtracts each modality's batch mean first. Untrained towers share one large
+    direction, and without this the loss falls by growing it until all embeddings are equal. Returns the loss, its six
+    terms and the number of pairs of each kind.
     """
     everyone = jnp.ones(touch.shape[0], bool)
     z = {"touch": (touch, everyone)}
@@ -126,8 +105,8 @@ def alignment_loss(
         z["vision"] = (image, everyone if has_image is None else has_image)
     if text is not None:
         z["text"] = (text, everyone if has_text is None else has_text)
-    if centre:
-        z = {name: (centred(x, has), has) for name, (x, has) in z.items()}
+    if center:
+        z = {name: (centered(x, has), has) for name, (x, has) in z.items()}
     total = jnp.zeros((), jnp.promote_types(touch.dtype, jnp.float32))
     metrics: Metrics = {}
     pairs = (("touch", "vision"), ("touch", "text"), ("vision", "text"))
@@ -150,21 +129,21 @@ def alignment_loss(
 def contrast_loss(
     first: Array, second: Array, scale: Array, *, groups: int = 1, place: Array | None = None
 ) -> tuple[Array, Array]:
-    """InfoNCE between the two touches (B, E), unit length, of each pair: a matching beyond the paper, for encoders
-    from scratch. The other places of the batch are the negatives, up to 2 B - 2 for each pair instead of one; which
-    pairs are of one is said by `place` i32 (B,) (None: no two).
+    """InfoNCE matching between the two unit-norm touches (B, E) of each pair. Not in the paper.
 
-    The mean of both directions, and the share of `first` to which a `second` of its own place is the nearest.
+    All other places of the batch are negatives, up to 2 B - 2 for each pair instead of one. `place` i32 (B,) is equal
+    for pairs of one place; None means that no two are. Returns the mean of both directions, and the share of `first`
+    whose nearest `second` is of its place.
     """
     everyone = jnp.ones(first.shape[0], bool)
-    how: dict[str, Any] = {"groups": groups, "place": place}
-    both = [info_nce(a, b, scale, everyone, **how) for a, b in ((first, second), (second, first))]
-    own = jnp.arange(first.shape[0]) if place is None else place
-    near = own[jnp.argmax(_wide(first) @ _wide(second).T, axis=1)] == own
-    return sum(both, jnp.zeros(())) / 2, jnp.mean(near.astype(jnp.float32))
+    forth = info_nce(first, second, scale, everyone, groups=groups, place=place)
+    back = info_nce(second, first, scale, everyone, groups=groups, place=place)
+    place = jnp.arange(first.shape[0]) if place is None else place
+    right = place[jnp.argmax(_wide(first) @ _wide(second).T, axis=1)] == place
+    return (forth + back) / 2, jnp.mean(right.astype(jnp.float32))
 
 
 def matching_loss(positive_logit: Array, negative_logit: Array) -> Array:
-    """Binary cross-entropy of cross-sensor matching from logits (B,), each kind averaged over the batch (Eq. 6)."""
+    """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the batch (Eq. 6)."""
     positive, negative = _wide(positive_logit), _wide(negative_logit)
     return jnp.mean(jax.nn.softplus(-positive)) + jnp.mean(jax.nn.softplus(negative))

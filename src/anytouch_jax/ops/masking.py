@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 
 
-def kept(positions: int, ratio: float) -> int:
-    """How many of `positions` stay visible: floor(N * ratio) in floating point, as the release."""
+def count_visible(positions: int, ratio: float) -> int:
+    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the release."""
     return int(positions * ratio)
 
 
@@ -15,7 +15,7 @@ def random_mask(noise: Array, keep: int) -> tuple[Array, Array, Array]:
     """Keep the `keep` positions of smallest noise, each sample by its own row of `noise` (B, N).
 
     Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N) such that position n is element
-    restore_ids[n] of [kept, hidden], and hidden (B, N), True where a position was removed (Omega_M of Eq. 1).
+    restore_ids[n] of [visible, hidden], and hidden (B, N), True where a position was removed (Omega_M of Eq. 1).
     """
     order = jnp.argsort(noise, axis=1)
     restore_ids = jnp.argsort(order, axis=1)
@@ -23,13 +23,13 @@ def random_mask(noise: Array, keep: int) -> tuple[Array, Array, Array]:
 
 
 def keep(x: Array, keep_ids: Array) -> Array:
-    """The kept positions of `x` (B, N, ...), by `keep_ids` (B, K), as (B, K, ...)."""
+    """Return the positions `keep_ids` (B, K) of `x` (B, N, ...), as (B, K, ...)."""
     ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
     return jnp.take_along_axis(x, ids, axis=1)
 
 
 def restore(visible: Array, mask_token: Array, restore_ids: Array) -> Array:
     """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N, D)."""
-    batch, shown, width = visible.shape
-    hidden = jnp.broadcast_to(mask_token.astype(visible.dtype), (batch, restore_ids.shape[1] - shown, width))
+    batch, count, width = visible.shape
+    hidden = jnp.broadcast_to(mask_token.astype(visible.dtype), (batch, restore_ids.shape[1] - count, width))
     return jnp.take_along_axis(jnp.concatenate([visible, hidden], axis=1), restore_ids[..., None], axis=1)

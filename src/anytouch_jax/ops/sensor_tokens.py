@@ -1,4 +1,4 @@
-"""The draw between a sensor's own tokens and the universal ones, and its schedule (Sec. 3.5, Eq. 7)."""
+"""Sensor tokens: the random draw between a sensor's own and the universal ones (Sec. 3.5, Eq. 7)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jax import Array
 
 
 def universal_probability(progress: Array, start: float, end: float) -> Array:
-    """p_u grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0 to 0.75)."""
+    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0 to 0.75)."""
     return start + (end - start) * progress
 
 

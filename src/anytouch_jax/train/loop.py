@@ -65,7 +65,7 @@ class FitResult:
 
 def used(state: TrainState) -> Tree:
     """All parameters as they are used: the trained ones (their average where a run keeps one) and the frozen ones."""
-    return merge(state.opt_state.ema or state.trainable, state.frozen)
+    return merge(state.trainable, state.frozen)
 
 
 def fit(
@@ -244,7 +244,7 @@ class _Loop:
         if skipped > self.config.run.max_skipped:
             raise UserError(
                 f"{skipped} steps in a row, up to step {step}, had a loss or a gradient that is not finite and were "
-                "skipped; lower optim.learning_rate, set optim.clip_norm, or look for NaN in the data, in another run "
+                "skipped; lower optim.learning_rate, set optim.grad_clip, or look for NaN in the data, in another run "
                 "folder"
             )
 

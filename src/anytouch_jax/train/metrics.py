@@ -83,7 +83,7 @@ def begun_with(run_dir: Path) -> Config | None:
         if not path.exists():
             path = run_dir / "checkpoints" / f"{done[-1]:08d}"
         text = read_record(path)["config"] if path.is_dir() else path.read_text(encoding="utf-8")
-        config: Config = from_json(text)
+        config: Config = from_json(text, allow_retired=False)
     except (ConfigError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read ({error}); choose another run folder, or mend it") from None
     return config

@@ -27,12 +27,11 @@ T = TypeVar("T")
 
 class OptState(NamedTuple):
     """State of `optimizer`: `counts` i32 (parameters,), how often each was updated; `mu` and `nu`, first and second
-    moments as `pack.packing` groups them; `ema`, averaged parameters or {}; `learning_rate` f32 (), the last one."""
+    moments as `pack.packing` groups them; `learning_rate` f32 (), the last one."""
 
     counts: Array
     mu: tuple[Array, ...]
     nu: tuple[Array, ...]
-    ema: Tree
     learning_rate: Array
 
 
@@ -107,20 +106,18 @@ def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | flo
 
 
 def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
-    """AdamW as PyTorch computes it: decoupled decay by `config.weight_decay`, optional global-norm clipping and EMA.
+    """AdamW as PyTorch computes it: decoupled decay by `config.weight_decay`, optional global-norm clipping.
 
     `update(grads, state, params, *, used=None, step=None, learning_rate=None)`: `used` is a tree of Python bools, a
     parameter that is not used stays as it is and does not count in the clipping norm; the rate is that of `schedule`
-    at `step`, or `learning_rate` if given. So a skipped step does not shift the schedule. `OptState.ema`: the average.
+    at `step`, or `learning_rate` if given. So a skipped step does not shift the schedule.
     """
     options, rate = config.optim, schedule(config)
 
     def init(params: Tree) -> OptState:
-        # A copy: the parameters and their average must not share buffers, since both are donated to the step.
-        ema = {} if options.ema is None else jax.tree.map(jnp.copy, params)
         layout = packing(params)
         mu, nu = (tuple(jnp.zeros_like(x) for x in layout.pack(params)) for _ in range(2))
-        return OptState(jnp.zeros(len(layout.shapes), jnp.int32), mu, nu, ema, jnp.zeros((), jnp.float32))
+        return OptState(jnp.zeros(len(layout.shapes), jnp.int32), mu, nu, jnp.zeros((), jnp.float32))
 
     def update(
         grads: Tree,
@@ -141,10 +138,7 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
         if options.layer_decay != 1:
             slower = [d * depth_rate(name, d.shape, config) for name, d in flatten(updates).items()]
             updates = layout.treedef.unflatten(slower)
-        ema = state.ema
-        if options.ema is not None:
-            ema = optax.incremental_update(optax.apply_updates(params, updates), ema, 1.0 - options.ema)
-        return updates, OptState(count, mu, nu, ema, lr)
+        return updates, OptState(count, mu, nu, lr)
 
     return optax.GradientTransformationExtraArgs(init, update)
 
@@ -160,9 +154,9 @@ def _adamw(
     first, second = (1.0 - jnp.float32(beta) ** count for beta in (options.beta1, options.beta2))  # bias corrections
     gradients = layout.pack(grads)
     use = [layout.spread(k, uses) for k in range(len(gradients))]
-    if options.clip_norm is not None:
+    if options.grad_clip is not None:
         length = norm([jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)])
-        gradients = tuple(g * jnp.minimum(1.0, options.clip_norm / length) for g in gradients)
+        gradients = tuple(g * jnp.minimum(1.0, options.grad_clip / length) for g in gradients)
     directions, mus, nus = [], list(state.mu), list(state.nu)
     for k, (grad, value) in enumerate(zip(gradients, layout.pack(params), strict=True)):
         if not np.any(use[k]):

@@ -77,7 +77,7 @@ def test_the_formula_of_stage_1_is_what_xla_counts(frames):
 @pytest.mark.parametrize("name", ["align", "match"])
 def test_the_formula_of_stage_2_is_what_xla_counts(name):
     two = preset("small", stage=2, recipe="release")
-    config = shallow(replace(two, objective=replace(two.objective, reconstruct=False)))
+    config = shallow(replace(two, recipe="paper"))
     work = Workload(f"stage2 {name}", config, 4, 3)
     batch, net = normalised(make_batch(work)), build(config.model)
     terms = partial(objectives.stage2_terms, net=net, config=config)
@@ -89,7 +89,7 @@ def test_the_formula_of_an_embedding_is_what_xla_counts():
     for frames in (1, 3):
         config = shallow(preset("small"))
         net, work = build(config.model), Workload("embed", config, 2, frames)
-        encode = lambda p, b, net=net: net.apply(p, "encode", b.clip, b.sensor)  # noqa: E731
+        encode = lambda p, b, net=net: net.encode_touch(p, b.clip, b.sensor)  # noqa: E731
         ratio = counted(encode, net.abstract(), normalised(make_batch(work))) / work.operations
         assert 1 < ratio < 1.02
 
@@ -121,7 +121,7 @@ def test_the_compiled_encoder_of_preset_large_costs_at_most_27_percent_of_the_un
     clip = jax.ShapeDtypeStruct((1, 3, 224, 224, 3), jnp.float32)
     kept = jax.ShapeDtypeStruct((1, model.patches // 4), jnp.int32)
     sensor = jax.ShapeDtypeStruct((1,), jnp.int32)
-    hidden = lambda p, c, s, k=None: net.apply(p, "touch.hidden", c, s, k)  # noqa: E731
+    hidden = lambda p, c, s, k=None: net.bind(p).touch.hidden(c, s, k)  # noqa: E731
     masked, whole = counted(hidden, net.abstract(), clip, sensor, kept), counted(hidden, net.abstract(), clip, sensor)
     assert 0.2 < masked / whole <= 0.27
 
@@ -143,10 +143,8 @@ def test_a_still_is_projected_as_one_frame():
     args = (jax.ShapeDtypeStruct((16, 1, 224, 224, 3), jnp.float32), jax.ShapeDtypeStruct((16,), jnp.int32))
     one_frame = 2 * 16 * model.patches * 588 * 384
     summed, positions = 3 * 588 * 384, 8 * 16 * 262 * 384  # adding kernels and tables is no projection
-    assert one_frame < counted(lambda p, *a: net.apply(p, "touch.tokens", *a), net.abstract(), *args)
-    assert (
-        counted(lambda p, *a: net.apply(p, "touch.tokens", *a), net.abstract(), *args) < one_frame + summed + positions
-    )
+    assert one_frame < counted(lambda p, *a: net.bind(p).touch.tokens(*a), net.abstract(), *args)
+    assert counted(lambda p, *a: net.bind(p).touch.tokens(*a), net.abstract(), *args) < one_frame + summed + positions
 
 
 # Batches ------------------------------------------------------------------------------------------------------------

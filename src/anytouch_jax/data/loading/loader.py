@@ -53,7 +53,7 @@ class Loader:
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
         size, groups = config.data.batch_size, config.objective.groups
         self._seed, self._match_size = config.run.seed % 2**63, size
-        if config.data.split_steps:
+        if config.splits_steps:
             self._match_size = max(1, size // 2)
         self._in_batch_negatives = config.model.match_head == "cosine"  # instead of a third touch
         if config.stage == 2 and size % groups:
@@ -85,7 +85,7 @@ class Loader:
         """Batches that hold every still and every clip once (and every anchor, if matching has separate steps)."""
         size = self.config.data.batch_size
         steps = sum(-(-pool.draws // size) for pool in self._drawn)
-        if self.config.data.split_steps:
+        if self.config.splits_steps:
             steps += sum(-(-pool.anchors.size // self._match_size) for pool in self._drawn_matches)
         return steps
 
@@ -111,7 +111,7 @@ class Loader:
     def _share_of_align_steps(self) -> float:
         """Return 1, or in separate steps (release) the share of align batches among all batches of an epoch."""
         pools = self._drawn_matches
-        if not self.config.data.split_steps or not pools:
+        if not self.config.splits_steps or not pools:
             return 1.0
         align = sum(pool.draws for pool in self._drawn) / self.config.data.batch_size
         return align / (align + sum(pool.anchors.size for pool in pools) / self._match_size)
@@ -130,7 +130,7 @@ class Loader:
         if self._match_pools[STILL] is None:
             return np.full(len(steps), _NONE)
         kinds = self._kinds(steps) if self._match_pools[CLIP] is not None else np.full(len(steps), STILL)
-        return np.where(self._align_kinds(steps) == _NONE, kinds, _NONE) if self.config.data.split_steps else kinds
+        return np.where(self._align_kinds(steps) == _NONE, kinds, _NONE) if self.config.splits_steps else kinds
 
     def _plan(self, step: int) -> BatchJobs[Batch]:
         """Return an empty batch, and a job for each slot that reads and writes one sample."""

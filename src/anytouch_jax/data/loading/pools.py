@@ -99,7 +99,7 @@ def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, 
     if config.stage == 2 and config.model.text:
         notes += _withheld_notes(manifest, config, usable.rows)
     data, frames = config.data, config.model.frames
-    length = frames + (config.stage == 1 or config.objective.reconstruct)
+    length = frames + config.reconstructs
     stills, clips = usable.rows[:, None], _clips(manifest, config, usable, length)
     touch = tuple(
         _pool(config, usable, kind, windows, devices)
@@ -116,7 +116,7 @@ def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, 
         if match[STILL] and match[CLIP] is None and len(touch) > 1:
             notes.append("no two clips share a touch: matching uses stills only")
     has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
-    if config.stage == 2 and not (has_modality or any(match) or config.objective.reconstruct):
+    if config.stage == 2 and not (has_modality or any(match) or config.reconstructs):
         raise UserError(
             f"stage 2 has nothing to learn from split {data.split!r}: it needs photographs (image_path), captions "
             "(text), or places touched by two sensors (touch), with the tower or head for them; add one, or train "

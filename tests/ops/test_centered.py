@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.config import preset
-from anytouch_jax.ops.losses import alignment_loss, centred, normalise
+from anytouch_jax.ops.losses import alignment_loss, centered, normalise
 
 B, E, WEIGHTS = 6, 5, (0.5, 0.25, 0.1)
 HAS_IMAGE, HAS_TEXT = jnp.asarray([1, 1, 0, 1, 1, 0], bool), jnp.asarray([0, 1, 1, 1, 0, 1], bool)
@@ -17,13 +17,13 @@ def draw():
     return tuple(jnp.asarray(rng.standard_normal((B, E)), jnp.float32) for _ in range(3))
 
 
-def loss(z, centre=True):
-    return alignment_loss(*z, HAS_IMAGE, HAS_TEXT, jnp.float32(5.0), WEIGHTS, centre=centre)[0]
+def loss(z, center=True):
+    return alignment_loss(*z, HAS_IMAGE, HAS_TEXT, jnp.float32(5.0), WEIGHTS, center=center)[0]
 
 
 def test_rows_have_unit_length_and_mean_zero_before_it():
     (x, _, _) = draw()
-    z = centred(x, HAS_IMAGE)
+    z = centered(x, HAS_IMAGE)
     there = np.asarray(HAS_IMAGE)
     np.testing.assert_allclose(np.linalg.norm(z[there], axis=1), 1.0, rtol=1e-6)
     own = np.asarray(x)[there] - np.asarray(x)[there].mean(0)
@@ -36,7 +36,7 @@ def test_what_all_samples_share_does_not_count(which):
     z = draw()
     moved = [x + (10.0 * jnp.arange(E)[None] if i == which else 0.0) for i, x in enumerate(z)]
     np.testing.assert_allclose(loss(moved), loss(z), rtol=1e-4)
-    assert abs(float(loss(moved, centre=False)) - float(loss(z, centre=False))) > 0.1
+    assert abs(float(loss(moved, center=False)) - float(loss(z, center=False))) > 0.1
 
 
 @pytest.mark.parametrize("garbage", [1e30, np.nan, np.inf])
@@ -60,12 +60,12 @@ def test_the_gradient_does_not_vanish_near_the_collapsed_point():
 def test_equal_embeddings_and_a_single_pair_have_a_finite_gradient():
     same = tuple(jnp.ones((B, E)) for _ in range(3))
     assert np.isfinite(jax.grad(lambda x: loss((x, *same[1:])))(same[0])).all()
-    one = alignment_loss(same[0][:1], same[1][:1], None, None, None, jnp.float32(5.0), WEIGHTS, centre=True)[0]
+    one = alignment_loss(same[0][:1], same[1][:1], None, None, None, jnp.float32(5.0), WEIGHTS, center=True)[0]
     assert float(one) == 0.0
 
 
 def test_towers_from_scratch_are_centred_and_the_papers_are_not():
-    assert preset("tiny", stage=2, towers="scratch").objective.centre
-    assert not preset("tiny", stage=2, towers="pretrained").objective.centre
-    assert not preset("tiny", stage=2, towers="scratch", recipe="release").objective.centre
-    assert not preset("tiny").objective.centre
+    assert preset("tiny", stage=2, towers="scratch").objective.center_embeddings
+    assert not preset("tiny", stage=2, towers="pretrained").objective.center_embeddings
+    assert not preset("tiny", stage=2, towers="scratch", recipe="release").objective.center_embeddings
+    assert not preset("tiny").objective.center_embeddings

@@ -90,7 +90,7 @@ def reconstruction_panels(
 
 @partial(jax.jit, static_argnames=("net", "config"))
 def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
-    pixels, _, hidden = reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
+    pixels, hidden = reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
     return pixels, hidden
 
 

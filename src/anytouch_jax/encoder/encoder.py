@@ -198,7 +198,10 @@ class Encoder:
                 f"{self.parts.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
                 f"{text.vocab}; copy the tokenizer of its training"
             )
-        ids, mask = tokenizer.encode([texts] if isinstance(texts, str) else list(texts), text.length)
+        texts = [texts] if isinstance(texts, str) else list(texts)
+        if not all(isinstance(sentence, str) for sentence in texts):
+            raise UserError("texts must be a string or a sequence of strings")
+        ids, mask = tokenizer.encode(texts, text.length)
         return self._embeddings(tower, zip(ids, mask, strict=True), batch)
 
     def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:

@@ -1,0 +1,53 @@
+"""One function runs in equal batches; frames of folders and videos become clips."""
+
+import numpy as np
+import pytest
+
+from anytouch_jax.encoder.embed import embed_frames, run_in_batches
+from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.errors import UserError
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(("count", "shapes"), [(0, []), (3, [3]), (4, [4]), (9, [4, 4, 4]), (8, [4, 4])])
+def test_batches_are_of_one_size_and_results_keep_their_order(count, shapes):
+    sizes, items = [], RNG.standard_normal((count, 5))
+
+    def double(batch):
+        sizes.append(len(batch))
+        return batch * 2
+
+    values = run_in_batches(double, items, 4)
+    assert sizes == shapes and len(values) == count
+    if count:
+        np.testing.assert_array_equal(values, items * 2)
+
+
+def test_tuples_are_stacked_one_by_one_and_the_last_item_fills_up():
+    def check(batch):
+        first, second = batch
+        assert first.shape == (2, 3) and second.shape == (2,)
+        return first.sum(1) + second
+
+    items = [(np.full(3, i), np.int32(10 * i)) for i in range(5)]
+    np.testing.assert_array_equal(run_in_batches(check, iter(items), 2), 13 * np.arange(5))
+
+
+@pytest.fixture(scope="module")
+def encoder(tiny_run):
+    return load_encoder(tiny_run)
+
+
+def test_no_clip_spans_a_gap_or_an_unreadable_frame(encoder):
+    frames = RNG.integers(0, 256, (8, 28, 28, 3), np.uint8)
+    named = [(number, f"{number}.png", frames[i]) for i, number in enumerate((0, 1, 2, 3, 6, 7, 8, 9))]
+    features = embed_frames(encoder, named, 1, length=3, batch=2)
+    assert features.rows.tolist() == [2, 3, 6, 7] and features.skipped == 2
+    assert features.keys["path"].tolist() == ["2.png", "3.png", "8.png", "9.png"]
+    wanted = encoder.encode_touch(np.stack([frames[i - 2 : i + 1] for i in (2, 3, 6, 7)]), "digit")
+    np.testing.assert_allclose(features.values, wanted, atol=1e-5)
+    named[1] = (1, "1.png", None)
+    assert embed_frames(encoder, named, 1, length=3).rows.tolist() == [6, 7]
+    with pytest.raises(UserError, match="too few for clips of 5"):
+        embed_frames(encoder, named, 1, length=5)

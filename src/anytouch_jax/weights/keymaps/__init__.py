@@ -92,7 +92,7 @@ def linear(theirs: str, ours: str) -> list[Entry]:
     return [Entry(f"{theirs}.weight", f"{ours}/kernel", LINEAR), Entry(f"{theirs}.bias", f"{ours}/bias", SAME)]
 
 
-def norm(theirs: str, ours: str) -> list[Entry]:
+def layer_norm(theirs: str, ours: str) -> list[Entry]:
     """Return the entries of a LayerNorm."""
     return [Entry(f"{theirs}.weight", f"{ours}/scale", SAME), Entry(f"{theirs}.bias", f"{ours}/bias", SAME)]
 

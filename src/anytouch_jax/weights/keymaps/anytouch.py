@@ -8,7 +8,7 @@ from typing import Any
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, detect_stack, hf_clip, linear, norm
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, detect_stack, hf_clip, layer_norm, linear
 
 _STAGE2 = "touch_mae_model."
 _CLIP_PATCH = "video_patch_embedding.weight"
@@ -21,8 +21,8 @@ _DECODER_BLOCK = [
     *linear("attention.output.dense", "attention/out"),
     *linear("intermediate.dense", "mlp/up"),
     *linear("output.dense", "mlp/down"),
-    *norm("layernorm_before", "norm1"),
-    *norm("layernorm_after", "norm2"),
+    *layer_norm("layernorm_before", "norm1"),
+    *layer_norm("layernorm_after", "norm2"),
 ]
 
 
@@ -40,7 +40,7 @@ def _decoder(model: ModelConfig, prefix: str = "") -> Iterator[Entry]:
         yield Entry(f"{prefix}sensor_token_proj.weight", "decoder/sensor_projection/kernel", LINEAR)
     yield from keymaps.stacked(f"{prefix}touch_decoder_blocks", "decoder/blocks", model.decoder.depth, _DECODER_BLOCK)
     yield from linear(f"{prefix}decoder_embed", "decoder/embed")
-    yield from norm(f"{prefix}decoder_norm", "decoder/norm")
+    yield from layer_norm(f"{prefix}decoder_norm", "decoder/norm")
     yield from linear(f"{prefix}decoder_pred", "decoder/still_head")
     yield from linear(f"{prefix}decoder_pred_video", "decoder/clip_head")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from anytouch_jax.config import ModelConfig, Stack, TextTower
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, linear, norm
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, layer_norm, linear
 
 _ATTENTION = tuple(zip(("q_proj", "k_proj", "v_proj", "out_proj"), keymaps.PROJECTIONS, strict=True))
 _LORA_BLOCK = [
@@ -21,8 +21,8 @@ DECODER = Stack(512, 8, 16, 2048)
 def _block(base: str = "") -> Iterator[Entry]:
     for theirs, ours in _ATTENTION:
         yield from linear(f"self_attn.{theirs}{base}", f"attention/{ours}")
-    yield from norm("layer_norm1", "norm1")
-    yield from norm("layer_norm2", "norm2")
+    yield from layer_norm("layer_norm1", "norm1")
+    yield from layer_norm("layer_norm2", "norm2")
     yield from linear("mlp.fc1", "mlp/up")
     yield from linear("mlp.fc2", "mlp/down")
 
@@ -31,12 +31,12 @@ def vision(prefix: str, ours: str, depth: int, *, lora: bool = False) -> Iterato
     """Yield the entries of a vision transformer, except its patch kernel and its projection."""
     yield Entry(f"{prefix}.embeddings.class_embedding", f"{ours}/class_token", SAME)
     yield Entry(f"{prefix}.embeddings.position_embedding.weight", f"{ours}/position", SAME)
-    yield from norm(f"{prefix}.pre_layrnorm", f"{ours}/pre_norm")  # the library's spelling
+    yield from layer_norm(f"{prefix}.pre_layrnorm", f"{ours}/pre_norm")  # the library's spelling
     layers = f"{prefix}.encoder.base_model.model.layers" if lora else f"{prefix}.encoder.layers"
     yield from keymaps.stacked(layers, f"{ours}/blocks", depth, _block(".base_layer" if lora else ""))
     if lora:
         yield from keymaps.stacked(layers, "lora", depth, _LORA_BLOCK)
-    yield from norm(f"{prefix}.post_layernorm", f"{ours}/post_norm")
+    yield from layer_norm(f"{prefix}.post_layernorm", f"{ours}/post_norm")
 
 
 def towers(model: ModelConfig, *, lora: bool = False) -> Iterator[Entry]:
@@ -49,7 +49,7 @@ def towers(model: ModelConfig, *, lora: bool = False) -> Iterator[Entry]:
         yield Entry("text_model.embeddings.token_embedding.weight", "text/token", SAME)
         yield Entry("text_model.embeddings.position_embedding.weight", "text/position", SAME)
         yield from keymaps.stacked("text_model.encoder.layers", "text/blocks", model.text.stack.depth, _block())
-        yield from norm("text_model.final_layer_norm", "text/final_norm")
+        yield from layer_norm("text_model.final_layer_norm", "text/final_norm")
         yield Entry("text_projection.weight", "text/projection/kernel", LINEAR)
     if model.image or model.text:
         yield Entry("logit_scale", "logit_scale", SAME)

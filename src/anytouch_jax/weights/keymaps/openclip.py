@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, linear, norm
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, layer_norm, linear
 from anytouch_jax.weights.keymaps.hf_clip import DECODER
 
 _BLOCK = [
-    *norm("ln_1", "norm1"),
-    *norm("ln_2", "norm2"),
+    *layer_norm("ln_1", "norm1"),
+    *layer_norm("ln_2", "norm2"),
     *linear("attn.out_proj", "attention/out"),
     *linear("mlp.c_fc", "mlp/up"),
     *linear("mlp.c_proj", "mlp/down"),
@@ -26,15 +26,15 @@ def _entries(model: ModelConfig) -> Iterator[Entry]:
         yield Entry("visual.class_embedding", "image/class_token", SAME)
         yield Entry("visual.positional_embedding", "image/position", SAME)
         yield Entry("visual.conv1.weight", "image/patch/kernel", keymaps.PATCH)
-        yield from norm("visual.ln_pre", "image/pre_norm")
+        yield from layer_norm("visual.ln_pre", "image/pre_norm")
         yield from keymaps.stacked("visual.transformer.resblocks", "image/blocks", model.image.depth, _BLOCK)
-        yield from norm("visual.ln_post", "image/post_norm")
+        yield from layer_norm("visual.ln_post", "image/post_norm")
         yield Entry("visual.proj", "image/projection/kernel", SAME)  # stored as (in, out), unlike a torch Linear
     if model.text:
         yield Entry("token_embedding.weight", "text/token", SAME)
         yield Entry("positional_embedding", "text/position", SAME)
         yield from keymaps.stacked("transformer.resblocks", "text/blocks", model.text.stack.depth, _BLOCK)
-        yield from norm("ln_final", "text/final_norm")
+        yield from layer_norm("ln_final", "text/final_norm")
         yield Entry("text_projection", "text/projection/kernel", SAME)
     yield Entry("logit_scale", "logit_scale", SAME)
 

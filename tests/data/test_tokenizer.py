@@ -13,7 +13,7 @@ CAPTIONS = ["A soft, springy surface.", "A hard, smooth surface with ridges.", "
 
 
 @pytest.mark.parametrize("folder", [CLIP] if CLIP.is_dir() else [])
-def test_clips_own_ids_exactly(folder):
+def test_the_ids_are_those_of_clip(folder):
     tokenizer = text.load_tokenizer(folder)
     assert (tokenizer.vocab_size, tokenizer.start_id, tokenizer.end_id) == (49408, 49406, 49407)
     cases = json.loads((folder / "token_ids.json").read_text())
@@ -71,7 +71,7 @@ def test_training_is_deterministic_and_covers_any_text(tmp_path):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["other.json", "tokenizer.json"]
 
 
-def test_mistakes_are_told_in_a_sentence(tmp_path):
+def test_mistakes_are_errors(tmp_path):
     with pytest.raises(UserError, match=r"there is no tokenizer .*none.*tokenizer\.json"):
         text.load_tokenizer(tmp_path / "none")
     (tmp_path / "tokenizer.json").write_text("{}")

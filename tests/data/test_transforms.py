@@ -49,13 +49,13 @@ def test_frames_of_different_sizes_make_one_clip():
 def test_flips_are_exact_mirrors_in_all_four_forms():
     plain = t.touch_evaluation(CLIP, 16)
     forms = {0: plain, 1: plain[:, :, ::-1], 2: plain[:, ::-1], 3: plain[:, ::-1, ::-1]}
-    seen = set()
+    collected = set()
     for key in range(40):
         out = t.touch_transform(CLIP, 16, _rng(key), replace(PLAIN, flip=0.5))
         match = [name for name, form in forms.items() if np.array_equal(out, form)]
         assert len(match) == 1
-        seen.add(match[0])
-    assert seen == {0, 1, 2, 3}
+        collected.add(match[0])
+    assert collected == {0, 1, 2, 3}
     both = t.touch_transform(CLIP, 16, _rng(), replace(PLAIN, flip=1.0))
     np.testing.assert_array_equal(both, forms[3])
 

@@ -54,9 +54,9 @@ def test_contrast_reads_no_third_touch_and_knows_which_pairs_are_of_one_place(ma
     for step in range(4):
         match = Loader(manifest, config).batch(step).match
         assert match.clip.any() and match.positive.any() and match.negative is match.negative_sensor is None
-        found = [manifest.codes("touch", own=True)[int(clip[-1, 0, 0, 0]) - 1] for clip in match.clip]
-        np.testing.assert_array_equal(match.place, found)
-        places |= set(found)
+        result = [manifest.codes("touch", own=True)[int(clip[-1, 0, 0, 0]) - 1] for clip in match.clip]
+        np.testing.assert_array_equal(match.place, result)
+        places |= set(result)
     assert len(places) > 1
 
 
@@ -111,7 +111,7 @@ def test_the_paper_takes_turns_and_the_release_draws(make, settings):
             assert Loader(manifest, settings(recipe=recipe, clip_share=share)).kind(7) == kind
 
 
-def test_without_clips_all_batches_are_stills_and_it_is_said(make, settings):
+def test_without_clips_all_batches_are_stills_with_a_note(make, settings):
     loader = Loader(make([{} for _ in range(3)]), settings())
     assert {loader.kind(step) for step in range(9)} == {"still"}
     assert any("no clip of 4 frames" in note for note in loader.notes)
@@ -136,7 +136,7 @@ def test_only_the_split_is_drawn(make, settings, read_back):
         Loader(make([{}]), settings(split="test"))
 
 
-def test_field_sensors_are_left_out_aloud(make, settings, read_back):
+def test_field_sensors_are_left_out_with_a_note(make, settings, read_back):
     loader = Loader(make([{"sensor": "tac3d"}, {}, {"sensor": "tac3d"}]), settings())
     assert (read_back(loader.batch(0).clip) == 1).all()
     assert any("2 rows of tac3d" in note for note in loader.notes)
@@ -152,7 +152,7 @@ def test_a_clip_holds_no_row_that_was_left_out(make, settings, read_back):
         assert 5 not in read_back(loader.batch(step).clip)
 
 
-def test_an_unknown_sensor_is_named_or_left_out_aloud(make, settings, read_back):
+def test_an_unknown_sensor_is_an_error_or_left_out_with_a_note(make, settings, read_back):
     manifest = make([{}, {"sensor": "newfinger"}, {"sensor": "newfinger", "split": "test"}])
     with pytest.raises(ManifestError, match=r"row 1 of .*manifest\.csv.*unknown sensor 'newfinger'"):
         Loader(manifest, settings())
@@ -228,14 +228,14 @@ def test_pictures_lie_anywhere_in_the_batch(make, settings):
 def test_every_row_is_aligned_although_strata_are_uneven(make, settings, read_back):
     rows = [{"image_path": f"v{i}.png", "text": "t"} if i else {} for i in range(20)]
     loader = Loader(make(rows), settings(2, batch_size=4))
-    seen, slots = [], set()
+    collected, slots = [], set()
     for step in range(40):
         batch = loader.batch(step).align
         slots.add(_check_align(batch, rows, read_back, loader.tokenizer))
-        seen += read_back(batch.clip)[:, 0].tolist()
+        collected += read_back(batch.clip)[:, 0].tolist()
     assert slots == {(4, 4), (3, 3)}  # where the bare row is, a slot is unused
-    assert set(seen) == set(range(20))
-    assert seen.count(0) == pytest.approx(8, abs=1)  # the one bare row comes as often as the others
+    assert set(collected) == set(range(20))
+    assert collected.count(0) == pytest.approx(8, abs=1)  # the one bare row comes as often as the others
 
 
 def test_no_vision_and_no_text_give_no_slots(make, settings):
@@ -325,9 +325,9 @@ def test_matching_triples_in_both_recipes(make, settings, read_back, rich):
 
 
 def test_joined_manifests_share_no_touch_by_accident(make, settings):
-    seen = {"text": "a caption"}
-    one = make([{"touch": "1"} | seen], "one")
-    two = make([{"touch": "1", "sensor": "gelslim"} | seen, {"touch": "2"}], "two")
+    caption = {"text": "a caption"}
+    one = make([{"touch": "1"} | caption], "one")
+    two = make([{"touch": "1", "sensor": "gelslim"} | caption, {"touch": "2"}], "two")
     for manifest in (one, two):
         write(manifest, manifest.files[0])
     loader = Loader(read([one.files[0], two.files[0]]), settings(2))
@@ -335,7 +335,7 @@ def test_joined_manifests_share_no_touch_by_accident(make, settings):
 
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
-def test_without_pairs_there_is_no_matching_and_it_is_said(make, settings, recipe):
+def test_without_pairs_there_is_no_matching_but_a_note(make, settings, recipe):
     loader = Loader(make([{"touch": f"p{i}", "text": "words"} for i in range(8)]), settings(2, recipe))
     assert any("no cross-sensor matching" in note for note in loader.notes)
     for _, batch, _ in loader.stream(0, 6):
@@ -346,15 +346,15 @@ def test_stage_two_with_nothing_to_learn_is_refused(make, settings):
     """Its loss would be 0 at every step, and the run would end well."""
     bare = [{"touch": f"p{i}"} for i in range(8)]
     twice = [{"touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
-    seen, told = [{"image_path": f"v{i}.png"} for i in range(8)], [{"text": "words"} for _ in range(8)]
+    pictured, captioned = [{"image_path": f"v{i}.png"} for i in range(8)], [{"text": "words"} for _ in range(8)]
     config = settings(2)
     no_matching = replace(config, model=replace(config.model, match_head="none"))
     no_vision = replace(config, model=replace(config.model, image=None))
     no_text = replace(config, model=replace(config.model, text=None))
-    for rows, one in ((bare, config), (twice, no_matching), (seen, no_vision), (told, no_text)):
+    for rows, one in ((bare, config), (twice, no_matching), (pictured, no_vision), (captioned, no_text)):
         with pytest.raises(UserError, match="stage 2 has nothing to learn from split 'train'"):
             Loader(make(rows), one)
-    for rows, one in ((twice, config), (seen, no_matching), (told, no_vision), (bare, settings(2, "release"))):
+    for rows, one in ((twice, config), (pictured, no_matching), (captioned, no_vision), (bare, settings(2, "release"))):
         assert Loader(make(rows), one).steps_per_epoch
     assert Loader(make(bare), settings(1)).steps_per_epoch
 
@@ -366,11 +366,11 @@ def test_pairs_of_stills_only_match_stills_in_clip_steps(make, settings, read_ba
         row |= {"touch": f"p{i // 2}", "sensor": ["digit", "gelslim"][i % 2], "object": f"o{i // 2}"}
     loader = Loader(make(rows), settings(2))
     assert any("matching uses stills only" in note for note in loader.notes)
-    seen = []
+    collected = []
     for step, batch, _ in loader.stream(0, 6):
         assert batch.align.clip.shape[1] == (1 if loader.kind(step) == "still" else 3)
-        seen += _check_match(batch.match, rows, read_back, 4, 1)
-    assert sorted(seen[:12]) == list(range(6, 18))  # its own epoch goes on through both kinds
+        collected += _check_match(batch.match, rows, read_back, 4, 1)
+    assert sorted(collected[:12]) == list(range(6, 18))  # its own epoch goes on through both kinds
 
 
 def test_a_bad_partner_replaces_the_triple(make, settings, read_back, rich):
@@ -471,7 +471,7 @@ def test_the_parts_joined_are_the_whole(make, settings, stage, recipe, count, ba
     assert (skipped > 0) == (bad == "skip")
 
 
-def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch, rich):
+def test_a_shard_reads_only_the_files_of_its_part(make, settings, monkeypatch, rich):
     manifest, read = make(rich), []
     decode = samples.decode
     monkeypatch.setattr(samples, "decode", lambda path: read.append(path) or decode(path))
@@ -486,7 +486,7 @@ def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch, rich):
 
 
 @pytest.mark.parametrize(
-    ("size", "devices", "shard", "told"),
+    ("size", "devices", "shard", "message"),
     [
         (6, 4, (0, 4), "batch_size 6 cannot be shared by 4 processes"),
         (8, 3, (0, 2), "devices 3 cannot be shared by 2 processes"),
@@ -494,8 +494,8 @@ def test_a_shard_reads_its_own_files_only(make, settings, monkeypatch, rich):
         (8, 2, (0, 0), "there is no shard 0 of 0"),
     ],
 )
-def test_shares_that_do_not_add_up_are_told(make, settings, size, devices, shard, told, rich):
-    with pytest.raises(UserError, match=told):
+def test_shards_that_do_not_divide_are_refused(make, settings, size, devices, shard, message, rich):
+    with pytest.raises(UserError, match=message):
         Loader(make(rich), settings(batch_size=size), devices=devices, shard=shard)
 
 

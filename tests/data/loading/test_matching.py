@@ -33,7 +33,7 @@ def test_an_unknown_unit_is_not_another_unit():
     assert _draws(matches, 2)[0] == {3}
 
 
-def test_negatives_are_elsewhere_and_where_asked_of_another_object():
+def test_negatives_are_elsewhere_and_by_option_of_another_object():
     keys = _keys(
         touch=[0, 0, 1, 2, 2, -1, -1, -1, -1],
         sensor=[0, 1, 0, 0, 1, 0, 0, 0, 0],
@@ -134,7 +134,7 @@ def test_a_negative_of_the_same_sensor_on_random_tables(seed):
             assert keys.sensor[n] == keys.sensor[p] and keys.touch[n] != keys.touch[anchor] == keys.touch[p]
 
 
-def test_a_sensor_that_felt_one_place_only_is_no_partner():
+def test_a_sensor_with_one_place_only_is_no_partner():
     keys = _keys(touch=[0, 0, 0, 1, 2], sensor=[0, 1, 2, 0, 1])
     assert Matches(np.arange(5), keys).anchors.tolist() == [0, 1, 2]
     matches = Matches(np.arange(5), keys, same_sensor=True)

@@ -42,7 +42,7 @@ def test_weight_zero_leaves_a_dataset_out_of_stills_clips_and_matching(make, set
             assert read_back(clip).max() < 24
 
 
-def test_the_release_has_weights_of_its_own_where_its_datasets_are(make, settings):
+def test_the_release_weighs_its_datasets(make, settings):
     there = make(_sets({"touch_and_go": 4, "octopi": 4, "x": 4}, image_path="v.png"))
     release, paper = Loader(there, settings(2, "release")), Loader(there, settings(2))
     assert Loader(there, settings(1, "release")).steps_per_epoch == 3  # its stage 1 draws every row once
@@ -62,7 +62,7 @@ def test_strata_follow_the_weights(make, settings):
 
 
 @pytest.mark.parametrize(
-    ("weights", "told"),
+    ("weights", "message"),
     [
         ((("c", 2.0),), r"names the dataset 'c', but split 'train' has a, b"),
         ((("a", -1.0),), r"--data\.weights of 'a'"),
@@ -71,8 +71,8 @@ def test_strata_follow_the_weights(make, settings):
         ((("a", 0.0), ("b", 0.0)), "leaves out every row"),
     ],
 )
-def test_weights_that_make_no_sense_are_errors(make, settings, weights, told):
-    with pytest.raises(UserError, match=told):
+def test_weights_that_make_no_sense_are_errors(make, settings, weights, message):
+    with pytest.raises(UserError, match=message):
         Loader(make(_sets({"a": 4, "b": 4})), settings(weights=weights))
 
 
@@ -81,7 +81,7 @@ def test_weights_survive_the_configuration_file(settings):
     assert from_json(to_json(config)) == config and from_json(to_json(settings())).data.weights is None
 
 
-def test_with_the_option_the_sensor_alone_tells_nothing(make, settings, rich):
+def test_with_same_sensor_negatives_the_sensor_predicts_nothing(make, settings, rich):
     manifest = make(rich)
 
     def told_apart(config):  # how often "another sensor than the anchor's" is right of the positive, wrong of the other
@@ -106,8 +106,8 @@ def test_where_the_batch_is_the_negatives_they_are_of_one_sensor(make, settings,
 
 
 def test_without_negatives_of_the_same_sensor_there_is_no_matching_and_a_note(make, settings):
-    seen = {"text": "words"}
-    rows = [{"touch": "p", "sensor": name, "object": "o", **seen} for name in ("digit", "gelslim")]
+    caption = {"text": "words"}
+    rows = [{"touch": "p", "sensor": name, "object": "o", **caption} for name in ("digit", "gelslim")]
     loader = Loader(make([*rows, {"touch": "q", "object": "r", "sensor": "duragel"}] * 2), settings(2))
     assert loader.batch(0).match is not None
     loader = Loader(loader.manifest, settings(2, negatives="same_sensor"))
@@ -172,24 +172,24 @@ def changed(config, name):
 
 def test_tlv_link_draws_only_samples_with_all_three(make, settings, read_back):
     loader = Loader(make(world()), changed(settings(2), "tlv_link"))
-    seen = set()
+    collected = set()
     for batch in batches(loader):
         align = batch.align
         assert align.clip.shape[1] == 1 and batch.match is None
         assert sorted(align.image_row.tolist()) == sorted(align.text_row.tolist()) == list(range(SIZE))
-        seen |= set((read_back(align.clip)[:, -1] // 6).tolist())
-    assert seen == {2, 4, 5, 7}
+        collected |= set((read_back(align.clip)[:, -1] // 6).tolist())
+    assert collected == {2, 4, 5, 7}
     assert any("24 of 48 rows have image and text" in note for note in loader.notes)
 
 
 def test_unitouch_draws_photographs_and_no_text(make, settings, read_back):
     loader = Loader(make(world()), changed(settings(2), "unitouch"))
-    seen = set()
+    collected = set()
     for batch in batches(loader):
         assert batch.align.text.shape[0] == 0 and batch.match is None
         assert sorted(batch.align.image_row.tolist()) == list(range(SIZE))
-        seen |= set((read_back(batch.align.clip)[:, -1] // 6).tolist())
-    assert seen == {0, 2, 4, 5, 7} and loader.tokenizer is None
+        collected |= set((read_back(batch.align.clip)[:, -1] // 6).tolist())
+    assert collected == {0, 2, 4, 5, 7} and loader.tokenizer is None
 
 
 def test_clips_end_at_rows_with_the_required_modalities(make, settings, read_back):
@@ -236,12 +236,12 @@ def test_contact_only_needs_the_contact_column(make, settings):
 
 
 def captions_drawn(loader, steps=24):
-    found = set()
+    result = set()
     for batch in batches(loader, steps):
         for ids, row in zip(batch.align.text, batch.align.text_row, strict=True):
             if row < SIZE:
-                found.add(tuple(ids.tolist()))
-    return {name for name in [f"caption {i}" for i in range(8)] if code(loader, name) in found}
+                result.add(tuple(ids.tolist()))
+    return {name for name in [f"caption {i}" for i in range(8)] if code(loader, name) in result}
 
 
 def code(loader, name):

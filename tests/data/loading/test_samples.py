@@ -17,7 +17,7 @@ from anytouch_jax.data.transforms import TOUCH, augmentation_rng, subtract_backg
 from anytouch_jax.errors import UserError
 
 
-def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, monkeypatch):
+def test_cached_frames_change_no_byte_and_are_read_once(make, settings, monkeypatch):
     rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
     manifest = make(rows)
     noise = np.random.default_rng(0)
@@ -41,9 +41,9 @@ def test_frames_kept_in_memory_change_no_byte_and_are_read_once(make, settings, 
     config = settings(1, plain=False, background="subtract")
     rng = augmentation_rng(config.run.seed, 3, 3, TOUCH)
     files = [decode(manifest.file(row)) for row in range(4)] + [decode(manifest.file(3, "background_path"))]
-    *seen, gel = touch_transform(files, config.model.image_size, rng, config.data)
+    *frames, gel = touch_transform(files, config.model.image_size, rng, config.data)
     made = samples.SampleReader(manifest, config).touch(np.arange(4), 3)
-    np.testing.assert_array_equal(made, subtract_background(seen, gel))
+    np.testing.assert_array_equal(made, subtract_background(frames, gel))
 
 
 def test_augmentation_does_not_depend_on_the_batch(make, settings):
@@ -51,13 +51,13 @@ def test_augmentation_does_not_depend_on_the_batch(make, settings):
     gradient = np.tile(np.arange(0, 240, 15, dtype=np.uint8)[None, :, None], (12, 1, 3))
     for i in range(6):
         cv2.imwrite(str(manifest.file(i)), gradient + np.uint8(2 * i))
-    seen = {}
+    images_of = {}
     for size in (2, 3, 6):
         loader = Loader(manifest, settings(plain=False, batch_size=size))
-        seen[size] = {frame.tobytes() for step in range(6 // size) for frame in loader.batch(step).clip}
-        assert len(seen[size]) == 6
-    assert seen[2] == seen[3] == seen[6]  # epoch 0 is the same set of six images
-    assert not seen[6] & {
+        images_of[size] = {frame.tobytes() for step in range(6 // size) for frame in loader.batch(step).clip}
+        assert len(images_of[size]) == 6
+    assert images_of[2] == images_of[3] == images_of[6]  # epoch 0 is the same set of six images
+    assert not images_of[6] & {
         frame.tobytes() for frame in Loader(manifest, settings(plain=False, batch_size=6)).batch(1).clip
     }
 

@@ -24,13 +24,13 @@ def test_uniform_is_a_function_of_seed_tag_and_step():
 
 def test_turns_count_the_earlier_steps_of_a_kind():
     turns = s.StepSchedule(lambda steps: (steps * 7 % 5 < 2).astype(np.int64))
-    seen = {0: 0, 1: 0}
+    earlier = {0: 0, 1: 0}
     for step in [*range(50), 3000]:
         if step == 3000:
-            seen = {k: sum((i * 7 % 5 < 2) == k for i in range(3000)) for k in (0, 1)}
+            earlier = {k: sum((i * 7 % 5 < 2) == k for i in range(3000)) for k in (0, 1)}
         kind, rank = turns.at(step)
-        assert kind == (step * 7 % 5 < 2) and rank == seen[kind]
-        seen[kind] += 1
+        assert kind == (step * 7 % 5 < 2) and rank == earlier[kind]
+        earlier[kind] += 1
     assert s.StepSchedule(lambda steps: steps % 3 == 0).at(3000) == (1, 1000)  # no need to walk there
     with pytest.raises(ValueError, match="from 0"):
         turns.at(-1)

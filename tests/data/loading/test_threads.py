@@ -75,11 +75,11 @@ def test_the_first_error_of_a_step_reaches_the_caller(threads):
 
         return BatchJobs(step, [lambda slot=slot: job(slot) for slot in range(9)])
 
-    seen = []
+    drawn = []
     with pytest.raises(ValueError, match="slot 5"):
         for step, _, _ in prefetch_batches(plan, range(9), threads, 4):
-            seen.append(step)
-    assert seen == [0, 1] and not _ours()
+            drawn.append(step)
+    assert drawn == [0, 1] and not _ours()
 
 
 def test_an_error_in_the_caller_ends_the_threads():

@@ -121,7 +121,7 @@ def test_other_ways_to_give_no_manifest(tmp_path):
             m.read(path)
 
 
-def test_a_link_into_the_cache_of_the_hub_is_told(tmp_path):
+def test_a_link_into_the_cache_of_the_hub_is_refused(tmp_path):
     real = _file(tmp_path, GOOD)
     link, cached = tmp_path / "link.csv", tmp_path / "cached.csv"
     link.symlink_to(real)
@@ -217,15 +217,15 @@ def test_sensor_rows(tmp_path):
 def _brute(rows, length):
     """Clips by dictionary: the plain meaning of the words."""
     at = {(row["sequence"], row["split"], row["frame_index"]): i for i, row in enumerate(rows)}
-    found = []
+    result = []
     for row in rows:
         keys = [
             (row["sequence"], row["split"], row["frame_index"] - back * row["stride"])
             for back in range(length - 1, -1, -1)
         ]
         if all(key in at for key in keys):
-            found.append([at[key] for key in keys])
-    return found
+            result.append([at[key] for key in keys])
+    return result
 
 
 @pytest.mark.parametrize("length", [1, 2, 3, 4])
@@ -259,9 +259,9 @@ def test_clips_of_many_rows():
 
     n = 400_000
     sequence, frame = np.repeat(np.arange(n // 100), 100), np.tile(np.arange(100), n // 100)
-    found = clip_windows(sequence, frame, np.ones(n, np.int64), 4)
-    assert found.shape == (n // 100 * 97, 4)
-    assert (np.diff(found, axis=1) == 1).all()
+    result = clip_windows(sequence, frame, np.ones(n, np.int64), 4)
+    assert result.shape == (n // 100 * 97, 4)
+    assert (np.diff(result, axis=1) == 1).all()
 
 
 def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
@@ -329,7 +329,7 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     pa.parquet.write_table(table, tmp_path / "t.parquet")
     more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
     assert more.column("text").to_pylist() == ['soft, "very" and round'] * 3 + ["new", "one", None]
-    assert notes == ["2 rows got a caption by 'frame_index'", "2 rows kept the caption they had"]
+    assert notes == ["2 rows got a caption by 'frame_index'", "2 rows already had a caption"]
     nested = replace_column(got, "extra", pa.array([[0]] * len(got)))
     pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
     with pytest.raises(UserError, match="column 'extra' of the manifest is no key: it is list"):

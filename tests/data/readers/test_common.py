@@ -42,17 +42,17 @@ def test_links_hidden_files_and_odd_names_are_counted_not_followed(tmp_path, rea
 
 def test_no_frame_is_opened_or_stated(tmp_path, monkeypatch):
     fill_ycb(tmp_path, ("a", "b"), 50)
-    seen = []
+    paths = []
     real_stat, real_scan = os.stat, os.scandir
-    monkeypatch.setattr(os, "stat", lambda path, *a, **k: (seen.append(os.fspath(path)), real_stat(path, *a, **k))[1])
+    monkeypatch.setattr(os, "stat", lambda path, *a, **k: (paths.append(os.fspath(path)), real_stat(path, *a, **k))[1])
     scans = []
     monkeypatch.setattr(os, "scandir", lambda path: (scans.append(os.fspath(path)), real_scan(path))[1])
     READERS["ycb_slide"].read(DatasetIndex("ycb_slide", tmp_path))
-    assert not [path for path in seen if str(path).endswith(".jpg")]
+    assert not [path for path in paths if str(path).endswith(".jpg")]
     assert len(scans) == len(set(scans)) == 1 + 2 + 2  # real, the objects, their frames: each once
 
 
-def test_hash_splits_are_stable_disjoint_and_of_the_asked_share():
+def test_hash_splits_are_stable_disjoint_and_of_the_wanted_share():
     options = IndexOptions(val=0.1, test=0.2)
     of = {f"o{k}": hash_split("x", f"o{k}", options) for k in range(4000)}
     shares = {split: sum(one == split for one in of.values()) / len(of) for split in ("train", "val", "test")}

@@ -59,7 +59,7 @@ def test_the_fold_is_chosen_and_objects_in_no_list_are_unused(tmp_path, read):
     assert table.reasons["grasp of an object that is in no list of split 3 (split unused)"] == 2
 
 
-def test_a_fold_that_is_not_there_is_told(tmp_path, read):
+def test_a_missing_fold_is_an_error(tmp_path, read):
     _tree(tmp_path)
     with pytest.raises(UserError, match=r"no split_99\.npy or \.json for --fold 99"):
         read("feel", fold=99)
@@ -182,7 +182,7 @@ def test_original_files_are_written_as_pictures(tmp_path, read, monkeypatch):
     assert table.rows["mug/touch_during/1_A.png"]["label.success"] == 0
 
 
-def test_a_broken_original_file_is_told_and_leaves_no_table(tmp_path, read, monkeypatch):
+def test_a_broken_original_file_is_an_error_and_leaves_no_table(tmp_path, read, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", _h5({}))
     (tmp_path / "calandra_corl2017_000.h5").write_bytes(b"")
     with pytest.raises(UserError, match=r"calandra_corl2017_000.h5 is not a file of Feel: truncated"):

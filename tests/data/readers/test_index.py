@@ -22,12 +22,12 @@ def test_every_reader_says_what_it_is():
     assert abs(total - 2_481_703) < 450_000  # the paper's table sums to 2.9 million, its text says 2,481,703
 
 
-def test_an_unknown_name_is_answered_with_the_nearest(tmp_path):
+def test_an_unknown_name_suggests_the_nearest(tmp_path):
     with pytest.raises(UserError, match=r"no reader is called 'Touch-and-go'; did you mean touch_and_go"):
         index("Touch-and-go", tmp_path)
 
 
-def test_an_option_that_is_not_heeded_is_an_error(tmp_path):
+def test_an_unused_option_is_an_error(tmp_path):
     fill_ycb(tmp_path)
     with pytest.raises(UserError, match="the reader ycb_slide does not use the option fold; it uses val, test"):
         index("ycb_slide", tmp_path, options=IndexOptions(fold=1))
@@ -45,7 +45,7 @@ def test_the_manifest_may_lie_above_the_data_but_not_elsewhere(tmp_path, read):
         index("ycb_slide", tmp_path / "nowhere")
 
 
-def test_a_failed_write_is_told_and_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_failed_write_is_an_error_and_leaves_the_old_file(tmp_path, monkeypatch):
     fill_ycb(tmp_path)
     before = index("ycb_slide", tmp_path).out.read_bytes()
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
@@ -90,7 +90,7 @@ def test_photographs_that_lie_elsewhere_are_refused(tmp_path):
         ("octopi", "dataset/apple_0.mov.png", "process_dataset.py"),
     ],
 )
-def test_a_renamed_folder_is_told(tmp_path, read, name, renamed, says):
+def test_a_renamed_folder_is_an_error(tmp_path, read, name, renamed, says):
     fill(tmp_path, [renamed])
     with pytest.raises(UserError, match=says):
         read(name)
@@ -101,7 +101,7 @@ EMPTY = ("visgel", "cloth", "objectfolder_real", "ycb_slide", "octopi", "tacquad
 
 
 @pytest.mark.parametrize("name", EMPTY)
-def test_an_empty_folder_is_told(tmp_path, read, name):
+def test_an_empty_folder_is_an_error(tmp_path, read, name):
     with pytest.raises(UserError, match=r"expected .*is ROOT the folder"):
         read(name)
 
@@ -123,7 +123,7 @@ def edited(tmp_path, read):
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])
-def test_an_edited_manifest_is_never_replaced_unasked(tmp_path, read, edited, ending):
+def test_an_edited_manifest_is_not_replaced_without_keep(tmp_path, read, edited, ending):
     out = edited(ending)
     before = out.read_bytes()
     options = IndexOptions(sensor="digit", val=0, test=0)

@@ -8,7 +8,7 @@ from reader_world import fill
 from anytouch_jax.errors import UserError
 
 
-def test_objectfolder_has_two_sensors_and_its_own_splits(tmp_path, read):
+def test_objectfolder_has_two_sensors_and_published_splits(tmp_path, read):
     fill(tmp_path, [f"obj1.0/{k}/{n}.png" for k in (1, 100) for n in range(3)])
     fill(tmp_path, [f"obj2.0/touch/{k}/{n}.png" for k in (100, 101, 1000) for n in range(3)])
     (tmp_path / "obj2.0/label.json").write_text(json.dumps({"1": 4, "100": 0, "101": "2"}))

@@ -15,8 +15,8 @@ def test_objectfolder_real_in_both_layouts(tmp_path, read, layout):
     assert numbers == list(range(11))  # 10.png comes after 9.png, not after 1.png
     row = table.rows[layout.format(1, 1) + "/3.png"]
     assert (row["object"], row["label.material"], row["label.object"]) == ("1", "Ceramic", "Soup_Spoon")
-    seen = [row["image_path"] for row in table.rows.values() if row.get("image_path")]
-    assert seen == [layout.format(1, 0).replace("gelsight", "camera") + "/0.png"]
+    collected = [row["image_path"] for row in table.rows.values() if row.get("image_path")]
+    assert collected == [layout.format(1, 0).replace("gelsight", "camera") + "/0.png"]
     by_object = {row["object"]: row["split"] for row in table.rows.values()}
     assert all(row["split"] == by_object[row["object"]] for row in table.rows.values())
 
@@ -31,7 +31,7 @@ def test_objectfolder_real_photographs_come_from_the_authors_list(tmp_path, read
     assert table.reasons["listed contact frame that is not on disk"] == 1
 
 
-def test_objectfolder_real_camera_views_lie_beside_the_touch(tmp_path, read):
+def test_objectfolder_real_camera_views_are_siblings_of_the_touch(tmp_path, read):
     frames = [f"tactile/3/0/gelsight/{n}.png" for n in range(4)]
     fill(tmp_path, [*frames, *(f"tactile/3/0/cam_{view}/{n}.png" for view in "ab" for n in range(3))])
     fill(tmp_path, ["tactile/3/notes/0.png"])

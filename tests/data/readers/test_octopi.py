@@ -6,7 +6,7 @@ from reader_world import fill
 from anytouch_jax.errors import UserError
 
 
-def test_octopi_follows_its_own_sample_files(tmp_path, read):
+def test_octopi_follows_its_sample_files(tmp_path, read):
     frames = (0, 1, 2, 7, 8)
     samples = ("physiclear_apple_0", "physiclear_apple_1", "physiclear_tea_towel_0", "physiclear_rest_0")
     fill(tmp_path, [f"processed/{name}/{i:010d}.jpg" for name in samples for i in frames])

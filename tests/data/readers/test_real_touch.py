@@ -7,7 +7,7 @@ from anytouch_jax.data.readers import index
 from anytouch_jax.errors import UserError
 
 
-def test_real_touch_is_checked_and_written_anew(tmp_path, read):
+def test_real_touch_is_checked_and_rewritten(tmp_path, read):
     fill(tmp_path, ["a/0.png", "a/1.png", "a/bg.png"])
     head = "path,sensor,sequence,frame_index,split,dataset,license,commercial,background_path,image_path,label.slip\n"
     lines = [f"a/{i}.png,digit,a,{i},train,x,MIT,1,a/bg.png,a/lost.png,{i}\n" for i in range(3)]

@@ -34,7 +34,7 @@ def test_frames_whose_names_do_not_count_are_counted(tmp_path, read):
     assert of == {"a": [0, 1, 2], "b": [0, 1], "c": [0, 1]}
 
 
-def test_what_lies_beside_or_above_belongs_to_a_recording(tmp_path, read):
+def test_files_in_or_above_the_folder_belong_to_a_recording(tmp_path, read):
     fill(tmp_path, ["background.png", "mug/photo.jpg", "mug/one/0.png", "mug/one/1.png", "mug/two/0.png"])
     fill(tmp_path, ["mug/two/Background.png", "ball/0.png"])
     (tmp_path / "mug" / "caption.txt").write_text("smooth,\n cold\n", encoding="utf-8")

@@ -69,7 +69,7 @@ def test_a_broken_list_names_its_line(tmp_path, read, line):
         read("tacquad")
 
 
-def test_a_missing_list_is_told(tmp_path, read):
+def test_a_missing_list_is_an_error(tmp_path, read):
     _tree(tmp_path)
     (tmp_path / "contact_indoor.csv").unlink()
     with pytest.raises(UserError, match=r"expected the list contact_indoor.csv .*beside data_indoor"):

@@ -126,7 +126,7 @@ def test_contact_of_a_swapped_recording_is_found_by_name(tmp_path, read):
 @pytest.mark.parametrize(
     "text", ['{"vision": []}', "[1, 2", "\xff", '{"tactile": [null]}', '{"tactile": [], "background": null}']
 )
-def test_a_broken_contact_json_is_told(tmp_path, read, text):
+def test_a_broken_contact_json_is_an_error(tmp_path, read, text):
     _recording(tmp_path)
     (tmp_path / "hct/data1/contact.json").write_bytes(text.encode("latin1"))
     with pytest.raises(UserError, match=r"contact.json"):

@@ -51,9 +51,9 @@ class MatchPool(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """All pools of a run: `touch` (stills, then clips if there are any) and `match` (stills, clips; None if empty).
+    """All pools of a run: `touch` (stills, then clips if there are any) and `match` (stills, clips, None if empty).
 
-    `sensor` i32 (rows of the manifest,) holds sensor-table rows, -1 for rows left out; `notes` are for the user.
+    `sensor` i32 (rows of the manifest,) holds sensor-table rows, -1 for rows left out. `notes` are for the user.
     """
 
     touch: tuple[Pool, ...]

@@ -53,10 +53,10 @@ class StepSchedule:
 
 
 class EpochSampler:
-    """An endless sequence of item ids, epoch after epoch; each epoch is a seeded permutation of `size` draws.
+    """An endless sequence of item ids, epoch after epoch. Each epoch is a seeded permutation of `size` draws.
 
-    `weights` f64 (items,) above 0 says how often an epoch draws each item; without weights each comes once. The items
-    of one weight w come floor(w) times each, and a seeded choice of them once more (at least one draw).
+    `weights` f64 (items,) above 0 is how often an epoch draws each item. Without weights each comes once. The items of
+    one weight w come floor(w) times each, and a seeded choice of them once more (at least one draw).
     """
 
     def __init__(self, items: int, seed: int, tag: int, weights: np.ndarray | None = None) -> None:

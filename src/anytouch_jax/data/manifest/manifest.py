@@ -44,8 +44,8 @@ KEYS = ("sequence", "touch", "grasp_group")  # columns whose values belong to th
 class Manifest:
     """A checked table of touch frames, from one file or several joined files.
 
-    `table` has typed columns; `files` are the absolute manifest files; `source` i32 (rows,) is the file of each row,
-    and `number` i64 (rows,) its row number there.
+    `table` has typed columns, and `files` are the absolute manifest files. `source` i32 (rows,) is the file of each
+    row, and `number` i64 (rows,) its row number there.
     """
 
     table: pa.Table
@@ -304,10 +304,10 @@ def sensor_rows(
     *,
     unknown: Literal["error", "skip", "universal"] = "error",
 ) -> tuple[np.ndarray, list[str]]:
-    """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out; and notes.
+    """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out, and notes.
 
-    Only `rows` (default: all) are considered; the others are -1. Force-field sensors have no images and are left out.
-    A sensor outside `model.sensors` is an error, is left out (`skip`), or uses the universal tokens (`universal`).
+    Only `rows` (default: all) are considered, and the others are -1. Force-field sensors have no images: they are left
+    out. A sensor outside `model.sensors` is an error, is left out (`skip`), or uses the universal tokens (`universal`).
     Raises ManifestError, which names the first row.
     """
     ids = np.full(len(manifest), -1, np.int32)
@@ -369,7 +369,9 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
     if relative[0] == "/":
         raise ManifestError(f"the path {relative!r} is absolute; write it relative to the manifest's folder, {root}")
     if not path.startswith(root if root[-1] == "/" else f"{root}/"):
-        link = "" if ".." in relative.split("/") else ", by a link; put the files there, or the manifest beside them"
+        link = (
+            "" if ".." in relative.split("/") else ", by a link; put the files there, or move the manifest next to them"
+        )
         raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}{link}")
     return Path(path)
 
@@ -418,7 +420,7 @@ def attach_text(
     unchanged = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
     unused = len(caption_of) - len(pc.unique(at.drop_null()))
     notes = [f"{matched - unchanged} rows got a caption by {key!r}"]
-    notes += [f"{unchanged} rows kept the caption they had"] if unchanged else []
+    notes += [f"{unchanged} rows already had a caption"] if unchanged else []
     notes += [f"{unused} of {len(caption_of)} keys of {path.name} are not in the manifest"] if unused else []
     return replace_column(manifest, "text", merged), notes
 

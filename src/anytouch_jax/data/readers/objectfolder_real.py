@@ -1,10 +1,10 @@
 """ObjectFolder Real (Gao et al., CVPR 2023): a robot touches 100 household objects with a GelSlim.
 
 Layout in others' code: `<object>/tactile_data/<trial>/0/gelsight/<n>.png` (T3, Sparsh), the same under `tactile/`
-(AnyTouch); `objectfolder_real_metadata.csv` with Index,Name,Material (T3); the authors' `contact_text_obj.csv` with
+(AnyTouch), and `objectfolder_real_metadata.csv` with Index,Name,Material (T3). The authors' `contact_text_obj.csv` has
 touch frame, photograph and caption number, where both paths start below `tactile/`. The names of the two camera folders
 are unknown. Assumed: they are siblings of `gelsight` with the same numbers. The first two by name are `image_path` and
-`image2_path`, unless the list names the photograph. ObjectFolder is CC BY 4.0 (its repository); assumed here too.
+`image2_path`, unless the list names the photograph. ObjectFolder is CC BY 4.0 (its repository), as assumed here.
 
 Any folder called `gelsight` is one recording. The object (the first number in its path) is the group of the split.
 """

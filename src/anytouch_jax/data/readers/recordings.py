@@ -7,9 +7,9 @@
     mine/mug/caption.txt                a caption, for the same recordings
 
 Frames are in natural order (2 before 10). Their numbers are those at the end of their names if these count frames, so
-that a missing frame is a gap; otherwise they are counted. If numbers repeat behind different stems (left_0.png,
+that a missing frame is a gap. Otherwise they are counted. If numbers repeat behind different stems (left_0.png,
 right_0.png: two fingers), each stem is a sequence and a unit. Whole objects, or recordings without objects, are held
-out; with `--split-by recording` some recordings of each object are.
+out. With `--split-by recording` some recordings of each object are.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Layout (the dataset's card): `hct/data{1,2,3}/<recording>/{tactile,vision}/<id>-<time>.jpg`, with `contact.json`,
 `not_contact.json`, `train.csv` and `test.csv` in each `data<k>`. In the authors' loader the JSON files hold equally
 long lists `tactile`, `vision`, `background` of paths below `data<k>`, and a missing background means
-`data<k>/digit_background.png`. The CSV files have the columns tactile and caption (T3). Code is Apache-2.0; no licence
+`data<k>/digit_background.png`. The CSV files have the columns tactile and caption (T3). Code is Apache-2.0. No licence
 of the data was found.
 
 * Some recordings have the two folders swapped (reported to the authors, who point to a corrected copy). They are
@@ -11,7 +11,7 @@ of the data was found.
   recordings' touch. Two pictures of each recording are opened for this, and no others.
 * The vision frame has the touch frame's name. Frames are matched by their whole number, never by a string prefix.
 * Frames in no contact list of a `data<k>` that has one are background (label.contact 0).
-* The split is that of test.csv, by frame; a recording's test frames are a separate sequence. Without the CSV files the
+* The split is that of test.csv, by frame. A recording's test frames are a separate sequence. Without the CSV files the
   split is by hash of the recording.
 """
 

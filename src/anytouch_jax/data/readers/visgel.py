@@ -1,8 +1,8 @@
 """VisGel (Li et al., CVPR 2019): a robot pokes 195 objects with a GelSight while a camera watches.
 
 Layout in others' code: `images/touch/<...>/frame%04d.jpg`, with the photograph of the same moment under the same path
-in `images/vision/` (AnyTouch); `data_seen/` and `data_unseen/` with two levels of folders as downloaded, where
-`frame0000.jpg` is the touch-free reference (T3). Assumed: the same `touch` / `vision` pair within `data_seen` and
+in `images/vision/` (AnyTouch). T3 has `data_seen/` and `data_unseen/` with two levels of folders as downloaded, where
+`frame0000.jpg` is the touch-free reference. Assumed: the same `touch` / `vision` pair within `data_seen` and
 `data_unseen`. No licence is stated.
 
 `data_unseen` is the dataset's own test part. Otherwise a recording is the group of the hash split. The authors' list

@@ -50,17 +50,13 @@ class ClipInput(NamedTuple):
 
 
 class ClipOutput(NamedTuple):
-    """A simulated clip with T frames.
+    """A simulated clip with T frames."""
 
-    `image` u8 (T, h, w, 3) and `background` u8 (h, w, 3) are None for a field sensor. `field` f32 is (T, 20, 20, 6)
-    for a field sensor, displacement mm and force N. Otherwise it is (T, h, w, channels) of the requested fields, or
-    None. `labels` f32 (T,) are force N, depth mm of the deepest point, area mm2, x and y mm of the centre of pressure
-    in the image, slip (share of the contact that slides), and, for fidelity exact, whether the solver converged.
-    """
-
-    image: Any
-    background: Any
-    field: Any
+    image: Any  # u8 (T, h, w, 3), or None for a field sensor
+    background: Any  # u8 (h, w, 3), or None for a field sensor
+    field: Any  # f32 (T, 20, 20, 6) mm and N of a field sensor, or (T, h, w, channels) of requested fields, or None
+    # f32 (T,) each: force N, depth mm of the deepest point, area mm2, x and y mm of the pressure in the image,
+    # slip (share of the contact that slides). With fidelity exact also whether the solver converged.
     labels: dict[str, Any]
 
 

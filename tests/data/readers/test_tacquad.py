@@ -72,5 +72,5 @@ def test_a_broken_list_names_its_line(tmp_path, read, line):
 def test_a_missing_list_is_an_error(tmp_path, read):
     _tree(tmp_path)
     (tmp_path / "contact_indoor.csv").unlink()
-    with pytest.raises(UserError, match=r"expected the list contact_indoor.csv .*beside data_indoor"):
+    with pytest.raises(UserError, match=r"expected the list contact_indoor.csv .*next to data_indoor"):
         read("tacquad")

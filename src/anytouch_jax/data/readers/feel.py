@@ -48,7 +48,7 @@ def read(index: DatasetIndex) -> None:
                                "that holds 'feel.csv'?")  # fmt: skip
         if not index.options.export:
             raise DatasetError(f"{root} has {len(original)} original .h5 files and no feel.csv; add --export to write "
-                               "the pictures beside them (needs pip install h5py)")  # fmt: skip
+                               "the pictures next to them (needs pip install h5py)")  # fmt: skip
         index.notes.append(f"{export_grasps(root, original)} grasps written from {len(original)} .h5 files")
     splits = _published_splits(index, base)
     prefix, table = index.prefix(base), base / "feel.csv"

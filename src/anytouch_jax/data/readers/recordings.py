@@ -165,7 +165,7 @@ def _export_videos(index: DatasetIndex) -> None:
             except images.ImageError:
                 index.skip("video that cannot be read", str(video))
             except OSError as error:
-                raise UserError(f"the frames of {video} cannot be written beside it: {error.strerror}") from None
+                raise UserError(f"the frames of {video} cannot be written next to it: {error.strerror}") from None
 
 
 def _write_frames(index: DatasetIndex, video: Path) -> None:

@@ -53,7 +53,7 @@ def _contact_spans(index: DatasetIndex, subset: str) -> dict[str, tuple[int, lis
     path = index.find_file([f"contact_{subset}.csv"])
     if path is None:
         place = index.options.lists or index.root
-        raise DatasetError(f"expected the list contact_{subset}.csv in {place}, beside data_{subset}")
+        raise DatasetError(f"expected the list contact_{subset}.csv in {place}, next to data_{subset}")
     spans: dict[str, tuple[int, list[tuple[int, int]]]] = {}
     for line, row in enumerate(read_csv(path)):
         try:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import optax
 
 from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.encoder.embed import Pooling
+from anytouch_jax.encoder.embed import Pooling, run_in_batches
 from anytouch_jax.encoder.encoder import Encoder, touch_features
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Net
@@ -135,11 +135,14 @@ def features(
     ahead = 1 if stills else FRAMES
     width = encoder.config.model.embed * (2 if pooling == "both" else 1)
     found = np.zeros((*wanted.shape, width), np.float32)
-    for start in range(0, len(where), batch):
-        part = where[start : start + batch]
-        padded = np.concatenate([part, np.repeat(part[-1:], batch - len(part), 0)])  # one shape, one compilation
-        clips = segments(encoder, trials.frames, padded, ahead, sides)
-        found[tuple(part.T)] = encoder.encode_touch(clips, sensor, pooling=pooling)[: len(part)]
+    frames = trials.frames
+
+    def encode(part: Array) -> Array:
+        clips = segments(encoder, frames, part, ahead, sides)
+        return encoder.encode_touch(clips, sensor, pooling=pooling)
+
+    if len(where):
+        found[tuple(where.T)] = run_in_batches(encode, where, batch)
     return found
 
 

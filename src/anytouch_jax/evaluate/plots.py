@@ -1,4 +1,4 @@
-"""Charts as PNG files, each written whole or not at all: losses, t-SNE, sample grids, bars with intervals, speed."""
+"""Charts as PNG files, written atomically: losses, t-SNE, sample grids, bars with intervals, Pareto fronts."""
 
 from __future__ import annotations
 
@@ -17,25 +17,15 @@ from anytouch_jax.files import atomic_write
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.transforms import Bbox, BboxBase
 
 Array = npt.NDArray[Any]
-TERMS = ("reconstruction", "next_frame", "align", "match")  # the parts of a loss worth a curve of their own
+TERMS = ("reconstruction", "next_frame", "align", "match")  # the terms of a loss that get a curve
 _DPI = 110
-_SMALL = 8  # font size of names in a plot
-_NEAR = 4  # of its places (see below): so near that a name needs no line to its point
-# Offsets of a name from its point, nearest first: points to the side and up, and the side of the name that is there.
-_PLACES = [
-    (dx, base + sign * up, side)
-    for up in range(0, 181, 6)
-    for sign, base in ((1, 2), (-1, -12))
-    for dx, side in ((5, "left"), (-5, "right"))
-]
-_LEGEND = 12  # more names than that are colours without a key
+_LEGEND = 12  # more names than that are colours without a legend
 
 
-class Bar(NamedTuple):
-    """A share (0..1) with its interval, and the chance level beside it; None is not drawn."""
+class ShareBar(NamedTuple):
+    """A share (0..1) with its interval and the chance level; None is not drawn."""
 
     value: float
     low: float | None = None
@@ -47,33 +37,33 @@ def write_figure(path: Path, figure: Figure) -> None:
     """Write a figure as PNG; the same figure gives the same bytes. Raises OSError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    FigureCanvasAgg(figure)  # drawn without pyplot: no global state, no display
+    FigureCanvasAgg(figure)  # without pyplot: no global state, no display
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
     atomic_write(path, data.getvalue())
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The lines of a run's metrics.jsonl (given the file or the run folder). Raises UserError when there are none."""
+    """Return the lines of metrics.jsonl of a run folder, or of the file. Raises UserError if there are none."""
     file = run / "metrics.jsonl" if run.is_dir() else run
     try:
         lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError) as error:
-        raise UserError(f"{file} is not the metrics of a run: {error}") from None
+        raise UserError(f"{file} is not a metrics.jsonl of a run ({error}); give a run folder") from None
     if not lines:
         raise UserError(f"{file} has no step yet; train first")
     return lines
 
 
 def loss_curves(path: Path, runs: Mapping[str, Path]) -> None:
-    """Loss against step, a panel a run {title: run folder or metrics.jsonl}, each term pale and smoothed."""
+    """Draw loss against step, a panel for each run {title: run folder or metrics.jsonl}, raw and smoothed."""
     figure, axes = _panels(1, len(runs), 5.0, 3.4)
     for axis, (title, run) in zip(axes[0], runs.items(), strict=True):
         lines = read_metrics(Path(run))
         names = [name for name in TERMS if any(name in line for line in lines)]
         for colour, name in enumerate(names if len(names) else ["loss"]):
-            found = [(line["step"], line[name]) for line in lines if line.get(name) is not None]
-            steps, values = np.array(found, np.float64).T if found else np.zeros((2, 0))
+            points = [(line["step"], line[name]) for line in lines if line.get(name) is not None]
+            steps, values = np.array(points, np.float64).T if points else np.zeros((2, 0))
             axis.plot(steps, values, color=f"C{colour}", alpha=0.25, linewidth=0.8)
             axis.plot(steps, smoothed(values), color=f"C{colour}", linewidth=1.6, label=name.replace("_", " "))
         axis.set(title=title, xlabel="step", ylabel="loss term")
@@ -84,7 +74,7 @@ def loss_curves(path: Path, runs: Mapping[str, Path]) -> None:
 
 
 def smoothed(values: Array) -> Array:
-    """Running mean over a twentieth of the values, over what there is of the window at the ends."""
+    """Return the running mean over a twentieth of the values; windows are cut at both ends."""
     width = max(1, len(values) // 20)
     if width == 1:
         return np.asarray(values)
@@ -93,7 +83,7 @@ def smoothed(values: Array) -> Array:
 
 
 def tsne_panels(path: Path, spaces: Mapping[str, Array], sensors: Any, objects: Any) -> None:
-    """Points (n, 2) of each named space, coloured by sensor above and by object below."""
+    """Draw points (n, 2) of each named space, coloured by sensor above and by object below."""
     figure, axes = _panels(2, len(spaces), 4.0, 3.8)
     for labels, what, row in ((sensors, "sensor", axes[0]), (objects, "object", axes[1])):
         names, codes = np.unique(np.asarray(labels).astype(str), return_inverse=True)
@@ -112,7 +102,7 @@ def tsne_panels(path: Path, spaces: Mapping[str, Array], sensors: Any, objects: 
 def sample_grid(
     path: Path, images: Sequence[Sequence[Array | None]], rows: Sequence[str], columns: Sequence[str]
 ) -> None:
-    """A grid of pictures: RGB u8 (h, w, 3), or a field (h, w) as a colour map; None is an empty cell."""
+    """Draw a grid of pictures RGB u8 (h, w, 3), or fields (h, w) as colour maps; None is an empty cell."""
     figure, axes = _panels(len(rows), len(columns), 1.75, 1.6)
     for i, (line, title) in enumerate(zip(images, rows, strict=True)):
         for j, (image, column) in enumerate(zip(line, columns, strict=True)):
@@ -132,8 +122,8 @@ def sample_grid(
     write_figure(path, figure)
 
 
-def bars(path: Path, series: Mapping[str, Mapping[str, Bar]], *, label: str = "share found") -> None:
-    """Horizontal bars of shares with their intervals, {panel: {name: Bar}}; dashes mark chance."""
+def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str = "share") -> None:
+    """Draw horizontal bars of shares with their intervals, {panel: {name: ShareBar}}; dashes mark chance."""
     longest = max(len(one) for one in series.values())
     figure, axes = _panels(1, len(series), 4.2, 0.9 + 0.34 * longest, sharex=True, sharey=True)
     names = list(dict.fromkeys(name for one in series.values() for name in one))
@@ -155,7 +145,7 @@ def bars(path: Path, series: Mapping[str, Mapping[str, Bar]], *, label: str = "s
 def pareto(
     path: Path, points: Mapping[str, tuple[float, float]], *, x: str = "time ratio", y: str = "error", title: str = ""
 ) -> None:
-    """Named points (time ratio, error) on logarithmic axes, with the line of those that no other beats in both.
+    """Draw named points (time ratio, error) on logarithmic axes, with the Pareto front.
 
     Raises UserError for a point that is not positive and finite.
     """
@@ -163,62 +153,27 @@ def pareto(
     bad = [name for name, point in points.items() if not all(np.isfinite(point)) or min(point) <= 0]
     if bad or not points:
         raise UserError(f"a point on logarithmic axes must be positive and finite: {', '.join(bad) or 'none is given'}")
-    figure, axes = _panels(1, 1, 6.4, 4.4)
+    figure, axes = _panels(1, 1, 7.6, 4.4)
     axis, best = axes[0][0], front(values)
     axis.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=title)
-    axis.plot(values[best, 0], values[best, 1], drawstyle="steps-post", color="C1", linewidth=1.2, zorder=1)
-    axis.scatter(values[:, 0], values[:, 1], s=26, color=np.where(np.isin(np.arange(len(values)), best), "C1", "C0"))
+    axis.plot(values[best, 0], values[best, 1], drawstyle="steps-post", color="#999999", linewidth=1.2, zorder=1)
+    for number, (name, (across, up)) in enumerate(points.items()):
+        marker = "oXs^vD"[number // 10 % 6]  # ten colours, then another marker
+        axis.scatter(across, up, s=26, color=f"C{number % 10}", marker=marker, label=name)
     axis.xaxis.set_major_formatter("{x:g}")
     wide = values.max(0) > 10 * values.min(0)  # then the numbers between powers of ten have no room
     axis.xaxis.set_minor_formatter("" if wide[0] else "{x:g}")
     if not wide[1]:
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:g}")
-    axis.margins(x=0.2, y=0.1)
+    axis.margins(x=0.1, y=0.1)
     axis.grid(alpha=0.25, which="both")
-    _name_points(figure, axis, points)
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8)
     write_figure(path, figure)
 
 
-def _name_points(figure: Figure, axis: Axes, points: Mapping[str, tuple[float, float]]) -> None:
-    """Each name beside its point, at the nearest place inside that lies on no point and on no name before it."""
-    from matplotlib import transforms
-    from matplotlib.text import Text
-
-    figure.draw_without_rendering()  # lays the axes out: only then is known where the points lie
-    scale, frame = figure.dpi / 72, axis.bbox
-    dots = axis.transData.transform(list(points.values()))
-    taken = [transforms.Bbox.from_bounds(x - 3 * scale, y - 3 * scale, 6 * scale, 6 * scale) for x, y in dots]
-    for (name, point), (x, y) in zip(points.items(), dots, strict=True):
-        size = Text(text=name, fontsize=_SMALL, figure=figure).get_window_extent()
-
-        def box(place: tuple[int, int, str], x: float = x, y: float = y, size: Bbox = size) -> Bbox:
-            dx, dy, side = place
-            return transforms.Bbox.from_bounds(
-                x + dx * scale - (size.width if side == "right" else 0), y + dy * scale, size.width, size.height
-            )
-
-        fit = (place for place in _PLACES if _free(box(place), frame, taken))
-        dx, dy, side = chosen = next(fit, _PLACES[0])
-        taken.append(box(chosen))
-        line: dict[str, Any] | None = None
-        if _PLACES.index(chosen) >= _NEAR:
-            end = (float(side == "right"), float(dy < 0))
-            line = {"arrowstyle": "-", "color": "#999999", "linewidth": 0.6, "relpos": end, "shrinkA": 0}
-        text = axis.annotate(
-            name, point, xytext=(dx, dy), textcoords="offset points", fontsize=_SMALL, ha=side, va="bottom",
-            arrowprops=line,
-        )  # fmt: skip
-        text.set_in_layout(False)  # the layout is done
-
-
-def _free(box: Bbox, frame: BboxBase, taken: Sequence[Bbox]) -> bool:
-    inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
-    return inside and not any(box.overlaps(other) for other in taken)
-
-
 def front(values: Array) -> Array:
-    """Rows of (n, 2) that no other row beats or equals in both columns (smaller is better), by the first column."""
+    """Return the Pareto front: rows of (n, 2) that no other row beats or equals in both columns (smaller is better)."""
     order = np.lexsort((values[:, 1], values[:, 0]))
     second = values[order, 1]
     before = np.concatenate([[np.inf], np.minimum.accumulate(second)[:-1]])
@@ -235,7 +190,7 @@ def _panels(rows: int, columns: int, width: float, height: float, **options: Any
 
 
 def _colours(count: int) -> Array:
-    """RGB colours (count, 3): ten distinct ones, or a wheel of hues in an order that keeps neighbours apart."""
+    """Return RGB colours (count, 3): ten distinct ones, or hues in an order that separates neighbours."""
     from matplotlib import colormaps
 
     if count <= 10:

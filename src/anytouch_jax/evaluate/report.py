@@ -495,7 +495,7 @@ def retrieval_section(
         kind = "matched" if "matched" in kinds else "by chance"
         plain = {name: pooled[name, kind, False] for name in names}
         panels[f"{grade}, gallery {kind}"] = {
-            name: plots.Bar(result.top1, result.low, result.high, result.chance1) for name, result in plain.items()
+            name: plots.ShareBar(result.top1, result.low, result.high, result.chance1) for name, result in plain.items()
         }
         others = [name for name in names if name != best] if best in names else []
         changes[grade] = {name: retrieval.difference(plain[best], plain[name]) for name in others}
@@ -549,11 +549,11 @@ def probes_section(
 ) -> Section:
     """Return probes {label: results}: accuracy of classes and R2 of quantities on held-out objects."""
     parts: list[str] = []
-    panels: dict[str, dict[str, plots.Bar]] = {}
+    panels: dict[str, dict[str, plots.ShareBar]] = {}
     for label, several in results.items():
         parts.append(f"### {label}\n\n{probe_results.probe_table(several).strip()}")
         bars = {
-            result.probe: plots.Bar(result.accuracy, result.low, result.high, result.baseline)
+            result.probe: plots.ShareBar(result.accuracy, result.low, result.high, result.baseline)
             for result in several if isinstance(result, probe_results.ProbeResult)
         }  # fmt: skip
         panels |= {label: bars} if bars else {}

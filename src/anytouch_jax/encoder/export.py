@@ -1,8 +1,8 @@
-"""A trained touch encoder as one file that jax alone can run (`anytouch export`), and its way back (`load`).
+"""Export of a touch encoder as one file that needs jax alone, and loading of that file.
 
-The file is a `jax.export` artefact: uint8 frames and sensor rows in, features out, for any number of touches;
-normalisation and parameters are inside. A JSON beside it says how to call it and holds its checksum. `load` reads
-both without a line of the network's code.
+The file is a `jax.export` artefact: uint8 frames and sensor rows in, features out, for any number of touches.
+Normalisation and parameters are inside. A JSON description says how to call it and has its checksum. Loading imports
+none of the network's code.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ features = jax.jit(run.call)(frames, sensor)  # uint8 (B, {frames}, {size}, {siz
 
 @dataclass(frozen=True)
 class Exported:
-    """An encoder from a file. `about` is the JSON beside it; call it with touches and a sensor."""
+    """An exported encoder. `about` is its JSON description; call it with touches and a sensor."""
 
     about: dict[str, Any]
     _run: Any = field(repr=False)
 
     def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
-        """Features f32 (B, E) of touches u8 RGB (B, T, H, W, 3); `sensor` is a name for all, names (B,), or rows i32
-        (B,).
+        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3).
 
-        Raises UserError for another shape or type, and for a sensor that the model does not know.
+        `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape or type, and for a sensor
+        that the model does not know.
         """
         frames = np.asarray(frames)
         wanted = (self.about["frames"], self.about["image_size"], self.about["image_size"], 3)
@@ -79,14 +79,14 @@ def describes(path: Path) -> Path:
 
 
 def load(path: str | Path) -> Exported:
-    """The encoder that `export` wrote to `path`. Raises UserError when it is not whole or not for this machine."""
+    """Load the encoder that `export` wrote to `path`. Raises UserError if it is damaged or for another platform."""
     path = Path(path)
     data, about = _read(path)
     if _here() not in about["platforms"]:
         raise UserError(f"{path} was exported for {', '.join(about['platforms'])}; this machine runs jax on {_here()}")
     try:
         module = jax_export.deserialize(bytearray(data))
-    except Exception as error:  # its bytes are right, so it is of another jax
+    except Exception as error:  # its checksum is right, so it was written by another jax
         raise UserError(
             f"{path} cannot be read by jax {jax.__version__}, it was exported by {about['jax']} "
             f"({' '.join(str(error).split())[:200]}); export it again"
@@ -103,10 +103,10 @@ def export(
     pooling: Pooling = "class",
     join: Join = "mean",
 ) -> dict[str, Any]:
-    """Write an encoder for touches of `frames` frames to `path`, and the JSON beside it; returns what that says.
+    """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
-    Before anything is written the artefact is called with 1 and 5 touches and compared with the live model. Raises
-    UserError when they differ, when it cannot be compared on this machine, or when the disk does not take it.
+    The artefact is first called with 1 and 5 touches and compared with the live model. Raises CheckError if they
+    differ, UserError if it cannot be compared on this machine, OSError for a full disk.
     """
     from anytouch_jax.encoder.encoder import check_frames
 
@@ -139,16 +139,16 @@ def export(
 def call_of(
     encoder: Encoder, *, frames: int, width: int, pooling: Pooling = "class", join: Join = "mean"
 ) -> dict[str, Any]:
-    """How an encoder in another form is called: what goes in, what comes out, which row is which sensor."""
+    """Return how an exported encoder is called: its inputs, its outputs, the row of each sensor."""
     model, side = encoder.config.model, encoder.config.model.image_size
-    less = ", less the untouched gel: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
+    subtracted = ", background-subtracted: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
     return {
         "source": encoder.source,
-        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){less}; sensor: int32 (B,)",
+        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){subtracted}; sensor: int32 (B,)",
         "output": f"features: float32 (B, {width}), not normalised",
         "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the shorter "
         f"side is above {side} pixels, else INTER_LINEAR"
-        + ("; the gel is taken off before" if encoder.subtracts else ""),
+        + ("; the background is subtracted before" if encoder.subtracts else ""),
         "frames": frames,
         "image_size": side,
         "features": width,
@@ -157,7 +157,7 @@ def call_of(
         "join": join,
         "dtype": model.dtype,
         "sensors": {name: row for row, name in enumerate(model.sensors)},
-        "seen": None if encoder.trained_sensors is None else list(encoder.trained_sensors),
+        "trained_sensors": None if encoder.trained_sensors is None else list(encoder.trained_sensors),
     }
 
 
@@ -172,7 +172,7 @@ def _check_platforms(platforms: Sequence[str]) -> None:
 
 
 def _here() -> str:
-    """The platform of this process, by its name in artefacts."""
+    """Return the platform of this process, by its name in artefacts."""
     return {"gpu": "cuda"}.get(jax.default_backend(), jax.default_backend())
 
 
@@ -187,17 +187,17 @@ def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: 
 
 
 def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: Join) -> tuple[float, int]:
-    """(the largest difference from the live model, as a share of the largest feature; features of a touch)."""
+    """Return the largest difference from the live model, as a share of the largest feature, and the feature count."""
     run = jax.jit(jax_export.deserialize(bytearray(data)).call)
     model, rng, worst, width = encoder.config.model, np.random.default_rng(0), 0.0, 0
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, model.image_size, model.image_size, 3), np.uint8)
         rows = rng.integers(0, len(model.sensors), count).astype(np.int32)
         live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
-        found = np.asarray(run(clips, rows))
-        if found.shape != live.shape or not np.isfinite(found).all():
-            raise CheckError(f"the artefact gives {found.shape}, the live model {live.shape}, or what is not finite")
-        worst = max(worst, float(np.abs(found - live).max() / np.abs(live).max()))
+        exported = np.asarray(run(clips, rows))
+        if exported.shape != live.shape or not np.isfinite(exported).all():
+            raise CheckError(f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite")
+        worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))
         width = live.shape[1]
     if worst > TOLERANCE[model.dtype]:
         raise CheckError(f"the artefact differs from the live model by {worst:.2g} of its largest feature: not written")
@@ -205,7 +205,7 @@ def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: J
 
 
 def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """The bytes of an artefact and its description, compared with each other."""
+    """Return the bytes of an artefact and its description, after comparing them."""
     try:
         data, text = path.read_bytes(), describes(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

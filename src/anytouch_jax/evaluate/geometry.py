@@ -1,4 +1,4 @@
-"""Numbers and a picture of a feature space: alignment, uniformity, silhouettes, t-SNE."""
+"""Feature-space geometry: alignment, uniformity, silhouettes, t-SNE."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.splits import subsample
 
 Array = npt.NDArray[Any]
-MOST = 4000  # rows that pairwise figures look at
+MOST = 4000  # rows that are compared in pairs
 
 
 @dataclass(frozen=True)
 class Space:
-    """Figures of one feature space; see the functions of the same names. None: not defined for these labels."""
+    """Numbers of one feature space; see the functions of the same names. None: not defined for these labels."""
 
     name: str
     alignment: float | None
@@ -28,7 +28,7 @@ class Space:
 
 
 def alignment(first: Array, second: Array, *, power: float = 2.0) -> float:
-    """Mean distance, to the `power`, of the unit-norm rows of positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
+    """Return the mean distance, to the `power`, of unit-norm positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
     first, second = _unit(first), _unit(second)
     if first.shape != second.shape or not len(first):
         raise UserError(f"alignment needs pairs of rows, not {first.shape} and {second.shape}")
@@ -36,9 +36,9 @@ def alignment(first: Array, second: Array, *, power: float = 2.0) -> float:
 
 
 def uniformity(features: Array) -> float:
-    """Log of the mean of exp(-2 |x - y|^2) over all pairs of unit-norm rows (Wang & Isola, 2020).
+    """Return the log of the mean of exp(-2 |x - y|^2) over all pairs of unit-norm rows (Wang & Isola, 2020).
 
-    Between -8 (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are looked at.
+    It is between -8 (a limit) and 0 (all rows equal); lower is more even. At most MOST rows are used.
     """
     x = _unit(subsample(np.asarray(features), MOST))
     if len(x) < 2:
@@ -48,9 +48,9 @@ def uniformity(features: Array) -> float:
 
 
 def silhouette(features: Array, labels: Any) -> float | None:
-    """Mean silhouette by cosine distance, -1..1: do rows lie nearer to their own label than to the next?
+    """Return the mean silhouette by cosine distance, -1..1: are rows nearer to their own label than to the next?
 
-    None when there are fewer than two labels, or as many as rows. At most MOST rows are looked at.
+    None with fewer than two labels, or as many as rows. At most MOST rows are used.
     """
     from sklearn.metrics import silhouette_score
 
@@ -62,7 +62,7 @@ def silhouette(features: Array, labels: Any) -> float | None:
 
 
 def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:
-    """t-SNE of features (n, d) by cosine distance, f32 (n, 2); the same for a seed. Raises UserError below 4 rows."""
+    """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2). Raises UserError below 4 rows."""
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits
 
@@ -71,12 +71,12 @@ def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:
         raise UserError(f"t-SNE needs 4 rows or more, not {len(x)}")
     # Squared Euclidean distances of unit-norm rows are twice the cosine distances.
     model = TSNE(perplexity=min(perplexity, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
-    with threadpool_limits(1):  # its threads wait for each other at every step: on a busy machine for ages
+    with threadpool_limits(1):  # its threads wait for each other at every step, very long on a busy machine
         return np.asarray(model.fit_transform(x.astype(np.float32)), np.float32)
 
 
 def describe(features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features") -> Space:
-    """All figures of features (n, d); positive pairs are all rows of the same touch by different sensors.
+    """Return all numbers of features (n, d); positive pairs are the rows of one touch by different sensors.
 
     Rows whose object is not known ("") have no part in the silhouette by object.
     """
@@ -106,5 +106,5 @@ def _positive_pairs(sensors: Array, touches: Array) -> tuple[Array, Array]:
 def _unit(features: Array) -> Array:
     x = np.asarray(features, np.float64)
     if x.ndim != 2 or not np.isfinite(x).all():
-        raise UserError(f"features must be finite and (n, d); these are {x.shape}, with NaN or Inf if that is right")
+        raise UserError(f"features must be (n, d) without NaN or Inf; these are {x.shape}")
     return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)

@@ -40,11 +40,11 @@ def touches(tmp_path):
 def test_captions_come_after_an_estimate_and_are_never_paid_twice(anytouch, touches, tmp_path):
     with serve() as server:
         words = ["data", "annotate", touches, "--url", server.url, "--yes", "--price-in", "2.5", "--price-out", "10"]
-        said = anytouch(*words, "--sheet", tmp_path / "look.html")
-        assert said.status == 0, said
-        assert f"gpt-4o at {server.url}: 3 questions (0 answered before), about " in said.out
-        assert ": about 0.0" in said.out
-        assert "300 tokens in, 60 tokens out" in said.out
+        done = anytouch(*words, "--sheet", tmp_path / "look.html")
+        assert done.status == 0, done
+        assert f"gpt-4o at {server.url}: 3 questions (0 answered before), about " in done.out
+        assert ": about 0.0" in done.out
+        assert "300 tokens in, 60 tokens out" in done.out
         captions = tmp_path / "touch_captions.parquet"
         before = captions.read_bytes()
         estimate = anytouch(*words, "--estimate")  # writes nothing, though all is answered
@@ -59,7 +59,7 @@ def test_captions_come_after_an_estimate_and_are_never_paid_twice(anytouch, touc
     assert server.heads[0][1]["Authorization"] == f"Bearer {KEY}"
     for file in tmp_path.rglob("*"):
         assert file.is_dir() or KEY.encode() not in file.read_bytes(), file
-    assert KEY not in said.out + said.err
+    assert KEY not in done.out + done.err
 
 
 def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, monkeypatch):
@@ -74,7 +74,7 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
         assert "not confirmed" in mistake(*words)
         monkeypatch.setattr("builtins.input", lambda _: (_ for _ in ()).throw(EOFError))  # Ctrl-D
         assert "not confirmed" in mistake(*words)
-        for wrong, told in (
+        for wrong, named in (
             (["--timeout", "-1"], "timeout"), (["--tries", "0"], "tries"),
             (["--price-in", "2.5"], "--price-out"),
             (["--sheet", str(tmp_path / "s.png"), "--sheet-count", "-1"], "--sheet-count"),
@@ -84,7 +84,7 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
             (["--url", "https://api..example.org/v1"], "http"),
             (["--second-image", "image_2_path"], "image_2_path"),
         ):  # fmt: skip
-            assert told in mistake(*words, *wrong)
+            assert named in mistake(*words, *wrong)
         assert server.heads == [] and not (tmp_path / "touch_captions.parquet").exists()
         monkeypatch.setattr("builtins.input", lambda _: "y")
         assert anytouch(*words).status == 0 and len(server.heads) == 3
@@ -93,8 +93,8 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
 def test_an_estimate_needs_no_key(anytouch, mistake, touches, monkeypatch):
     monkeypatch.delenv("OPENAI_API_KEY")
     words = ("data", "annotate", touches, "--url", "https://api.example.org/v1")
-    said = anytouch(*words, "--estimate")
-    assert said.status == 0 and "3 questions" in said.out and "OPENAI_API_KEY" not in said.err
+    done = anytouch(*words, "--estimate")
+    assert done.status == 0 and "3 questions" in done.out and "OPENAI_API_KEY" not in done.err
     assert "http" in mistake(*words[:3], "--url", "example", "--estimate")
     assert "OPENAI_API_KEY" in mistake(*words, "--yes")
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
@@ -105,8 +105,8 @@ def test_an_estimate_needs_no_key(anytouch, mistake, touches, monkeypatch):
 def test_failures_are_told_counted_and_the_rest_is_kept(anytouch, touches, tmp_path):
     (tmp_path / "see1.png").write_bytes(b"no picture")
     with serve() as server:
-        said = anytouch("data", "annotate", touches, "--url", server.url, "--yes", "--out", tmp_path / "c.csv")
-    assert said.status == 1 and "2 captions" in said.out and f"no caption for row 0 of {touches}" in said.err
+        done = anytouch("data", "annotate", touches, "--url", server.url, "--yes", "--out", tmp_path / "c.csv")
+    assert done.status == 1 and "2 captions" in done.out and f"no caption for row 0 of {touches}" in done.err
     assert manifests.read(tmp_path / "c.csv").column("text").to_pylist() == [None] * 2 + [GOOD["caption"]] * 4
 
 
@@ -133,13 +133,13 @@ def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, tmp_path
     path = tmp_path / "m.csv"
     manifests.write(manifests.from_columns(columns, path), path)
     (tmp_path / "captions.csv").write_text("caption_id,text\noctopi_3,rough and hard\n")
-    said = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--key", "caption_id")
-    assert said.status == 0, said.err
+    done = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--key", "caption_id")
+    assert done.status == 0, done.err
     assert manifests.read(tmp_path / "m_captions.csv").column("text").to_pylist() == ["rough and hard"]
-    assert "1 of 1 rows have a caption" in said.out
-    said = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--limit", 1, "--split", "train")
-    assert said.status == 2 and "--split" in said.err and "--limit" in said.err
-    said = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--price-in", 1, "--yes")
-    assert said.status == 2 and "--yes" in said.err and "--price-in" in said.err
-    said = anytouch("data", "annotate", path, "--key", "caption_id", "--yes")
-    assert said.status == 2 and "--key" in said.err
+    assert "1 of 1 rows have a caption" in done.out
+    done = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--limit", 1, "--split", "train")
+    assert done.status == 2 and "--split" in done.err and "--limit" in done.err
+    done = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--price-in", 1, "--yes")
+    assert done.status == 2 and "--yes" in done.err and "--price-in" in done.err
+    done = anytouch("data", "annotate", path, "--key", "caption_id", "--yes")
+    assert done.status == 2 and "--key" in done.err

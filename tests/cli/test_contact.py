@@ -16,18 +16,18 @@ def contacts(path):
 
 
 def test_every_frame_is_marked_beside_the_manifest(anytouch, pressed):
-    said = anytouch("data", "contact", pressed)
-    assert said.status == 0
+    done = anytouch("data", "contact", pressed)
+    assert done.status == 0
     target = pressed.with_name("touch_contact.parquet")
     assert contacts(target) == [0] * 6 + [1] * 4
-    assert "10 rows: contact 4, no contact 6, unknown 0; dropped 0" in said.out and str(target) in said.out
+    assert "10 rows: contact 4, no contact 6, unknown 0; dropped 0" in done.out and str(target) in done.out
     assert manifests.read(pressed).table.column_names.count("label.contact") == 0  # the one that was read is as it was
 
 
 def test_drop_keeps_the_background_and_what_is_unknown(anytouch, pressed, tmp_path):
     (tmp_path / "5.png").unlink()
-    said = anytouch("data", "contact", pressed, "--drop", "--out", tmp_path / "kept.csv")
-    assert said.status == 0 and "unknown 1; dropped 3" in said.out
+    done = anytouch("data", "contact", pressed, "--drop", "--out", tmp_path / "kept.csv")
+    assert done.status == 0 and "unknown 1; dropped 3" in done.out
     kept = manifests.read(tmp_path / "kept.csv")
     assert kept.column("path").to_pylist() == [f"{i}.png" for i in (0, 1, 5, 6, 7, 8, 9)]
     assert contacts(tmp_path / "kept.csv") == [0, 0, None, 1, 1, 1, 1]
@@ -37,18 +37,18 @@ def test_a_threshold_moves_the_border_in_marks_check_and_picture(anytouch, press
     scores = (anytouch("data", "contact", pressed), manifests.read(pressed.with_name("touch_contact.parquet")))[1]
     deep = scores.column("label.contact_score").to_pylist()
     limit = (deep[7] + deep[8]) / 2
-    said = anytouch(
+    done = anytouch(
         "data", "contact", pressed, "--threshold", "digit", limit, "--check", "--picture", tmp_path / "p.png"
     )
-    assert said.status == 0 and "contact 2, no contact 8" in said.out
-    assert "precision 1.000, recall 0.500" in said.out
+    assert done.status == 0 and "contact 2, no contact 8" in done.out
+    assert "precision 1.000, recall 0.500" in done.out
     assert cv2.imread(str(tmp_path / "p.png")).shape[1] == 1200
     assert "'gelsight'" in anytouch("data", "contact", pressed, "--threshold", "gelsight", "5").err
 
 
 def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_path):
-    said = anytouch("data", "contact", pressed, "--check")
-    assert said.status == 0 and "precision 1.000, recall 1.000" in said.out
+    done = anytouch("data", "contact", pressed, "--check")
+    assert done.status == 0 and "precision 1.000, recall 1.000" in done.out
     assert sorted(path.name for path in tmp_path.glob("*.parquet")) == ["touch.parquet"]
     assert anytouch("data", "contact", pressed, "--check", "--out", tmp_path / "m.parquet").status == 0
     assert contacts(tmp_path / "m.parquet") == [0] * 6 + [1] * 4
@@ -57,7 +57,7 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "named"),
     [
         (["--out", "touch.parquet"], "touch.parquet"),
         (["--out", "m.json"], "m.json"),
@@ -72,7 +72,7 @@ def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_pat
         (["--threshold", "gelsigth", "5"], "gelsigth"),
     ],
 )
-def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, told):
+def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, named):
     monkeypatch.chdir(pressed.parent)
     Path("mine.csv").write_text("place,contact\na,1\n")  # a table of the user's
     before = pressed.read_bytes()
@@ -80,7 +80,7 @@ def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, told):
         table = manifests.read(pressed).table.slice(2)
         manifests.write(manifests.from_columns({n: table[n].to_pylist() for n in table.column_names}, pressed), pressed)
         before = pressed.read_bytes()
-    assert told in mistake("data", "contact", "touch.parquet", *words)
+    assert named in mistake("data", "contact", "touch.parquet", *words)
     assert pressed.read_bytes() == before
 
 
@@ -93,8 +93,8 @@ def test_known_contact_may_be_true_or_false_and_nothing_else(anytouch, mistake, 
     assert contacts(tmp_path / "m.parquet") == [0, 1, 0, *[0] * 7]
     columns["label.contact"][4] = "yes"
     manifests.write(manifests.from_columns(columns, tmp_path / "words.csv"), tmp_path / "words.csv")
-    told = mistake("data", "contact", tmp_path / "words.csv")
-    assert "row 4 of" in told and "'yes'" in told
+    named = mistake("data", "contact", tmp_path / "words.csv")
+    assert "row 4 of" in named and "'yes'" in named
 
 
 def test_marks_that_are_kept_are_told_of_and_cannot_be_moved(anytouch, mistake, pressed, monkeypatch):
@@ -105,8 +105,8 @@ def test_marks_that_are_kept_are_told_of_and_cannot_be_moved(anytouch, mistake, 
     )
     assert "--share" in mistake("data", "contact", marked, "--share", 0.6)
     monkeypatch.undo()
-    said = anytouch("data", "contact", marked)
-    assert said.status == 0 and "10 rows keep the label.contact that they had" in said.out
+    done = anytouch("data", "contact", marked)
+    assert done.status == 0 and "10 rows keep the label.contact that they had" in done.out
 
 
 def test_what_is_compared_with_is_looked_for_before_the_work(mistake, pressed, monkeypatch):
@@ -124,5 +124,5 @@ def test_a_place_that_cannot_be_written_is_named_before_the_work(anytouch, press
     from anytouch_jax.data.prepare import contact
 
     monkeypatch.setattr(contact, "contact_scores", lambda *a, **k: pytest.fail("hours of work began"))
-    said = anytouch("data", "contact", pressed, "--out", tmp_path / out)
-    assert said.status == 2 and words in said.err and len(said.err.strip().splitlines()) == 1
+    done = anytouch("data", "contact", pressed, "--out", tmp_path / out)
+    assert done.status == 2 and words in done.err and len(done.err.strip().splitlines()) == 1

@@ -21,13 +21,13 @@ def slides(tmp_path):
 
 
 def test_a_manifest_is_written_and_the_counts_stand_beside_the_papers(anytouch, slides, tmp_path):
-    said = anytouch("data", "index", "ycb_slide", slides, "--out", tmp_path / "slides.csv", "--val", "0", "--test", "0")
-    assert (said.status, said.err) == (0, "")
-    assert f"{tmp_path / 'slides.csv'}: 20 rows of 5 sequences (train 20)" in said.out
-    assert "183,000 in the paper" in said.out and "licence: " in said.out and "content hash " in said.out
+    done = anytouch("data", "index", "ycb_slide", slides, "--out", tmp_path / "slides.csv", "--val", "0", "--test", "0")
+    assert (done.status, done.err) == (0, "")
+    assert f"{tmp_path / 'slides.csv'}: 20 rows of 5 sequences (train 20)" in done.out
+    assert "183,000 in the paper" in done.out and "licence: " in done.out and "content hash " in done.out
     manifest = manifests.read(tmp_path / "slides.csv")
     assert manifest.value(0, "path") == "my data/real/mug/dataset_0/frames/frame_0000000.jpg"
-    assert manifest.content_hash in said.out
+    assert manifest.content_hash in done.out
 
 
 def test_without_out_it_lies_in_the_folder(anytouch, slides):

@@ -19,8 +19,8 @@ def _closed():
 
 
 def test_a_pack_reads_like_the_files(anytouch, pressed, tmp_path):
-    said = anytouch("data", "pack", pressed, "--out", tmp_path / "shards")
-    assert said.status == 0 and f"{tmp_path / 'shards' / 'manifest.parquet'}: 10 rows" in said.out
+    done = anytouch("data", "pack", pressed, "--out", tmp_path / "shards")
+    assert done.status == 0 and f"{tmp_path / 'shards' / 'manifest.parquet'}: 10 rows" in done.out
     loose, packed = manifests.read(pressed), manifests.read(tmp_path / "shards" / "manifest.parquet")
     for row in range(10):
         np.testing.assert_array_equal(decode(packed.file(row)), decode(loose.file(row)))
@@ -39,5 +39,5 @@ def test_mistakes_are_one_sentence(mistake, pressed, tmp_path):
     assert str(tmp_path) in mistake("data", "pack", pressed, "--out", tmp_path)
     assert "shard" in mistake("data", "pack", pressed, "--shard-mb", 0)
     (tmp_path / "3.png").unlink()
-    told = mistake("data", "pack", pressed)
-    assert f"row 3 of {pressed}" in told and "--repair" in told
+    named = mistake("data", "pack", pressed)
+    assert f"row 3 of {pressed}" in named and "--repair" in named

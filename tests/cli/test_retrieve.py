@@ -55,12 +55,12 @@ def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
 def test_a_mistake_is_one_sentence(touches, capsys, monkeypatch, words, sentence):
     monkeypatch.setattr(embed, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
     assert main(["retrieve", "--data", str(touches), *words]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.startswith("anytouch retrieve: ") and sentence in said and said.count("\n") == 0
+    done = capsys.readouterr().err.strip()
+    assert done.startswith("anytouch retrieve: ") and sentence in done and done.count("\n") == 0
 
 
 def test_a_report_of_what_is_not_there_is_one_sentence(touches, tmp_path, capsys):
     words = ["--data", str(touches), "--stage1", str(tmp_path / "s1"), "--stage2", str(tmp_path / "s2")]
     assert main(["report", *words, "--out", str(tmp_path / "report")]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.startswith("anytouch report: ") and "s1" in said and not (tmp_path / "report").exists()
+    done = capsys.readouterr().err.strip()
+    assert done.startswith("anytouch report: ") and "s1" in done and not (tmp_path / "report").exists()

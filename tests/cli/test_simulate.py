@@ -18,7 +18,7 @@ def _no_physics(monkeypatch, compiled_once):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "named"),
     [
         (["--sensors", "nose"], "no simulated sensor 'nose'"),
         (["--depth", "-1", "1"], "depth is a range of mm"),
@@ -28,8 +28,8 @@ def _no_physics(monkeypatch, compiled_once):
         (["--size", "20000"], "size is 16 to 4096"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_nothing(mistake, tmp_path, words, told):
-    assert told in mistake("data", "simulate", "--out", tmp_path / "x", *words)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(mistake, tmp_path, words, named):
+    assert named in mistake("data", "simulate", "--out", tmp_path / "x", *words)
     assert not (tmp_path / "x").exists()
 
 
@@ -42,19 +42,19 @@ def test_a_file_is_no_folder(mistake, tmp_path, place):
 
 def test_the_command_makes_a_data_set(anytouch, tmp_path):
     out = tmp_path / "scenes"
-    said = anytouch("data", "simulate", "--out", out, "--touches", 2, "--sensors", "digit", *SMALL)
-    assert said.status == 0, said
-    few, compiling, *_ = said.err.splitlines()
-    assert "val" in few and "test" in few and "compiling" in compiling and "2 touches by digit" in said.err
+    outcome = anytouch("data", "simulate", "--out", out, "--touches", 2, "--sensors", "digit", *SMALL)
+    assert outcome.status == 0, outcome
+    few, compiling, *_ = outcome.err.splitlines()
+    assert "val" in few and "test" in few and "compiling" in compiling and "2 touches by digit" in outcome.err
     assert len(manifests.read(out / "manifest.parquet")) == 2 * 2 + 2
 
 
 def test_without_a_terminal_every_tenth_of_the_touches_is_a_line(anytouch, tmp_path, monkeypatch):
     monkeypatch.setattr(dataset, "GROUP", 1)
     words = ["--sensors", "digit", "--vision", "0", "--held-out", "0", *SMALL]
-    said = anytouch("data", "simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
-    assert said.status == 0, said
-    assert [line for line in said.err.splitlines() if " of 25 touches" in line] == [
+    outcome = anytouch("data", "simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
+    assert outcome.status == 0, outcome
+    assert [line for line in outcome.err.splitlines() if " of 25 touches" in line] == [
         f"{done} of 25 touches" for done in (3, 5, 8, 10, 13, 15, 18, 20, 23, 25)
     ]
     again = anytouch("data", "simulate", "--out", tmp_path / "scenes", "--touches", 25, *words)
@@ -69,5 +69,5 @@ def test_frames_that_did_not_converge_are_counted(anytouch, tmp_path, monkeypatc
 
     monkeypatch.setattr(dataset, "Recorder", Rough)
     words = ["--touches", 3, "--sensors", "digit", "--fidelity", "exact", *SMALL]
-    said = anytouch("data", "simulate", "--out", tmp_path, *words)
-    assert said.status == 0 and "3 of 6 frames did not converge" in said.err
+    outcome = anytouch("data", "simulate", "--out", tmp_path, *words)
+    assert outcome.status == 0 and "3 of 6 frames did not converge" in outcome.err

@@ -25,9 +25,9 @@ def video(tmp_path_factory):
 def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video, tiny_run):
     streamed, plain = tmp_path / "streamed.npz", tmp_path / "plain.npz"
     args = ("--model", tiny_run, "--data", video, "--frames", 3, "--sensor", "digit")
-    said = anytouch("stream", *args, "--out", streamed)
-    assert said.status == 0 and "4 features of 12 values" in said.out
-    words = " ".join(said.err.split())
+    done = anytouch("stream", *args, "--out", streamed)
+    assert done.status == 0 and "4 features of 12 values" in done.out
+    words = " ".join(done.err.split())
     assert "p50 ms p99 ms decode" in words and "4 frames embedded, 0 dropped" in words
     assert anytouch("embed", *args, "--batch", 4, "--out", plain).status == 0
     with np.load(streamed) as a, np.load(plain) as b:
@@ -36,13 +36,13 @@ def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video,
         np.testing.assert_allclose(a["key/time"], [0.2, 0.3, 0.4, 0.5])  # in the film of ten frames a second
         assert str(a["about/stride"]) == "1" and "about/started" not in a
 
-    said = anytouch("stream", *args, "--out", "-")
-    lines = [json.loads(line) for line in said.out.splitlines()]
-    assert said.status == 0 and [line["frame"] for line in lines] == [2, 3, 4, 5]
+    done = anytouch("stream", *args, "--out", "-")
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    assert done.status == 0 and [line["frame"] for line in lines] == [2, 3, 4, 5]
     assert [line["time"] for line in lines] == [0.2, 0.3, 0.4, 0.5]
     with np.load(streamed) as a:
         np.testing.assert_array_equal(np.asarray([line["features"] for line in lines], np.float32), a["features"])
-    assert "4 frames embedded" in said.err
+    assert "4 frames embedded" in done.err
 
 
 def test_what_cannot_be_streamed(mistake, tmp_path, video, tiny_run):
@@ -82,11 +82,11 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
         signal.SIGINT, signal.default_int_handler
     )  # ignored, where a shell put pytest in the background
     try:
-        said = anytouch("stream", "--model", tiny_run, "--data", 0, "--frames", 3, "--out", tmp_path / "f.npz")
+        done = anytouch("stream", "--model", tiny_run, "--data", 0, "--frames", 3, "--out", tmp_path / "f.npz")
     finally:
         signal.signal(signal.SIGINT, before)
         over.set()
-    assert said.status == 0, said
+    assert done.status == 0, done
     with np.load(tmp_path / "f.npz") as file:
         assert (
             len(file["features"]) <= 1 and file["features"].ndim == 2
@@ -112,8 +112,8 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
         turn = ("--rotate", 90, "--flip", "across") if name == "lying" else ()
         for form, command in ((name, "embed"), (f"{name}.avi", "stream")):
             out = tmp_path / "f.npz"
-            said = anytouch(command, "--model", tiny_run, "--data", tmp_path / form, "--out", out, *turn)
-            assert said.status == 0, said
+            done = anytouch(command, "--model", tiny_run, "--data", tmp_path / form, "--out", out, *turn)
+            assert done.status == 0, done
             with np.load(out) as file:
                 found[form] = file["features"]
     np.testing.assert_array_equal(found["lying"], found["upright"])
@@ -136,8 +136,8 @@ def test_a_camera_tells_when_it_began(anytouch, tmp_path, tiny_run, monkeypatch)
 
     monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
     before = time.time()
-    said = anytouch("stream", "--model", tiny_run, "--data", 0, "--out", tmp_path / "f.npz")
-    assert said.status == 0, said
+    done = anytouch("stream", "--model", tiny_run, "--data", 0, "--out", tmp_path / "f.npz")
+    assert done.status == 0, done
     with np.load(tmp_path / "f.npz") as file:
         clock = float(str(file["about/started"])) + file["key/time"]
     assert (before <= clock).all() and (clock <= time.time()).all()

@@ -31,26 +31,26 @@ def distinct(pressed):
 
 
 def test_a_sound_manifest_passes(anytouch, distinct):
-    said = anytouch("data", "verify", distinct)
-    assert said.status == 0, said.out
-    assert "10 rows, 10 files" in said.out and "No fault was found" in said.out
-    assert "| CC-BY-NC-4.0 | no | 3 | mine |" in said.out and "| - | unknown | 1 |" in said.out
+    done = anytouch("data", "verify", distinct)
+    assert done.status == 0, done.out
+    assert "10 rows, 10 files" in done.out and "No fault was found" in done.out
+    assert "| CC-BY-NC-4.0 | no | 3 | mine |" in done.out and "| - | unknown | 1 |" in done.out
 
 
 def test_a_broken_file_is_an_error_until_it_is_repaired(anytouch, distinct, tmp_path):
     data = (tmp_path / "7.png").read_bytes()
     (tmp_path / "7.png").write_bytes(data[: len(data) // 2])
     (tmp_path / "8.png").unlink()
-    said = anytouch("data", "verify", distinct, "--out", tmp_path / "report.json")
-    assert said.status == 1
-    assert f"row 7 of {distinct}" in said.out and f"row 8 of {distinct}" in said.out
+    done = anytouch("data", "verify", distinct, "--out", tmp_path / "report.json")
+    assert done.status == 1
+    assert f"row 7 of {distinct}" in done.out and f"row 8 of {distinct}" in done.out
     report = json.loads((tmp_path / "report.json").read_text())
     assert not report["ok"] and sorted(row for f in report["findings"] for row in f["rows"]) == [7, 8]
     assert anytouch("data", "verify", distinct, "--no-decode").out.count("row 7") == 0
 
     fixed = tmp_path / "fixed.parquet"
-    said = anytouch("data", "verify", distinct, "--repair", fixed)
-    assert said.status == 0 and f"{fixed}: 8 of 10 rows" in said.out and "dropped 2 rows" in said.out
+    done = anytouch("data", "verify", distinct, "--repair", fixed)
+    assert done.status == 0 and f"{fixed}: 8 of 10 rows" in done.out and "dropped 2 rows" in done.out
     assert anytouch("data", "verify", fixed).status == 0
     assert len(manifests.read(distinct)) == 10
 
@@ -58,9 +58,9 @@ def test_a_broken_file_is_an_error_until_it_is_repaired(anytouch, distinct, tmp_
 def test_what_no_repair_can_decide_stays_an_error(anytouch, distinct, tmp_path):
     edit(distinct, touch=["t"] * 10, split=["background"] * 2 + ["train"] * 4 + ["test"] * 4)
     (tmp_path / "4.png").unlink()
-    said = anytouch("data", "verify", distinct, "--repair", tmp_path / "fixed.parquet")
-    assert said.status == 1 and "left to you: 1 values of touch are in more than one of" in said.out
-    assert "left to you: 1 rows whose path" not in said.out
+    done = anytouch("data", "verify", distinct, "--repair", tmp_path / "fixed.parquet")
+    assert done.status == 1 and "left to you: 1 values of touch are in more than one of" in done.out
+    assert "left to you: 1 rows whose path" not in done.out
 
 
 def test_objects_on_both_sides_are_an_error_on_request(anytouch, distinct):
@@ -82,8 +82,8 @@ def test_swapped_folders_are_exchanged_when_the_user_says_so(anytouch, distinct,
 def test_commercial_rows_only_also_of_the_repaired_copy(anytouch, distinct, tmp_path):
     (tmp_path / "5.png").unlink()
     words = ["--repair", tmp_path / "fixed.parquet", "--commercial-only", tmp_path / "free.parquet"]
-    said = anytouch("data", "verify", distinct, *words)
-    assert "free.parquet: 5 rows" in said.out and " 3 " in said.out and " 1 " in said.out
+    done = anytouch("data", "verify", distinct, *words)
+    assert "free.parquet: 5 rows" in done.out and " 3 " in done.out and " 1 " in done.out
     assert manifests.read(tmp_path / "free.parquet").column("license").to_pylist() == ["MIT"] * 5
 
 
@@ -93,8 +93,8 @@ def test_several_manifests_are_looked_at_together(anytouch, distinct, tmp_path):
     columns = {name: table[name].to_pylist() for name in table.column_names}
     manifests.write(manifests.from_columns(columns | {"split": ["test"] * 10}, other), other)
     assert anytouch("data", "verify", distinct).status == anytouch("data", "verify", other).status == 0
-    said = anytouch("data", "verify", distinct, other)
-    assert said.status == 1 and "leak_file" in said.out  # the same pictures in train and test
+    done = anytouch("data", "verify", distinct, other)
+    assert done.status == 1 and "leak_file" in done.out  # the same pictures in train and test
 
 
 def test_mistakes_are_one_sentence(mistake, distinct, tmp_path, monkeypatch):

@@ -33,7 +33,7 @@ from anytouch_jax.cli import (
     train,
     verify,
 )
-from anytouch_jax.cli.arguments import RENAMED_COMMANDS, parse
+from anytouch_jax.cli.arguments import RENAMED_COMMANDS, parse_options
 from anytouch_jax.errors import CheckError, UserError
 
 
@@ -42,7 +42,7 @@ class Command(NamedTuple):
 
     options: type
     run: Callable[[Any], int]
-    parse: Callable[..., Any] = parse
+    parse: Callable[..., Any] = parse_options
 
     @property
     def summary(self) -> str:

@@ -37,7 +37,7 @@ RENAMED_OPTIONS = {
 }
 
 
-def parse(kind: Any, name: str, args: Sequence[str], default: Any = None, *, add_help: bool = True) -> Any:
+def parse_options(kind: Any, name: str, args: Sequence[str], default: Any = None, *, add_help: bool = True) -> Any:
     """Return the record `kind` of the options in `args`.
 
     Raises UserError for a renamed or repeated option, and SystemExit after --help and tyro's own errors.

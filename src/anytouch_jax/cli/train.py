@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 import tyro
 
-from anytouch_jax.cli.arguments import option_of
-from anytouch_jax.cli.arguments import parse as parse_options
+from anytouch_jax.cli.arguments import option_of, parse_options
 from anytouch_jax.cli.output import log
 from anytouch_jax.config import (
     Config,

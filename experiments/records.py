@@ -17,7 +17,7 @@ Record = dict[str, Any]
 
 
 def read_records(path: Path) -> dict[str, Record]:
-    """Return {key: record} of a file of results, {} where there is no file.
+    """Return {key: record} of a file of results, {} for a missing file.
 
     Raises UserError for a line that is no record.
     """

@@ -199,8 +199,8 @@ def ask(answer: Callable[[str], None], question: str, devices: int = 1) -> dict[
         check=False,
     )
     if done.returncode:
-        said = done.stderr.strip().splitlines()
-        raise UserError(f"the child process of {answer.__name__} failed: {said[-1] if said else done.returncode}")
+        errors = done.stderr.strip().splitlines()
+        raise UserError(f"the child process of {answer.__name__} failed: {errors[-1] if errors else done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 

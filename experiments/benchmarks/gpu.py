@@ -1,4 +1,4 @@
-"""ViT-L/14 on an accelerator: steps of both stages, speed beside error, memory against batch size.
+"""ViT-L/14 on an accelerator: steps of both stages, speed against error, memory against batch size.
 
     make bench-gpu PYTHON=python3
 

@@ -83,14 +83,14 @@ VARIANTS = (
 
 @dataclass(frozen=True)
 class FidelityRow:
-    """A variant's figures; errors are over the reference's largest displacement, of the worst scene where not told.
+    """A variant's figures; errors are over the reference's largest displacement, of the worst scene unless noted.
 
     `press_ms`, `shear_ms`: median milliseconds a frame of one step, a batch of all scenes at a time. `rms`, `largest`:
     scene -> error of the normal displacement, brought to the reference's grid by cubic interpolation. `shear`: the
     root mean square of the tangential one. `slip`: of the share of the contact that slips, in points. `force`: of the
     normal force, over the force. `converged`: of the scenes.
     `image`: scene -> mean absolute error in grey levels (0..255) of the picture rendered from the variant's own grid,
-    beside that of the reference, over the pixels that the touch changes.
+    and that of the reference, over the pixels that the touch changes.
     """
 
     fidelity: str

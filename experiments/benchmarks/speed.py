@@ -1,4 +1,4 @@
-"""Speed against error: variants of a workload in turns in one process, beside a float64 reference (`make bench`).
+"""Speed against error: variants of a workload in turns in one process, and a float64 reference.
 
 A variant's time is a ratio to the float32 baseline *of the same round*, so that a busy machine slows both. Errors are
 those of the same parameters and the same batch computed in float64. Imports nothing but jax, flax, optax, numpy.
@@ -106,7 +106,7 @@ def _values(variant: Variant, small: Workload, params: Tree, noise: Any) -> dict
 
 
 def widened(x: Any) -> np.ndarray:
-    """A float32 array as float64; any other as it is."""
+    """Return a float32 array as float64, and any other unchanged."""
     x = np.asarray(x)
     return x.astype(np.float64) if x.dtype == np.float32 else x
 

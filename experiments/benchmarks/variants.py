@@ -1,4 +1,4 @@
-"""Variants of a workload: what they change, and how each is compiled, cold, with what compiling told.
+"""Variants of a workload: what they change, and how each is compiled, cold.
 
 Imports nothing but jax, flax, optax, numpy.
 """
@@ -78,7 +78,7 @@ def variants_of(work: Workload, backend: str = "cpu") -> tuple[Variant, ...]:
 
 @dataclass
 class Program:
-    """A compiled variant and what compiling told."""
+    """A compiled variant, its compile times and its memory."""
 
     work: Workload
     variant: Variant

@@ -2,7 +2,7 @@
 
     make export-onnx RUN=runs/stage2 OUT=encoder.onnx FRAMES=3
 
-This process runs the live model; another, with jax2onnx and onnxruntime in an environment of its own (jax2onnx wants an
+This process runs the live model; another, with jax2onnx and onnxruntime in a separate environment (jax2onnx wants an
 older Orbax), converts it and runs the result on the same touches. Nothing is written when they differ.
 """
 

@@ -40,7 +40,7 @@ def encoder_of(folder: Path):
 
 
 def _is_worth_telling(record: logging.LogRecord) -> bool:
-    """Not that a value inside has no type beside its shape, a line each: nothing reads it, the result is checked."""
+    """Return whether to log a record: not that an inner value has no type, since the result is checked."""
     return not record.getMessage().startswith("The value type for shape ")
 
 

@@ -1,4 +1,4 @@
-"""What pouring by touch is compared with: policies with the same MLP that are told the time, or the load on the gel."""
+"""Bounds of pouring by touch: policies with the same MLP that get the time, or the load on the gel."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def blind_inputs(actions: Array) -> Array:
 
 
 class Blind:
-    """The same MLP, told only the time and its own actions."""
+    """A policy with the same MLP that gets only the time and its own actions."""
 
     looks = False
 
@@ -67,11 +67,11 @@ def learn_blind(task: Task, seed: int, count: int, learning: Learning) -> Blind:
     waited.
     """
     trials = demonstrate(task, seed, count, side=None, patient=False, chunk=count)
-    return Blind(imitate_told(trials, blind_inputs(trials.actions)[START:], learning))
+    return Blind(imitate_plainly(trials, blind_inputs(trials.actions)[START:], learning))
 
 
-def imitate_told(trials: Trials, x: Array, learning: Learning) -> Head:
-    """The MLP over inputs x (S - START, B, d) that a policy is told: few and without noise, so none is left out."""
+def imitate_plainly(trials: Trials, x: Array, learning: Learning) -> Head:
+    """Return the MLP over inputs x (S - START, B, d), trained without dropout: they are few and without noise."""
     return imitate(*moments(trials, x), replace(learning, dropout=0.0))[0]
 
 
@@ -89,7 +89,7 @@ def _loads(state: State, setups: Setup, *, task: Task) -> jax.Array:
 class Scales:
     """Notes the load of stacked runs `setups` while another controller acts, or acts on it with the MLP `head`.
 
-    It is given what the gel bears, blows and jolts included, and no picture: no touch of this gel can tell more.
+    It gets the load on the gel, with blows and jolts, and no picture. No touch of this gel holds more information.
     """
 
     looks = False
@@ -124,4 +124,4 @@ def learn_loads(task: Task, seed: int, count: int, learning: Learning) -> Head:
     setups, keys = draw_runs(task, seed, count)
     noting = Scales(task, setups, Expert(task))
     trials = run(task, setups, keys, noting, late=late_hands(seed, count))
-    return imitate_told(trials, input_table(noting.segments()), learning)
+    return imitate_plainly(trials, input_table(noting.segments()), learning)

@@ -28,7 +28,7 @@ FLOW, MARGIN = 1.03, 1.4  # constants of the slot law; the margin is in bead dia
 STAND = 3  # moments in which the gripped cylinder still stands on the table; then it is lifted to its first tilt
 EXPOSURE = 1 / 60  # s of one frame: blows shorter than this are averaged
 STEEPEST = math.radians(86)
-SHOCKS, PIXELS = 101, 102  # numbers of a state's chances beside those of `advance`, whose split gives 0, 1 and 2
+SHOCKS, PIXELS = 101, 102  # random streams of a state. Those of `advance` are 0, 1 and 2
 VERSION = 3  # of what a run gives for its seed
 
 
@@ -164,7 +164,7 @@ def _start(key: Array) -> Array:
 
 
 def advance(state: State, action: Array, setup: Setup, task: Task) -> State:
-    """One action and the fifth of a second after it; a run that is done stays as it is.
+    """Return the state after one action and a fifth of a second; a finished run does not change.
 
     Beads break loose when their surface is steeper than the angle of maximal stability, and run out at the rate of a
     slot of the lip's width and the depth of what lies over the angle of repose (Myers and Sellers 1978, after Beverloo

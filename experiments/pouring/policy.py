@@ -146,23 +146,25 @@ def features(
     return found
 
 
-def seen(encoder: Encoder, frames: Array, first: Array) -> Array:
-    """Frames u8 (..., B, side, side, 3) as the encoder was trained to see them: as they are, or less the `first` ones
-    u8 (B, side, side, 3) of their runs, of the gel that holds the standing cylinder."""
+def subtracted(encoder: Encoder, frames: Array, first: Array) -> Array:
+    """Return frames u8 (..., B, side, side, 3) as the encoder reads them: untouched, or minus the `first` frames.
+
+    `first` u8 (B, side, side, 3) show the gel that holds the standing cylinder.
+    """
     if not encoder.subtracts:
         return frames
     return np.clip(frames.astype(np.int16) - first + 128, 0, 255).astype(np.uint8)
 
 
 def segments(encoder: Encoder, frames: Array, where: Array, ahead: int, sides: Array | None = None) -> Array:
-    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `seen`.
+    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `subtracted`.
 
     A gel in a mirror bears the same load: runs are shown upside down where the first of `sides` (B, 2) is 1, left to
     right where the second is.
     """
     ends, runs = where[:, 0] + FRAMES - 1, where[:, 1]
     first = frames[0, runs]
-    clips = np.stack([seen(encoder, frames[ends - back, runs], first) for back in range(ahead - 1, -1, -1)], 1)
+    clips = np.stack([subtracted(encoder, frames[ends - back, runs], first) for back in range(ahead - 1, -1, -1)], 1)
     if sides is None:
         return clips
     turns = 1 - 2 * sides[runs]
@@ -245,7 +247,7 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
     data = tuple((jnp.asarray(x[part], jnp.float32), jnp.asarray(actions[part])) for part in (known, late))
 
     @jax.jit
-    def train(layers: Any, head: Head, data: Any) -> tuple[Any, jax.Array]:  # (constants would be compiled anew)
+    def train(layers: Any, head: Head, data: Any) -> tuple[Any, jax.Array]:  # (constants would be compiled again)
         (x, actions), unseen = data
 
         def loss(layers: Any, x: jax.Array, actions: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -306,11 +308,11 @@ class Touch:
         self._said: list[Array] = []
 
     def act(self, frames: Array | None, state: State | None = None) -> Array:
-        """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has seen a segment."""
+        """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has subtracted a segment."""
         assert frames is not None
         frames = np.stack([touch_evaluation([frame], self.encoder.config.model.image_size)[0] for frame in frames])
         self._first = frames if self._first is None else self._first
-        frames = seen(self.encoder, frames, self._first)
+        frames = subtracted(self.encoder, frames, self._first)
         self._frames = [*self._frames[-FRAMES + 1 :], frames]
         if len(self._frames) < FRAMES:
             return np.full(len(frames), WAIT)
@@ -333,7 +335,7 @@ def moments(trials: Trials, x: Array, learned: Array | None = None) -> tuple[Arr
 
 
 def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR) -> Touch:
-    """A policy over frozen features, from demonstrations with frames of `sensor`: each as it is, and in a mirror.
+    """Return a policy over frozen features of `sensor`, from demonstrations and their mirror images.
 
     It learns from every LAG-th moment of a run: those between resemble them, and cost as much.
     """

@@ -2,8 +2,8 @@
 
 The form: a manifest whose sequences are runs, one row a moment of choice (five a second), `label.action` pour, wait or
 retract. In the first STAND moments of a run the fingers hold the cylinder while it still stands; then it is lifted. A
-column `label.choice` says what should have been done where that differs (a hand that was late). `split` test is
-learned by nobody.
+column `label.choice` says what should have been done where that differs (a hand that was late). Nothing is
+learned from split test.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from experiments.pouring.bounds import blind_inputs, imitate_told
+from experiments.pouring.bounds import blind_inputs, imitate_plainly
 from experiments.pouring.physics import ACTIONS, STAND, Task
 from experiments.pouring.policy import Head, Learning, Touch, forward
 from experiments.pouring.trials import SENSOR, START, Controller, Trials
@@ -114,7 +114,7 @@ def read(path: Path, side: int) -> Recordings:
 
 
 def _runs(table: Manifest, path: Path) -> list[Array]:
-    """The rows of each run in time. Raises UserError for a run on both sides of a split, or where there is none."""
+    """The rows of each run in time. Raises UserError for a run on both sides of a split, or without a run."""
     split = text_column(table, "split")
     sequences = np.where(np.isin(split, LEARNING), text_column(table, "sequence"), "")
     names = np.unique(sequences[sequences != ""])
@@ -165,32 +165,32 @@ def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
     """Show the frames of recorded runs to a policy, as the hand's actions led to them; `rate` moments a second."""
     assert trials.frames is not None
     policy.begin(len(trials.steps))
-    said = np.stack([policy.act(frames, None) for frames in trials.frames])  # type: ignore[arg-type]
-    return compare(said, trials, rate)
+    predicted = np.stack([policy.act(frames, None) for frames in trials.frames])  # type: ignore[arg-type]
+    return compare(predicted, trials, rate)
 
 
 def agreement_blind(shown: Trials, unseen: Trials, learning: Learning, rate: float) -> Agreement:
-    """The agreement of the same MLP that is told the time and the hand's actions so far, not the touch."""
-    head = imitate_told(shown, blind_inputs(shown.actions)[START:], learning)
-    said = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
-    return compare(np.stack(said), unseen, rate)
+    """The agreement of the same MLP that gets the time and the hand's actions so far, not the touch."""
+    head = imitate_plainly(shown, blind_inputs(shown.actions)[START:], learning)
+    predicted = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
+    return compare(np.stack(predicted), unseen, rate)
 
 
-def compare(said: Array, trials: Trials, rate: float) -> Agreement:
-    """The agreement of actions `said` (S, B) with those that the hand chose."""
+def compare(predicted: Array, trials: Trials, rate: float) -> Agreement:
+    """The agreement of actions `predicted` (S, B) with those that the hand chose."""
     taken = trials.taken.copy()
     taken[:START] = False
-    same = (said == trials.choices) & taken
+    same = (predicted == trials.choices) & taken
     by_action = [same[chosen].mean() for a in range(len(ACTIONS)) if (chosen := taken & (trials.choices == a)).any()]
     back = ACTIONS.index("retract")
-    moment = np.arange(len(said))[:, None]
-    turns = [np.where((one == back) & taken, moment, trials.steps).min(0) for one in (said, trials.choices)]
+    moment = np.arange(len(predicted))[:, None]
+    turns = [np.where((one == back) & taken, moment, trials.steps).min(0) for one in (predicted, trials.choices)]
     late = np.abs(turns[0] - turns[1]) / rate
     return Agreement(float((same.sum(0) / taken.sum(0)).mean()), float(np.mean(by_action)), float(np.median(late)))
 
 
 def save_policy(folder: Path, policy: Touch) -> None:
-    """Write the MLP to `policy.npz` and the encoder beside it, each in one move. Raises UserError."""
+    """Write the MLP to `policy.npz` and the encoder next to it, each in one move. Raises UserError."""
     from anytouch_jax.config import to_json
     from anytouch_jax.weights import safetensors
 
@@ -205,10 +205,10 @@ def save_policy(folder: Path, policy: Touch) -> None:
     safetensors.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
-    told = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}
+    metadata = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}
     data = io.BytesIO()
     arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
-    np.savez(data, about=np.asarray(json.dumps(told | {"encoder": encoder.fingerprint})), **arrays)
+    np.savez(data, about=np.asarray(json.dumps(metadata | {"encoder": encoder.fingerprint})), **arrays)
     atomic_write(folder / POLICY, data.getvalue())
 
 
@@ -219,9 +219,9 @@ def load_policy(folder: Path | str) -> Touch:
     encoder = load_encoder(folder / WEIGHTS)
     try:
         with np.load(io.BytesIO((folder / POLICY).read_bytes()), allow_pickle=False) as file:
-            arrays, told = dict(file), json.loads(str(file["about"]))
-        stills, sensor, mark = bool(told["stills"]), str(told["sensor"]), told["encoder"]
-        pooling, votes = told.get("pooling", "class"), int(told.get("votes", 1))  # of earlier policies
+            arrays, metadata = dict(file), json.loads(str(file["about"]))
+        stills, sensor, mark = bool(metadata["stills"]), str(metadata["sensor"]), metadata["encoder"]
+        pooling, votes = metadata.get("pooling", "class"), int(metadata.get("votes", 1))  # of earlier policies
         count = sum(name.startswith("w/") for name in arrays)
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
         head = Head(arrays["mean"], arrays["basis"], layers)

@@ -13,7 +13,7 @@
 # retract) tilt it by 0.25 degrees five times a second. Pour out 60 g, then retract, with nothing but tactile frames.
 # The paper did it with a robot; here cylinder, beads, gel and camera are simulated, and bead size, friction, grip,
 # stiffness, first pose and sensor differ from run to run. A run begins with the grip on the standing cylinder: nothing
-# else tells how soft the gel and how firm the grip is. Then it is lifted, and the actions begin. An expert that sees
+# else shows how soft the gel and how firm the grip is. Then it is lifted, and the actions begin. An expert that sees
 # the scales demonstrates; a small MLP over features of four segments (the last two, the first of the lifted cylinder
 # and that of the standing one) imitates it, the encoder frozen or fine-tuned.
 #
@@ -105,7 +105,7 @@ def encoder_of(name: str, seed: int) -> Encoder | None:
 
 
 def source_of(name: str, seed: int, encoder: Encoder) -> str:
-    """What a row's encoder is, and a mark of its weights: a run that was trained anew is another encoder."""
+    """Return the source of a row's encoder and the fingerprint of its weights."""
     shown = "" if name in RUNS or name == "none" or not RUNS else f", {table.SHOWN}"
     path = path_of(name, seed)
     return f"{'untrained' if path is None else Path(path).name} (weights {encoder.fingerprint}{shown})"
@@ -219,9 +219,9 @@ fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.
 picture = f"{NAME}.png"
 table.draw(figures / picture, rows)
 settings = max((row.settings for row in rows), key=len)
-told = json.loads(settings)
-other = "" if told["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
-text = f"""# Pouring by touch alone (simulated), {told["demonstrations"]} demonstrations
+used = json.loads(settings)
+other = "" if used["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
+text = f"""# Pouring by touch alone (simulated), {used["demonstrations"]} demonstrations
 
 {len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
     "; fewer: " + ", ".join(fewer) if fewer else ""

@@ -151,7 +151,7 @@ def difference(a: Row, b: Row) -> Difference:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Markdown: mean errors beside the paper's, then each of the paper's orders with its paired difference."""
+    """Return the table: mean errors and the paper's, then each of the paper's orders with its paired difference."""
     by = {(row.name, row.mode): row for row in rows}
     lines = []
     for name, title in TITLES.items():

@@ -21,7 +21,7 @@ from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Set
 Array = npt.NDArray[Any]
 SENSOR = render.SENSOR.name
 FRAMES = 3  # of a segment
-START = STAND + FRAMES - 1  # the first moment at which somebody chooses: a segment of the lifted cylinder is complete
+START = STAND + FRAMES - 1  # the first moment of choice: a segment of the lifted cylinder is complete
 
 
 class Controller(Protocol):
@@ -184,7 +184,7 @@ def run(
     `film`: of so many runs, the first ones, the frames are kept.
 
     `grasps`: those of `hold` for these runs and `side`, where they are at hand.
-    `late` (B,): a hand that goes on pouring for so many moments after it was told to retract, which then stays the
+    `late` (B,): a hand that goes on pouring for so many moments after the controller retracts, which then stays the
     choice. So demonstrations show what to do where the target is already passed.
     """
     drawn = controller.looks or film > 0
@@ -193,25 +193,25 @@ def run(
     state = _begin(setups, keys, task=task)
     count = len(state.mass)
     controller.begin(count)
-    told: list[tuple[Array, ...]] = []
+    history: list[tuple[Array, ...]] = []
     frames: list[Array] = []
     steps, waited = np.zeros(count, np.int64), np.zeros(count, np.int64)
     while not np.asarray(state.done).all():
         seen = np.asarray(look(state, setups, grasps, task=task, side=side)) if drawn else None
         choices = np.asarray(controller.act(seen if controller.looks else None, state), np.int32)
-        if len(told) < START:
+        if len(history) < START:
             choices = np.full_like(choices, WAIT)
         actions = choices
         if late is not None:
             choices = np.where(waited > 0, RETRACT, choices)
             waited += choices == RETRACT
             actions = np.where((choices == RETRACT) & (waited <= late), POUR, choices)
-        told.append((choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate))))
+        history.append((choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate))))
         steps += ~np.asarray(state.done)
         if seen is not None and film:
             frames.append(seen[:film].copy())
         state = _advance(state, actions, setups, task=task)
-    choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*told, strict=True))
+    choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*history, strict=True))
     out = np.asarray(physics.poured(state, task))
     return Trials(out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if film else None)
 
@@ -231,7 +231,7 @@ def error(poured: Array, target: float) -> Error:
 
 
 def write_film(path: Path, trials: Trials, task: Task, *, every: int = 4) -> None:
-    """Write the first run as a GIF: the frame, beside it the mass left over time and the action. Whole or not at all.
+    """Write the first run as a GIF: the frame, and next to it the mass left over time and the action.
 
     Every `every`-th moment is shown, ten a second. Raises OSError.
     """

@@ -56,7 +56,7 @@ for ours, paper, name in sorted(order):
 # ## A checkpoint of yours
 #
 # `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
-# scored as above, in minutes on a CPU, and stands beside our rows.
+# scored as above, in minutes on a CPU, and compared with our rows.
 
 # %%
 mine = page.yours("ablations", runs)

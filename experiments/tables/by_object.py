@@ -1,4 +1,4 @@
-"""What sets of features get right of each object, kept as sums; shares, and differences over objects, from them."""
+"""Correct answers of sets of features by object, and their shares and paired differences over objects."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def probed(
     the test split, by label; `commonest` is the commonest answer of train there."""
     found = {}
     for label, values in labels.items():
-        told = {"commonest": array_probes.majority_baseline(values, groups, split)}
+        results = {"commonest": array_probes.majority_baseline(values, groups, split)}
         for name, x in features.items():
             scaling: array_probes.Scaling = "common" if name == "pixels" else "column"
-            told[name] = array_probes.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
-        outcomes = {name: one.outcome for name, one in told.items() if one.outcome is not None}
+            results[name] = array_probes.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
+        outcomes = {name: one.outcome for name, one in results.items() if one.outcome is not None}
         found[label] = by_object(outcomes["commonest"].groups, {name: one.correct for name, one in outcomes.items()})
     return found
 

@@ -1,4 +1,4 @@
-"""Manifests cut from a simulated data set: what one training or one task sees of it, written beside it."""
+"""Subsets of a simulated data set, one for each training or task, written next to its manifest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPLITS = ("train", "val", "test")
 
 
 def cut(table: Manifest, rows: np.ndarray, path: Path, change: Callable[[pa.Table], pa.Table] | None = None) -> Path:
-    """Write `rows` of a manifest, changed, as another beside it."""
+    """Write `rows` of a manifest, changed, as another manifest next to it."""
     part = table.table.take(pa.array(np.sort(rows)))
     columns = (change(part) if change else part).to_pydict()
     manifests.write(manifests.from_columns(columns, path), path)
@@ -47,7 +47,7 @@ def cut_all(folder: Path) -> None:
 
 
 def content_hash(path: Path) -> str:
-    """The content hash of a manifest; a file that was written anew is read again."""
+    """Return the content hash of a manifest. A file that has changed is read again."""
     return _content_hash(path, path.stat().st_mtime_ns)
 
 
@@ -57,7 +57,7 @@ def _content_hash(path: Path, changed: int) -> str:
 
 
 def lock(part: pa.Table) -> pa.Table:
-    """A data set that no other sensor has a share in: its touches are nobody else's."""
+    """Return the rows without `touch`: no touch is shared with another sensor."""
     return part.set_column(part.column_names.index("touch"), "touch", pa.nulls(part.num_rows, pa.string()))
 
 

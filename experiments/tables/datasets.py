@@ -67,7 +67,7 @@ for thing, grain in (("mug", 0.25), ("sponge", 0.7)):
 # %% [markdown]
 # ## 1. Index
 #
-# The same as `anytouch index ycb_slide YCB-Slide --val 0 --test 0`. It prints the counts beside the paper's.
+# The same as `anytouch data index ycb_slide YCB-Slide --val 0 --test 0`. It prints the counts and the paper's.
 
 # %%
 report = index("ycb_slide", ROOT, options=IndexOptions(val=0, test=0))
@@ -78,7 +78,7 @@ manifest.table.select(["path", "sensor", "sequence", "frame_index", "split", "ob
 # %% [markdown]
 # ## 2. Contact
 #
-# `anytouch contact ycb_slide.parquet --drop --picture contact.png`. Look at the picture: the doubtful frames stand at
+# `anytouch data contact ycb_slide.parquet --drop --picture contact.png`. Look at the picture: doubtful frames are at
 # the border between red and green.
 
 # %%
@@ -91,7 +91,7 @@ manifests.write(touched, ROOT / "touched.parquet")
 # %% [markdown]
 # ## 3. Verify
 #
-# `anytouch verify touched.parquet`: every file is decoded, every rule checked. `--repair OUT` writes a clean copy.
+# `anytouch data verify touched.parquet`: every file is decoded, every rule checked. `--repair OUT` writes a clean copy.
 
 # %%
 checked = verify(manifests.read(ROOT / "touched.parquet"))
@@ -101,7 +101,7 @@ assert checked.ok
 # %% [markdown]
 # ## 4. Pack (for a cluster)
 #
-# `anytouch pack touched.parquet --out packed`: the same bytes in a few shards; the loader reads them alike.
+# `anytouch data pack touched.parquet --out packed`: the same bytes in a few shards; the loader reads them alike.
 
 # %%
 packed = manifests.read(pack(manifests.read(ROOT / "touched.parquet"), FOLDER / "packed"))

@@ -91,12 +91,12 @@ def execute(
 ) -> Outcome:
     """Do the runs in order, a record each; stop before one that would not fit in `minutes`.
 
-    How long things take is estimated by `budget`, corrected by what they took in this call. A run that fails is told
+    How long things take is estimated by `budget`, corrected by what they took in this call. A run that fails is logged
     and left out; the others go on. Raises UserError when not even the first run fits.
     """
     start, planned, waited = clock(), 0.0, 0.0
     result = Outcome([], [], [], {})
-    waiting, told = list(leaves), set[str]()
+    waiting, announced = list(leaves), set[str]()
     while waiting:
         later: list[Leaf] = []  # another process works on these, or on what they need
         for leaf in waiting:
@@ -106,7 +106,7 @@ def execute(
             expected, spent = budget.cost(leaf, work.ready(leaf)), clock() - start
             seconds = expected * (max(1.0, (spent - waited) / planned) if planned else 1.0)
             if minutes is not None and spent + seconds > 60 * minutes:
-                if not (result.made or result.failed or told):
+                if not (result.made or result.failed or announced):
                     raise UserError(
                         f"{leaf.key} takes about {expected / 60:.0f} minutes with what it needs, and MINUTES is "
                         f"{minutes:g}; give more"
@@ -116,9 +116,9 @@ def execute(
                 return result._replace(left=rest)
 
             def begin(leaf: Leaf = leaf, seconds: float = seconds) -> None:
-                if leaf.key not in told:
+                if leaf.key not in announced:
                     log(f"{leaf.key}: about {seconds / 60:.1f} min")
-                    told.add(leaf.key)
+                    announced.add(leaf.key)
 
             with work.claim(leaf.key) as mine:
                 try:

@@ -28,7 +28,7 @@ SIZE = plan.FULL
 
 
 def runs(question: str) -> list[Run]:
-    """The runs of a question; tells what to do where there are none."""
+    """Return the runs of a question. Without any, print how to make them."""
     results = Path(os.environ.get("RESULTS") or DEFAULT)
     found = [run for run in read(results) if run.question == question]
     if not found:
@@ -50,7 +50,7 @@ def show(path: Path) -> None:
 
 
 def picture(several: list[Run]) -> Path | None:
-    """Draw and show the picture of a question's runs; None where there is nothing to draw."""
+    """Draw and show the picture of a question's runs. Return None without a run."""
     folder = Path(os.environ.get("FIGURES") or tempfile.mkdtemp(prefix="anytouch-"))
     for path in pictures.draw_all(several, folder):
         show(path)
@@ -59,7 +59,7 @@ def picture(several: list[Run]) -> Path | None:
 
 
 def finding(question: str, several: list[Run]) -> str:
-    """The tables of a question and what is said of its signs, shown and given back."""
+    """Show and return the tables of a question and its signs."""
     part = report.parts(several)[question]
     text(part.text)
     return part.text
@@ -77,7 +77,7 @@ class Given(Work):
 
 
 def yours(question: str, several: list[Run]) -> list[dict[str, object]]:
-    """Score the run `RUN` on the question as the matrix does, show it beside our rows, and give back its rows.
+    """Score the run `RUN` on the question as the matrix does, show it next to our rows, and return its rows.
 
     Without RUN it says how. Simulated data sets that are not in DATA (default: runs/matrix) are made there. Raises
     UserError for a run, or a manifest of real touch, that is not there.

@@ -125,7 +125,7 @@ def q3(runs: Sequence[Run], path: Path) -> Path:
 
 
 def ablations(runs: Sequence[Run], path: Path) -> Path:
-    """What leaving out a part changes, in points: the material beside the paper's change, and the form."""
+    """What leaving out a part changes, in points: the material and the paper's change, and the form."""
     names = [name for name in paper.TABLE6 if name != "anytouch"]
     figure, axes = _lines(names, questions.FOUR)
     for number, (axis, column) in enumerate(zip(axes, questions.FOUR, strict=True)):

@@ -1,10 +1,10 @@
-"""What is run: for each question of the paper its runs, as a graph of data -> stage 1 -> stage 2 -> scores.
+"""The plan of the matrix: for each question of the paper its runs, as a graph of data, stage 1, stage 2 and scores.
 
 A `Training` is its configuration, its data and the training that it starts from; two that are equal are one, so what
-can be shared is shared without being said. Nothing here computes.
+can be shared is shared. Nothing here computes.
 
-Data, after the paper's: `own` is the data set of each sensor by itself (touches nobody else felt), `fine` and `coarse`
-its TacQuad (four sensors at one place, by one motion or by hand), `other` a data set never trained on, of other
+Data: `own` is the data set of each sensor by itself (touches of no other sensor). `fine` and `coarse`
+are its TacQuad (four sensors at one place, by one motion or by hand), `other` a data set never trained on, of other
 individuals (more than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out
 are held out in `own`, `fine` and `coarse` alike (`work.check_objects` refuses sizes at which they are not). `own` also
 has DuraGel, which only the runs `seen` train on: it is the unseen sensor, as Taxim and TACTO are in the paper.
@@ -28,7 +28,7 @@ RESTRICTED = ("gelsight", "digit")  # of the control of Table 2
 REAL = "real"
 STACK, DECODER = Stack(128, 2, 4, 512), Stack(128, 2, 4, 512)
 LABELS = ("name", "seeds")  # fields of a size that no single run hangs on
-# Versions of how a question is scored, 1 where it is not named. 2: frames that touch are told by force, not by picture.
+# Versions of how a question is scored, 1 where it is not named. 2: contact frames are those with force.
 SCORING = dict.fromkeys(("q1", "q3", "ablations", "restricted", "dynamics", "new_sensor"), 2)
 
 
@@ -43,11 +43,11 @@ class Size:
     Towers from scratch learn nothing in minutes from matching one pair against one other, as the paper does on CLIP's
     weights. So `match_head` is "cosine", each touch against all others of the batch, on a share `match_keep` of the
     patches and weighed by `match_weight`, all of a step's touches to be found by one sensor (`negatives`), so that the
-    sensor tells nothing; only frames in contact are drawn, those with a share `contact` of the
+    sensor is no clue; only frames in contact are drawn, those with a share `contact` of the
     strongest of their recording (`anytouch contact`), as the paper's are contact frames (those of `real` are not
     marked, and all drawn); a row of question q2 has the paper's head. The softmax starts mild (`temperature`): a sharp
-    one only punishes untrained towers. Touches are shown less the untouched gel (but for `real`, where one in ten has
-    no picture of it), and their colours are left as they are, since colours tell slopes. `seeds` are those of questions
+    one only punishes untrained towers. Touches are background-subtracted (except for `real`, where one in ten has
+    no background), and their colours are not jittered, since colours show slopes. `seeds` are those of questions
     whose sign is claimed; the others take the first.
     """
 

@@ -204,7 +204,7 @@ def restricted(runs: Sequence[Run]) -> Part:
 
 
 def grasp(runs: Sequence[Run]) -> Part:
-    """Frames after the grasp beside frames during it."""
+    """Compare frames after the grasp with frames during it."""
     table = Table("grasp", ("anytouch",), GRASP, {"anytouch": paper.FEEL_AFTER}, ("Feel, during", "Feel, after"))
     pair = Pair("frames after the grasp are easier than frames during it", "after", "during", (1,))
     views = by_view(runs, "grasp", "anytouch", ("during", "after"))

@@ -1,4 +1,4 @@
-"""Real touch: object, and slip with objects left out, beside raw pixels and an untrained encoder.
+"""Real touch: object, and slip with objects left out, compared with raw pixels and an untrained encoder.
 
 Differences are paired by test frame, with an interval over recordings (over objects, where these are left out).
 """

@@ -53,7 +53,7 @@ for task in dict.fromkeys(row["task"] for run in runs for row in run.about["rows
 # ## A checkpoint of yours
 #
 # `RUN=` names a run, `DATA=` the manifest of real touch: it is
-# scored as above, in minutes on a CPU, and stands beside our rows.
+# scored as above, in minutes on a CPU, and compared with our rows.
 
 # %%
 mine = page.yours("real", runs)

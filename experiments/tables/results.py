@@ -55,7 +55,7 @@ class Column(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A difference over seeds: mean and 95 % interval (of Student's t), and what is to be said of its sign."""
+    """A difference over seeds: mean, 95 % interval (Student's t), and a word for its sign."""
 
     word: str
     mean: float | None = None
@@ -79,7 +79,7 @@ def read(path: Path) -> list[Run]:
 
 
 def noted(path: Path) -> dict[str, Any]:
-    """What a file of notes holds; nothing where there is none, or a broken one."""
+    """Return the content of a file of notes, {} for a missing or broken one."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -97,7 +97,7 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
 
     Simulator, scoring, settings, and, within a seed, the content of every data set by its name: signs are taken seed by
     seed. The data of another seed may be of another processor, where the same scenes gave another content hash. Records
-    that do not note their settings are told apart by the name of their size.
+    without settings are distinguished by the name of their size.
     """
     found: dict[str, set[str]] = {}
     names = {name for about in records for name in about.get("settings") or {} if name not in LABELS}
@@ -134,7 +134,7 @@ def comparable(runs: Sequence[Run]) -> list[Run]:
 
 
 def values(runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest") -> Seeds:
-    """{seed: value as it is printed} of a cell."""
+    """Return {seed: printed value} of a cell."""
     return {
         run.seed: column.factor * float(row["mean"])
         for run in runs

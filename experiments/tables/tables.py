@@ -54,7 +54,7 @@ class Pair(NamedTuple):
 
 
 class Statement(NamedTuple):
-    """What is said of a pair: of the row as a whole (the mean of `over`), and of its columns {title: change}."""
+    """The outcome of a pair: of the row as a whole (the mean of `over`), and of its columns {title: change}."""
 
     label: str
     row: Change
@@ -113,7 +113,7 @@ def title(name: str) -> str:
 
 
 def block(runs: Sequence[Run], table: Table, statements: Sequence[Statement]) -> str:
-    """The table, the published protocol beside it, and the statements, as Markdown."""
+    """Return the table, that of the published protocol, and the statements, as Markdown."""
     parts = [_ours(runs, table)]
     parts += [said] if (said := published(runs, table)) else []
     if statements:
@@ -174,7 +174,7 @@ def cell(runs: Sequence[Run], question: str, name: str, column: Column) -> str:
 
 
 def sentence(one: Statement) -> str:
-    """A statement as a line of a list. A sign is told of the row alone: of many columns some differ by chance."""
+    """Return a statement as a line of a list. Only the row has a sign: of many columns some differ by chance."""
     if one.row.word == "not run":
         return f"- {one.label}: **not run**."
     columns = "; ".join(f"{name} {_signed(part)}" for name, part in one.columns.items())
@@ -200,13 +200,13 @@ def _signed(one: Change) -> str:
 
 def by_chance(statements: Sequence[Statement]) -> str:
     """How many intervals by column there are, and how many of them would leave zero out if nothing differed."""
-    told = ("agrees", "disagrees", "undecided")
-    columns = sum(part.word in told for one in statements for part in one.columns.values())
-    rows = sum(one.row.word in told for one in statements)
+    decided = ("agrees", "disagrees", "undecided")
+    columns = sum(part.word in decided for one in statements for part in one.columns.values())
+    rows = sum(one.row.word in decided for one in statements)
     few = f"about {columns / 20:.0f}" if columns >= 20 else "less than one"
     return (
         f"Of {columns} columns a sign is expected (the paper's, or that of a control of ours) and there is an\n"
-        f"interval; {few} of so many leave zero out by chance alone. So a sign is told of a whole row, {rows} times,\n"
+        f"interval; {few} of so many leave zero out by chance alone. So a sign is given for a row, {rows} times,\n"
         "and nothing is corrected for that number."
     )
 

@@ -79,7 +79,7 @@ def anytouch(*words: Any) -> None:
 # ## Data and runs
 #
 # One data set a grade, and one by the sensor that is left out, with six touches of each of the same objects (at two
-# touches an object a probe cannot tell encoders apart). Places differ from grade to grade; objects, and which of
+# touches an object a probe cannot distinguish encoders). Places differ from grade to grade; objects, and which of
 # them are held out, do not. `MORE=` touches a grade, of the same objects at other places, are trained on alone, so that
 # what is scored stays the same whatever their number. Both stages for every seed, on all grades together as on
 # TacQuad's two parts, at preset tiny with smaller towers and pictures: less work a step, and more is learned in a
@@ -100,9 +100,9 @@ def anytouch(*words: Any) -> None:
 # %%
 SMALL = ["--preset", "tiny", "--model.image-size", 84]
 SMALL += ["--model.patch-encoder", "convolutional"] if CONVOLUTIONS else []
-LESS = ["--data.background", "subtract"]  # the contact alone: units differ more than touches do
-LESS += ["--data.contact-only", "--data.jitter", 0, 0, 0, 0]  # colours tell slopes
-LESS += ["--data.cache", 5000]  # all frames, once read
+SUBTRACT = ["--data.background", "subtract"]  # the contact alone: units differ more than touches do
+SUBTRACT += ["--data.contact-only", "--data.jitter", 0, 0, 0, 0]  # colours show slopes
+SUBTRACT += ["--data.cache", 5000]  # all frames, once read
 
 
 def tower(name: str) -> list[Any]:
@@ -140,7 +140,7 @@ def prepare(seed: int) -> tuple[Path, Path]:
     name = "-".join([*GRADES, *(["convolutional"] if CONVOLUTIONS else []), str(seed)])
     one, two = (WORK / f"{name}-stage{stage}" for stage in (1, 2))
     manifests_of = [manifest for grade in GRADES for manifest in scenes(grade)]
-    data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *KNOWN, *LESS]
+    data = ["--data", *manifests_of, "--seed", seed, "--model.sensors", *KNOWN, *SUBTRACT]
     anytouch("train", "--stage", 1, "--run", one, *TRAIN1, *data)
     finished(one, STEPS1)
     anytouch("train", "--stage", 2, "--run", two, "--init", one, *TRAIN2, *data)
@@ -253,15 +253,15 @@ def retrieval_table(found: list[dict[str, Any]]) -> str:
 
 # %%
 files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
-told = files[GRADES[0]][0]
-if any(one["settings"] != told["settings"] for found in files.values() for one in found):
+first = files[GRADES[0]][0]
+if any(one["settings"] != first["settings"] for found in files.values() for one in found):
     raise UserError(f"{RESULTS} has records made by different settings. Run this page without TABLE=1.")
-size = " ".join(f"{name.upper()}={told['settings'][name]}" for name in ("touches", "more", "objects"))
-size += " STEPS1={} STEPS2={}".format(*told["settings"]["steps"])
+size = " ".join(f"{name.upper()}={first['settings'][name]}" for name in ("touches", "more", "objects"))
+size += " STEPS1={} STEPS2={}".format(*first["settings"]["steps"])
 size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
-tower = told["config"]["model"]["touch"]
+tower = first["config"]["model"]["touch"]
 network = f"preset tiny with a touch tower of {tower['width']} x {tower['depth']}"
-network += f" at {told['config']['model']['image_size']} pixels"
+network += f" at {first['config']['model']['image_size']} pixels"
 network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
 lines = [
     "# Simulated scenes as teachers",

@@ -1,4 +1,4 @@
-"""A translation between two sensors: what it is, how it is applied, saved and loaded; training is in `generation`.
+"""Translations between two sensors: their design, how they are applied, saved and loaded.
 
 The source's image goes through a ViT encoder with its sensor's tokens. A ViT decoder paints the target's image from all
 tokens, as the generator of a ViTGAN (Lee et al., 2021); a field is regressed by an MLP from the patch tokens (App.
@@ -45,7 +45,7 @@ _GREY = (0, 128, 255)  # least, middle and most of a touch less its gel (`data.t
 
 @dataclass(frozen=True)
 class Fit:
-    """How a translation is trained. `adversarial`: weight of the critic's verdict beside the mean squared error, as a
+    """How a translation is trained. `adversarial`: weight of the critic's verdict added to the mean squared error, as a
     share of the error of copying the mean target, so that it means the same in every unit; 0 for no critic. `penalty`:
     on the critic's slope at real touches (R1, on features), which keeps the two in step. `tune` fine also trains the
     encoders, at a tenth of the rate.
@@ -70,7 +70,7 @@ class Fit:
 class Design:
     """What a generator is: sensors, shapes, where its encoder came from (None: it reads pixels), how it was trained.
 
-    `subtracts`: source images are wanted less the untouched gel.
+    `subtracts`: source images are background-subtracted.
     """
 
     source: str
@@ -90,7 +90,7 @@ class Design:
 
     @property
     def critic(self) -> Part:
-        """What tells a real touch from a painted one, by an encoder's features."""
+        """Return the network that distinguishes real touches from generated ones by an encoder's features."""
         return Part(Critic, self.shape)
 
     @property

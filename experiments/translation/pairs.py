@@ -123,7 +123,7 @@ def read_pairs(manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = 
 
 
 def read_pixels(manifest: Manifest, rows: np.ndarray, size: int, *, subtract: bool = False) -> np.ndarray:
-    """Images u8 (n, size, size, 3) of manifest rows, or what they are beside their backgrounds. Raises UserError."""
+    """Return images u8 (n, size, size, 3) of manifest rows, background-subtracted or not. Raises UserError."""
     out = np.empty((len(rows), size, size, 3), np.uint8)
     model = replace(preset("tiny").model, image_size=size)
     reader = SampleReader(manifest, Config(model, data=DataConfig(background="subtract" if subtract else "keep")))

@@ -22,7 +22,7 @@
 # from stage 1 to stage 2 (`anytouch convert --between`); one of each a seed, on the scenes of `make experiments`
 # (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs.
 # `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
-# for one a seed. `STEPS1=3000` gives stage 1, T3-style's too, so many steps, and its table a page of its own
+# for one a seed. `STEPS1=3000` gives stage 1, T3-style's too, so many steps, and its table a separate page
 # (`translation_3000.md`). Each is compared with two plain references trained on the same pairs: copying the mean
 # training target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
 #
@@ -95,7 +95,7 @@ PAIRS = WORK / f"pairs-{TOUCHES}-{version(scenes.sensors)}"
 #
 # The paper takes the coarse data of the same objects out of pre-training. `encoders.py` does so by name: it
 # keeps the rows whose object is in no split of the pairs. For encoders of your own `REMAINING="coarse.parquet ..."
-# make translation` writes `coarse_own_encoders.parquet` beside each and stops; train them on that.
+# make translation` writes `coarse_remaining.parquet` next to each and stops. Train them on that.
 
 
 # %%
@@ -118,12 +118,12 @@ def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
 
 # %%
 def seen_by(encoder: Encoder) -> tuple[int, bool]:
-    """The size of picture that an encoder is shown, and whether less the untouched gel."""
+    """Return the picture size of an encoder, and whether it subtracts the background."""
     return encoder.config.model.image_size, encoder.subtracts
 
 
 def mark(encoder: Encoder | None) -> str:
-    """Where an encoder is from, and a mark of its weights: a run that was trained anew is another encoder."""
+    """Return the source of an encoder and the fingerprint of its weights."""
     if encoder is None:
         return PIXELS
     return f"{Path(encoder.source).name} (weights {encoder.fingerprint})"
@@ -187,9 +187,9 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
 
 
 # %% [markdown]
-# ## What an encoder knows beside pictures
+# ## What an encoder knows besides pictures
 #
-# What a stage keeps of the picture it may lose for what touches have in common, so beside the errors stands how often
+# What a stage learns of pictures it may lose of what touches have in common. So the page also has how often
 # the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`).
 
 
@@ -244,8 +244,8 @@ if not TABLE:
 # ## The table, from the records of the runs
 
 # %%
-said = translated.page(RESULTS)
-atomic_write(OUT / f"{NAME}.md", said)
-print(said)
+text = translated.page(RESULTS)
+atomic_write(OUT / f"{NAME}.md", text)
+print(text)
 for picture in translated.pictures(RESULTS):
     page.show(picture)

@@ -163,17 +163,17 @@ def _pairs(design: Design, params: Params, images: np.ndarray, targets: np.ndarr
 
 
 def _finite(step: int, metrics: dict[str, Any], error: float | None) -> dict[str, float]:
-    """The losses of a step as they are told. Raises UserError for an error that is not finite."""
-    told = {"step": step + 1} | {name: float(value) for name, value in metrics.items()}
-    told |= {} if error is None else {"val": error}
+    """Return the losses of a step as floats. Raises UserError for an error that is not finite."""
+    losses = {"step": step + 1} | {name: float(value) for name, value in metrics.items()}
+    losses |= {} if error is None else {"val": error}
     for name, where in (("error", ""), ("val", " on val")):
-        if not np.isfinite(told.get(name, 0.0)):
+        if not np.isfinite(losses.get(name, 0.0)):
             raise UserError(f"the error{where} is not finite at step {step + 1}; lower the learning rate")
-    return told
+    return losses
 
 
 def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: np.ndarray) -> Params:
-    """First parameters: `encoder` as it is, a fresh `head`, and what stays `fixed`, measured on the training pairs."""
+    """Return the first parameters: `encoder`, a new `head`, and constants `fixed` of the training pairs."""
     key = jax.random.fold_in(jax.random.key(design.fit.seed), 0)
     params: Params = {"head": design.head.init(key)}
     if encoder is not None:
@@ -255,7 +255,7 @@ def rates(design: Design, fixed: Params, step: int) -> Rates:
 
 
 def begin(design: Design, params: Params) -> tuple[State, Params]:
-    """The state before the first step, and the parameters that stay as they are."""
+    """Return the state before the first step, and the frozen parameters."""
     made, still = {"head": params["head"]}, {"fixed": params["fixed"]}
     critic: Params = {}
     if design.has_critic:
@@ -293,8 +293,8 @@ def _step(design: Design) -> Any:
         logit = lambda x: design.critic.apply(critic["head"], x)  # noqa: E731
         slope = jax.grad(lambda x: jnp.sum(logit(x)))(real)
         penalty = jnp.mean(jnp.sum(slope**2, axis=-1))
-        told = jnp.mean(jax.nn.softplus(-logit(real))) + jnp.mean(jax.nn.softplus(logit(fake)))
-        return told + 0.5 * weight * penalty
+        losses = jnp.mean(jax.nn.softplus(-logit(real))) + jnp.mean(jax.nn.softplus(logit(fake)))
+        return losses + 0.5 * weight * penalty
 
     def step(state: State, still: Params, batch: Batch, rates: Rates) -> tuple[State, dict[str, Array]]:
         rate, weight, penalty = rates

@@ -1,6 +1,6 @@
 """Golden folders: cases of arrays recorded from the authors' PyTorch code, and the comparison with ours.
 
-A case is `<name>.json` beside `<name>.npz`: arrays in/..., out/..., grad/..., final/... and what they mean.
+A case is `<name>.json` and `<name>.npz`: arrays in/..., out/..., grad/..., final/... and what they mean.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Row:
 
 @dataclass
 class Case:
-    """One golden case and the rows found so far; an array that nobody compared is a failure."""
+    """One golden case and the rows found so far; an array without a comparison is a failure."""
 
     name: str
     folder: Path

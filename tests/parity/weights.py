@@ -139,13 +139,13 @@ def parameters(case: Case) -> None:
 
 
 def checkpoint(case: Case) -> None:
-    """A `.pth` in the authors' format gives exactly the parameters stored beside it."""
+    """A `.pth` in the authors' format gives exactly the stored parameters."""
     stage = 2 if case.name.startswith("stage2") else 1
     weights = load.read_weights(case.folder / case.name)
     stored = read_arrays(case.folder / f"stage{stage}_params.npz")
     extra = {key for key in stored if key not in weights and key.endswith("sensor_token_proj.weight")}
-    beside = {key: value for key, value in stored.items() if key not in extra}
-    ours, theirs = (flatten(convert.to_params(w, convert.detect_model(w))) for w in (weights, beside))
+    expected = {key: value for key, value in stored.items() if key not in extra}
+    ours, theirs = (flatten(convert.to_params(w, convert.detect_model(w))) for w in (weights, expected))
     _equal(case, "parameters", ours, theirs)
 
 

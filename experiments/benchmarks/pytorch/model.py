@@ -1,6 +1,6 @@
-"""The rival: AnyTouch in PyTorch, of `transformers`' modules, as a PyTorch user would, by the authors' key names.
+"""AnyTouch in PyTorch, from the modules of `transformers`, by the authors' key names.
 
-Runs in an environment of its own (torch, transformers, safetensors, numpy); the package never imports it. Attention
+Runs in a separate environment (torch, transformers, safetensors, numpy); the package never imports it. Attention
 is PyTorch's fused one, the optimiser its fused AdamW; images and texts are packed as in ours, so that what is compared
 is the framework and not a detour.
 """

@@ -3,7 +3,7 @@
     make bench-torch PRESET=small BATCH=16
 
 First each rival must give the loss of ours to 1e-5 (float32). Then all take turns, round by round: ours in this
-process, PyTorch in a process of its own that works only when asked. The first step of a turn is not counted.
+process, PyTorch in a separate process that works only when asked. The first step of a turn is not counted.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def rival_errors(loss: float, file: Path, exact: dict[str, Any]) -> dict[str, fl
     return errors
 
 
-# Filled by the authors' layout and read by nobody (golden Q2), and the fixed table.
+# Filled by the authors' layout and read by nothing (golden Q2), and the fixed table.
 UNUSED = {
     prefix + key
     for prefix in ("", "touch_mae_model.")

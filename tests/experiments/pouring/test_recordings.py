@@ -23,6 +23,8 @@ from experiments.pouring import trials as pouring
 from experiments.pouring.physics import POUR, RETRACT, WAIT, Task
 from experiments.pouring.policy import Learning
 
+pytestmark = pytest.mark.slow  # the fixture renders demonstrations
+
 SIDE, COUNT = 28, 4
 TASK = replace(Task(), limit=9)
 FAST = Learning(steps=20, width=8, tune_steps=2, tune_runs=2)

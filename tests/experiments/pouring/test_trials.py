@@ -81,6 +81,7 @@ def test_a_late_hand_changes_what_is_done_and_not_what_is_told(told, late):
     assert late.poured.std() > 5 and late.poured.min() > 59
 
 
+@pytest.mark.slow
 def test_a_blind_policy_pours_but_cannot_know():
     blind = bounds.learn_blind(TASK, 0, 20, FAST)
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
@@ -89,6 +90,7 @@ def test_a_blind_policy_pours_but_cannot_know():
     assert found.poured.std() > 4  # the runs differ, it does not
 
 
+@pytest.mark.slow
 def test_counting_is_the_best_it_can_be_and_no_more(told):
     counter = pouring.best_counter(TASK, *pouring.draw_runs(TASK, 0, 20))
     setups, keys = pouring.draw_runs(TASK, 0, 20)
@@ -138,6 +140,7 @@ def test_imitation_learns_a_toy_signal_and_beats_blind(late):
     assert np.mean(np.abs(seen.poured - 60) < np.abs(blind.poured - 60)) > 0.6
 
 
+@pytest.mark.slow
 def test_the_loss_is_that_of_demonstrations_held_out_at_their_best():
     rng = np.random.default_rng(0)
     runs = np.repeat(np.arange(10), 12)
@@ -177,7 +180,7 @@ def test_dropout_keeps_features_from_being_learned_by_heart_and_told_policies_ha
     assert losses[1] < losses[0]
     met = []
     monkeypatch.setattr(bounds, "imitate", lambda *a: met.append(a[-1]) or (None, 0.0))
-    bounds.imitate_told(late, bounds.blind_inputs(late.actions)[START:], FAST)
+    bounds.imitate_plainly(late, bounds.blind_inputs(late.actions)[START:], FAST)
     assert met[0].dropout == 0 < FAST.dropout
 
 

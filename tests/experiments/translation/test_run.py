@@ -14,6 +14,8 @@ from pair_world import make_pairs
 from experiments.translation import run as translate
 from experiments.translation.generator import load
 
+pytestmark = pytest.mark.slow  # the fixture trains two translations
+
 FIT = ("--steps", 2, "--batch", 4)
 
 

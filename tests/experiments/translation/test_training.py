@@ -119,6 +119,7 @@ def test_the_state_that_does_best_on_other_objects_is_kept():
     assert "val" not in training.fit(None, X, FIELDS, **SENSORS, val=empty, options=options, shape=FIELD)[1][-1]
 
 
+@pytest.mark.slow
 def test_weight_0_is_plain_regression():
     """No critic exists, and the update is that of the squared error alone."""
     one = design(adversarial=0.0)
@@ -174,6 +175,7 @@ def test_each_network_moves_against_the_other():
     assert gap(after.critic) > gap(state.critic)
 
 
+@pytest.mark.slow
 def test_an_encoder_that_knows_touches_less_the_gel_judges_them_so():
     """Its critic reads painted and real images as `subtract_background` would show them."""
     config = ENCODER.config
@@ -200,6 +202,7 @@ def test_equal_seeds_give_equal_generators_and_others_do_not(made):
     assert not np.array_equal(other(X[:1]), made(X[:1]))
 
 
+@pytest.mark.slow
 def test_a_field_that_is_linear_in_the_features_is_found_again():
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (1600, 28, 28, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Several processes: who they are, that they train as one, stop as one, and end when one of them is lost."""
+"""Runs of several processes: joining, training as one, stopping as one, and the end when one is lost."""
 
 from __future__ import annotations
 
@@ -13,118 +13,106 @@ from train_toy import toy_loss, toy_params
 
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.train import distributed
-from anytouch_jax.train.distributed import Place, find_place, joined
+from anytouch_jax.train.distributed import joined, process_count
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
 
 SLURM = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "3", "SLURM_LOCALID": "1"}
+ALLOCATION = {"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}  # without srun
 OMPI = {"OMPI_COMM_WORLD_SIZE": "4", "OMPI_COMM_WORLD_RANK": "3", "OMPI_COMM_WORLD_LOCAL_RANK": "1"}
-HERE = {"JAX_COORDINATOR_ADDRESS": "node1:29400"}
-HAND = HERE | {"JAX_NUM_PROCESSES": "4", "JAX_PROCESS_ID": "3"}
-URI = {"OMPI_MCA_orte_hnp_uri": "1531576320.0;tcp://10.96.0.1:34911"}
+ADDRESS = {"JAX_COORDINATOR_ADDRESS": "node1:29400"}
+BY_HAND = ADDRESS | {"JAX_NUM_PROCESSES": "4", "JAX_PROCESS_ID": "3"}
+
+
+@pytest.fixture
+def initialized(monkeypatch):
+    """The arguments of each call of `jax.distributed.initialize`, which does nothing; exits raise SystemExit."""
+    calls = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **kwargs: calls.append(kwargs))
+    monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
+    monkeypatch.setattr(distributed.os, "_exit", lambda status: (_ for _ in ()).throw(SystemExit(status)))
+    return calls
 
 
 @pytest.mark.parametrize(
-    ("environ", "place"),
+    ("environ", "count"),
     [
-        ({}, None),
-        ({"JAX_NUM_PROCESSES": "1"}, None),
-        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, None),  # any pod, also one alone
-        ({"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}, None),  # no srun
-        (SLURM | {"SLURM_STEP_NUM_TASKS": "1", "SLURM_PROCID": "0"}, None),
-        (HERE | {"JAX_NUM_PROCESSES": "1", "JAX_PROCESS_ID": "0"}, None),
-        (HAND, Place(4, 3, None, "node1:29400")),
-        (HAND | SLURM, Place(4, 3, None, "node1:29400")),
-        (SLURM, Place(4, 3, 1, None, "slurm")),
-        (SLURM | HERE, Place(4, 3, 1, "node1:29400", "slurm")),
-        (OMPI | URI, Place(4, 3, 1, None, "ompi")),
-        (OMPI | HERE, Place(4, 3, 1, "node1:29400", "ompi")),
+        ({}, 1),
+        ({"JAX_NUM_PROCESSES": "1"}, 1),
+        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, 1),
+        (ALLOCATION, 1),
+        (SLURM | {"SLURM_STEP_NUM_TASKS": "1"}, 1),
+        (BY_HAND, 4),
+        (BY_HAND | {"JAX_NUM_PROCESSES": "2"} | SLURM, 2),
+        (SLURM, 4),
+        (OMPI, 4),
     ],
 )
-def test_the_environment_tells_who_this_process_is(environ, place):
-    assert find_place(environ) == place
+def test_processes_of_the_environment(environ, count, initialized):
+    assert process_count(environ) == count
+    with joined(environ) as process:
+        assert (process is None) == (count == 1)
+    assert [call["num_processes"] for call in initialized] == [count] * (count > 1)
 
 
-@pytest.mark.parametrize(
-    ("environ", "sentence"),
-    [
-        (HERE, "JAX_NUM_PROCESSES must be a number, not ''"),
-        (HERE | {"JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": "one"}, "JAX_PROCESS_ID must be a number, not 'one'"),
-        (HAND | {"JAX_PROCESS_ID": "4"}, "JAX_PROCESS_ID must be below JAX_NUM_PROCESSES=4, not 4"),
-        ({"JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": "1"}, "JAX_NUM_PROCESSES needs JAX_COORDINATOR_ADDRESS"),
-        (OMPI, "add -x JAX_COORDINATOR_ADDRESS=host:port"),
-    ],
-)
-def test_half_an_environment_is_one_sentence(environ, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        find_place(environ)
+def test_numbers_set_by_hand_go_before_detection(initialized):
+    for environ in (BY_HAND, BY_HAND | SLURM, SLURM | ADDRESS):
+        with joined(environ):
+            pass
+    by_hand, before_slurm, slurm = initialized
+    assert by_hand == before_slurm
+    assert by_hand["process_id"] == 3 and by_hand["cluster_detection_method"] == "deactivate"
+    assert slurm["coordinator_address"] == "node1:29400" and "process_id" not in slurm
 
 
-def test_a_process_alone_is_left_alone(monkeypatch):
-    monkeypatch.setattr(jax.distributed, "initialize", None)
-    with joined({}) as place:
-        assert place is None
+@pytest.mark.parametrize(("name", "value"), [("JAX_NUM_PROCESSES", "two"), ("JAX_PROCESS_ID", "one")])
+def test_a_number_that_is_none_is_named(name, value, initialized, capfd):
+    with pytest.raises((ConfigError, SystemExit)) as raised, joined(BY_HAND | {name: value}):
+        raise AssertionError("it must not run")
+    message = capfd.readouterr().err or str(raised.value)
+    assert name in message and message.count("\n") < 2 and not initialized
+
+
+def test_one_process_raises_its_errors():
     with pytest.raises(UserError, match="a mistake"), joined({}):
         raise UserError("a mistake")
 
 
 @pytest.mark.parametrize(
-    ("error", "said", "status"),
+    ("error", "status"),
     [
-        (UserError("batch_size 3"), "process 1 of 2: batch_size 3", 1),
-        (KeyboardInterrupt(), "process 1 of 2 was interrupted", 130),
-        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), "another one was lost", 1),
-        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory"), "RESOURCE_EXHAUSTED", 1),
-        (ValueError("odd"), "ValueError: odd", 1),
+        (UserError("batch_size 3"), 2),
+        (KeyboardInterrupt(), 130),
+        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1),
+        (ValueError("odd"), 1),
     ],
 )
-def test_what_is_said_in_the_end(error, said, status):
-    sentence, code = distributed._farewell(error, Place(2, 1))
-    assert said in sentence and code == status
-    assert ("another one was lost" in sentence) == ("Gloo" in str(error))
+def test_a_process_that_fails_exits_at_once(error, status, initialized, capfd):
+    with pytest.raises(SystemExit) as exit_, joined(BY_HAND):
+        raise error
+    message = capfd.readouterr().err
+    assert exit_.value.code == status and "process 0 of 1" in message
+    assert " ".join(str(error).split()) in message
+    assert ("Traceback" in message) == (type(error) is ValueError)
 
 
-def test_a_lost_process_is_the_cause_whatever_it_led_to():
-    try:
-        try:
-            raise jax.errors.JaxRuntimeError("UNAVAILABLE: Gloo: connection reset by peer")
-        except jax.errors.JaxRuntimeError as error:
-            raise UserError("could not write checkpoint 3") from error
-    except UserError as error:
-        assert "process 1 of 2 ends because another one was lost" in distributed._farewell(error, Place(2, 1))[0]
+@pytest.mark.parametrize("error", [RuntimeError("DEADLINE_EXCEEDED"), ValueError("undefined"), KeyError("URI")])
+def test_a_failed_join_is_one_sentence_that_names_the_variables(error, initialized, monkeypatch, capfd):
+    def fail(**kwargs):
+        raise error
 
-
-def test_of_one_process_everything_is_whole_and_the_first_tells_itself(tmp_path):
-    tree = {"a": jax.numpy.ones(3)}
-    assert distributed.whole(tree) is tree and distributed.told_by_first(7) == 7
-    distributed.check_shared(tmp_path / "nowhere")
-
-
-def test_it_is_told_when_a_process_ends_without_a_word(capfd):
-    distributed._last_words(Place(2, 1)).communicate(b".")
-    assert capfd.readouterr().err == ""
-    distributed._last_words(Place(2, 1)).communicate(b"")
-    said = capfd.readouterr().err
-    assert said.startswith("process 1 of 2 was killed, or gave up") and said.count("\n") == 1
-    assert said.endswith("the same command goes on from the last complete checkpoint\n")
-
-
-def test_a_coordinator_that_does_not_answer_is_one_sentence(monkeypatch, capfd):
-    def nobody(*args, **kwargs):
-        assert args == ("node1:29400", 4, 3) and kwargs["cluster_detection_method"] == "deactivate"
-        assert kwargs["local_device_ids"] == 1
-        raise RuntimeError("DEADLINE_EXCEEDED: Deadline Exceeded")
-
-    def left(status):
-        raise SystemExit(status)
-
-    monkeypatch.setattr(jax.distributed, "initialize", nobody)
-    monkeypatch.setattr(distributed.os, "_exit", left)
-    with pytest.raises(SystemExit, match="1"), joined(SLURM | HERE):
+    monkeypatch.setattr(jax.distributed, "initialize", fail)
+    with pytest.raises(SystemExit, match="2"), joined(SLURM):
         raise AssertionError("it must not run")
-    said = capfd.readouterr().err
-    assert said.startswith("process 3 of 4: could not join the other processes at node1:29400 (DEADLINE_EXCEEDED")
-    assert said.count("\n") == 1
+    message = capfd.readouterr().err
+    assert str(error) in message and message.count("\n") == 1
+    assert all(name in message for name in BY_HAND)
+
+
+def test_in_one_process_nothing_is_exchanged(tmp_path):
+    tree = {"a": jax.numpy.ones(3)}
+    assert distributed.gather(tree) is tree and distributed.broadcast(7) == 7
+    distributed.check_shared(tmp_path / "missing")
 
 
 def test_a_ballot_gives_the_largest_vote():
@@ -189,13 +177,10 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
 def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(tmp_path, undisturbed, lost, number):
     """The checkpoint of step 3 is complete before that of step 6 is begun, and at step 7 one is lost."""
     ended = finish(start(tmp_path, hit=lost, at=7, number=number, steps=12, fsdp=2))
-    (status, said), (left, words) = ended[lost], ended[1 - lost]
-    assert status == (-signal.SIGKILL if number > 0 else 1)
-    assert said.count("\n" if lost and number < 0 else f"process {lost} of 2") == 1, said
-    assert ("was killed, or gave up" if number > 0 else f"process {lost} of 2: no such row") in said
-    assert left != 0 and words.count(f"process {1 - lost} of 2") == 1, words
-    assert words.count("another one was lost") == 1 and "the last complete checkpoint" in words
-    assert "Traceback" not in said + words
+    (status, message), (other_status, other_message) = ended[lost], ended[1 - lost]
+    assert status == (-signal.SIGKILL if number > 0 else 2)
+    assert number > 0 or message.count(f"process {lost} of 2: no such row") == 1
+    assert other_status != 0 and "Traceback" not in message + other_message
     again = finish(start(tmp_path, steps=12, fsdp=2))
     assert [status for status, _ in again] == [0, 0], again
     assert "going on from the checkpoint of step 3" in again[0][1] or "of step 6" in again[0][1]

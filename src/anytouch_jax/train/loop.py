@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, to_json
 from anytouch_jax.errors import UserError
-from anytouch_jax.train.distributed import Ballot, check_shared, told_by_first, whole
+from anytouch_jax.train.distributed import Ballot, broadcast, check_shared, gather
 from anytouch_jax.train.mesh import (
     batch_sharding,
     donated,
@@ -270,7 +270,7 @@ class _Loop:
         if self.on_report is not None:
             self.log_metrics()
             try:
-                self.on_report(done, whole(used(state)), whole(batch))
+                self.on_report(done, gather(used(state)), gather(batch))
             except Exception as error:
                 self.bar.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
@@ -281,7 +281,7 @@ def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: M
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
     places = state_sharding(shapes, mesh)
-    latest = told_by_first(checkpoints.latest() or 0)
+    latest = broadcast(checkpoints.latest() or 0)
     if latest:
         shaped = [
             jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)

@@ -98,7 +98,7 @@ def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
     first = train(config, tmp_path / "r", stop_after=2)
     assert (first.step, saved_steps(tmp_path / "r")) == (2, [2])
     second = train(config, tmp_path / "r", log)
-    assert second.resumed == 2 and "going on from the checkpoint of step 2" in log
+    assert second.resumed == 2 and "continuing from the checkpoint of step 2" in log
     assert_equal_results(result, second)
     assert read_metrics(tmp_path / "r") == read_metrics(run)
     figures = sorted((tmp_path / "r" / "figures").iterdir())  # at the end of each part
@@ -308,7 +308,7 @@ def test_two_processes_never_train_one_run(straight, world, tmp_path):
         with (run / ".lock").open("ab") as held:
             fcntl.flock(held, fcntl.LOCK_EX)  # as another process holds it, from before its first checkpoint
             before = sorted(path.name for path in run.iterdir())
-            assert f"another process trains {run}" in refused(clips_only(run_config(world, 2)), run, init=straight[0])
+            assert f"another process trains in {run}" in refused(clips_only(run_config(world, 2)), run, init=straight[0])
             assert sorted(path.name for path in run.iterdir()) == before  # not even a tokenizer
         assert started or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step == 1
 

@@ -160,7 +160,7 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
     ended = finish(start(tmp_path, hit=1, at=4, number=signal.SIGTERM, steps=12, fsdp=2))
     assert [status for status, _ in ended] == [0, 0], ended
     (_, first), (_, second) = ended
-    assert first.count("stopped by SIGTERM after step 6; saved") == 1 and "step 1/12" in first
+    assert first.count("stopped by SIGTERM after step 6 and saved") == 1 and "step 1/12" in first
     assert second == ""  # one of them speaks
     assert sorted(entry.name for entry in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000006"]
     assert column(tmp_path, "skipped_samples") == [1 + 2] * 6  # by both
@@ -183,7 +183,7 @@ def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(tmp_path, undi
     assert other_status != 0 and "Traceback" not in message + other_message
     again = finish(start(tmp_path, steps=12, fsdp=2))
     assert [status for status, _ in again] == [0, 0], again
-    assert "going on from the checkpoint of step 3" in again[0][1] or "of step 6" in again[0][1]
+    assert "continuing from the checkpoint of step 3" in again[0][1] or "of step 6" in again[0][1]
     same(lock(tmp_path, run={"fsdp": 2}), tmp_path, undisturbed)
 
 

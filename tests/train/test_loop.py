@@ -173,7 +173,7 @@ def test_another_number_of_devices_goes_on(tmp_path):
 
 
 def test_rows_that_do_not_divide_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match="6 rows cannot be shared by 4 devices"):
+    with pytest.raises(ConfigError, match="6 rows cannot be divided among 4 devices"):
         run(tmp_path, batches=lambda start, stop: ((s, toy_batch(s, rows=6), {}) for s in range(start, stop)))
 
 
@@ -196,7 +196,7 @@ def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
         return toy_batches(start, stop, bad=range(2, 100))
 
     config = toy_config(save_every=2, max_skipped=3)
-    with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* in another run folder$"):
+    with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* optim.grad-clip"):
         run(tmp_path, config, batches=batches)
     assert [row["step"] for row in rows(tmp_path)] == list(range(6))
     with pytest.raises(UserError, match="4 steps in a row, up to step 5"):  # going on recalls those before
@@ -406,7 +406,7 @@ def test_a_saved_state_is_not_touched_by_the_steps_after_it(undisturbed, tmp_pat
 
 
 def test_batches_out_of_order_or_too_few_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="gave step 1 where step 0 was due"):
+    with pytest.raises(ValueError, match="gave step 1 instead of step 0"):
         run(tmp_path / "a", batches=lambda start, stop: toy_batches(start + 1, stop))
     with pytest.raises(UserError, match="the data ended after 3 of 8 steps"):
         run(tmp_path / "b", batches=lambda start, stop: toy_batches(start, 3))
@@ -494,7 +494,7 @@ def test_a_killed_run_goes_on_and_ends_as_if_undisturbed(undisturbed, tmp_path):
 def test_exit_code_of_a_terminated_process(tmp_path):
     ended = child(tmp_path, 2, signal.SIGTERM)
     assert ended.returncode == 0, ended.stderr
-    assert "stopped by SIGTERM after step 3; saved" in ended.stderr
+    assert "stopped by SIGTERM after step 3 and saved" in ended.stderr
     assert [row["step"] for row in rows(tmp_path)] == [0, 1, 2]
 
 

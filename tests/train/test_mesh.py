@@ -68,7 +68,7 @@ def test_a_batch_is_shared_out_by_rows_and_an_empty_axis_is_fine():
     assert [shard.data.shape for shard in placed["clip"].addressable_shards] == [(2, 3)] * 4
     np.testing.assert_array_equal(placed["clip"], batch["clip"])
     assert placed["none"].shape == (0, 5)
-    with pytest.raises(ConfigError, match="6 rows cannot be shared by 4 devices"):
+    with pytest.raises(ConfigError, match="6 rows cannot be divided among 4 devices"):
         put_batch({"clip": np.zeros((6, 2))}, sharding)
 
 

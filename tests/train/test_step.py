@@ -153,7 +153,7 @@ def test_rows_are_dealt_out_to_micro_batches():
     parts = micro_batches({"x": np.arange(8), "none": np.zeros((0, 3))}, 2)
     np.testing.assert_array_equal(parts["x"], [[0, 2, 4, 6], [1, 3, 5, 7]])
     assert parts["none"].shape == (2, 0, 3)
-    with pytest.raises(ConfigError, match=r"8 rows does not divide by optim.accumulate=3"):
+    with pytest.raises(ConfigError, match=r"8 rows is not divisible by --optim.accumulate 3"):
         micro_batches({"x": np.arange(8)}, 3)
 
 

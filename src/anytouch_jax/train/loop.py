@@ -1,4 +1,4 @@
-"""fit(): jit, feed, log, save, resume. Every side effect of training lives here and in `record.py`."""
+"""The training loop: compile, feed, log, save, continue. Its side effects are here and in `metrics.py`."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from anytouch_jax.train.mesh import (
     replicated,
     state_sharding,
 )
-from anytouch_jax.train.metrics import Record, alone_in, goes_on, open_run, writing
+from anytouch_jax.train.metrics import Record, alone_in, continues, open_run, writing
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.progress import Bar, Log, progress, signals, silent, to_stderr
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
 Tree = Any
-_SIGNAL, _SKIPPED = "signal", "skipped_samples"  # beside the metrics of a step: what its ballot says
-# batches(start, stop) -> (step, batch, what the loader wants in the log) for each step of the range
+_SIGNAL, _SKIPPED = "signal", "skipped_samples"  # the metrics of a step that its ballot adds
+# batches(start, stop) -> (step, batch, numbers of the loader for the log) for each step of the range
 Item = tuple[int, Any, Mapping[str, Any]]
 Batches = Callable[[int, int], Iterator[Item]]
 Report = Callable[[int, Tree, Any], None]
@@ -44,10 +44,10 @@ Report = Callable[[int, Tree, Any], None]
 
 @dataclass(frozen=True)
 class FitResult:
-    """How a run, or its part, ended: the state after `step` steps and the last line of metrics.
+    """The result of a run or a part of one: the state after `step` steps and the last line of metrics.
 
-    `traces` counts how often the step was traced (once a batch structure); `interrupted` is the signal that ended the
-    run early, `resumed` the step it went on from.
+    `traces` counts how often the step was traced, which is once a batch structure. `resumed` is the step that the run
+    continued from, and `interrupted` the signal that ended it early.
     """
 
     state: TrainState
@@ -59,13 +59,8 @@ class FitResult:
 
     @property
     def params(self) -> Tree:
-        """All parameters as one nested dict, see `used`."""
-        return used(self.state)
-
-
-def used(state: TrainState) -> Tree:
-    """All parameters as they are used: the trained ones (their average where a run keeps one) and the frozen ones."""
-    return merge(state.trainable, state.frozen)
+        """All parameters, trained and frozen, as one nested dict."""
+        return merge(self.state.trainable, self.state.frozen)
 
 
 def fit(
@@ -81,13 +76,13 @@ def fit(
     log: Log | None = None,
     mesh: Mesh | None = None,
 ) -> FitResult:
-    """Train `config.run.steps` steps in a run folder, or go on from its latest complete checkpoint.
+    """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
-    `params` are the first parameters (shapes only matter on resume); `stop_after` ends early, after that many steps in
-    all, without changing the schedule. `on_report(step, params, batch)` draws figures; it must not keep the arrays.
-    SIGTERM and Ctrl-C finish the step, save and return; of several processes one may get the signal, and all do so a
-    step later. Raises UserError: other settings than the run was started with, too many skipped steps in a row, a full
-    disk, a checkpoint that cannot be read, a folder that not all processes see.
+    `params` are the first parameters. When a run continues, only their shapes matter. `stop_after` ends the run after
+    that many steps in all, without changing the schedule. `on_report(step, params, batch)` draws figures and must not
+    keep the arrays. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal,
+    all stop a step later. Raises UserError for settings that changed since the start, too many skipped steps in a row,
+    a full disk, an unreadable checkpoint, and a folder that some process cannot see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
     log = log or to_stderr
@@ -98,7 +93,7 @@ def fit(
             stack.enter_context(alone_in(run_dir))
             open_run(run_dir, config)
         else:
-            goes_on(run_dir, config)  # so that each process finds a mistake by itself
+            continues(run_dir, config)  # each process reports a changed setting
             log = silent
         check_shared(run_dir / "figures")
         with writing(run_dir / "checkpoints"):
@@ -111,7 +106,7 @@ def fit(
         stack.push(checkpoints.leave)
         state, start = _first_state(config, params, checkpoints, mesh)
         if start:
-            log(f"going on from the checkpoint of step {start}")
+            log(f"continuing from the checkpoint of step {start}")
         if start >= stop:
             log(f"nothing to do: {start} of {config.run.steps} steps are done")
             return FitResult(state, start, resumed=start)
@@ -125,7 +120,7 @@ def fit(
 
 
 class _Loop:
-    """The loop itself; what is mutable between steps."""
+    """The loop, and its state between steps."""
 
     def __init__(
         self,
@@ -140,10 +135,10 @@ class _Loop:
         self.record, self.bar, self.on_report = record, bar, on_report
         self.pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
         self.row: dict[str, Any] = {}
-        self.losses: list[float] = []  # since the last checkpoint: its mean decides which one is the best
+        self.losses: list[float] = []  # since the last checkpoint: their mean decides which checkpoint is the best
         self.traces = 0
         self.ballot = Ballot(mesh) if jax.process_count() > 1 else None
-        self.told: signal.Signals | None = None  # with several processes: the signal that one of them got
+        self.shared_signal: signal.Signals | None = None  # the signal that one of several processes received
         self.clock, self.waited, self.last = time.perf_counter(), 0.0, LastStep()
 
     def run(
@@ -155,7 +150,7 @@ class _Loop:
         loss_fn: LossFn,
         interrupt: list[signal.Signals],
     ) -> FitResult:
-        """Steps `start` to `stop`, or until a signal has been seen."""
+        """Run steps `start` to `stop`, or until a signal arrives."""
         every, figures = self.config.run.save_every, self.config.run.figure_every
         step_fn, sharding = self.compile(state, loss_fn), batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
@@ -186,11 +181,13 @@ class _Loop:
         if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
         if signalled:
-            self.bar.log(f"stopped by {signalled.name} after step {done}; saved, the same command goes on from here")
+            self.bar.log(
+                f"stopped by {signalled.name} after step {done} and saved, the same command continues from here"
+            )
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
     def awaited(self, feed: Iterator[Item]) -> Iterator[Item]:
-        """The feed, with its waiting counted: for how long there was neither a batch nor a step that still ran."""
+        """Yield from the feed, and count the time with neither a batch nor a running step."""
         asked = time.perf_counter()
         for item in feed:
             ended = self.last.ended() if self.pending else asked
@@ -200,11 +197,11 @@ class _Loop:
             asked = time.perf_counter()
 
     def signalled(self, interrupt: list[signal.Signals]) -> signal.Signals | None:
-        """The signal that ends the run: our own, or with several processes the one that all of them know of."""
-        return self.told if self.ballot else next(iter(interrupt), None)
+        """Return the signal that ends the run: of this process, or the shared one of several."""
+        return self.shared_signal if self.ballot else next(iter(interrupt), None)
 
     def compile(self, state: TrainState, loss_fn: LossFn) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
-        """The step under jit: the state keeps its place; each structure of a batch is traced once."""
+        """Return the jitted step, which keeps the sharding of the state and is traced once a batch structure."""
         config = self.config
         loss_fn = gathering(loss_fn, self.mesh)
         step = make_step(loss_fn, optimizer(config), total_steps=config.run.steps, accumulate=config.optim.accumulate)
@@ -224,8 +221,8 @@ class _Loop:
         (step, metrics, info), self.pending = self.pending, None
         numbers = jax.device_get(metrics)
         if number := int(numbers.pop(_SIGNAL, 0)):
-            self.told = signal.Signals(number)
-        if _SKIPPED in numbers:  # by all processes, not by this one alone
+            self.shared_signal = signal.Signals(number)
+        if _SKIPPED in numbers:  # the sum over all processes
             info[_SKIPPED] = int(numbers.pop(_SKIPPED))
         now = time.perf_counter()
         elapsed = max(now - self.clock, 1e-9)
@@ -244,14 +241,15 @@ class _Loop:
         if skipped > self.config.run.max_skipped:
             raise UserError(
                 f"{skipped} steps in a row, up to step {step}, had a loss or a gradient that is not finite and were "
-                "skipped; lower optim.learning_rate, set optim.grad_clip, or look for NaN in the data, in another run "
-                "folder"
+                "skipped. In another run folder, lower --optim.learning-rate, set --optim.grad-clip, or look for NaN "
+                "in the data."
             )
 
     def save(self, done: int, state: TrainState, since: int) -> int:
-        """Write a checkpoint in the background, after the metrics of all its steps, `since` the one before.
+        """Write a checkpoint in the background, after the metrics of its `since` steps, and return `done`.
 
-        Its loss is their mean. That of fewer steps than others' is `partial`: it would be the best by chance.
+        Its loss is the mean over these steps. A mean over fewer steps than usual is marked `partial`, because it could
+        be the best by chance.
         """
         self.log_metrics()
         self.record.sync()
@@ -266,18 +264,18 @@ class _Loop:
         return done
 
     def report(self, done: int, state: TrainState, batch: Any) -> int:
-        """Draw figures; a fault in that must not end the run."""
+        """Draw figures. An error in them does not end the run."""
         if self.on_report is not None:
             self.log_metrics()
             try:
-                self.on_report(done, gather(used(state)), gather(batch))
+                self.on_report(done, gather(merge(state.trainable, state.frozen)), gather(batch))
             except Exception as error:
                 self.bar.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
 
 
 def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: Mesh) -> tuple[TrainState, int]:
-    """The state of the latest complete checkpoint and its step, or a new one, laid out on the mesh."""
+    """Return the state of the latest complete checkpoint and its step, or a new state, sharded over the mesh."""
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
     places = state_sharding(shapes, mesh)
@@ -292,17 +290,17 @@ def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: M
 
 
 def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
-    """The batches of steps `start` to `stop`, each once and in order; closes their source in the end."""
+    """Yield the batches of steps `start` to `stop`, check their order, and close their source in the end."""
     source, expected = batches(start, stop), start
     try:
         for step, batch, info in source:
             if step != expected:
-                raise ValueError(f"the batches gave step {step} where step {expected} was due")
+                raise ValueError(f"the batches gave step {step} instead of step {expected}")
             yield step, batch, info
             expected += 1
             if expected == stop:
                 return
-        raise UserError(f"the data ended after {expected} of {stop} steps; its source must serve every step")
+        raise UserError(f"the data ended after {expected} of {stop} steps. Pass batches for every step.")
     finally:
         close = getattr(source, "close", None)
         if close is not None:
@@ -310,28 +308,28 @@ def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, N
 
 
 class LastStep:
-    """When the latest step ended, seen by a thread that waits for it."""
+    """The time at which the latest step ended. A thread waits for it."""
 
     def __init__(self) -> None:
         self._end: list[float] = []
 
     def began(self, metrics: Mapping[str, Any]) -> None:
-        """The step that gives these metrics has been sent off."""
-        self._end = []  # a new one: the thread of an older step keeps its own
-        # A daemon: where a step never ends, because a process is lost, the run must.
-        threading.Thread(target=_see, args=(metrics, self._end), name="last step", daemon=True).start()
+        """Wait for the step that returns these metrics."""
+        self._end = []  # the thread of an older step has another list
+        # A daemon thread: a step never ends when a process is lost, but the run must.
+        threading.Thread(target=_wait_for, args=(metrics, self._end), name="last step", daemon=True).start()
 
     def ended(self) -> float | None:
-        """When it ended; None while it runs, and where it failed."""
+        """Return when the step ended, or None if it still runs or failed."""
         return self._end[0] if self._end else None
 
 
-def _see(metrics: Mapping[str, Any], end: list[float]) -> None:
-    with contextlib.suppress(Exception):  # the loop itself meets the error where it reads the metrics
+def _wait_for(metrics: Mapping[str, Any], end: list[float]) -> None:
+    with contextlib.suppress(Exception):  # the loop raises the error when it reads the metrics
         jax.block_until_ready(metrics)
         end.append(time.perf_counter())
 
 
 def _rows(batch: Any) -> int:
-    """Samples in a batch, over all processes."""
+    """Return the samples in a batch, over all processes."""
     return jax.tree.leaves(batch)[0].shape[0] * jax.process_count()

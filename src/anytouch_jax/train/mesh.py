@@ -1,4 +1,4 @@
-"""Devices: the mesh, and how batches and parameters are laid out on it."""
+"""Device mesh, and the sharding of batches and parameters over it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from anytouch_jax.train.pack import SMALL
 
 Tree = Any
 BATCH_AXES = ("data", "fsdp")
-CACHE_DAYS = 60  # a compiled program is kept
+CACHE_DAYS = 60  # age at which a compiled program is removed
 
 
 def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """A mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError when there are too few.
+    """Return a mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError if there are too few.
 
-    Axes are of type Auto, so that jit places the computation; `jax.make_mesh` would choose explicit ones.
+    The axes have type Auto, so that jit places the computation. The default of `jax.make_mesh` is explicit axes.
     """
     devices = list(jax.devices() if devices is None else devices)
     if fsdp < 1 or (data is None and len(devices) % fsdp):
@@ -39,20 +39,20 @@ def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Devi
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Rows of a batch over all devices."""
+    """Return the sharding of a batch: its rows over all devices."""
     return NamedSharding(mesh, PartitionSpec(BATCH_AXES))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """A whole copy on each device."""
+    """Return the sharding that keeps a whole copy on each device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> Tree:
-    """A sharding for each array of a state: over "fsdp" on its largest divisible axis; copies where that axis is 1.
+    """Return a sharding for each array of a state: its largest divisible axis over "fsdp".
 
-    Arrays of fewer than `small` elements, or without a divisible axis, are copied to each device. So are vectors:
-    a long one is the optimiser's, packed from many small arrays (`pack`), and to cut it would send each of them about.
+    Arrays of fewer than `small` elements, or without a divisible axis, are copied to each device. Vectors are copied
+    too: a long one has many small arrays (`pack`), and each of them would have to be sent.
     """
     parts = mesh.shape["fsdp"]
 
@@ -67,23 +67,23 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
 
 
 def put_state(tree: Tree, places: Tree) -> Tree:
-    """Copy a host's tree to the devices, each array to its place; every process has the same tree and gives its part.
+    """Copy a host's tree to the devices, each array by its sharding. Every process passes the same tree.
 
-    A copy also where it could be shared, and by way of the host: the step donates its state, and must not delete the
-    caller's own arrays, but `device_put` shares one that lies on one of several devices whatever `may_alias` says.
+    Arrays are never shared with the caller, because the step donates its state. They are copied through the host:
+    `device_put` shares an array that is on one of several devices, whatever `may_alias` is.
     """
     host = jax.tree.map(np.asarray, tree)
     if jax.process_count() == 1:
         return jax.device_put(host, places, may_alias=False)
-    # Not device_put: it would compare every array among all processes.
+    # device_put would compare every array among all processes.
     return jax.tree.map(lambda x, place: jax.make_array_from_callback(x.shape, place, x.__getitem__), host, places)
 
 
 def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """`loss_fn(params, ...)` with sharded parameters made whole just before their use; as it is without "fsdp".
+    """Return `loss_fn(params, ...)` that gathers sharded parameters just before their use.
 
-    Else XLA's partitioner cuts activations along the axis of a parameter, and exchanges those: twice the bytes. State
-    and optimiser stay cut (ZeRO, Rajbhandari et al., 2020); whole parameters and gradients are there during a step.
+    Otherwise XLA's partitioner shards activations along the axis of a parameter, and sends twice the bytes. State and
+    optimiser stay sharded (ZeRO, Rajbhandari et al., 2020). Without an "fsdp" axis the loss is returned unchanged.
     """
     if mesh.shape["fsdp"] == 1:
         return loss_fn
@@ -95,34 +95,33 @@ def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
 
 
 def donated() -> tuple[int, ...]:
-    """Which arguments of a step its compiled program may overwrite, for `jax.jit(donate_argnums=...)`: the state.
+    """Return the arguments of a step that are donated, for `jax.jit(donate_argnums=...)`: the state, on an accelerator.
 
-    On a CPU none: XLA copies a donated array that several of its kernels read before it is overwritten, which is every
-    parameter and moment, and the step takes longer (`python -m experiments.benchmarks.run stage1` has both).
+    On a CPU none is. XLA would copy every parameter and moment, because several kernels read them before they are
+    overwritten, and the step would be slower (`python -m experiments.benchmarks.run stage1` measures both).
     """
     return () if jax.default_backend() == "cpu" else (0,)
 
 
 def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
-    """Send a host batch to the devices; with several processes each gives its own share of the rows.
+    """Send a host batch to the devices. Each of several processes passes its own share of the rows.
 
-    Raises ConfigError when the rows cannot be shared out evenly.
+    Raises ConfigError if the rows cannot be divided evenly.
     """
     devices, processes = sharding.num_devices, jax.process_count()
     for leaf in jax.tree.leaves(batch):
         rows = leaf.shape[0] * processes
         if rows % devices:
-            raise ConfigError(f"a batch axis of {rows} rows cannot be shared by {devices} devices; choose a multiple")
+            raise ConfigError(f"{rows} rows cannot be divided among {devices} devices. Choose a multiple with --batch.")
     if processes == 1:
         return jax.device_put(batch, sharding)
     return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch)
 
 
 def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
-    """Keep compiled programs on disk, so that the next start of the same run need not compile again.
+    """Keep compiled programs on disk for the next start. Return the folder, or None if it cannot be made.
 
-    The default folder is anytouch_jax under $XDG_CACHE_HOME or ~/.cache; programs of more than CACHE_DAYS ago are
-    removed from it. Returns it, or None where it cannot be made.
+    The default is anytouch_jax under $XDG_CACHE_HOME or ~/.cache. Programs older than CACHE_DAYS are removed.
     """
     if folder is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "anytouch_jax"
@@ -133,9 +132,9 @@ def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
         return None
     old = time.time() - CACHE_DAYS * 86400
     for file in folder.glob("*-cache"):
-        with contextlib.suppress(OSError):  # another process removes it, or it is somebody else's
+        with contextlib.suppress(OSError):  # another process may remove it, or own it
             if file.stat().st_mtime < old:
                 file.unlink()
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    compilation_cache.reset_cache()  # else a program compiled before would have switched it off for good
+    compilation_cache.reset_cache()  # a program compiled before would have switched the cache off
     return folder

@@ -1,4 +1,4 @@
-"""What a run leaves on disk beside its checkpoints: config.json, and metrics.jsonl with one line a step."""
+"""Files of a run folder: config.json, metrics.jsonl with one line a step, and the lock."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.weights.checkpoint import read_record, steps
 
-# Settings that may change between the parts of a run: they decide where and how fast it runs, not what it computes.
-HARMLESS = {
+# Settings that may change when a run continues. They decide where and how fast it runs, not its numbers.
+CHANGEABLE = {
     "data.cache",
-    "data.manifests",  # their content is compared (`pretrain`): a data set may have moved
+    "data.manifests",  # `pretrain` compares their content, since a data set may have moved
     "data.on_bad_sample",
     "data.prefetch",
     "data.threads",
-    "data.tokenizer",  # a run has its own copy
+    "data.tokenizer",  # the run folder has a copy
     "run.figure_every",
     "run.fsdp",
     "run.keep",
@@ -36,28 +36,28 @@ HARMLESS = {
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn a failed write (disk full, no permission) into one sentence."""
+    """Turn a failed write, such as a full disk, into a UserError."""
     try:
         yield
     except OSError as error:
         reason = error.strerror or str(error)
         raise UserError(
-            f"cannot write {path}: {reason}; free some space or mend the folder, then run the same command again: "
-            "it goes on from the last complete checkpoint"
+            f"cannot write {path}: {reason}. Free some space or make the folder writable, then run the same command "
+            "again to continue from the last complete checkpoint."
         ) from error
 
 
-_held: set[tuple[int, Path]] = set()
+_locked: set[tuple[int, Path]] = set()
 
 
 @contextlib.contextmanager
 def alone_in(run_dir: Path) -> Iterator[None]:
-    """Keep other processes from training in a run folder, which is made; a thread may ask for it again inside.
+    """Make and lock a run folder, so that no other process trains in it. The same thread may enter it twice.
 
-    Raises UserError where another one trains there, and for a folder that cannot be written.
+    Raises UserError if another process trains there, or if the folder cannot be written.
     """
     mine = (threading.get_ident(), run_dir.resolve())
-    if mine in _held:
+    if mine in _locked:
         yield
         return
     with writing(run_dir):
@@ -66,16 +66,18 @@ def alone_in(run_dir: Path) -> Iterator[None]:
         with writing(run_dir):
             free = stack.enter_context(lock(run_dir / ".lock"))
         if not free:
-            raise UserError(f"another process trains {run_dir}: wait for it, or name another folder with --run")
-        _held.add(mine)
-        stack.callback(_held.discard, mine)
+            raise UserError(f"another process trains in {run_dir}. Wait for it, or choose another folder with --run.")
+        _locked.add(mine)
+        stack.callback(_locked.discard, mine)
         yield
 
 
 def begun_with(run_dir: Path) -> Config | None:
-    """The settings that the run in a folder was begun with, None without a complete checkpoint: what lies in such a
-    folder was left by a start that failed, or is not ours. Where config.json is lost the latest checkpoint tells them.
-    Raises UserError when they cannot be read."""
+    """Return the settings that the run in a folder started with, or None without a complete checkpoint.
+
+    A folder without one was left by a start that failed. If config.json is lost, the latest checkpoint has the
+    settings. Raises UserError when they cannot be read.
+    """
     path, done = run_dir / "config.json", steps(run_dir / "checkpoints")
     if not done:
         return None
@@ -85,27 +87,26 @@ def begun_with(run_dir: Path) -> Config | None:
         text = read_record(path)["config"] if path.is_dir() else path.read_text(encoding="utf-8")
         config: Config = from_json(text, allow_retired=False)
     except (ConfigError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read ({error}); choose another run folder, or mend it") from None
+        raise UserError(f"{path} cannot be read ({error}). Choose another run folder, or repair the file.") from None
     return config
 
 
 def open_run(run_dir: Path, config: Config) -> None:
-    """Make a run folder with its config.json, or check that the one there was started with the same settings.
+    """Make a run folder with its config.json, or check that its run started with the same settings.
 
-    A folder without a complete checkpoint was left by a start that failed, and is begun anew. Raises UserError as
-    `goes_on`, and for a full disk.
+    A folder without a complete checkpoint starts again. Raises UserError as `continues` does, and for a full disk.
     """
     path = run_dir / "config.json"
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
-        if not goes_on(run_dir, config) or not path.exists():
+        if not continues(run_dir, config) or not path.exists():
             atomic_write(path, to_json(config) + "\n")
 
 
-def goes_on(run_dir: Path, config: Config) -> bool:
-    """Whether a folder holds a run that was begun, with the same settings; those in `HARMLESS` may differ.
+def continues(run_dir: Path, config: Config) -> bool:
+    """Return whether a folder has a run to continue. Its settings must be equal, except for `CHANGEABLE`.
 
-    Raises UserError that names each other setting with both values.
+    Raises UserError that names every changed setting with both values.
     """
     begun = begun_with(run_dir)
     if begun is None:
@@ -115,20 +116,21 @@ def goes_on(run_dir: Path, config: Config) -> bool:
     changed = [
         f"{name} was {before.get(name)!r} and is now {now.get(name)!r}"
         for name in sorted(before.keys() | now.keys())
-        if name not in HARMLESS and before.get(name) != now.get(name)
+        if name not in CHANGEABLE and before.get(name) != now.get(name)
     ]
     if changed:
-        longer = f"; --init {run_dir} with another --run folder goes on from what it learned"
+        longer = f", or start from its weights by --init {run_dir} and another --run folder"
         raise UserError(
             f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. "
-            "Use the same settings to go on with it, or choose another run folder"
+            "Use the same settings to continue it, or choose another run folder"
             + (longer if before["run.steps"] != now["run.steps"] else "")
+            + "."
         )
     return True
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested dict as {dotted name: value}; sequences compare as tuples."""
+    """Return a nested dict as {dotted name: value}, with lists as tuples."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, Mapping):
@@ -139,11 +141,11 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 class Record:
-    """metrics.jsonl from step `start` on: earlier lines stay, later ones (of a killed run) and torn ones are cut off.
+    """metrics.jsonl from step `start` on. Earlier lines stay. Later and incomplete lines, of a killed run, are removed.
 
-    `skipped` counts the skipped steps so far and `in_a_row` those without a break at the end, as the lines tell.
-    With `tensorboard` the numbers also go to an event file. Without `lead` (all processes of a run but the first)
-    it counts and writes nothing. Raises UserError when the disk is full.
+    `skipped` counts the skipped steps so far, and `in_a_row` those at the end without a break. With `tensorboard` the
+    numbers also go to an event file. Only the `lead` process writes, the others count. Raises UserError for a full
+    disk.
     """
 
     def __init__(self, run_dir: Path, start: int, *, tensorboard: bool = False, lead: bool = True) -> None:
@@ -157,7 +159,7 @@ class Record:
             self._file: TextIO = place.open("a", encoding="utf-8")
 
     def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Append the line of a step and return it; what is not finite becomes null, as JSON has no NaN."""
+        """Append the line of a step and return it. A number that is not finite becomes null, as JSON has no NaN."""
         row = {"step": step} | {name: _plain(value) for name, value in numbers.items()}
         self._count(row)
         row["skipped_batches"] = self.skipped
@@ -171,13 +173,13 @@ class Record:
         return row
 
     def sync(self) -> None:
-        """Put the lines on the disk itself, before a checkpoint that follows them."""
-        if self._file.name == str(self.path):  # the null device has no disk below it
+        """Flush the lines to disk, so that a checkpoint never has steps that are missing here."""
+        if self._file.name == str(self.path):  # the null device cannot be synced
             with writing(self.path):
                 os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the files; what could not be written was reported by `write`."""
+        """Close the files. `write` has reported what could not be written."""
         with contextlib.suppress(OSError):
             self._file.close()
         if self._board is not None:
@@ -189,35 +191,35 @@ class Record:
 
 
 def _plain(value: Any) -> Any:
-    """A number as JSON can hold it."""
+    """Return a number that JSON can store."""
     value = value.item() if hasattr(value, "item") else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
-    """Drop the lines of step `start` and later, and torn ones; return the rest."""
+    """Remove the lines of step `start` and later, and incomplete ones, and return the rest."""
     if not path.exists():
         return []
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
     rows: list[dict[str, Any]] = []
-    kept: list[str] = []
+    complete: list[str] = []
     for line in lines:
         with contextlib.suppress(ValueError):
             row = json.loads(line)
             if line.endswith("\n") and isinstance(row, dict) and row.get("step", start) < start:
                 rows.append(row)
-                kept.append(line)
-    if rewrite and len(kept) < len(lines):
-        atomic_write(path, "".join(kept))
+                complete.append(line)
+    if rewrite and len(complete) < len(lines):
+        atomic_write(path, "".join(complete))
     return rows
 
 
 def _tensorboard(run_dir: Path, start: int) -> Any:
-    """A writer of TensorBoard events, from step `start` on."""
+    """Return a writer of TensorBoard events, from step `start` on."""
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise UserError(
-            "run.tensorboard needs tensorboardX: pip install 'anytouch-jax[tensorboard]', or leave it off"
+            "--run.tensorboard needs tensorboardX. Run pip install 'anytouch-jax[tensorboard]', or leave it off."
         ) from None
     return SummaryWriter(str(run_dir / "tensorboard"), purge_step=start)

@@ -1,7 +1,8 @@
-"""The optimiser: names and regex rules, the learning-rate schedule, AdamW with one count per parameter.
+"""AdamW, the learning-rate schedule, and rules over parameter names.
 
-A step may leave a parameter out (a clip's head on a batch of stills). Such a parameter is skipped whole: no decay,
-no moment, no count, as PyTorch does when a gradient is None. Hence each parameter has its own count.
+A step may not use a parameter, such as a clip's head on a batch of stills. That parameter is skipped: no decay, no
+moment and no count, as in PyTorch when a gradient is None. So each parameter needs its own count, and `optax.adamw`
+has one for all.
 """
 
 from __future__ import annotations
@@ -26,8 +27,11 @@ T = TypeVar("T")
 
 
 class OptState(NamedTuple):
-    """State of `optimizer`: `counts` i32 (parameters,), how often each was updated; `mu` and `nu`, first and second
-    moments as `pack.packing` groups them; `learning_rate` f32 (), the last one."""
+    """The state of `optimizer`.
+
+    `counts` i32 (parameters,) is how often each parameter was updated. `mu` and `nu` are the first and second moments,
+    packed by `pack.packing`. `learning_rate` f32 () is the last one.
+    """
 
     counts: Array
     mu: tuple[Array, ...]
@@ -36,7 +40,7 @@ class OptState(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """What Adam knows of one parameter: `updates` i32 (), how often; `mu` and `nu` of its shape."""
+    """The state of Adam for one parameter: the count `updates` i32 (), and `mu` and `nu` of its shape."""
 
     updates: Array
     mu: Array
@@ -44,31 +48,32 @@ class Moments(NamedTuple):
 
 
 def moments(state: OptState, params: Tree) -> Tree:
-    """The `Moments` of every parameter, in a tree like `params`."""
+    """Return the `Moments` of every parameter, in a tree like `params`."""
     layout = packing(params)
     counts = layout.treedef.unflatten(list(state.counts))
     return jax.tree.map(Moments, counts, layout.unpack(state.mu), layout.unpack(state.nu))
 
 
 def match_rules(rules: Sequence[tuple[str, T]], names: Iterable[str]) -> dict[str, T]:
-    """The value of the first rule whose regex is found in each name. Raises ConfigError for a name without a rule."""
-    found: dict[str, T] = {}
+    """Return for each name the value of the first rule whose regex matches. Raises ConfigError if none does."""
+    matched: dict[str, T] = {}
     for name in names:
         values = [value for pattern, value in rules if re.search(pattern, name)]
         if not values:
-            raise ConfigError(f'no rule matches the parameter {name}; end the rules with ("", value)')
-        found[name] = values[0]
-    return found
+            raise ConfigError(f'no rule matches the parameter {name}. End the rules with ("", value).')
+        matched[name] = values[0]
+    return matched
 
 
 def learning_rate(t: Array | float, *, peak: float, floor: float, warmup: float, total: float, decay: str) -> Array:
-    """Learning rate at time `t`: from 0 linearly to `peak` at `warmup`, then down to `floor` at `total`, and there on.
+    """Return the learning rate at time `t`, f32 of its shape.
 
-    `t`, `warmup` and `total` share a unit (steps or epochs) and may be fractions; `decay` is "linear" (the paper) or
-    "cosine", half a period (the release). Returns f32 of t's shape. Raises ConfigError for another decay.
+    It rises linearly from 0 to `peak` at `warmup`, falls to `floor` at `total`, and stays there. `t`, `warmup` and
+    `total` share a unit (steps or epochs) and may be fractions. `decay` is "linear" (the paper) or "cosine", half a
+    period (the release). Raises ConfigError for another decay.
     """
     if decay not in ("linear", "cosine"):
-        raise ConfigError(f"unknown decay {decay!r}; choose linear or cosine")
+        raise ConfigError(f"unknown decay {decay!r}. Choose linear or cosine.")
     t = jnp.asarray(t, jnp.float32)
     share = jnp.clip((t - warmup) / max(total - warmup, 1e-9), 0.0, 1.0)
     height = 1.0 - share if decay == "linear" else 0.5 * (1.0 + jnp.cos(jnp.pi * share))
@@ -76,7 +81,7 @@ def learning_rate(t: Array | float, *, peak: float, floor: float, warmup: float,
 
 
 def schedule(config: Config) -> Callable[[Array | float], Array]:
-    """The schedule of a run: step -> learning rate. Step 0 has rate 0 (golden H)."""
+    """Return the schedule of a run: step -> learning rate. Step 0 has rate 0 (golden H)."""
     options = config.optim
 
     def rate(step: Array | float) -> Array:
@@ -93,11 +98,11 @@ def schedule(config: Config) -> Callable[[Array | float], Array]:
 
 
 def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | float:
-    """How fast a parameter learns beside the others: `layer_decay` once for every block of the touch encoder behind it.
+    """Return the factor on a parameter's learning rate: a number, or one for each of stacked blocks (L, 1, ...).
 
-    Of L blocks the i-th learns by layer_decay^(L - i), what stands before them by layer_decay^L, all else, the last
-    block among it, by 1; in the manner of BEiT's fine-tuning (Bao et al. 2022), where the last block learns by the
-    factor once. Returns a number, or one for each of stacked blocks (L, 1, ...).
+    Of L blocks of the touch encoder, block i of 1 to L has the factor layer_decay^(L - i). Parameters before the
+    blocks have layer_decay^L, and all others 1. BEiT's fine-tuning (Bao et al. 2022) is alike, but its last block has
+    the factor layer_decay.
     """
     depth, decay = config.model.touch.depth, config.optim.layer_decay
     if name.startswith("touch/blocks/"):
@@ -106,11 +111,11 @@ def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | flo
 
 
 def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
-    """AdamW as PyTorch computes it: decoupled decay by `config.weight_decay`, optional global-norm clipping.
+    """Return AdamW as PyTorch computes it, with decoupled decay by `config.weight_decay` and optional clipping.
 
-    `update(grads, state, params, *, used=None, step=None, learning_rate=None)`: `used` is a tree of Python bools, a
-    parameter that is not used stays as it is and does not count in the clipping norm; the rate is that of `schedule`
-    at `step`, or `learning_rate` if given. So a skipped step does not shift the schedule.
+    Call `update(grads, state, params, *, used=None, step=None, learning_rate=None)`. `used` is a tree of Python bools.
+    An unused parameter does not change, and does not count in the clipping norm. The rate is `learning_rate`, or that
+    of `schedule` at `step`, so that a skipped step does not shift the schedule.
     """
     options, rate = config.optim, schedule(config)
 
@@ -146,7 +151,7 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
 def _adamw(
     config: Config, layout: Packing, grads: Tree, state: OptState, params: Tree, used: Tree | None
 ) -> tuple[list[Array], Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Packed directions of AdamW before the learning rate, counts and moments; a leaf not used gets 0 and stays."""
+    """Return packed directions before the learning rate, counts and moments. An unused leaf has direction 0."""
     options = config.optim
     uses = np.asarray([True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used))
     decays = np.asarray(list(match_rules(config.weight_decay, flatten(params)).values()), np.float32)
@@ -166,7 +171,7 @@ def _adamw(
         nu = options.beta2 * nus[k] + (1 - options.beta2) * grad * grad
         mu_hat, nu_hat = mu / layout.spread(k, first), nu / layout.spread(k, second)
         direction = mu_hat / (jnp.sqrt(nu_hat) + options.eps) + layout.spread(k, decays) * value
-        if not np.all(use[k]):  # the counts of unused leaves may be 0: what stands there is not a number
+        if not np.all(use[k]):  # where a count is 0, the corrected moments are NaN
             direction, mu, nu = (
                 jnp.where(use[k], new, old) for new, old in ((direction, 0.0), (mu, mus[k]), (nu, nus[k]))
             )

@@ -1,6 +1,6 @@
-"""Small arrays of a tree as one vector, so that the optimiser has a few large kernels, not hundreds of small ones.
+"""Packing of small arrays into one vector, so that the optimiser has a few large kernels.
 
-A ViT has some twenty parameters a stack and most are vectors. Updated one by one they cost more time to compile than
+A ViT has about twenty parameters a stack, and most are vectors. Updated one by one, they take longer to compile than
 the whole backward pass.
 """
 
@@ -15,13 +15,13 @@ import numpy as np
 
 Array = jax.Array
 Tree = Any
-SMALL = 2**16  # elements; a larger array is worth a kernel of its own, and a share on each device
+SMALL = 2**16  # elements; a larger array gets its own kernel and is sharded
 
 
 class Packing(NamedTuple):
-    """Which leaves of a tree lie together: `groups` of leaf numbers, `shapes` and `treedef` of the tree.
+    """Which leaves of a tree are packed together: `groups` of leaf numbers, `shapes` and `treedef` of the tree.
 
-    A group of several is a vector of all its leaves, in their order; a group of one is the leaf itself.
+    A group of several leaves is one vector in their order. A group of one is the leaf itself.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -29,7 +29,7 @@ class Packing(NamedTuple):
     treedef: Any
 
     def pack(self, tree: Tree) -> tuple[Array, ...]:
-        """One array a group."""
+        """Return one array a group."""
         leaves = self.treedef.flatten_up_to(tree)
         return tuple(
             leaves[group[0]] if len(group) == 1 else jnp.concatenate([leaves[i].reshape(-1) for i in group])
@@ -37,7 +37,7 @@ class Packing(NamedTuple):
         )
 
     def unpack(self, arrays: Sequence[Array]) -> Tree:
-        """The tree that was packed."""
+        """Return the tree that was packed."""
         leaves: list[Any] = [None] * len(self.shapes)
         for group, array in zip(self.groups, arrays, strict=True):
             start = 0
@@ -48,7 +48,7 @@ class Packing(NamedTuple):
         return self.treedef.unflatten(leaves)
 
     def spread(self, group: int, values: Any) -> Any:
-        """`values` (leaves,), one a leaf, over the elements of a group's array: (n,), or () for a leaf alone."""
+        """Repeat `values` (leaves,) over the elements of a group: (n,), or () for a group of one leaf."""
         leaves = self.groups[group]
         if len(leaves) == 1:
             return values[leaves[0]]
@@ -57,7 +57,7 @@ class Packing(NamedTuple):
 
 
 def packing(tree: Tree, small: int = SMALL) -> Packing:
-    """How to pack a tree of arrays (or their shapes): the leaves below `small` elements together, by data type."""
+    """Return how to pack a tree of arrays or shapes: leaves below `small` elements together, by data type."""
     leaves, treedef = jax.tree.flatten(tree)
     together: dict[Any, list[int]] = {}
     for i, leaf in enumerate(leaves):
@@ -67,5 +67,5 @@ def packing(tree: Tree, small: int = SMALL) -> Packing:
 
 
 def norm(arrays: Sequence[Array]) -> Array:
-    """Euclidean norm of all elements, f32 ()."""
+    """Return the Euclidean norm of all elements, f32 ()."""
     return jnp.sqrt(sum(jnp.sum(jnp.square(x.astype(jnp.float32))) for x in arrays))

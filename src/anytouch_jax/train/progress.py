@@ -1,4 +1,4 @@
-"""A run and its user: the progress bar on a terminal, a line now and then elsewhere, and the signals that end a run."""
+"""Progress of a run on a terminal or in a log, and the signals that end it."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from dataclasses import dataclass
 from typing import Any
 
 Log = Callable[[str], None]
-_WORTH_TELLING = 0.05  # share of its time that a run may wait for data before the user hears of it
+_WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its time reports it
 
 
 @dataclass(frozen=True)
 class Bar:
-    """Where the user sees the run: `say` a sentence, `advance` by one step with its line of metrics."""
+    """The display of a run: `log` a sentence, or `advance` by one step with its line of metrics."""
 
     log: Log
     advance: Callable[[Mapping[str, Any]], None]
 
 
 def to_stderr(sentence: str) -> None:
-    """Say a sentence on the error stream, which keeps the output free for results."""
+    """Write a sentence to the error stream, which keeps the output free for results."""
     sys.stderr.write(sentence + "\n")
     sys.stderr.flush()
 
 
 def silent(sentence: str) -> None:
-    """Say nothing."""
+    """Drop a sentence."""
 
 
 @contextlib.contextmanager
 def progress(start: int, stop: int, log: Log) -> Iterator[Bar]:
-    """A bar from step `start` to `stop` on a terminal, else some twenty lines through `say`."""
+    """Show a bar from step `start` to `stop` on a terminal, else log about twenty lines."""
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
 
@@ -58,29 +58,28 @@ def progress(start: int, stop: int, log: Log) -> Iterator[Bar]:
 
 
 def summary(row: Mapping[str, Any]) -> str:
-    """The few numbers of a line of metrics that a user watches."""
+    """Return the loss, the speed and the problems of a line of metrics."""
     loss = "not finite" if row["loss"] is None else f"{row['loss']:.4f}"
     skipped = f"  skipped {row['skipped_batches']}" if row["skipped_batches"] else ""
     replaced = row.get("skipped_samples", 0)
     skipped += f"  {replaced:.0f} samples could not be read and were replaced" if replaced else ""
-    waits = f"  waits for data {row['wait_share']:.0%}" if row.get("wait_share", 0) >= _WORTH_TELLING else ""
+    waits = f"  waits for data {row['wait_share']:.0%}" if row.get("wait_share", 0) >= _WAIT_SHARE else ""
     return f"loss {loss}  {row['samples_per_second']:.0f} samples/s{skipped}{waits}"
 
 
 @contextlib.contextmanager
 def signals() -> Iterator[list[signal.Signals]]:
-    """A list that SIGTERM or Ctrl-C is put in instead of ending the process; a second Ctrl-C interrupts at once.
+    """Yield a list that collects SIGTERM and Ctrl-C, which then do not end the process. A second Ctrl-C does.
 
-    The handlers of before are restored in the end. Outside the main thread, where Python has no handlers, it stays
-    empty.
+    Outside the main thread Python has no handlers, and the list stays empty.
     """
-    seen: list[signal.Signals] = []
+    received: list[signal.Signals] = []
     if threading.current_thread() is not threading.main_thread():
-        yield seen
+        yield received
         return
 
     def note(number: int, frame: Any) -> None:
-        seen.append(signal.Signals(number))
+        received.append(signal.Signals(number))
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, before[signal.SIGINT])
 
@@ -88,22 +87,21 @@ def signals() -> Iterator[list[signal.Signals]]:
     try:
         for name in (signal.SIGTERM, signal.SIGINT):
             before[name] = signal.signal(name, note)
-        yield seen
+        yield received
     finally:
         for name, handler in before.items():
             signal.signal(name, handler)
 
 
 class Terminated(BaseException):
-    """SIGTERM while no step is under way."""
+    """SIGTERM outside a training step."""
 
 
 @contextlib.contextmanager
 def terminating() -> Iterator[None]:
-    """Let SIGTERM raise `Terminated` while the block runs, so that it is left as after any error: nothing half written.
+    """Let SIGTERM raise `Terminated` while the block runs, so that the block cleans up as after any error.
 
-    Inside `signals` that one decides. The handler of before is restored in the end; outside the main thread, where
-    Python has no handlers, nothing changes.
+    `signals` takes over inside it. Outside the main thread Python has no handlers, and nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""One training step as a pure function: loss and gradients, accumulation, the update, its metrics. No jit inside."""
+"""Training steps as pure functions: loss and gradients, accumulation, the update and its metrics."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ StepFn = Callable[["TrainState", Any, Array], tuple["TrainState", dict[str, Arra
 
 
 class TrainState(NamedTuple):
-    """What a step carries on: `step` i32 (), two disjoint nested dicts of parameters, the optimiser's state."""
+    """The state of training: `step` i32 (), trainable and frozen parameters as nested dicts, the optimiser's state."""
 
     step: Array
     trainable: Tree
@@ -37,15 +37,15 @@ class TrainState(NamedTuple):
 
 
 def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
-    """Cut nested parameters in (trainable, frozen) by (regex, frozen?) rules; the first match decides."""
+    """Split nested parameters into (trainable, frozen) by (regex, frozen?) rules. The first match decides."""
     leaves = flatten(params)
     frozen = match_rules(rules, leaves)
-    trained, kept = ({name: leaves[name] for name in leaves if frozen[name] == part} for part in (False, True))
-    return nest(trained), nest(kept)
+    trainable, fixed = ({name: leaves[name] for name in leaves if frozen[name] == part} for part in (False, True))
+    return nest(trainable), nest(fixed)
 
 
 def merge(trainable: Tree, frozen: Tree) -> Tree:
-    """The nested parameters that `split` cut. Raises ValueError when a parameter is in both."""
+    """Return the nested parameters that `split` separated. Raises ValueError if a parameter is in both."""
     merged = dict(trainable)
     for name, value in frozen.items():
         if name not in merged:
@@ -58,22 +58,23 @@ def merge(trainable: Tree, frozen: Tree) -> Tree:
 
 
 def init_state(params: Tree, config: Config) -> TrainState:
-    """The state before the first step: parameters split by `config.frozen`, moments zero."""
+    """Return the state before the first step: parameters split by `config.frozen`, moments zero."""
     trainable, frozen = split(params, config.frozen)
     return TrainState(jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable))
 
 
 def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps: int, accumulate: int = 1) -> StepFn:
-    """Build `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
+    """Return `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
-    differentiated, and those that the batch does not use are skipped (golden H_mixed). When the loss or the gradient
-    norm is not finite the update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: the
-    loss's own, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
+    differentiated, and those that the batch does not use are skipped (golden H_mixed). If the loss or the gradient
+    norm is not finite, the update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: those
+    of the loss, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
 
-    `accumulate` micro-batches (rows m, m + accumulate, ...) run one after the other and their losses, gradients and
-    metrics are averaged. That equals the large batch for a mean over rows; InfoNCE negatives stay within a
-    micro-batch. Raises ConfigError for rows that do not divide, and for packed image or text slots.
+    `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses, gradients and metrics are
+    averaged. For a mean over rows this equals the large batch. InfoNCE compares rows of one micro-batch only. Raises
+    ConfigError for rows that do not divide, and for packed image or text slots. `optax.MultiSteps` would apply an
+    update and advance the schedule over several calls, and one step here is one call.
     """
     tx = optax.with_extra_args_support(tx)
 
@@ -104,10 +105,10 @@ def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps:
 def _finish(
     state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
-    """Apply the update where loss and gradient are finite, and report.
+    """Apply the update if loss and gradient are finite, and return the new state and its metrics.
 
-    The update itself is read once, where it is added: of what has two readers XLA keeps a copy as large as the
-    parameters. So its norm is that of what the parameters changed by, and does not decide.
+    The update is read only once. For a second reader XLA would keep a copy as large as the parameters. So
+    `update_norm` is the norm of the change of the parameters, and does not decide whether a step is skipped.
     """
     layout = packing(state.trainable)
     grad_norm = norm(layout.pack(grads))
@@ -129,27 +130,27 @@ def _finish(
 
 
 def micro_batches(batch: Any, accumulate: int) -> Any:
-    """Cut every leading axis B into (accumulate, B / accumulate): micro-batch m has the rows m, m + accumulate, ...
+    """Split every leading axis B into (accumulate, B / accumulate): micro-batch m has the rows m, m + accumulate, ...
 
-    Rows are dealt out, not cut in runs, so that a batch sharded over devices stays where it is. Raises ConfigError.
+    With strided rows a batch that is sharded over devices needs no transfer. Raises ConfigError.
     """
     for part in jax.tree.leaves(batch, is_leaf=lambda x: isinstance(x, AlignBatch)):
         if isinstance(part, AlignBatch) and part.image.shape[0] + part.text.shape[0] > 0:
             raise ConfigError(
-                "optim.accumulate must be 1 for batches with images or texts, whose slots belong to rows of the whole "
-                "batch; lower data.batch_size instead"
+                "--optim.accumulate must be 1 for batches with images or texts, whose slots refer to rows of the whole "
+                "batch. Lower --batch instead."
             )
 
     def deal(x: Array) -> Array:
         if x.shape[0] % accumulate:
-            raise ConfigError(f"a batch of {x.shape[0]} rows does not divide by optim.accumulate={accumulate}")
+            raise ConfigError(f"a batch of {x.shape[0]} rows is not divisible by --optim.accumulate {accumulate}")
         return jnp.swapaxes(x.reshape(x.shape[0] // accumulate, accumulate, *x.shape[1:]), 0, 1)
 
     return jax.tree.map(deal, batch)
 
 
 def _mean_over(gradients: Callable[[Any, Array], Any], parts: Any, key: Array) -> Any:
-    """Mean of (loss, metrics, gradients) over micro-batches, one at a time; each has its own key."""
+    """Return the mean of (loss, metrics, gradients) over micro-batches, one at a time, each with its own key."""
     count = jax.tree.leaves(parts)[0].shape[0]
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(count))
     first = jax.tree.map(lambda x: x[0], (parts, keys))

@@ -1,7 +1,7 @@
-"""Which parameters a loss really uses: the loss's jaxpr, walked backwards from its value.
+"""Parameters that a loss uses, read from its jaxpr.
 
-A parameter counts as used when a gradient can flow from the loss to it, as in PyTorch, where the gradient of any
-other parameter is None. Dead code, integers and `stop_gradient` carry none. Metrics do not count.
+A parameter is used if a gradient can flow to it from the loss. PyTorch gives all others a gradient of None. Dead code,
+integers and `stop_gradient` carry no gradient, and metrics do not count.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _CALLS = {
 
 
 def used_parameters(loss_fn: Callable[..., Any], params: Tree, *args: Any) -> Tree:
-    """A tree like `params` of Python bools: does the value of `loss_fn(params, *args)` depend on that leaf?
+    """Return a tree like `params` of Python bools: whether the value of `loss_fn(params, *args)` depends on the leaf.
 
-    `loss_fn` returns a scalar, or a scalar and anything else. Arrays, tracers and shapes will do; nothing is computed.
-    A loop, a branch, a call or a custom derivative is entered: a leaf that the program inside ignores is unused.
+    `loss_fn` returns a scalar, or a scalar and anything else. Arguments may be arrays, tracers or shapes, and nothing
+    is computed. Loops, branches, calls and custom derivatives are entered.
     """
     jaxpr = jax.make_jaxpr(loss_fn)(*jax.tree.map(_abstract, (params, *args))).jaxpr
     live = _live_inputs(jaxpr, [i == 0 for i in range(len(jaxpr.outvars))])
@@ -48,7 +48,7 @@ def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def _live_inputs(jaxpr: Any, live_outputs: list[bool]) -> list[bool]:
-    """Which inputs of a jaxpr reach one of its live outputs through differentiable values."""
+    """Return which inputs of a jaxpr reach one of its live outputs through differentiable values."""
     live = {var for var, on in zip(jaxpr.outvars, live_outputs, strict=True) if on and _carries_gradient(var)}
     for eqn in reversed(jaxpr.eqns):
         outputs = [var in live for var in eqn.outvars]
@@ -63,7 +63,7 @@ def _carries_gradient(var: Any) -> bool:
 
 
 def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
-    """Which operands of an equation reach its live outputs; all of them where the primitive is not known."""
+    """Return which operands of an equation reach its live outputs. An unknown primitive uses all of them."""
     name, params, everything = eqn.primitive.name, eqn.params, [True] * len(eqn.invars)
     if name == "stop_gradient":
         return [False] * len(eqn.invars)
@@ -89,7 +89,7 @@ def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
 
 
 def _live_loop(body: Any, outputs: list[bool], consts: int, carry: int) -> list[bool]:
-    """Live operands [constants, carry, scanned] of a loop: a round must give what the next one needs of the carry."""
+    """Return the live operands [constants, carry, scanned] of a loop, whose carry may be read rounds later."""
     needed = outputs[:carry]
     while True:
         inputs = _live_inputs(body, needed + outputs[carry:])

@@ -308,7 +308,9 @@ def test_two_processes_never_train_one_run(straight, world, tmp_path):
         with (run / ".lock").open("ab") as held:
             fcntl.flock(held, fcntl.LOCK_EX)  # as another process holds it, from before its first checkpoint
             before = sorted(path.name for path in run.iterdir())
-            assert f"another process trains in {run}" in refused(clips_only(run_config(world, 2)), run, init=straight[0])
+            assert f"another process trains in {run}" in refused(
+                clips_only(run_config(world, 2)), run, init=straight[0]
+            )
             assert sorted(path.name for path in run.iterdir()) == before  # not even a tokenizer
         assert started or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step == 1
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from anytouch_jax.train.pack import norm, packing
+from anytouch_jax.train.pack import global_norm, packing
 
 TREE = {
     "b": jnp.arange(6.0).reshape(2, 3),
@@ -47,4 +47,4 @@ def test_the_norm_is_that_of_all_elements():
     floats = {name: value for name, value in TREE.items() if name != "whole"}
     flat = np.concatenate([np.asarray(leaf).ravel() for leaf in jax.tree.leaves(floats)])
     for small in (0, 1000):
-        np.testing.assert_allclose(norm(packing(floats, small).pack(floats)), np.linalg.norm(flat), rtol=1e-6)
+        np.testing.assert_allclose(global_norm(packing(floats, small).pack(floats)), np.linalg.norm(flat), rtol=1e-6)

@@ -18,7 +18,7 @@ import optax
 
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.pack import Packing, norm, packing
+from anytouch_jax.train.pack import Packing, global_norm, packing
 from anytouch_jax.weights.tree import flatten
 
 Array = jax.Array
@@ -160,7 +160,7 @@ def _adamw(
     gradients = layout.pack(grads)
     use = [layout.spread(k, uses) for k in range(len(gradients))]
     if options.grad_clip is not None:
-        length = norm([jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)])
+        length = global_norm([jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)])
         gradients = tuple(g * jnp.minimum(1.0, options.grad_clip / length) for g in gradients)
     directions, mus, nus = [], list(state.mu), list(state.nu)
     for k, (grad, value) in enumerate(zip(gradients, layout.pack(params), strict=True)):

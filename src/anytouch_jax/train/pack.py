@@ -66,6 +66,6 @@ def packing(tree: Tree, small: int = SMALL) -> Packing:
     return Packing(groups, tuple(leaf.shape for leaf in leaves), treedef)
 
 
-def norm(arrays: Sequence[Array]) -> Array:
+def global_norm(arrays: Sequence[Array]) -> Array:
     """Return the Euclidean norm of all elements, f32 ()."""
     return jnp.sqrt(sum(jnp.sum(jnp.square(x.astype(jnp.float32))) for x in arrays))

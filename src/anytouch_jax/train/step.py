@@ -13,7 +13,7 @@ from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.optim import match_rules, optimizer
-from anytouch_jax.train.pack import norm, packing
+from anytouch_jax.train.pack import global_norm, packing
 from anytouch_jax.train.usage import used_parameters
 from anytouch_jax.weights.tree import flatten, nest
 
@@ -111,7 +111,7 @@ def _finish(
     `update_norm` is the norm of the change of the parameters, and does not decide whether a step is skipped.
     """
     layout = packing(state.trainable)
-    grad_norm = norm(layout.pack(grads))
+    grad_norm = global_norm(layout.pack(grads))
     good = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
     new = (optax.apply_updates(state.trainable, updates), opt_state)
     old = (state.trainable, state.opt_state)
@@ -120,8 +120,8 @@ def _finish(
     metrics = metrics | {
         "loss": loss,
         "grad_norm": grad_norm,
-        "param_norm": norm(before),
-        "update_norm": norm([a - b for a, b in zip(layout.pack(trainable), before, strict=True)]),
+        "param_norm": global_norm(before),
+        "update_norm": global_norm([a - b for a, b in zip(layout.pack(trainable), before, strict=True)]),
         "learning_rate": jnp.asarray(getattr(new[1], "learning_rate", jnp.nan)),
         "skipped": jnp.where(good, 0.0, 1.0),
     }

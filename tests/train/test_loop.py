@@ -196,7 +196,7 @@ def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
         return toy_batches(start, stop, bad=range(2, 100))
 
     config = toy_config(save_every=2, max_skipped=3)
-    with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* optim.grad-clip"):
+    with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* --optim.grad-clip"):
         run(tmp_path, config, batches=batches)
     assert [row["step"] for row in rows(tmp_path)] == list(range(6))
     with pytest.raises(UserError, match="4 steps in a row, up to step 5"):  # going on recalls those before

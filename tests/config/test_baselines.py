@@ -95,7 +95,7 @@ def test_a_stage_that_a_recipe_lacks_is_refused(name: str) -> None:
 
 
 def test_unknown_names_are_one_sentence() -> None:
-    with pytest.raises(UserError, match="no baseline is called 'clip'; choose one of anytouch, no_pretraining"):
+    with pytest.raises(UserError, match=r"no baseline is called 'clip'\. Choose one of anytouch, no_pretraining"):
         baselines.apply("clip", preset("tiny"))
 
 

@@ -1,8 +1,8 @@
-"""Baselines and ablations as recipes: each a small change of the configuration, trained in the same framework.
+"""Baselines and ablations: small changes of the configuration.
 
-The rivals are in the manner of the papers they are named after, reduced to what sets them apart (Sec. 4.1 and
-appendix "Baselines"): all of them run on this network, on these data, from the same first weights. The ablations are
-the rows of Table 6, and two additions of our own. A stage that a recipe leaves as it is may be shared between recipes.
+A baseline keeps what distinguishes the method it is named after (Sec. 4.1 and appendix "Baselines"). All run on this
+network, on the same data, from the same first weights. The ablations are the rows of Table 6. Baselines with an equal
+stage may share its run.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from anytouch_jax.errors import UserError
 
 @dataclass(frozen=True)
 class Baseline:
-    """A recipe: `stages` that it trains (none: nothing is trained), and its `change` of a stage's configuration."""
+    """A baseline: the `stages` that it trains, and its `change` of a stage's configuration."""
 
     name: str
     about: str
@@ -26,26 +26,24 @@ class Baseline:
 
     @property
     def starts_from_stage1(self) -> bool:
-        """Whether its stage 2 starts from a stage 1 (`--init`)."""
+        """Whether stage 2 starts from a stage 1 (`--init`)."""
         return self.stages == (1, 2)
 
 
 def apply(name: str, config: Config) -> Config:
-    """`config` changed to the recipe called `name`. Raises UserError: no such recipe, or it lacks that stage."""
+    """Return `config` changed to a baseline. Raises UserError if it is unknown, or does not train the stage."""
     baseline = find(name)
     if config.stage in baseline.stages:
         return baseline.change(config)
     if not baseline.stages:
-        raise UserError(
-            f"baseline {name} is not trained: evaluate the image tower of a stage-2 run, or CLIP's, instead"
-        )
-    raise UserError(f"baseline {name} has no stage {config.stage}, only stage {baseline.stages[0]}: {baseline.about}")
+        raise UserError(f"baseline {name} is not trained. Evaluate the image tower of a stage-2 run, or that of CLIP.")
+    raise UserError(f"baseline {name} has no stage {config.stage}, only stage {baseline.stages[0]} ({baseline.about})")
 
 
 def find(name: str) -> Baseline:
-    """The recipe called `name`. Raises UserError."""
+    """Return the baseline called `name`. Raises UserError."""
     if name not in BASELINES:
-        raise UserError(f"no baseline is called {name!r}; choose one of {', '.join(BASELINES)}")
+        raise UserError(f"no baseline is called {name!r}. Choose one of {', '.join(BASELINES)}")
     return BASELINES[name]
 
 
@@ -56,7 +54,7 @@ def _change(
     objective: dict[str, Any] | None = None,
     data: dict[str, Any] | None = None,
 ) -> Callable[[Config], Config]:
-    """Set these fields in `stages`; other stages stay as they are."""
+    """Return a change that sets these fields in `stages` only."""
 
     def change(config: Config) -> Config:
         if config.stage not in stages:
@@ -71,7 +69,10 @@ def _change(
     return change
 
 
-_OWN_TOKENS: dict[str, Any] = {"universal_start": 0.0, "universal_end": 0.0}  # never drawn, so never trained
+_OWN_TOKENS: dict[str, Any] = {
+    "universal_start": 0.0,
+    "universal_end": 0.0,
+}  # the universal tokens are never drawn and never trained
 _STILLS: dict[str, Any] = {"clip_share": 0.0}
 _NO_CLIPS = _change(data=_STILLS, objective={"next_frame": False})
 _ALL = (
@@ -112,9 +113,9 @@ _ALL = (
             data=_STILLS,
         ),
     ),
-    # The paper has one model for both: Table 4 calls it AnyTouch without dynamic perception, "trained solely on tactile
-    # images", Table 6 "w/o Dynamic Perception". So the two are the same recipe, under the names of their tables.
-    Baseline("static_only", "AnyTouch that never sees a clip, in either stage (Table 4)", (1, 2), _NO_CLIPS),
+    # The paper has one model for both names: "trained solely on tactile images" in Table 4, "w/o Dynamic Perception" in
+    # Table 6.
+    Baseline("static_only", "AnyTouch without clips in both stages (Table 4)", (1, 2), _NO_CLIPS),
     Baseline("no_dynamic", "without dynamic perception: the same model as static_only (Table 6)", (1, 2), _NO_CLIPS),
     Baseline(
         "no_text",
@@ -130,7 +131,7 @@ _ALL = (
     ),
     Baseline(
         "no_text_aligned",
-        "text withheld in the aligned set alone: rows whose touch other sensors or units felt too",
+        "no text for touches that other sensors or units recorded too",
         (1, 2),
         _change((2,), data={"aligned_text": False}),
     ),

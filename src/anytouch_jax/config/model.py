@@ -1,4 +1,4 @@
-"""The settings of the network: sizes of its stacks, what it is built of, the table of sensors."""
+"""Settings of the network: sizes of its stacks, its parts, the table of sensors."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 
 
 class SpellingError(ConfigError):
-    """The name of a known sensor, spelled otherwise."""
+    """A sensor name that differs from a known one only in spelling."""
 
 
 def check_spelling(name: str, known: Iterable[str] = ()) -> None:
-    """Raise SpellingError for a name that differs from a known one (SENSORS, FIELD_SENSORS, `known`) by case, or - or a
-    blank for _, alone."""
-    names = {one: _plain(one) for one in (*SENSORS, *FIELD_SENSORS, *known)}
-    right = next((one for one, plain in names.items() if plain == _plain(name)), None)
-    if name not in names and right is not None:
-        raise SpellingError(f"sensor {name!r}: it is called {right}")
+    """Raise SpellingError for a name that differs from a known one only by case, or by - or a blank instead of _.
+
+    Known are SENSORS, FIELD_SENSORS and `known`.
+    """
+    names = {sensor: _plain(sensor) for sensor in (*SENSORS, *FIELD_SENSORS, *known)}
+    correct = next((sensor for sensor, plain in names.items() if plain == _plain(name)), None)
+    if name not in names and correct is not None:
+        raise SpellingError(f"sensor {name!r}: it is called {correct}")
 
 
 def _plain(name: str) -> str:
@@ -38,10 +40,10 @@ def _plain(name: str) -> str:
 class Stack:
     """A stack of transformer blocks."""
 
-    width: int  # channels
-    depth: int  # blocks
-    heads: int  # of attention
-    mlp: int  # hidden channels of a block
+    width: int  # Channels.
+    depth: int  # Blocks.
+    heads: int  # Attention heads.
+    mlp: int  # Hidden channels of the MLP in a block.
 
     def __post_init__(self) -> None:
         in_range("", self, width=COUNT, depth=NOT_NEGATIVE, heads=COUNT, mlp=COUNT)
@@ -54,9 +56,9 @@ class TextTower:
     """CLIP's text tower."""
 
     stack: Stack
-    vocab: int = 49408  # tokens
-    length: int = 77  # of a caption in tokens, with its ends
-    end_token: int | None = None  # whose first occurrence is pooled; None: that of the largest id (CLIP)
+    vocab: int = 49408  # Tokens of the vocabulary.
+    length: int = 77  # Tokens of a caption, with start and end.
+    end_token: int | None = None  # Token to pool, at its first position. None pools the largest id (CLIP).
 
     def __post_init__(self) -> None:
         in_range("--model.text.", self, vocab=COUNT, length=COUNT)
@@ -69,28 +71,35 @@ class ModelConfig:
     `sensors` names the rows of sensor tokens (Sec. 3.5), and of patch encoders if each has its own (T3).
     """
 
-    image_size: int  # pixels of a side
-    patch: int  # pixels of a patch's side
-    embed: int  # values of an embedding
-    touch: Stack  # touch encoder
-    decoder: Stack  # decoder of stage 1
-    image: Stack | None = None  # image tower; None: none (stage 1)
-    text: TextTower | None = None  # text tower; None: none (stage 1)
-    frames: int = 3  # of a clip
-    sensors: tuple[str, ...] = SENSORS  # names; "universal" serves those never seen
-    sensor_tokens: int = 5  # of each sensor
-    activation: Literal["gelu", "quick_gelu"] = "gelu"  # of the encoders; CLIP's own weights want quick_gelu
-    norm_eps: float = 1e-5  # of layer norms
-    decoder_norm_eps: float = 1e-12  # of the decoder's
-    decoder_sensor_tokens: bool = False  # the decoder gets the sensor tokens themselves, not as encoded
-    patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # one; one a sensor (T3); small CNN (ours)
-    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # cosine is ours: `ops.losses.contrast_loss`
-    lora_rank: int = 0  # of the image tower's LoRA; 0: none
-    lora_alpha: float = 16.0  # LoRA's scale, over its rank
-    temperature: float = 0.07  # of InfoNCE at the start; it is learned
-    dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # of the arithmetic; parameters are float32
-    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"  # forms of one sum; auto: the fastest here
-    remat: bool = False  # activations are computed again, not kept: less memory, slower
+    image_size: int  # Side of an image, pixels.
+    patch: int  # Side of a patch, pixels.
+    embed: int  # Values of an embedding.
+    touch: Stack  # Touch encoder.
+    decoder: Stack  # Decoder of stage 1.
+    image: Stack | None = None  # Image tower. Stage 1 has none.
+    text: TextTower | None = None  # Text tower. Stage 1 has none.
+    frames: int = 3  # Frames of a clip.
+    sensors: tuple[str, ...] = SENSORS  # Sensors with tokens. "universal" serves all other sensors.
+    sensor_tokens: int = 5  # Tokens of each sensor.
+    activation: Literal["gelu", "quick_gelu"] = (
+        "gelu"  # Activation of the encoders. OpenAI's CLIP weights need quick_gelu.
+    )
+    norm_eps: float = 1e-5  # Epsilon of layer norms.
+    decoder_norm_eps: float = 1e-12  # Epsilon of the decoder's layer norms.
+    # The authors' weights need it (golden C).
+    decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding.
+    patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
+    match_head: Literal["mlp", "linear", "cosine", "none"] = (
+        "none"  # linear is the release's. cosine is not in the paper.
+    )
+    lora_rank: int = 0  # Rank of the image tower's LoRA. 0: off.
+    lora_alpha: float = 16.0  # Scale of LoRA, divided by its rank.
+    temperature: float = 0.07  # Temperature of InfoNCE at the start. It is learned.
+    dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # Type of the arithmetic. Parameters are float32.
+    attention: Literal["auto", "xla", "mapped", "cudnn"] = (
+        "auto"  # Implementation of attention. auto takes the fastest here.
+    )
+    remat: bool = False  # Recompute activations in the backward pass. Saves memory, takes time.
 
     def __post_init__(self) -> None:
         chosen("--model.", self)
@@ -111,23 +120,22 @@ class ModelConfig:
 
     @property
     def patches(self) -> int:
-        """Number of patch positions N = (image_size / patch)^2."""
+        """The number of patch positions N = (image_size / patch)^2."""
         return (self.image_size // self.patch) ** 2
 
     @property
     def universal_row(self) -> int:
-        """Row of the universal sensor tokens."""
+        """The row of the universal sensor tokens."""
         return self.sensors.index(UNIVERSAL)
 
     def sensor_row(self, name: str) -> int:
-        """Row of the sensor called `name`. Raises ConfigError when the table does not have it."""
+        """Return the row of a sensor. Raises ConfigError if the table does not have it."""
         if name in FIELD_SENSORS:
-            raise ConfigError(f"sensor {name!r} measures a force field and has no images; leave it out of training")
+            raise ConfigError(f"sensor {name!r} measures a force field and has no images. Leave it out of training.")
         check_spelling(name, self.sensors)
         if name not in self.sensors:
             known, table = ", ".join(self.sensors), " ".join(self.sensors)
             raise ConfigError(
-                f"unknown sensor {name!r}; known: {known}. A new one is named with the others: "
-                f"--model.sensors {name} {table}"
+                f"unknown sensor {name!r}. Choose one of {known}, or add it by --model.sensors {name} {table}"
             )
         return self.sensors.index(name)

@@ -1,4 +1,4 @@
-"""Reading dataclasses from JSON strictly, ranges, choices, and the errors that all rooms raise for a user's mistake."""
+"""Strict reading of dataclasses from JSON, with ranges and choices of their fields."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from anytouch_jax.errors import ConfigError
 
 
 class Range(NamedTuple):
-    """Numbers `low` to `high`, both included, and how a message calls them."""
+    """Numbers from `low` to `high`, both included, and their description in messages."""
 
     low: float
     high: float
@@ -23,7 +23,7 @@ class Range(NamedTuple):
 COUNT = Range(1, math.inf, "1 or more")
 NOT_NEGATIVE = Range(0, math.inf, "0 or more")
 ABOVE_0 = Range(math.ulp(0.0), math.inf, "above 0")
-FLOAT32 = 3.4e38  # what is larger is infinite where it is used
+FLOAT32 = 3.4e38  # larger numbers are infinite in float32
 NORMAL = Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")
 SHARE = Range(0, 1, "0 to 1")
 SEED = Range(0, 2**32 - 1, "0 to 4294967295")
@@ -31,9 +31,9 @@ BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
 
 
 def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
-    """Raise ConfigError for a field of `settings` outside its range; `prefix` is its section on the command line.
+    """Raise ConfigError for a field of `settings` outside its range. `prefix` is its section on the command line.
 
-    None is in every range, NaN and what is infinite in float32 in none; of a tuple every entry counts.
+    None is always valid. NaN and numbers that are infinite in float32 never are. Every entry of a tuple is checked.
     """
     for name, (low, high, words) in ranges.items():
         value = getattr(settings, name)
@@ -43,16 +43,18 @@ def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
 
 
 def chosen(prefix: str, settings: Any) -> None:
-    """Raise ConfigError for a field of `settings` that is none of the choices (Literal) of its annotation; `prefix` as
-    for `in_range`. Of a tuple every entry counts."""
+    """Raise ConfigError for a field of `settings` that is not a choice (Literal) of its annotation.
+
+    `prefix` is its section on the command line. Every entry of a tuple is checked.
+    """
     kind: Any = type(settings)
     for name, hint in _choices(kind).items():
-        build(hint, getattr(settings, name), _spelled(prefix, name))
+        read_value(hint, getattr(settings, name), _spelled(prefix, name))
 
 
 @functools.cache
 def _choices(kind: type) -> dict[str, Any]:
-    """The annotations of those fields of a dataclass that have choices, by name."""
+    """Return the annotations of those fields of a dataclass that have choices, by name."""
 
     def has_some(hint: Any) -> bool:
         return typing.get_origin(hint) is Literal or any(map(has_some, typing.get_args(hint)))
@@ -64,8 +66,8 @@ def _spelled(prefix: str, name: str) -> str:
     return f"{prefix}{name.replace('_', '-')}" if prefix else name
 
 
-def build(kind: Any, value: Any, where: str) -> Any:
-    """`value` (from JSON) as an instance of the annotation `kind`; `where` names the place in errors."""
+def read_value(kind: Any, value: Any, where: str) -> Any:
+    """Return `value` (from JSON) as an instance of the annotation `kind`. `where` is its name in errors."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         if not isinstance(value, dict):
@@ -73,17 +75,17 @@ def build(kind: Any, value: Any, where: str) -> Any:
         hints = typing.get_type_hints(kind)
         unknown = sorted(set(value) - set(hints))
         if unknown:
-            raise ConfigError(f"{where} has no setting called {', '.join(unknown)}; it has {', '.join(hints)}")
+            raise ConfigError(f"{where} has no setting called {', '.join(unknown)}. Choose from {', '.join(hints)}.")
         required = [f.name for f in dataclasses.fields(kind) if _required(f)]
         missing = [name for name in required if name not in value]
         if missing:
-            raise ConfigError(f"{where} lacks {', '.join(missing)}")
-        return kind(**{name: build(hints[name], item, f"{where}.{name}") for name, item in value.items()})
+            raise ConfigError(f"{where} has no {', '.join(missing)}")
+        return kind(**{name: read_value(hints[name], item, f"{where}.{name}") for name, item in value.items()})
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in args:
             return None
         (inner,) = [arg for arg in args if arg is not type(None)]
-        return build(inner, value, where)
+        return read_value(inner, value, where)
     if origin is Literal:
         if value not in args:
             raise ConfigError(f"{where} must be one of {', '.join(map(str, args))}, not {value!r}")
@@ -94,7 +96,7 @@ def build(kind: Any, value: Any, where: str) -> Any:
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
         if len(kinds) != len(value):
             raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
-        return tuple(build(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+        return tuple(read_value(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Literal
 
 from anytouch_jax.config.model import ModelConfig, Stack, TextTower
-from anytouch_jax.config.parsing import build
+from anytouch_jax.config.parsing import read_value
 from anytouch_jax.config.train import Config, DataConfig, PresetName, Recipe, Towers
 from anytouch_jax.errors import ConfigError
 
@@ -54,8 +54,8 @@ def preset(
     `objective.groups` is 4 for a batch of 256. Raises ConfigError for an unknown name or choice.
     """
     if name not in _PRESETS:
-        raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(_PRESETS)}")
-    build(Towers, towers, "towers")  # stage 1 has none, but a wrong word is refused there too
+        raise ConfigError(f"unknown preset {name!r}. Choose one of {', '.join(_PRESETS)}")
+    read_value(Towers, towers, "towers")  # stage 1 has no towers, but a wrong choice is an error there too
     full, image, batch = _PRESETS[name]
     config = Config(
         model=replace(full, text=None),
@@ -66,7 +66,7 @@ def preset(
     )
     if stage == 2:
         if towers == "none":
-            raise ConfigError("stage 2 needs towers: choose towers=scratch or towers=pretrained")
+            raise ConfigError("stage 2 needs towers. Choose --towers scratch or --towers pretrained.")
         model = replace(
             full,
             image=image,

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from anytouch_jax.config.parsing import build
+from anytouch_jax.config.parsing import read_value
 from anytouch_jax.config.train import Config
 from anytouch_jax.errors import ConfigError
 
@@ -44,7 +44,7 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
         data = _modern(data, allow_retired)
     elif isinstance(data, dict):
         data = {name: value for name, value in data.items() if ("model", name) not in _RETIRED}
-    return build(cls, data, "config" if cls is Config else cls.__name__.lower())
+    return read_value(cls, data, "config" if cls is Config else cls.__name__.lower())
 
 
 def _modern(data: Mapping[str, Any], allow_retired: bool) -> dict[str, Any]:

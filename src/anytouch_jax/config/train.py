@@ -88,7 +88,7 @@ class DataConfig:
     negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
     require: tuple[Literal["image", "text"], ...] = ()  # Draw only rows that have these modalities.
     contact_only: bool = False  # Leave out rows that label.contact marks as free. Unmarked rows stay.
-    aligned_text: bool = True  # Use the text of rows whose touch other sensors or units felt too.
+    aligned_text: bool = True  # Use the text of touches that other sensors or units recorded too.
     background: Literal["keep", "subtract"] = "keep"  # Subtract the untouched gel (background_path). Not in the paper.
     flip: float = 0.5  # Probability of a mirror image, for each direction.
     affine: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Largest turn (degrees), shift and zoom (shares of the side).

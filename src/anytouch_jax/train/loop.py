@@ -30,7 +30,7 @@ from anytouch_jax.train.mesh import (
 )
 from anytouch_jax.train.metrics import Record, alone_in, continues, open_run, writing
 from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.progress import Bar, Log, progress, signals, silent, to_stderr
+from anytouch_jax.train.progress import Log, RunDisplay, progress, signals, silent, to_stderr
 from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
@@ -128,7 +128,7 @@ class _Loop:
         mesh: Mesh,
         checkpoints: Checkpoints,
         record: Record,
-        bar: Bar,
+        bar: RunDisplay,
         on_report: Report | None,
     ) -> None:
         self.config, self.mesh, self.checkpoints = config, mesh, checkpoints

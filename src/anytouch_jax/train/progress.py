@@ -15,7 +15,7 @@ _WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its ti
 
 
 @dataclass(frozen=True)
-class Bar:
+class RunDisplay:
     """The display of a run: `log` a sentence, or `advance` by one step with its line of metrics."""
 
     log: Log
@@ -33,7 +33,7 @@ def silent(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(start: int, stop: int, log: Log) -> Iterator[Bar]:
+def progress(start: int, stop: int, log: Log) -> Iterator[RunDisplay]:
     """Show a bar from step `start` to `stop` on a terminal, else log about twenty lines."""
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
@@ -43,7 +43,7 @@ def progress(start: int, stop: int, log: Log) -> Iterator[Bar]:
             if done == start + 1 or done == stop or (done - start) % every == 0:
                 log(f"step {done}/{stop}  {summary(row)}")
 
-        yield Bar(log, line)
+        yield RunDisplay(log, line)
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -51,7 +51,7 @@ def progress(start: int, stop: int, log: Log) -> Iterator[Bar]:
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("compiling", total=stop, completed=start)
-        yield Bar(
+        yield RunDisplay(
             log,
             lambda row: bar.update(task, completed=row["step"] + 1, description=summary(row)),
         )

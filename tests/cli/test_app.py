@@ -75,6 +75,7 @@ def test_an_unknown_command_gets_one_line_that_names_the_right_one(anytouch, typ
         ("train --data m.csv --run r --loader.flip 0", "--data.flip"),
         ("train --data m.csv --run r --loop.seed=1", "--run.seed"),
         ("train --data m.csv --run r --clip weights", "--clip-weights"),
+        ("train --data m.csv --run r --optim.clip_norm 1", "--optim.grad-clip"),
         ("probe label --data m.csv --tasks all", "anytouch probe tasks"),
         ("export --run r --out f.bin", "--model"),
     ],

@@ -34,6 +34,7 @@ RENAMED_OPTIONS = {
     "--loader": "--data",
     "--loop": "--run",
     "--optim.clip-norm": "--optim.grad-clip",
+    "--objective.centre": "--objective.center-embeddings",
 }
 
 
@@ -69,7 +70,7 @@ def _refuse_renamed(kind: Any, args: Sequence[str]) -> None:
     for option in map(option_of, args):
         section = option.partition(".")[0]
         for old in (option, section):
-            if old in RENAMED_OPTIONS and section not in known:
+            if old in RENAMED_OPTIONS and old not in known:
                 rest = option.removeprefix(old) if RENAMED_OPTIONS[old].startswith("--") else ""
                 raise UserError(f"{option} has a new name: use {RENAMED_OPTIONS[old]}{rest}")
 

@@ -178,7 +178,7 @@ def _refuse_other_stage(options: TrainOptions, config: Config) -> None:
     for section, names in unread.items():
         ours, theirs = getattr(config, section), getattr(usual, section)
         for name in names:
-            if getattr(ours, name, None) != getattr(theirs, name, None):
+            if getattr(ours, name) != getattr(theirs, name):
                 raise UserError(f"--{section}.{name.replace('_', '-')} has no effect {where}. Remove it.")
 
 

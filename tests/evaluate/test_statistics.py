@@ -10,6 +10,7 @@ from anytouch_jax.evaluate.statistics import (
     bootstrap_interval,
     classification_sums,
     mae_of,
+    markdown_table,
     mean_interval,
     mean_of,
     r2_interval,
@@ -116,3 +117,9 @@ def test_a_value_that_no_draw_has_has_no_interval() -> None:
 )
 def test_a_sign_is_told_of_an_interval_that_leaves_zero_out(low, high, seeds, wanted, word):
     assert verdict(low, high, seeds, wanted=wanted) == word
+
+
+def test_a_table_escapes_its_cells_and_aligns_its_columns() -> None:
+    table = markdown_table(("a", "b|c"), [("1", "two\nlines"), (2.5, None)], "lr")
+    assert table.splitlines() == ["| a | b\\|c |", "| :--- | ---: |", "| 1 | two lines |", "| 2.5 | None |"]
+    assert markdown_table(("a",), []).splitlines() == ["| a |", "| --- |"]

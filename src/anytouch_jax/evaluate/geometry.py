@@ -106,5 +106,5 @@ def _positive_pairs(sensors: Array, touches: Array) -> tuple[Array, Array]:
 def _unit(features: Array) -> Array:
     x = np.asarray(features, np.float64)
     if x.ndim != 2 or not np.isfinite(x).all():
-        raise UserError(f"features must be (n, d) without NaN or Inf; these are {x.shape}")
+        raise UserError(f"features must be finite numbers (n, d), not {x.shape} with NaN or Inf")
     return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)

@@ -1,4 +1,4 @@
-"""`anytouch data pack`: a manifest's files in a few Parquet shards."""
+"""`anytouch data pack`: files of a manifest in a few ZIP shards."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from anytouch_jax.cli.output import default_target, log
 
 @dataclass(frozen=True)
 class PackOptions:
-    """Store millions of small files in a few Parquet shards, from which training reads the same batches.
+    """Store millions of small files in a few ZIP shards, from which training reads the same batches.
 
     Example: anytouch data pack touch.parquet --out packed
 

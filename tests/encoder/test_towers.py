@@ -84,7 +84,7 @@ def test_the_matching_head_of_a_run(encoder, stored):
     first, second = RNG.standard_normal((2, 7, 12)).astype(np.float32)
     net = build(stored.config.model)
     logits = encoder.match(first, second)
-    wanted = net.apply(stored.params, "match", normalise(first), normalise(second))
+    wanted = net.match(stored.params, normalise(first), normalise(second))
     np.testing.assert_allclose(logits, wanted, atol=1e-5)
     assert logits.shape == (7,) and np.ptp(logits) > 1e-4
 

@@ -72,7 +72,7 @@ def spec(work: Workload) -> dict[str, Any]:
         "stage": config.stage,
         "kept": int(config.model.patches * config.objective.keep_ratio),
         "model": dataclasses.asdict(config.model),
-        "weights": config.objective.pair_weights,
+        "weights": config.pair_weights,
         "match_weight": config.objective.match_weight,
     }
 

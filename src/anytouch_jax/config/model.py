@@ -81,24 +81,18 @@ class ModelConfig:
     frames: int = 3  # Frames of a clip.
     sensors: tuple[str, ...] = SENSORS  # Sensors with tokens. "universal" serves all other sensors.
     sensor_tokens: int = 5  # Tokens of each sensor.
-    activation: Literal["gelu", "quick_gelu"] = (
-        "gelu"  # Activation of the encoders. OpenAI's CLIP weights need quick_gelu.
-    )
+    activation: Literal["gelu", "quick_gelu"] = "gelu"  # Activation of the encoders. OpenAI CLIP needs quick_gelu.
     norm_eps: float = 1e-5  # Epsilon of layer norms.
     decoder_norm_eps: float = 1e-12  # Epsilon of the decoder's layer norms.
     # The authors' weights need it (golden C).
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding.
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
-    match_head: Literal["mlp", "linear", "cosine", "none"] = (
-        "none"  # linear is the release's. cosine is not in the paper.
-    )
+    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
     lora_rank: int = 0  # Rank of the image tower's LoRA. 0: off.
     lora_alpha: float = 16.0  # Scale of LoRA, divided by its rank.
     temperature: float = 0.07  # Temperature of InfoNCE at the start. It is learned.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # Type of the arithmetic. Parameters are float32.
-    attention: Literal["auto", "xla", "mapped", "cudnn"] = (
-        "auto"  # Implementation of attention. auto takes the fastest here.
-    )
+    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"  # Implementation. auto takes the fastest here.
     remat: bool = False  # Recompute activations in the backward pass. Saves memory, takes time.
 
     def __post_init__(self) -> None:

@@ -105,7 +105,7 @@ _ALL = (
     ),
     Baseline(
         "t3",
-        "T3: a patch encoder of its own for each sensor, a shared trunk, masked autoencoding of stills",
+        "T3: one patch encoder a sensor, a shared trunk, masked autoencoding of stills",
         (1,),
         _change(
             model={"patch_encoder": "sensor", "sensor_tokens": 0},

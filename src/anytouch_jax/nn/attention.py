@@ -1,4 +1,4 @@
-"""Multi-head attention in three forms with one result: by XLA, by cuDNN, or mapped over cache-sized groups of heads."""
+"""Multi-head attention in three equal forms: by XLA, by cuDNN, or mapped over cache-sized groups of heads."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from jax import Array
 
 from anytouch_jax.config import ModelConfig
 
-CACHE = 1_700_000  # bytes of logits at a time: what stays in a core's cache; six heads of a still at 262 tokens
+CACHE = 1_700_000  # bytes of logits that fit in a core's cache: six heads of a still at 262 tokens
 
 
 def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, mask: Array | None = None) -> Array:
-    """softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool marks the keys to be read.
+    """Return softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool marks keys to read.
 
     `how` is "xla", "cudnn", "mapped", or "auto": mapped where one CPU does the work, XLA's own form elsewhere. A causal
     or masked call is never mapped (text is short), nor one of few queries. cuDNN does what it can: 16 bits, an even Q,
@@ -33,14 +33,14 @@ def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, m
 
 
 def usable(model: ModelConfig) -> ModelConfig:
-    """`model` with a form of attention that this machine has: what cuDNN trained can be used where there is none."""
+    """Return `model` with a form of attention that this machine has, for weights trained by cuDNN."""
     there = model.attention != "cudnn" or jax.default_backend() == "gpu"
     return model if there else replace(model, attention="auto")
 
 
 @jax.custom_vjp
 def mapped(q: Array, k: Array, v: Array) -> Array:
-    """Attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from its saved log-sum.
+    """Return attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from its saved log-sum.
 
     All B * H tables of S x S logits at once are written to memory and read back a dozen times; a few at a time never
     leave the cache (Rabe and Staats, 2021; Dao et al., 2022). On two CPU cores 2 to 4 times as fast.
@@ -67,7 +67,7 @@ mapped.defvjp(_forward, _backward)
 
 
 def _groups(x: Array) -> Array:
-    """(B, S, H, D) -> (groups, G, S, D), G heads whose logits fit in `CACHE`."""
+    """Reshape (B, S, H, D) to (groups, G, S, D), G heads whose logits fit in `CACHE`."""
     b, s, h, d = x.shape
     most = max(1, CACHE // (4 * s * s))
     size = next(n for n in range(min(most, b * h), 0, -1) if b * h % n == 0)
@@ -75,18 +75,18 @@ def _groups(x: Array) -> Array:
 
 
 def _heads(x: Array, shape: tuple[int, ...]) -> Array:
-    """The inverse of `_groups`."""
+    """Invert `_groups`."""
     b, s, h, d = shape
     return jnp.swapaxes(x.reshape(b, h, s, d), 1, 2)
 
 
 def _product(subscripts: str, a: Array, b: Array) -> Array:
-    """A product of small matrices, in the wider type where one is narrow, summed in float32 or wider."""
+    """Return a product of small matrices in the wider of both types, summed in float32 or wider."""
     return jnp.einsum(subscripts, a, b, preferred_element_type=jnp.promote_types(a.dtype, jnp.float32))
 
 
 def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Output (G, S, D) and log-sum of the logits (G, S) of one group."""
+    """Return output (G, S, D) and log-sum of the logits (G, S) of one group."""
     q, k, v = part
     logits = _product("gqd,gkd->gqk", q * q.shape[-1] ** -0.5, k)
     largest = jnp.max(logits, axis=-1, keepdims=True)
@@ -97,7 +97,7 @@ def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
 
 
 def _differentiate(part: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-    """Gradients (G, S, D) with respect to query, key and value of one group; `own` (G, S, 1) is gradient times out."""
+    """Return gradients (G, S, D) of query, key and value of a group. `own` (G, S, 1) is gradient times output."""
     q, k, v, log_sum, own, gradient = part
     scale = q.shape[-1] ** -0.5
     weights = jnp.exp(_product("gqd,gkd->gqk", q * scale, k) - log_sum[..., None])

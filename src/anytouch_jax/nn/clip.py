@@ -1,4 +1,4 @@
-"""CLIP's image and text towers (Radford et al., 2021), the partners of stage 2."""
+"""Image and text towers of CLIP (Radford et al., 2021), for stage 2."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from anytouch_jax.ops import tokens
 
 
 class ImageTower(nnx.Module):
-    """ViT over [class, patches] of one photograph; embedding from the class token."""
+    """ViT over [class, patches] of a photograph, with the embedding from the class token."""
 
     def __init__(self, model: ModelConfig, stack: Stack) -> None:
         self.patch = Dense(model.patch**2 * 3, stack.width, model, bias=False)
@@ -26,23 +26,23 @@ class ImageTower(nnx.Module):
         self.patch_size, self.remat = model.patch, model.remat
 
     def hidden(self, image: Array) -> Array:
-        """Last hidden states (V, 1 + N, D) of normalised images (V, H, W, 3)."""
+        """Return the last hidden states (V, 1 + N, D) of normalised images (V, H, W, 3)."""
         x = self.patch(tokens.patchify(image[:, None], self.patch_size)[:, :, 0])
         start = jnp.broadcast_to(self.class_token[...].astype(x.dtype)[None, None], (len(x), 1, x.shape[-1]))
         x = jnp.concatenate([start, x], axis=1) + self.position[...].astype(x.dtype)[None]
         return run_blocks(self.blocks, self.pre_norm(x), remat=self.remat)
 
     def pooled(self, image: Array) -> Array:
-        """The normed class token (V, D), before the projection."""
+        """Return the normed class token (V, D), before the projection."""
         return self.post_norm(self.hidden(image)[:, 0])
 
     def __call__(self, image: Array) -> Array:
-        """Image embedding (V, E), not normalised."""
+        """Return the image embedding (V, E), not normalised."""
         return self.projection(self.pooled(image))
 
 
 class TextEncoder(nnx.Module):
-    """Causal transformer over token ids; embedding from the end token (golden Q10)."""
+    """Causal transformer over token ids, with the embedding from the end token (golden Q10)."""
 
     def __init__(self, model: ModelConfig, tower: TextTower) -> None:
         width = tower.stack.width
@@ -54,15 +54,15 @@ class TextEncoder(nnx.Module):
         self.end_token, self.dtype, self.remat = tower.end_token, stored(model.dtype), model.remat
 
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
-        """Normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""
+        """Return normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""
         x = (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(self.dtype)
         return self.final_norm(run_blocks(self.blocks, x, remat=self.remat, causal=True, mask=mask))
 
     def pooled(self, ids: Array, mask: Array | None = None) -> Array:
-        """The hidden state (L, W) of the end token: the largest id, or the first occurrence of `end_token`."""
+        """Return the hidden state (L, W) of the end token: the largest id, or the first occurrence of `end_token`."""
         at = jnp.argmax(ids if self.end_token is None else ids == self.end_token, axis=1)
         return jnp.take_along_axis(self.hidden(ids, mask), at[:, None, None], axis=1)[:, 0]
 
     def __call__(self, ids: Array, mask: Array | None = None) -> Array:
-        """Text embedding (L, E), not normalised."""
+        """Return the text embedding (L, E), not normalised."""
         return self.projection(self.pooled(ids, mask))

@@ -10,9 +10,9 @@ Params = dict[str, Any]
 
 
 def merge_lora(params: Params, alpha: float) -> Params:
-    """`params` with the low-rank updates of "lora" added to the image tower's q, k, v and output kernels.
+    """Return `params` with the low-rank updates of "lora" added to the image tower's q, k, v and output kernels.
 
-    a (depth, D, r) and b (depth, r, D); without a "lora" entry the tree is returned as it is. Being linear, the
+    a (depth, D, r) and b (depth, r, D); without a "lora" entry the tree is returned unchanged. Being linear, the
     update may be added to the kernel instead of being applied to the activations: same output, same gradient.
     """
     if "lora" not in params:

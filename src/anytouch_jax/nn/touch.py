@@ -1,4 +1,4 @@
-"""The touch encoder with its sensor tokens (Sec. 3.1, 3.5) and the pixel decoder (Sec. 3.2)."""
+"""Touch encoder with sensor tokens (Sec. 3.1, 3.5), and pixel decoder (Sec. 3.2)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from anytouch_jax.ops import masking, tokens
 
 
 class TouchPatch(nnx.Module):
-    """The patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias.
+    """Patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias.
 
     It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3, D).
     """
@@ -37,7 +37,7 @@ class TouchPatch(nnx.Module):
         self.own, self.dtype = bool(rows), jnp.dtype(model.dtype)
 
     def __call__(self, patches: Array, sensor: Array) -> Array:
-        """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
+        """Project (B, K, T, P*P*3) to (B, K, D). A still is a clip of equal frames (Sec. 3.1): kernels are summed."""
         kernel = self.kernel[...]
         if patches.shape[2] == 1:
             kernel = reduce(jnp.add, jnp.moveaxis(kernel, -3, 0))[..., None, :, :]
@@ -65,7 +65,7 @@ class ConvolutionalPatch(nnx.Module):
         self.patch, self.dtype = model.patch, jnp.dtype(model.dtype)
 
     def __call__(self, patches: Array, sensor: Array) -> Array:
-        """(B, K, T, P*P*3) -> (B, K, D). A still is a clip of equal frames (Sec. 3.1), so its kernels are summed."""
+        """Project (B, K, T, P*P*3) to (B, K, D). A still is a clip of equal frames (Sec. 3.1): kernels are summed."""
         b, k, frames, _ = patches.shape
         kernel = self.kernel[...]
         if frames == 1:
@@ -105,7 +105,7 @@ class TouchEncoder(nnx.Module):
         self.patch_size, self.depth, self.remat = model.patch, model.touch.depth, model.remat
 
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """The input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
+        """Return the input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
         patches = tokens.patchify(clip, self.patch_size)
         position = jnp.broadcast_to(self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape))
         if keep_ids is not None:
@@ -118,35 +118,37 @@ class TouchEncoder(nnx.Module):
         return jnp.concatenate([start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1)
 
     def hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Last hidden states (B, 1 + S + K, D), without the final norm (golden Q5)."""
+        """Return the last hidden states (B, 1 + S + K, D), without the final norm (golden Q5)."""
         x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
         return run_blocks(self.blocks, x, remat=self.remat)
 
     def states(self, clip: Array, sensor: Array, count: int) -> Array:
-        """`count` hidden states, evenly spaced from the embedded tokens (normed, as the first block gets them) to the
-        last block's, beside each other: (B, 1 + S + N, count * D); one is the last. What paints or measures reads them
-        (as DPT does, Ranftl et al. 2021): an encoder's last block holds what it was last asked for."""
+        """Return `count` hidden states, evenly spaced from the first block's input to the last block's output.
+
+        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state. Dense prediction needs
+        earlier states too (DPT, Ranftl et al. 2021), because the last block serves the training loss.
+        """
         x = self.pre_norm(self.tokens(clip, sensor))
-        found, before = [], 0
+        states, before = [], 0
         for number in range(count):
             block = round(number * self.depth / (count - 1)) if count > 1 else self.depth
             x = run_blocks(blocks_between(self.blocks, before, block), x, remat=self.remat) if block > before else x
-            found.append(x)
+            states.append(x)
             before = block
-        return jnp.concatenate(found, axis=-1)
+        return jnp.concatenate(states, axis=-1)
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Touch embedding (B, E) from the class token, of all patches or those to keep (B, K); not normalised."""
+        """Return the touch embedding (B, E) of all patches or of `keep_ids` (B, K), not normalised."""
         x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
         return self.embedding(read_blocks(self.blocks, x, remat=self.remat))
 
     def embedding(self, token: Array) -> Array:
-        """Touch embedding (B, E) from the last hidden state of the class token (B, D)."""
+        """Return the touch embedding (B, E) from the last hidden state of the class token (B, D)."""
         return self.projection(self.post_norm(token))
 
 
 class TouchDecoder(nnx.Module):
-    """Light ViT that paints every position from the visible ones; heads for a still and for a clip."""
+    """Light ViT that predicts every position from the visible ones, with a head for stills and one for clips."""
 
     def __init__(self, model: ModelConfig) -> None:
         width, pixels = model.decoder.width, model.patch**2 * 3
@@ -162,7 +164,7 @@ class TouchDecoder(nnx.Module):
         self.special, self.remat = 1 + model.sensor_tokens, model.remat
 
     def __call__(self, latent: Array, restore_ids: Array, frames: int, sensor_tokens: Array | None = None) -> Array:
-        """(B, 1 + S + K, E) -> pixels (B, N, frames, P*P*3); `sensor_tokens` (B, S, D) replace the encoded ones."""
+        """Return pixels (B, N, frames, P*P*3) of (B, 1 + S + K, E). `sensor_tokens` (B, S, D) replace encoded ones."""
         x = self.embed(latent)
         position = self.position[...].astype(x.dtype)
         start = x[:, :1] + position[None, :1]
@@ -173,7 +175,7 @@ class TouchDecoder(nnx.Module):
         return self.pixels(x, frames)
 
     def pixels(self, x: Array, frames: int) -> Array:
-        """(B, N, Dd) -> (B, N, frames, P*P*3). Only the frames that the loss reads are computed."""
+        """Return (B, N, frames, P*P*3) of (B, N, Dd). Only the frames that the loss reads are computed."""
         if frames == 1:
             return self.still_head(x)[:, :, None]
         size = self.still_head.kernel.shape[1]

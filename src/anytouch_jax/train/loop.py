@@ -188,13 +188,13 @@ class _Loop:
 
     def awaited(self, feed: Iterator[Item]) -> Iterator[Item]:
         """Yield from the feed, and count the time with neither a batch nor a running step."""
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         for item in feed:
-            ended = self.last.ended() if self.pending else asked
+            ended = self.last.ended() if self.pending else requested
             if ended is not None:
-                self.waited += time.perf_counter() - max(asked, ended)
+                self.waited += time.perf_counter() - max(requested, ended)
             yield item
-            asked = time.perf_counter()
+            requested = time.perf_counter()
 
     def signalled(self, interrupt: list[signal.Signals]) -> signal.Signals | None:
         """Return the signal that ends the run: of this process, or the shared one of several."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tiny_models import full_model
 
+from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.functional import build
-from anytouch_jax.nn.lora import merge_lora
 
 NET = build(full_model())
 PARAMS = NET.init(jax.random.key(0))

@@ -12,7 +12,6 @@ from anytouch_jax.config.model import (
     check_spelling,
 )
 from anytouch_jax.config.presets import preset
-from anytouch_jax.config.serialise import from_json, to_json
 from anytouch_jax.config.train import (
     CLIP_MEAN,
     CLIP_STD,
@@ -27,6 +26,8 @@ from anytouch_jax.config.train import (
     Recipe,
     RunConfig,
     Towers,
+    from_json,
+    to_json,
 )
 
 __all__ = [

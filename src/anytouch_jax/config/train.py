@@ -1,15 +1,29 @@
-"""Configuration of a training run: losses, optimiser, data, schedule.
+"""Configuration of a training run (losses, optimiser, data, schedule), and its strict JSON.
 
 Frozen dataclasses without arrays. The comment of each field is its help text on the command line.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 from anytouch_jax.config.model import ModelConfig
-from anytouch_jax.config.parsing import ABOVE_0, BELOW_1, COUNT, NORMAL, NOT_NEGATIVE, SEED, SHARE, chosen, in_range
+from anytouch_jax.config.parsing import (
+    ABOVE_0,
+    BELOW_1,
+    COUNT,
+    NORMAL,
+    NOT_NEGATIVE,
+    SEED,
+    SHARE,
+    chosen,
+    in_range,
+    read_value,
+)
+from anytouch_jax.errors import ConfigError
 
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
@@ -181,3 +195,61 @@ class Config:
     def weight_decay(self) -> tuple[tuple[str, float], ...]:
         """Rules (regex over parameter names, weight decay). Vectors have none (golden Q8)."""
         return ((r"(bias|scale|class_token)$", 0.0), (r"", self.optim.weight_decay))
+
+
+# Settings of version 0.1 by section. A new name, or the values that change nothing ("recipe": what the recipe implies).
+_RENAMED = {("objective", "centre"): "center_embeddings", ("optim", "clip_norm"): "grad_clip"}
+_RETIRED: dict[tuple[str, str], tuple[Any, ...] | str] = {
+    ("model", "force_head"): (False,),
+    ("objective", "differences"): (0.0,),
+    ("objective", "force"): (0.0,),
+    ("objective", "touch_text_sum"): "recipe",
+    ("objective", "reconstruct"): "recipe",
+    ("objective", "universal_shared"): "recipe",
+    ("optim", "ema"): (None,),
+    ("data", "split_steps"): "recipe",
+}
+
+
+def to_json(config: Any) -> str:
+    """Write a config dataclass as indented JSON. `from_json` reads it back to an equal value."""
+    return json.dumps(asdict(config), indent=2)
+
+
+def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> Any:
+    """Read a config written by `to_json`, of this version or an older one.
+
+    Settings that no longer exist are dropped. With `allow_retired` False, one that changed the training is an error:
+    the run cannot be continued. Raises ConfigError, which names an unknown, missing, mistyped or retired setting.
+    """
+    try:
+        data = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ConfigError(f"not a JSON configuration: {error}") from None
+    if cls is Config and isinstance(data, dict):
+        data = _modern(data, allow_retired)
+    elif isinstance(data, dict):
+        data = {name: value for name, value in data.items() if ("model", name) not in _RETIRED}
+    return read_value(cls, data, "config" if cls is Config else cls.__name__.lower())
+
+
+def _modern(data: Mapping[str, Any], allow_retired: bool) -> dict[str, Any]:
+    """Return the settings of a run under today's names, without the retired ones."""
+    modern = {name: dict(part) if isinstance(part, dict) else part for name, part in data.items()}
+    for (section, name), new_name in _RENAMED.items():
+        part = modern.get(section)
+        if isinstance(part, dict) and name in part:
+            part[new_name] = part.pop(name)
+    for (section, name), inert in _RETIRED.items():
+        part = modern.get(section)
+        if not isinstance(part, dict) or name not in part:
+            continue
+        value = part.pop(name)
+        release = data.get("recipe") == "release"
+        implied = (release and (data.get("stage") == 2 or name == "touch_text_sum"),) if inert == "recipe" else inert
+        if not allow_retired and value not in implied:
+            raise ConfigError(
+                f"the run sets {section}.{name} to {value!r}, which this version no longer has. "
+                "Continue it with version 0.1, or start a new run from it with --init."
+            )
+    return modern

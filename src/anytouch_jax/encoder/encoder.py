@@ -27,8 +27,8 @@ from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
 from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable
+from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.functional import Net, build
-from anytouch_jax.nn.lora import merge_lora
 from anytouch_jax.objectives import normalise_image, normalise_touch
 from anytouch_jax.ops import losses
 from anytouch_jax.weights import load

@@ -12,19 +12,12 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.nn.clip import ImageTower, TextEncoder
+from anytouch_jax.nn.clip import ImageTower, Lora, TextEncoder
 from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
 from anytouch_jax.ops import tokens
 
 Features = TypeVar("Features")  # an array, or a tuple of arrays
-
-
-class Lora(nnx.Module):
-    """Low-rank factors of one projection in every block: a (depth, D, r), b (depth, r, D)."""
-
-    def __init__(self, depth: int, width: int, rank: int) -> None:
-        self.a, self.b = table(depth, width, rank), table(depth, rank, width)
 
 
 def _matcher(model: ModelConfig) -> Mlp | Dense | None:

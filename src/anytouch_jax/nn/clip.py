@@ -1,6 +1,8 @@
-"""Image and text towers of CLIP (Radford et al., 2021), for stage 2."""
+"""Image and text towers of CLIP (Radford et al., 2021), for stage 2, and LoRA of the image tower."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax.numpy as jnp
 from flax import nnx
@@ -10,6 +12,8 @@ from anytouch_jax.config import ModelConfig, Stack, TextTower
 from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
 from anytouch_jax.nn.matmul import stored
 from anytouch_jax.ops import tokens
+
+Params = dict[str, Any]
 
 
 class ImageTower(nnx.Module):
@@ -66,3 +70,26 @@ class TextEncoder(nnx.Module):
     def __call__(self, ids: Array, mask: Array | None = None) -> Array:
         """Return the text embedding (L, E), not normalised."""
         return self.projection(self.pooled(ids, mask))
+
+
+class Lora(nnx.Module):
+    """Low-rank factors of one projection in every block: a (depth, D, r), b (depth, r, D)."""
+
+    def __init__(self, depth: int, width: int, rank: int) -> None:
+        self.a, self.b = table(depth, width, rank), table(depth, rank, width)
+
+
+def merge_lora(params: Params, alpha: float) -> Params:
+    """Return `params` with W + alpha / r * A B for the image tower's q, k, v and output kernels W (Hu et al., 2022).
+
+    Without a "lora" entry the tree is unchanged. The update is linear, so adding it to the kernel gives the output and
+    the gradient of applying it to the activations.
+    """
+    if "lora" not in params:
+        return params
+    attention = dict(params["image"]["blocks"]["attention"])
+    for name, factors in params["lora"].items():
+        update = jnp.einsum("ldr,lre->lde", factors["a"], factors["b"]) * (alpha / factors["a"].shape[-1])
+        attention[name] = attention[name] | {"kernel": attention[name]["kernel"] + update}
+    image = params["image"] | {"blocks": params["image"]["blocks"] | {"attention": attention}}
+    return {name: value for name, value in params.items() if name != "lora"} | {"image": image}

@@ -16,7 +16,7 @@ from jax import Array
 
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.anytouch import AnyTouch
-from anytouch_jax.nn.lora import merge_lora
+from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.ops import tokens
 
 Params = dict[str, Any]

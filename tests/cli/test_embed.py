@@ -121,9 +121,10 @@ def test_a_bad_row_of_a_manifest_is_named_however_the_run_was_trained(anytouch, 
     ("names", "ends"),
     [
         ([f"{finger}_{number}" for finger in ("left", "right") for number in range(3)], ["left_2", "right_2"]),
+        ([f"{number}_D2{serial}" for number in range(3) for serial in (1, 2)], ["2_D21", "2_D22"]),
         ([f"img{number:03d}" for number in (0, 1, 2, 5, 6, 7, 8)], ["img002", "img007", "img008"]),
     ],
-    ids=["fingers", "gap"],
+    ids=["fingers", "serials", "gap"],
 )  # fmt: skip
 def test_no_clip_spans_two_fingers_or_a_missing_number(embed, tmp_path, world, names, ends):
     folder = tmp_path / "frames"

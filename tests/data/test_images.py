@@ -284,6 +284,14 @@ def test_frames_are_numbered_by_what_counts_them():
     assert images.frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
     assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []
     assert images.frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
+    for form in (
+        "{}_left.png",
+        "{:05d}_D20012.png",
+        "img_{:04d}_left_raw.png",
+        "frame{:04d}_cam0.png",
+        "{}_320x240.png",
+    ):
+        assert images.frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
     assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
 
@@ -299,9 +307,31 @@ def test_frames_are_numbered_by_what_counts_them():
         (["at_12-00-05.png", "at_12-01-05.png"], None),
         (["2024_05.png", "2025_05.png"], None),
         (["1.png", "1.jpg"], None),
+        (["0_left.png", "0_right.png", "1_left.png", "1_right.png"], ("left", "right")),
+        (["0_A.png", "0_B.png", "1_A.png", "1_B.png"], ("A", "B")),
+        (["0A.png", "0B.png"], ("A", "B")),
+        (["L0001.png", "L0002.png", "R0001.png", "R0002.png"], ("L", "L", "R", "R")),
+        (["000000-L.jpg", "000000-R.jpg"], ("L", "R")),
+        (["D20012_00000.png", "D20345_00000.png"], ("D20012", "D20345")),
+        (["00000_D20012.png", "00000_D20345.png", "00001_D20012.png"], ("D20012", "D20345", "D20012")),
+        (["frame0000_left.png", "frame0000_right.png"], ("frame_left", "frame_right")),
+        (["frame0_cam0.png", "frame0_cam1.png", "frame1_cam0.png", "frame1_cam1.png"], ("frame_cam0", "frame_cam1")),
+        (["img_0000_left_raw.png", "img_0000_right_raw.png"], ("img_left_raw", "img_right_raw")),
+        ([f"1_touch{i}_{side}.png" for i in range(6) for side in "LR"], ("touch_L", "touch_R")),
+        ([f"{side}_17000000{i}.{i}5.png" for i in range(4) for side in ("left", "right")], ("left", "right")),
+        ([f"{'LR'[i % 2]}_{i}.png" for i in range(8)], ("L", "R")),  # one counter of two cameras
+        ([f"{'LR'[i % 2]}_170.{i}.png" for i in range(8)], ("L", "R")),
+        ([f"{i}_{('contact', 'free')[i % 2]}.png" for i in range(8)], None),  # one recording with labels in its names
+        ([f"2024-05-01T1{i}-00-05.png" for i in range(8)], None),
+        ([f"1{i}h00m05s.png" for i in range(8)], None),
+        ([f"{i}_t{33 * i}.png" for i in range(9)], None),
+        (["a3f9.png", "b3c1.png", "3d3e.png", "c9f9.png", "7f3.png", "e1.png"], None),
     ],
 )
 def test_series_that_share_numbers_are_apart(names, series):
+    if isinstance(series, tuple):  # the series of each name, in turn
+        keys = [series[i % len(series)] for i in range(len(names))]
+        series = {key: [name for name, of in zip(names, keys, strict=True) if of == key] for key in series}
     assert images.split_series(names) == (series or {"": names})
 
 

@@ -24,6 +24,10 @@ MAX_ASPECT = 100  # a longer strip would fill the memory when its short side is 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
 BACKGROUND, PHOTO = "background", "photo"  # names of images in a recording that are not frames
 
+_COUNTED = {"frame", "frames", "frm", "f", "img", "image", "i", "picture", "pic", "photo", "shot", "sample", "step"}
+_COUNTED |= {"index", "idx", "no", "nr", "num", "n", "t", "time", "ts"}  # words before the number of a frame
+_SIDE = re.compile(r"\d|(?<![^\W_])(?:left|right|l|r|thumb|index|middle|ring|little|pinky)(?![^\W_])", re.IGNORECASE)
+
 # Since OpenCV 4.11; orientation tags are ignored as for other files.
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
 if hasattr(cv2, "IMREAD_COLOR_RGB"):
@@ -255,32 +259,74 @@ def _suggestion(folder: Path) -> str:
 def frame_numbers(names: Sequence[str]) -> list[int]:
     """Return the numbers of frames in order.
 
-    They are the numbers at the end of the names if these count frames: a third of the steps or more are 1. Then a
-    missing frame is a gap. Otherwise (time stamps) they are 0, 1, 2, ...
+    They are the last numbers of the names that differ (`_series_of`), if these count frames: a third of the steps or
+    more are 1. Then a missing frame is a gap. Otherwise (time stamps) they are 0, 1, 2, ...
     """
-    ends = [re.search(r"(\d{1,18})$", Path(name).stem) for name in names]
-    numbers = [int(end[1]) for end in ends if end]
+    counters = [numbers for _, numbers in _series_of(names)]
+    if len(set(map(len, counters))) == 1:
+        columns = [column for column in zip(*counters, strict=True) if len(set(column)) > 1]
+        numbers = list(columns[-1] if columns else [numbers[-1] for numbers in counters if numbers])
+    else:
+        numbers = [numbers[-1] for numbers in counters if numbers]
     steps = [b - a for a, b in itertools.pairwise(numbers)]
     is_count = len(numbers) == len(names) and min(steps, default=0) == 1 and 3 * steps.count(1) >= len(steps)
     return numbers if is_count else list(range(len(names)))
 
 
 def split_series(names: Sequence[str]) -> dict[str, list[str]]:
-    """Return the names of a folder by the stem before their numbers, if two series share a number; else under "".
+    """Return the names of a folder by series, if they are of several recorders; else all of them under "".
 
-    left_0 and right_0 are two fingers. Series differ by more than numbers: 12-00-05 is a time.
+    left_0 and right_0 (0_A and 0_B, 0_D20012 and 0_D20345) are two fingers: two series share a number. Series of sides
+    or serial numbers that alternate are apart too, as their numbers may be times. 12-00-05 is one time.
     """
+    parts = _series_of(names)
     series: dict[str, list[str]] = {}
-    stems: dict[int, set[str]] = {}
-    for name in names:
-        stem = Path(name).stem
-        end = None if re.fullmatch(r"\d+\.\d+", stem) else re.search(r"\d{1,18}$", stem)
-        key = stem[: end.start()].rstrip(" ._-") if end else ""
+    owners: dict[tuple[int, ...], set[str]] = {}
+    for name, (key, numbers) in zip(names, parts, strict=True):
         series.setdefault(key, []).append(name)
-        if end:
-            stems.setdefault(int(end[0]), set()).add(re.sub(r"(?<![^\W\d_])(?<!\d)\d+", "", key))
-    shared = any(len(keys) > 1 for keys in stems.values())
-    return series if shared else {"": list(names)}
+        owners.setdefault(numbers, set()).add(key)
+    if len(series) > 4 and 2 * sum(len(one) == 1 for one in series.values()) > len(series):
+        return {"": list(names)}  # names without a system, such as hash values
+    shared = any(numbers and len(keys) > 1 for numbers, keys in owners.items())
+    in_time = [key for key, _ in sorted(parts, key=lambda part: part[1])]
+    changes = sum(a != b for a, b in itertools.pairwise(in_time))
+    alternate = changes > len(series) and all(_SIDE.search(key) for key in series)
+    return series if len(series) > 1 and (shared or alternate) else {"": list(names)}
+
+
+def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
+    """Return the series of each name, and its numbers that count frames.
+
+    The series is the words of the name with their serial numbers: numbers right behind a word (D20012, cam0), unless
+    the word announces a count (frame0001) or the name has no other number that differs.
+    """
+    forms: dict[str, list[list[str]]] = {}
+    pieces = [re.split(r"(\d+)", Path(name).stem) for name in names]
+    for one in pieces:
+        forms.setdefault("0".join(one[::2]), []).append(one)
+    counters = {form: _counters(alike) for form, alike in forms.items()}
+    parts = []
+    for one in pieces:
+        at = counters["0".join(one[::2])]
+        words = "".join("/" if i in at else piece for i, piece in enumerate(one)).split("/")
+        key = "_".join(word for word in (word.strip(" ._-()") for word in words) if word)
+        parts.append((key, tuple(int(one[i][-18:]) for i in at)))  # a manifest holds numbers of 64 bits
+    return parts
+
+
+def _counters(alike: list[list[str]]) -> list[int]:
+    """Return which pieces of names of one form (words and numbers in turn) count frames."""
+    counters, serials = [], []
+    for at in range(1, len(alike[0]), 2):
+        word = re.search(r"[^\W\d_]+$", alike[0][at - 1])
+        # In 12h05 or 01T12 the letter is between two numbers: it is no word.
+        is_serial = word and (word.start() > 0 or at == 1) and word[0].lower() not in _COUNTED
+        (serials if is_serial else counters).append(at)
+    values = {at: len({one[at] for one in alike}) for at in (*counters, *serials)}
+    most = max(reversed(serials), key=values.__getitem__, default=0)
+    if most and all(values[at] == 1 for at in counters) and (not counters or values[most] > 4):
+        counters.append(most)
+    return sorted(counters)
 
 
 def frame_sort_key(name: str) -> tuple[int | float, list[tuple[int, str]]]:

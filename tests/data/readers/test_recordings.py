@@ -154,6 +154,26 @@ def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
     assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
 
 
+@pytest.mark.parametrize(
+    ("form", "sides"),
+    [
+        ("{}_{:d}.png", ("left", "right")), ("{1:d}_{0}.png", ("left", "right")), ("{1:d}_{0}.png", ("A", "B")),
+        ("frame{1:04d}_{0}.png", ("left", "right")), ("{1:06d}-{0}.jpg", ("L", "R")),
+        ("{}_{:05d}.png", ("D20012", "D20345")), ("{1:05d}_{0}.png", ("D20012", "D20345")),
+        ("img_{1:04d}_{0}_raw.png", ("left", "right")),
+    ],
+)  # fmt: skip
+def test_the_side_may_stand_anywhere_in_the_name(tmp_path, read, form, sides):
+    fill(tmp_path, [f"mug/one/{form.format(side, n)}" for side in sides for n in (0, 1, 2, 4, 5)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert len({row["sequence"] for row in table.rows.values()}) == len({r["unit"] for r in table.rows.values()}) == 2
+    for path, row in table.rows.items():
+        assert {side in path.removeprefix("mug/one/") for side in sides if side in row["unit"]} == {True}
+        assert row["frame_index"] in (0, 1, 2, 4, 5)  # the missing frame is a gap
+    clips = table.clips(3)
+    assert len(clips) == 2 and all(len({table.rows[path]["unit"] for path in clip}) == 1 for clip in clips)
+
+
 def _film(path, frames=5):
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))

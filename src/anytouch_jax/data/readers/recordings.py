@@ -6,10 +6,10 @@
     mine/mug/photo.jpg                  a photograph of the touched object, for the same recordings
     mine/mug/caption.txt                a caption, for the same recordings
 
-Frames are in natural order (2 before 10). Their numbers are those at the end of their names if these count frames, so
-that a missing frame is a gap. Otherwise they are counted. If numbers repeat behind different stems (left_0.png,
-right_0.png: two fingers), each stem is a sequence and a unit. Whole objects, or recordings without objects, are held
-out. With `--split-by recording` some recordings of each object are.
+Frames are in natural order (2 before 10). Their numbers are the last ones that differ between their names if these
+count frames, so that a missing frame is a gap. Otherwise they are counted. If numbers repeat with other words or serial
+numbers (left_0.png and right_0.png, or 0_D1.png and 0_D2.png: two fingers), each finger is a sequence and a unit. Whole
+objects, or recordings without objects, are held out. With `--split-by recording` some recordings of each object are.
 """
 
 from __future__ import annotations

@@ -316,7 +316,8 @@ def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
 
 def _counters(alike: list[list[str]]) -> list[int]:
     """Return which pieces of names of one form (words and numbers in turn) count frames."""
-    counters, serials = [], []
+    counters: list[int] = []
+    serials: list[int] = []
     for at in range(1, len(alike[0]), 2):
         word = re.search(r"[^\W\d_]+$", alike[0][at - 1])
         # In 12h05 or 01T12 the letter is between two numbers: it is no word.

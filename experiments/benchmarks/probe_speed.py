@@ -25,7 +25,7 @@ import numpy as np
 from sklearn.linear_model import LogisticRegression
 
 from anytouch_jax.evaluate import logistic
-from anytouch_jax.evaluate.array_probes import linear_probe
+from anytouch_jax.evaluate.array_probes import probe_features
 from experiments.tables import env
 
 ROWS, OTHERS = env.number("ROWS", 100_000), 10_000
@@ -41,7 +41,7 @@ split = np.repeat(["train", "val", "test"], [ROWS, OTHERS, OTHERS])
 
 # %%
 start, spent = time.perf_counter(), time.process_time()
-result = linear_probe(features, labels, np.arange(len(labels)), split, seeds=0)
+result = probe_features(features, labels, np.arange(len(labels)), split, seeds=0)
 accuracy, penalty = result.accuracy, result.penalty
 wall, spent = time.perf_counter() - start, time.process_time() - spent
 assert penalty is not None

@@ -9,6 +9,7 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import array_probes, statistics
+from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.statistics import markdown_table
 
 Right = dict[str, list[np.ndarray]]  # by name: for every seed, how many each object has right
@@ -30,8 +31,8 @@ def probed(
     for label, values in labels.items():
         results = {"commonest": array_probes.majority_baseline(values, groups, split)}
         for name, x in features.items():
-            scaling: array_probes.Scaling = "common" if name == "pixels" else "column"
-            results[name] = array_probes.linear_probe(x, values, groups, split, name=name, seeds=0, scaling=scaling)
+            head = ProbeHead("linear", "common" if name == "pixels" else "column")
+            results[name] = array_probes.probe_features(x, values, groups, split, head, name=name, seeds=0)
         outcomes = {name: one.outcome for name, one in results.items() if one.outcome is not None}
         found[label] = by_object(outcomes["commonest"].groups, {name: one.correct for name, one in outcomes.items()})
     return found

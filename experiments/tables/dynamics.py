@@ -16,8 +16,8 @@
 # **Directions and flips.** A mirrored picture of a clockwise twist shows a counter-clockwise one. Training flips
 # touches (as the authors do), and the positive of a matching pair apart from its anchor, which asks the encoder to
 # overlook directions. No label is destroyed here, since nothing is trained with direction labels and a probe sees
-# every frame unflipped; whoever trains with such labels sets `--loader.flip 0`, or turns the label with the picture
-# (`evaluate.tasks.mirrored`). The row "touches never flipped" shows what the flips cost.
+# every frame unflipped; whoever trains with such labels sets `--data.flip 0`. The row "touches never flipped" shows
+# what the flips cost.
 #
 #     make experiments ONLY=dynamics
 

@@ -80,10 +80,10 @@ def scores(values: np.ndarray) -> dict[str, dict[str, Any]]:
     for name, one in chosen.items():
         given = (values[np.searchsorted(rows, one.rows[:, 0])], one.labels, one.groups, one.split)
         if name == "force":
-            fit = array_probes.regression_probe(*given)
+            fit = array_probes.probe_features(*given, measured=True)
             result[name] = {"mean": fit.r2, "low": fit.low, "high": fit.high, "test": fit.n_test, "chance": 0.0}
         else:
-            hit = array_probes.linear_probe(*given, seeds=0)
+            hit = array_probes.probe_features(*given, seeds=0)
             result[name] = {"mean": hit.accuracy, "low": hit.low, "high": hit.high, "test": hit.n_test}
             result[name] |= {"chance": hit.baseline, "balanced": hit.balanced_accuracy}
     return result

@@ -39,7 +39,7 @@ from anytouch_jax.data.loading.samples import SampleReader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.evaluate import probe_results
+from anytouch_jax.evaluate import array_probes
 from anytouch_jax.evaluate.array_probes import majority_baseline
 from anytouch_jax.evaluate.feature_cache import pixel_features
 from anytouch_jax.evaluate.probing import label_rows, pixel_components, probe_rows
@@ -149,8 +149,8 @@ raw = pixel_components(pixels_of_rows, task)
 found += probe_rows(raw, task, "raw pixels", scaling="common", subsets=subsets)
 found.append(majority_baseline(task.labels, task.groups, task.split, subsets=subsets))
 write("## Object, test recordings, contact frames\n")
-write(probe_results.probe_table(found))
-record["object"] = json.loads(probe_results.probe_json(found))
+write(array_probes.probe_table(found))
+record["object"] = json.loads(array_probes.probe_json(found))
 
 metrics = [json.loads(line) for line in (LABELLED / "metrics.jsonl").read_text().splitlines()]
 record["labelled_train"] = learned = float(np.mean([row["accuracy"] for row in metrics[-50:]]))
@@ -172,7 +172,7 @@ for first, second in (
     ("trained with labels", "stage 2"),
 ):
     for kind in ("linear", "kNN"):
-        change, low, high = probe_results.accuracy_difference(by_name[f"{first}: {kind}"], by_name[f"{second}: {kind}"])
+        change, low, high = array_probes.accuracy_difference(by_name[f"{first}: {kind}"], by_name[f"{second}: {kind}"])
         bounds = "-" if low is None or high is None else f"{100 * low:.1f} to {100 * high:.1f}"
         write(f"| {first} - {second}, {kind} | {100 * change:+.1f} | {bounds} |")
         record["differences"][f"{first} - {second}, {kind}"] = [change, low, high]
@@ -194,8 +194,8 @@ for name, encoder in encoders.items():
     slips += probe_rows(values, slip, name, **held_out)
 slips += probe_rows(pixel_components(pixels_of_rows, slip), slip, "raw pixels", scaling="common", **held_out)
 write("## Slip, objects left out, contact frames of all splits\n")
-write(probe_results.probe_table(slips))
-record["slip"] = json.loads(probe_results.probe_json(slips))
+write(array_probes.probe_table(slips))
+record["slip"] = json.loads(array_probes.probe_json(slips))
 
 # %% [markdown]
 # ## Finding

@@ -1,21 +1,29 @@
-"""Probes on data whose answer is known: separable, shuffled, leaking and measured labels."""
+"""Probes on data whose answer is known: separable, shuffled, leaking and measured labels; differences, tables, JSON."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.array_probes import (
-    knn_probe,
+    Outcome,
+    ProbeResult,
+    SubsetResult,
+    accuracy_difference,
     leave_groups_out,
-    linear_probe,
     majority_baseline,
-    regression_probe,
+    probe_features,
+    probe_json,
+    probe_table,
 )
-from anytouch_jax.evaluate.heads import linear_path
+from anytouch_jax.evaluate.heads import ProbeHead, linear_path
+from anytouch_jax.evaluate.statistics import mean_interval
 
 Array = np.ndarray[Any, Any]
 
@@ -32,6 +40,18 @@ def table(
     third = (group // classes) % 6
     split = np.where(third < 3, "train", np.where((third == 3) & val, "val", "test"))
     return features, np.array(["ball", "cube", "ring", "rod"])[label], group, split
+
+
+def linear_probe(*arrays: Any, penalties: Any = None, scaling: Any = "column", **options: Any) -> ProbeResult:
+    return probe_features(*arrays, ProbeHead("linear", scaling, penalties), **options)
+
+
+def knn_probe(*arrays: Any, **options: Any) -> ProbeResult:
+    return probe_features(*arrays, ProbeHead("knn"), **options)
+
+
+def regression_probe(*arrays: Any, head: ProbeHead | None = None, **options: Any) -> ProbeResult:
+    return probe_features(*arrays, head, measured=True, **options)
 
 
 PROBES = [linear_probe, knn_probe]
@@ -279,6 +299,23 @@ def test_regression_on_nothing_is_no_better_than_the_mean() -> None:
     assert result.mae == pytest.approx(result.baseline_mae, rel=0.15)
 
 
+@pytest.mark.parametrize("name", ["knn", "gradient"])
+def test_every_head_predicts_a_number(name: Any) -> None:
+    recipe = heads.GradientRecipe(epochs=40, batch=32, rate=0.05)
+    result = regression_probe(*measured(0.0), head=ProbeHead(name, recipe=recipe))
+    assert result.measured and result.r2 > 0.3 and result.chosen_on == "val"
+
+
+def test_the_selected_epoch_is_the_tested_one() -> None:
+    arrays, recipe = table(apart=1.0), heads.GradientRecipe(epochs=8, batch=32, rate=0.01)
+    by_epoch = [
+        probe_features(*arrays, ProbeHead("gradient", options=(epoch,), recipe=recipe), seeds=0).accuracy
+        for epoch in range(1, 9)
+    ]
+    result = probe_features(*arrays, ProbeHead("gradient", recipe=recipe), protocol="published", seeds=0)
+    assert result.penalty is not None and result.accuracy == by_epoch[int(result.penalty) - 1] == max(by_epoch)
+
+
 # ---- a user's mistakes -------------------------------------------------------------------------------------
 
 NUMBERS = np.arange(300) + 0.5
@@ -333,3 +370,106 @@ def test_an_unfinished_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     features, labels, groups, split = table(apart=1.0)
     monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 2)
     assert any("limit of iterations" in note for note in linear_probe(features, labels, groups, split).notes)
+
+
+# ---- differences, tables and JSON ---------------------------------------------------------------------------
+
+ONE = ProbeResult(
+    probe="linear",
+    protocol="honest",
+    accuracy=0.5,
+    balanced_accuracy=0.4,
+    low=0.25,
+    high=0.75,
+    baseline=0.1,
+    refit_mean=0.45,
+    refit_std=0.02,
+    seeds=5,
+    penalty=0.01,
+    chosen_on="val",
+    n_train=100,
+    n_test=40,
+    test_groups=8,
+    classes=("ball", "cube"),
+    parts=(SubsetResult("with photo", 0.6, 0.5, 0.7, 20), SubsetResult("empty", float("nan"), None, None, 0)),
+    notes=("3 rows without this label left out",),
+)
+TWO = ProbeResult(
+    probe="ridge",
+    protocol="published",
+    r2=0.81,
+    low=0.7,
+    high=0.9,
+    mae=0.123,
+    mae_low=0.1,
+    mae_high=0.15,
+    baseline_mae=0.5,
+    penalty=1.0,
+    chosen_on="test",
+    n_train=100,
+    n_test=40,
+    test_groups=8,
+)
+
+
+def outcome(correct: Any, first: int = 0) -> ProbeResult:
+    rows = np.arange(first, first + len(correct))
+    return replace(ONE, outcome=Outcome(rows, np.asarray(correct, bool), rows // 5))
+
+
+def test_a_difference_is_paired() -> None:
+    rng = np.random.default_rng(0)
+    hard = rng.random(60)[np.arange(300) // 5] < 0.5  # whole recordings are hard for both
+    better, worse = ~hard, ~hard & (rng.random(300) < 0.9)
+    change, low, high = accuracy_difference(outcome(better), outcome(worse))
+    assert change == pytest.approx(better.mean() - worse.mean())
+    assert 0 < low < change < high
+    lock = mean_interval(better, np.arange(300) // 5)
+    assert high - low < (lock[1] - lock[0]) / 2
+    assert accuracy_difference(outcome(better), outcome(better)) == (0.0, 0.0, 0.0)
+
+
+def test_a_difference_needs_the_same_rows() -> None:
+    with pytest.raises(UserError, match="same rows"):
+        accuracy_difference(outcome([True] * 10), outcome([True] * 10, first=1))
+    with pytest.raises(UserError, match="same rows"):
+        accuracy_difference(ONE, outcome([True] * 10))
+
+
+def test_a_table_of_classes_and_numbers() -> None:
+    lines = probe_table([ONE, TWO]).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    one, part, empty, two = (dict(zip(cells[0], row, strict=True)) for row in cells[2:])
+    assert (one["score"], one["95 %"], one["chance"], one["refits"]) == (
+        "50.0 %",
+        "25.0 to 75.0",
+        "10.0 %",
+        "45.0 % ± 2.0",
+    )
+    assert (one["test (groups)"], one["penalty or k"], one["balanced"]) == ("40 (8)", "0.01 (val)", "40.0 %")
+    assert (part["probe"], part["score"], empty["score"]) == ("linear: with photo", "60.0 %", "-")
+    assert (two["score"], two["95 %"], two["chance"]) == ("R2 0.810, 0.123", "0.700 to 0.900", "0.5")
+    assert lines[-1] == "- linear (honest): 3 rows without this label left out"
+
+
+def test_json() -> None:
+    one, two = json.loads(probe_json([outcome([True]), TWO]))
+    assert one["accuracy"] == 0.5
+    assert one["classes"] == ["ball", "cube"]
+    assert one["parts"][1]["accuracy"] is None
+    assert "outcome" not in one
+    assert two["r2"] == 0.81
+    assert "r2" not in one and "accuracy" not in two
+
+
+def test_the_table_of_tasks() -> None:
+    names = {"features": "run", "task": "slip", "head": "knn", "protocol": "honest", "metric": "accuracy"}
+    sizes = {"train": 50, "test": 20, "groups": 8, "notes": ["folds"]}
+    row: dict[str, Any] = names | sizes | {"mean": 0.635, "low": 0.5, "high": 0.75, "chance": 0.6}
+    errors = {"mae": 5.1234, "unit": "N", "chance_mae": 6.0}
+    force = row | errors | {"task": "force", "metric": "r2", "mean": -0.3, "low": None, "high": None}
+    lines = probe_table([row, force], 0.8).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    assert cells[2][4:] == ["63.5 %", "50.0 to 75.0", "60.0 %", "50", "20 (8)"]
+    assert cells[3][4:7] == ["R2 -0.300, 5.12 N", "-", "6 N"]
+    assert "- slip: folds" in lines and "80.00 %" in lines[-1]

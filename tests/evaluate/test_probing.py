@@ -22,9 +22,9 @@ from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, heads
+from anytouch_jax.evaluate.array_probes import probe_table
 from anytouch_jax.evaluate.feature_cache import FeatureStore
 from anytouch_jax.evaluate.heads import load_head
-from anytouch_jax.evaluate.probe_results import task_table
 from anytouch_jax.evaluate.probing import (
     label_rows,
     pixel_components,
@@ -349,7 +349,7 @@ QUICK = ("feel_grasp", "objectfolder1_material")
 def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
     out, data = tmp_path / "result.json", trees[source_of(name)]
     report = probe_benchmark([tiny_run], [data], name, seeds=1, cache=tmp_path / "cache", out=out, log=quiet)
-    record, printed = json.loads(out.read_text()), task_table(report)
+    record, printed = json.loads(out.read_text()), probe_table(report["results"], report["paper"])
     assert name in printed and "raw pixels" in printed and "paper" in printed
     published = {one["features"]: one for one in record["results"] if one["protocol"] == "published"}
     assert {(one["train"], one["test"]) for one in published.values()} == {SIZES[name]}
@@ -378,7 +378,7 @@ def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
     names = [str(tiny_run), "random encoder", str(tmp_path / "f.npz"), "raw pixels"]
     assert list(dict.fromkeys(one["features"] for one in results)) == names
     assert {one["protocol"] for one in results} == {"honest", "published"}
-    assert " N" in task_table(report)
+    assert " N" in probe_table(report["results"], report["paper"])
     for word, change in (("--order", {"order": "shuffled"}), ("--join", {"join": "sum"}), ("probe", {"models": []})):
         changed = {
             "models": [tiny_run],

@@ -99,7 +99,7 @@ class BenchmarkOptions(BatteryOptions):
 
 def run_label(options: LabelOptions) -> int:
     """Probe a label column, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.probe_results import probe_table
+    from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_label
 
     in_range("--", options, frames=COUNT)
@@ -118,7 +118,7 @@ def run_label(options: LabelOptions) -> int:
 
 def run_tasks(options: TasksOptions) -> int:
     """Probe named tasks, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.probe_results import task_table
+    from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_tasks
 
     in_range("--", options, frames=COUNT, max_rows=COUNT)
@@ -129,19 +129,19 @@ def run_tasks(options: TasksOptions) -> int:
     _prepare(options, options.seeds, options.cache)
     settings = _settings(options) | {"tasks": "all" if options.tasks == ("all",) else options.tasks}
     results = probe_tasks(options.model, options.data, **settings, log=log)
-    print_table(task_table(results))
+    print_table(probe_table(results["results"], results["paper"]))
     return 0
 
 
 def run_benchmark(options: BenchmarkOptions) -> int:
     """Probe a public benchmark, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.probe_results import task_table
+    from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_benchmark
 
     in_range("--", options, max_rows=COUNT)
     _prepare(options, options.seeds, options.cache)
     results = probe_benchmark(options.model, options.data, **_settings(options), log=log)
-    print_table(task_table(results))
+    print_table(probe_table(results["results"], results["paper"]))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Linear probes, nearest-neighbour probes and regression probes of feature arrays.
+"""Linear, nearest-neighbour and regression probes of feature arrays, their results and tables.
 
 They take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups` (n,), recordings or objects that
 no fold or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that take part.
@@ -9,8 +9,9 @@ over groups of train, and test is read once. published: it is selected on test, 
 
 from __future__ import annotations
 
-import dataclasses
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,13 +20,83 @@ import numpy.typing as npt
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits, statistics
 from anytouch_jax.evaluate.heads import FittedHead, ProbeHead, Scaling
-from anytouch_jax.evaluate.probe_results import Outcome, ProbeResult, RegressionResult, subset_results
 from anytouch_jax.evaluate.splits import Split
 from anytouch_jax.evaluate.statistics import Protocol
 from anytouch_jax.evaluate.tasks import label_text
 
 Array = npt.NDArray[Any]
 Subsets = Mapping[str, Array]
+Notes = tuple[str, ...]
+
+NAN = float("nan")
+OF_CLASSES = ("accuracy", "balanced_accuracy", "baseline", "refit_mean", "refit_std", "seeds", "classes", "parts")
+OF_NUMBERS = ("r2", "mae", "mae_low", "mae_high", "baseline_mae")
+
+
+@dataclass(frozen=True)
+class SubsetResult:
+    """Accuracy on a named part of the test rows; `low`, `high` as in `ProbeResult`."""
+
+    name: str
+    accuracy: float
+    low: float | None
+    high: float | None
+    n_test: int
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The test rows, whether each was right, and its group; `fitted`: the linear model and the names of its classes."""
+
+    rows: Array
+    correct: Array
+    groups: Array
+    fitted: tuple[Any, Array] | None = None
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """The score of a head fitted on all of train, on the test rows. Shares are in 0..1.
+
+    `low`, `high`: 95 % interval of the accuracy or R2 under a bootstrap over the test groups, None with fewer than two.
+    `penalty` (k, epoch) was selected on `chosen_on`. If that is test, the score is an upper estimate.
+
+    Of classes: a test row of a class that train lacks counts as an error. `baseline` is the accuracy of the most
+    frequent class of train. `refit_mean`, `refit_std`: accuracy of `seeds` heads fitted on bootstraps of the train
+    groups. Each has some 63 % of the groups, so the mean is a little below `accuracy`.
+
+    Of numbers: `r2` and the mean absolute error `mae` in units of the label. `baseline_mae` is that of train's mean.
+    """
+
+    probe: str
+    protocol: Protocol
+    low: float | None
+    high: float | None
+    penalty: float | None
+    chosen_on: str
+    n_train: int
+    n_test: int
+    test_groups: int
+    accuracy: float = NAN
+    balanced_accuracy: float = NAN
+    baseline: float = NAN
+    refit_mean: float | None = None
+    refit_std: float | None = None
+    seeds: int = 0
+    classes: tuple[str, ...] = ()
+    parts: tuple[SubsetResult, ...] = ()
+    r2: float = NAN
+    mae: float = NAN
+    mae_low: float | None = None
+    mae_high: float | None = None
+    baseline_mae: float = NAN
+    notes: Notes = ()
+    outcome: Outcome | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the label is a number."""
+        return not np.isnan(self.r2)
 
 
 class LabelledFeatures(NamedTuple):
@@ -36,6 +107,10 @@ class LabelledFeatures(NamedTuple):
     names: Array
     groups: Array
 
+    def fit(self, head: ProbeHead, ids: Array, **options: Any) -> FittedHead:
+        """Fit a head on some rows; `options` are those of `fit_head`."""
+        return heads.fit_head(head, self.x[ids], self.y[ids], len(self.names), **options)
+
 
 class Selection(NamedTuple):
     """The selected option of a head and its place, the rows it was chosen on, and the scores and the fit of all."""
@@ -43,95 +118,77 @@ class Selection(NamedTuple):
     place: int
     option: float
     chosen_on: str
-    scores: Sequence[float] = ()
+    scores: Sequence[float] | Array = ()
     fitted: FittedHead | None = None
 
 
 def select_option(head: ProbeHead, data: LabelledFeatures, split: Split, protocol: Protocol) -> Selection:
     """Fit all options of a head on at most SELECT_ROWS rows of `split.fit` and select the best by the protocol."""
     splits.check_protocol(protocol)
-    classes = len(data.names)
     if head.options is not None and len(head.options) == 1:
         return Selection(0, head.options[0], "given")
     # An epoch is not selected on fewer rows, as its number of steps would change.
     fit = split.fit if head.name == "gradient" else splits.subsample(split.fit)
 
-    def scores(fitted: FittedHead, rows: Array) -> list[float]:
-        return [heads.head_score(predicted, data.y[rows], classes) for predicted in fitted.predict(data.x[rows])]
+    def scores(fitted: FittedHead, rows: Array) -> Array:
+        predictions = fitted.predict(data.x[rows])
+        return np.array([heads.head_score(predicted, data.y[rows], len(data.names)) for predicted in predictions])
 
     if protocol == "published" or len(split.val):
         chosen_on, rows = ("test", split.test) if protocol == "published" else ("val", split.val)
-        fitted = heads.fit_head(head, data.x[fit], data.y[fit], classes)
+        fitted = data.fit(head, fit)
         values = scores(fitted, rows)
         index = splits.best_option(values)
         return Selection(index, fitted.options[index], chosen_on, values, fitted)
     totals: Any = 0
-    for inner, out in splits.group_folds(fit, data.groups, data.y if classes else None, splits.FOLDS):
-        fitted = heads.fit_head(head, data.x[inner], data.y[inner], classes)
-        totals = totals + len(out) * np.array(scores(fitted, out))
+    for inner, out in splits.group_folds(fit, data.groups, data.y if len(data.names) else None, splits.FOLDS):
+        fitted = data.fit(head, inner)
+        totals = totals + len(out) * scores(fitted, out)
     index = splits.best_option(totals)
     return Selection(index, fitted.options[index], "cross-validation", totals)
 
 
-def linear_probe(
-    features: Array, labels: Any, groups: Any, split: Any, *, protocol: Protocol = "honest",
-    penalties: Sequence[float] = heads.PENALTIES, seeds: int = 5, scaling: Scaling = "column",
-    subsets: Subsets | None = None, name: str = "linear",
+def probe_features(
+    features: Array, labels: Any, groups: Any, split: Any, head: ProbeHead | None = None, *, measured: bool = False,
+    protocol: Protocol = "honest", seeds: int = 5, subsets: Subsets | None = None, name: str = "linear",
 ) -> ProbeResult:  # fmt: skip
-    """Probe with multinomial logistic regression on features standardised by train.
+    """Probe with a head (default: linear) that is selected and fitted on train, and tested on test.
 
-    A penalty is the factor of half the squared weights, next to the mean log loss. `seeds` bootstraps of the train
-    groups are fitted too. `scaling`: "common" for principal components. `subsets` (name -> mask over all rows) report
-    parts of test. Raises UserError for features that are not finite, labels of one class, or an empty train or test.
+    `measured`: labels are numbers. `seeds` heads of classes are fitted on bootstraps of the train groups too. `subsets`
+    (name -> mask over all rows) report parts of test. Raises UserError as `check_rows`.
     """
-    head = ProbeHead("linear", scaling, _strongest_first(penalties))
-    return _probe_classes(head, (features, labels, groups, split), protocol, seeds, subsets, name)
-
-
-def knn_probe(
-    features: Array, labels: Any, groups: Any, split: Any, *, protocol: Protocol = "honest",
-    neighbours: Sequence[int] = heads.NEIGHBOURS, seeds: int = 5, subsets: Subsets | None = None, name: str = "kNN",
-) -> ProbeResult:  # fmt: skip
-    """Probe with a vote of the k nearest rows of train by cosine. Parameters and errors are those of `linear_probe`."""
-    head = ProbeHead("knn", options=_strongest_first(neighbours))
-    return _probe_classes(head, (features, labels, groups, split), protocol, seeds, subsets, name)
-
-
-def _probe_classes(
-    head: ProbeHead, arrays: tuple[Any, ...], protocol: Protocol, seeds: int, subsets: Subsets | None, name: str
-) -> ProbeResult:
-    data, rows, notes = check_rows(*arrays)
+    data, rows, notes = check_rows(features, labels, groups, split, measured=measured)
+    head = head or ProbeHead()
     selected = select_option(head, data, rows, protocol)
     notes += _selection_notes(selected, head)
-    head = dataclasses.replace(head, options=(selected.option,))
-    truth, tested = data.y[rows.test], data.x[rows.test]
-
-    def fit(ids: Array, weights: Array | None = None, start: Any = None) -> FittedHead:
-        return heads.fit_head(head, data.x[ids], data.y[ids], len(data.names), weights=weights, start=start)
-
-    best = fit(rows.fit)
+    head = replace(head, options=(selected.option,))
+    best = data.fit(head, rows.fit)
     model = best.models[0] if best.models else None
-    correct, refits = best.predict(tested)[0] == truth, []
-    for ids, weights in splits.group_bootstraps(rows.fit, data.groups, seeds):
-        refits.append(float(np.mean(fit(ids, weights, model).predict(tested)[0] == truth)))
+    refits = []
+    for ids, weights in splits.group_bootstraps(rows.fit, data.groups, 0 if measured else seeds):
+        (predicted,) = data.fit(head, ids, weights=weights, start=model).predict(data.x[rows.test])
+        refits.append(float(np.mean(predicted == data.y[rows.test])))
     if model is not None and not model.finished:
         notes += ("the fit stopped at its limit of iterations",)
-    result = _probe_result(name, protocol, data, rows, correct, selected, notes, subsets, refits)
-    outcome = Outcome(rows.test, correct, data.groups[rows.test], (model, data.names))
-    return dataclasses.replace(result, outcome=outcome)
+    (predicted,) = best.predict(data.x[rows.test])
+    result = _result(name, protocol, data, rows, predicted, selected, notes, subsets)
+    if refits:
+        spread = float(np.std(refits, ddof=1)) if len(refits) > 1 else None
+        result = replace(result, refit_mean=float(np.mean(refits)), refit_std=spread, seeds=len(refits))
+    return replace(result, outcome=result.outcome and replace(result.outcome, fitted=(model, data.names)))
 
 
 def majority_baseline(labels: Any, groups: Any, split: Any, *, subsets: Subsets | None = None) -> ProbeResult:
     """Score the most frequent class of train on test."""
     data, rows, _ = check_rows(np.zeros((len(labels), 1), np.float32), labels, groups, split, least_classes=1)
-    correct = data.y[rows.test] == heads.majority_class(data.y[rows.fit])
-    return _probe_result("commonest class", "honest", data, rows, correct, None, (), subsets)
+    predicted = np.full(len(rows.test), heads.majority_class(data.y[rows.fit]))
+    return _result("commonest class", "honest", data, rows, predicted, None, (), subsets)
 
 
 def leave_groups_out(
     features: Array, labels: Any, groups: Any, *, folds: int | None = 10,
-    penalties: Sequence[float] = (10.0, *heads.PENALTIES), scaling: Scaling = "column", subsets: Subsets | None = None,
-    name: str = "linear, groups left out",
+    penalties: Sequence[float] = (10.0, *heads.PENALTIES), scaling: Scaling = "column",
+    subsets: Subsets | None = None, name: str = "linear, groups left out",
 ) -> ProbeResult:  # fmt: skip
     """Probe each row with a linear fit on no row of its group, for instance on held-out objects.
 
@@ -141,101 +198,63 @@ def leave_groups_out(
     data, rows, notes = check_rows(features, labels, groups, np.full(len(labels), "train"), tested=False)
     used, y, chosen = rows.fit, data.y, []
     predicted, baseline = np.full(len(y), -1), np.full(len(y), -1)
-    head = ProbeHead("linear", scaling, _strongest_first(penalties))
+    head = ProbeHead("linear", scaling, tuple(penalties))
     count = len(np.unique(data.groups[used])) if folds is None else folds
     for fit, out in splits.group_folds(used, data.groups, y, count):
-        penalty = select_option(head, data, Split(fit, fit[:0], out), "honest").option
-        chosen.append(penalty)
-        (model,) = heads.linear_path(data.x[fit], y[fit], [penalty], scaling=scaling)
-        predicted[out], baseline[out] = model(data.x[out]), heads.majority_class(y[fit])
+        chosen.append(select_option(head, data, Split(fit, fit[:0], out), "honest").option)
+        (predicted[out],) = data.fit(replace(head, options=(chosen[-1],)), fit).predict(data.x[out])
+        baseline[out] = heads.majority_class(y[fit])
     values, times = np.unique(chosen, return_counts=True)
     counts = ", ".join(f"{value:g} ({count} x)" for value, count in zip(values, times, strict=True))
     selected = Selection(0, float(np.median(chosen)), "cross-validation, median of the folds")
     notes += (f"penalties of the folds: {counts}",)
-    everything, correct = Split(used, used[:0], used), (predicted == y)[used]
-    result = _probe_result(name, "honest", data, everything, correct, selected, notes, subsets)
-    return dataclasses.replace(result, baseline=float(np.mean(baseline[used] == y[used])))
+    result = _result(name, "honest", data, Split(used, used[:0], used), predicted[used], selected, notes, subsets)
+    return replace(result, baseline=float(np.mean(baseline[used] == y[used])))
 
 
-def regression_probe(
-    features: Array, labels: Any, groups: Any, split: Any, *, protocol: Protocol = "honest",
-    penalties: Sequence[float] = heads.RIDGE, name: str = "ridge",
-) -> RegressionResult:  # fmt: skip
-    """Probe with ridge regression of a measured label (floats) on features standardised by train.
-
-    A penalty is added to the mean squared error. Raises UserError as `linear_probe`, and for a constant label.
-    """
-    data, rows, notes = check_rows(features, labels, groups, split, measured=True)
-    head = ProbeHead("linear", options=_strongest_first(penalties))
-    selected = select_option(head, data, rows, protocol)
-    (predicted,) = heads.fit_ridge(data.x[rows.fit], data.y[rows.fit], [selected.option])(data.x[rows.test])
-    truth, tested_groups = data.y[rows.test], data.groups[rows.test]
-    error = predicted - truth
-    low, high = statistics.r2_interval(error, truth, tested_groups)
-    mae_low, mae_high = statistics.mean_interval(np.abs(error), tested_groups)
-    return RegressionResult(
-        probe=name,
-        protocol=protocol,
-        r2=1 - float(np.sum(error**2) / np.sum((truth - truth.mean()) ** 2)),
-        low=low,
-        high=high,
-        mae=float(np.abs(error).mean()),
-        mae_low=mae_low,
-        mae_high=mae_high,
-        baseline_mae=float(np.abs(data.y[rows.fit].mean() - truth).mean()),
-        penalty=selected.option,
-        chosen_on=selected.chosen_on,
-        n_train=len(rows.fit),
-        n_test=len(rows.test),
-        test_groups=len(np.unique(tested_groups)),
-        notes=notes + _selection_notes(selected, head),
-    )
-
-
-def _strongest_first(options: Sequence[float]) -> tuple[float, ...]:
-    """Return the options in falling order: a strong penalty is a good start for the next weaker one."""
-    if not options or min(options) <= 0:
-        raise UserError(f"Penalties and numbers of neighbours must be above 0, at least one, not {list(options)}.")
-    return tuple(sorted(set(options), reverse=True))
-
-
-def _selection_notes(selected: Selection, head: ProbeHead) -> tuple[str, ...]:
-    notes: tuple[str, ...] = ()
+def _selection_notes(selected: Selection, head: ProbeHead) -> Notes:
+    notes: Notes = ()
     if selected.chosen_on == "test":
         notes += ("chosen on test, as the authors' code does: an upper estimate",)
     alone = len(selected.scores) and np.count_nonzero(np.asarray(selected.scores) == np.max(selected.scores)) == 1
-    if alone and head.name != "knn" and selected.place in (0, len(selected.scores) - 1):
+    if alone and head.name == "linear" and selected.place in (0, len(selected.scores) - 1):
         notes += (f"the chosen penalty {selected.option:g} lies at the edge of those tried",)
     return notes
 
 
-def _probe_result(
-    name: str, protocol: Protocol, data: LabelledFeatures, rows: Split, correct: Array, selected: Selection | None,
-    notes: tuple[str, ...], subsets: Subsets | None, refits: Sequence[float] = (),
+def _result(
+    name: str, protocol: Protocol, data: LabelledFeatures, rows: Split, predicted: Array, selected: Selection | None,
+    notes: Notes, subsets: Subsets | None,
 ) -> ProbeResult:  # fmt: skip
-    y, groups = data.y[rows.test], data.groups[rows.test]
-    low, high = statistics.mean_interval(correct, groups)
-    return ProbeResult(
-        probe=name,
-        protocol=protocol,
-        accuracy=float(correct.mean()),
-        balanced_accuracy=float(np.mean([correct[y == number].mean() for number in np.unique(y)])),
-        low=low,
-        high=high,
-        baseline=float(np.mean(y == heads.majority_class(data.y[rows.fit]))),
-        refit_mean=float(np.mean(refits)) if len(refits) else None,
-        refit_std=float(np.std(refits, ddof=1)) if len(refits) > 1 else None,
-        seeds=len(refits),
-        penalty=selected.option if selected else None,
-        chosen_on=selected.chosen_on if selected else "",
-        n_train=len(rows.fit),
-        n_test=len(rows.test),
-        test_groups=len(np.unique(groups)),
-        classes=tuple(map(str, data.names[np.unique(data.y[rows.fit])])),
-        parts=subset_results(correct, groups, subsets or {}, rows.test),
-        notes=notes if low is not None else (*notes, "test has one group only: no interval"),
-        outcome=Outcome(rows.test, correct, groups),
-    )
+    """Return the scores of predictions for the test rows."""
+    y, truth, groups = data.y[rows.fit], data.y[rows.test], data.groups[rows.test]
+    scores: dict[str, Any]
+    if not len(data.names):
+        error = predicted - truth
+        low, high = statistics.r2_interval(error, truth, groups)
+        mae_low, mae_high = statistics.mean_interval(np.abs(error), groups)
+        scores = {
+            "r2": 1 - float(np.sum(error**2) / np.sum((truth - truth.mean()) ** 2)), "mae": float(np.abs(error).mean()),
+            "mae_low": mae_low, "mae_high": mae_high, "baseline_mae": float(np.abs(y.mean() - truth).mean()),
+        }  # fmt: skip
+    else:
+        correct, parts = predicted == truth, []
+        low, high = statistics.mean_interval(correct, groups)
+        for part, mask in (subsets or {}).items():
+            chosen = np.asarray(mask, bool)[rows.test]
+            interval = statistics.mean_interval(correct[chosen], groups[chosen])
+            accuracy = float(correct[chosen].mean()) if chosen.any() else NAN
+            parts.append(SubsetResult(part, accuracy, *interval, int(chosen.sum())))
+        scores = {
+            "accuracy": float(correct.mean()), "baseline": float(np.mean(truth == heads.majority_class(y))),
+            "balanced_accuracy": float(np.mean([correct[truth == number].mean() for number in np.unique(truth)])),
+            "classes": tuple(map(str, data.names[np.unique(y)])), "parts": tuple(parts),
+            "outcome": Outcome(rows.test, correct, groups),
+        }  # fmt: skip
+        notes = notes if low is not None else (*notes, "test has one group only: no interval")
+    option, chosen_on = (selected.option, selected.chosen_on) if selected else (None, "")
+    sizes = (len(rows.fit), len(rows.test), len(np.unique(groups)))
+    return ProbeResult(name, protocol, low, high, option, chosen_on, *sizes, **scores, notes=notes)
 
 
 def check_rows(
@@ -308,3 +327,95 @@ def _measured_labels(labels: Any) -> tuple[Array, Array, Array]:
 
 def _listed(items: Array) -> str:
     return ", ".join(map(str, items[:10])) + (f" and {len(items) - 10} more" if len(items) > 10 else "")
+
+
+def accuracy_difference(first: ProbeResult, second: ProbeResult) -> tuple[float, float | None, float | None]:
+    """Return the accuracy of `first` minus that of `second` with its 95 % interval over groups, paired by test row.
+
+    Two encoders err on the same hard recordings, so this is narrower than two separate intervals. Raises UserError if
+    the two were not tested on the same rows.
+    """
+    a, b = first.outcome, second.outcome
+    if a is None or b is None or not np.array_equal(a.rows, b.rows) or not np.array_equal(a.groups, b.groups):
+        raise UserError(
+            f"{first.probe!r} and {second.probe!r} were not tested on the same rows. Give both the same table."
+        )
+    change = a.correct.astype(np.float64) - b.correct
+    return float(change.mean()), *statistics.mean_interval(change, a.groups)
+
+
+def probe_json(results: Sequence[ProbeResult]) -> str:
+    """Return the results as a JSON list of objects, without outcomes; a number that does not exist is null."""
+    records = []
+    for result in results:
+        others = OF_CLASSES if result.measured else OF_NUMBERS
+        records.append({name: value for name, value in statistics.plain(result).items() if name not in others})
+    return json.dumps(records, indent=2, allow_nan=False)
+
+
+def probe_table(results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None) -> str:
+    """Return results, or rows of `score_tasks`, as one Markdown table, with the notes below.
+
+    `paper`: the accuracy of AnyTouch in the paper.
+    """
+    lines, notes = list[dict[str, str]](), list[str]()
+    for result in results:
+        if isinstance(result, ProbeResult):
+            lines += _result_lines(result)
+            notes += [f"- {result.probe} ({result.protocol}): {note}" for note in result.notes]
+        else:
+            lines.append(_task_line(result))
+            notes += [f"- {result['task']}: {note}" for note in result["notes"]]
+    if paper is not None:
+        notes.append(f"- the paper reports {100 * paper:.2f} % for AnyTouch, its epoch chosen on test")
+    header = list(dict.fromkeys(column for line in lines for column in line))
+    table = statistics.markdown_table(header, [[line.get(column, "") for column in header] for line in lines])
+    return "\n\n".join([table, *(["\n".join(dict.fromkeys(notes))] if notes else [])]) + "\n"
+
+
+def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
+    """Return the cells of a result, and of its parts, by column."""
+    line = {"probe": result.probe, "protocol": result.protocol}
+    if result.measured:
+        line |= _score_cells("r2", result.r2, result.low, result.high, result.baseline_mae, result.mae)
+        line["MAE 95 %"] = _interval(result.mae_low, result.mae_high, 1.0, 3)
+    else:
+        refits = f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}"
+        line |= _score_cells("accuracy", result.accuracy, result.low, result.high, result.baseline)
+        line |= {"balanced": _share(result.balanced_accuracy), "refits": refits if result.seeds else "-"}
+    line |= {"train": str(result.n_train), "test (groups)": f"{result.n_test} ({result.test_groups})"}
+    line |= {} if result.measured else {"classes": str(len(result.classes))}
+    line["penalty or k"] = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
+    parts = []
+    for part in result.parts:
+        cells = {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol}
+        cells |= {"score": _share(part.accuracy), "95 %": _interval(part.low, part.high)}
+        parts.append(cells | {"test (groups)": str(part.n_test)})
+    return [line, *parts]
+
+
+def _task_line(row: Mapping[str, Any]) -> dict[str, str]:
+    """Return the cells of a row of `score_tasks` by column."""
+    mae, chance = (row["mae"], row["chance_mae"]) if row["metric"] == "r2" else (None, row["chance"])
+    line = {"features": row.get("features", ""), **{name: row[name] for name in ("task", "head", "protocol")}}
+    line |= _score_cells(row["metric"], row["mean"], row["low"], row["high"], chance, mae, row.get("unit", ""))
+    return line | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
+
+
+def _score_cells(
+    metric: str, value: float, low: float | None, high: float | None, chance: float, mae: float | None = None,
+    unit: str = "",
+) -> dict[str, str]:  # fmt: skip
+    """Return the cells of a score, its interval and chance; errors in `unit`."""
+    if metric != "r2":
+        return {"score": _share(value), "95 %": _interval(low, high), "chance": _share(chance)}
+    score = f"R2 {value:.3f}, {mae:.3g} {unit}".strip()
+    return {"score": score, "95 %": _interval(low, high, 1.0, 3), "chance": f"{chance:.3g} {unit}".strip()}
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None or np.isnan(value) else f"{100 * value:.1f} %"
+
+
+def _interval(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
+    return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"

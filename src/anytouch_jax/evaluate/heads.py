@@ -56,8 +56,9 @@ class ProbeHead:
     """A head to fit; on numbers "linear" is ridge regression.
 
     `scaling` "column" brings every feature to unit variance. "common" divides all by one factor, which keeps the
-    ranking of principal components. `options` replace the default penalties or numbers of neighbours, strongest first.
-    `recipe` and `seed` are of "gradient".
+    ranking of principal components. `options` replace the default penalties, numbers of neighbours or epochs. They are
+    sorted, as a strong penalty is a good start for the next weaker one. `recipe` and `seed` are of "gradient". Raises
+    UserError for an unknown head, and for options that are not above 0.
     """
 
     name: HeadName = "linear"
@@ -65,6 +66,14 @@ class ProbeHead:
     options: tuple[float, ...] | None = None
     recipe: GradientRecipe = GradientRecipe()
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.name not in get_args(HeadName):
+            raise UserError(f"Unknown head {self.name!r}. Choose among {', '.join(get_args(HeadName))}.")
+        if self.options is not None:
+            if not self.options or min(self.options) <= 0:
+                raise UserError(f"Penalties and numbers of neighbours must be above 0, not {list(self.options)}.")
+            object.__setattr__(self, "options", tuple(sorted(set(map(float, self.options)), reverse=True)))
 
 
 class FittedHead(NamedTuple):
@@ -99,28 +108,25 @@ def fit_head(
 ) -> FittedHead:
     """Fit all options of a head on features f32 (n, d) and class numbers below `classes` (0: y are numbers).
 
-    `weights` (n,): how often each row counts in "linear" (whole times in "knn"). `start` is where logistic regression
-    starts. Raises UserError for an unknown head.
+    `weights` (n,): how often each row counts, whole times but in logistic regression. `start` is where that starts.
     """
-    if head.name not in get_args(HeadName):
-        raise UserError(f"Unknown head {head.name!r}. Choose among {', '.join(get_args(HeadName))}.")
-    options = head.options or {
+    defaults = {
         "linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": range(1, head.recipe.epochs + 1)
-    }[head.name]  # fmt: skip
-    options, models = tuple(map(float, options)), list[LinearModel]()
+    }  # fmt: skip
+    options = head.options or tuple(map(float, defaults[head.name]))
     if classes and len(np.unique(y)) == 1:  # a small fold may hold one class only
         return FittedHead(options, lambda rows: [np.full(len(rows), y[0])] * len(options))
-    if head.name == "gradient":
-        predict = _fit_gradient(x, y, classes, head.recipe, head.seed)
-    elif head.name == "knn":
-        times = np.ones(len(x), np.int64) if weights is None else weights.astype(np.int64)
-        predict = _fit_neighbours(np.repeat(x, times, 0), np.repeat(y, times), classes, options)
-    elif classes:
+    if head.name == "linear" and classes:
         models = linear_path(x, y, options, scaling=head.scaling, weights=weights, start=start)
         return FittedHead(options, lambda rows: [model(rows) for model in models], models)
-    else:
-        predict = fit_ridge(x, y, options, head.scaling)
-    return FittedHead(options, predict)
+    if weights is not None:
+        times = weights.astype(np.int64)
+        x, y = np.repeat(x, times, 0), np.repeat(y, times)
+    if head.name == "gradient":
+        return FittedHead(options, _fit_gradient(x, y, classes, options, head.recipe, head.seed))
+    if head.name == "knn":
+        return FittedHead(options, _fit_neighbours(x, y, classes, options))
+    return FittedHead(options, fit_ridge(x, y, options, head.scaling))
 
 
 def head_score(predicted: Array, truth: Array, classes: int) -> float:
@@ -242,8 +248,10 @@ def majority_class(y: Array) -> int:
     return int(np.bincount(y).argmax())
 
 
-def _fit_gradient(x: Array, y: Array, classes: int, recipe: GradientRecipe, seed: int) -> Predict:
-    """Fit the authors' layer; numbers are fitted in standard deviations. An option is the end of an epoch."""
+def _fit_gradient(
+    x: Array, y: Array, classes: int, options: Sequence[float], recipe: GradientRecipe, seed: int
+) -> Predict:
+    """Fit the authors' layer; numbers are fitted in standard deviations. An option is an epoch, counted from 1."""
     rng = np.random.default_rng(seed)
     x, (n, d), columns = np.asarray(x, np.float32), x.shape, classes if classes > 2 else 1
     middle, spread = (0.0, 1.0) if classes else (float(y.mean()), float(y.std()) or 1.0)
@@ -262,7 +270,7 @@ def _fit_gradient(x: Array, y: Array, classes: int, recipe: GradientRecipe, seed
         epochs.append((np.asarray(params[0]), np.asarray(params[1])))
 
     def predict(rows: Array) -> list[Array]:
-        logits = [rows @ weights + bias for weights, bias in epochs]
+        logits = [rows @ weights + bias for weights, bias in (epochs[int(epoch) - 1] for epoch in options)]
         if classes > 2:
             return [each.argmax(1) for each in logits]
         return [(each[:, 0] > 0).astype(np.int64) if classes else each[:, 0] * spread + middle for each in logits]

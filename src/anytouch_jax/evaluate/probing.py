@@ -24,11 +24,18 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, feature_cache, heads, logistic, splits, statistics, tasks
-from anytouch_jax.evaluate.array_probes import LabelledFeatures
+from anytouch_jax.evaluate import array_probes, feature_cache, logistic, splits, statistics, tasks
+from anytouch_jax.evaluate.array_probes import LabelledFeatures, ProbeResult
 from anytouch_jax.evaluate.feature_cache import FeatureStore, Order
-from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, ProbeHead, Scaling
-from anytouch_jax.evaluate.probe_results import ProbeResult, probe_json
+from anytouch_jax.evaluate.heads import (
+    GradientRecipe,
+    HeadName,
+    ProbeHead,
+    Scaling,
+    linear_head,
+    majority_class,
+    save_head,
+)
 from anytouch_jax.evaluate.splits import RowRoles, Split
 from anytouch_jax.evaluate.statistics import GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
@@ -39,6 +46,7 @@ Log = Callable[[str], None]
 Paths = Sequence[str | Path]
 Names = Sequence[str] | None
 RAW, RANDOM = "raw pixels", "random encoder"
+SIDES = ("train_sensors", "test_sensors", "train_units", "test_units")
 
 
 class _Source(NamedTuple):
@@ -48,29 +56,6 @@ class _Source(NamedTuple):
     store: FeatureStore
     encoder: Encoder | None = None
     scaling: Scaling = "column"
-
-    @property
-    def is_file(self) -> bool:
-        return self.encoder is None and self.name != RAW
-
-
-class _Sides(NamedTuple):
-    """Sensors and units (patterns) to fit on and to test on; None: all."""
-
-    train_sensors: Names = None
-    test_sensors: Names = None
-    train_units: Names = None
-    test_units: Names = None
-
-
-class _Settings(NamedTuple):
-    """How every task is probed: seeds, heads, protocols, the recipe of the gradient head, the order of frames."""
-
-    seeds: int
-    heads: Sequence[HeadName]
-    protocols: Sequence[Protocol]
-    recipe: GradientRecipe
-    order: Order
 
 
 class _Plan(NamedTuple):
@@ -90,7 +75,7 @@ def probe_label(
     pooling: Pooling = "class", join: Join = "mean", seeds: int = 5, protocol: Protocol = "honest",
     controls: bool = True, cache: Path | None = None, save: Path | None = None, out: Path | None = None,
     log: Log = print,
-) -> list[Any]:  # fmt: skip
+) -> list[ProbeResult]:  # fmt: skip
     """Probe a label column with features of every model, of features files, and of the controls.
 
     `group` is the column that no split cuts. `leave_out` tests every value of a column held out, instead of the splits.
@@ -99,35 +84,30 @@ def probe_label(
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
-    table = _read(data)
-    filters: dict[str, Any] = {"group": group, "leave_out": leave_out, "where": where, "sensor": sensor}
-    rows, subsets = label_rows(table, label, **filters, frames=frames)
+    table = manifests.read([str(path) for path in data])
+    rows, subsets = label_rows(
+        table, label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames
+    )
     log(f"{len(rows.rows)} of {len(table)} rows take part")
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
     array_probes.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
-    results: list[Any] = []
-    sources = _sources(table, models, features, controls, frames, cache, pooling=pooling, join=join, log=log)
-    for source in sources:
-        if source.is_file:  # a file that lacks rows is reported before the work
-            source.store.add(rows.rows, frames)
-    for source in sources:
+    results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join)
+    for source in _sources(table, models, features, controls, cache, {frames: rows.rows}, **encoding):
         values = pixel_components(source.store, rows) if source.name == RAW else source.store.get(rows.rows, frames)
-        options: dict[str, Any] = {"leave_out": leave_out, "protocol": protocol, "seeds": seeds, "subsets": subsets}
-        scored = probe_rows(values, rows, source.name, scaling=source.scaling, **options)
-        if save is not None and source.encoder is not None and source.name != RANDOM:
-            assert scored[0].outcome is not None and scored[0].outcome.fitted is not None
-            model, names = scored[0].outcome.fitted
-            about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
-            heads.save_head(save, heads.linear_head(model, names, fingerprint=source.encoder.fingerprint, **about))
-            log(f"{save}: the linear head")
-        results += scored
+        results += probe_rows(values, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds,
+                              scaling=source.scaling, subsets=subsets)  # fmt: skip
         log(f"probed {source.name}")
+        if save is not None and source.encoder is not None and source.name != RANDOM and (tested := results[0].outcome):
+            about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
+            assert tested.fitted is not None
+            save_head(save, linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint))
+            log(f"{save}: the linear head")
     if leave_out is None:
         results.append(array_probes.majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
     if out is not None:
-        atomic_write(out, probe_json(results))
+        atomic_write(out, array_probes.probe_json(results))
     return results
 
 
@@ -153,57 +133,66 @@ def probe_rows(
     seeds: int = 5, scaling: Scaling = "column", subsets: dict[str, Array] | None = None,
 ) -> list[ProbeResult]:  # fmt: skip
     """Return the linear and kNN results of features (n, d) on the rows of a task, or that of held-out groups."""
-    arrays, options = (features, rows.labels, rows.groups), dict[str, Any](subsets=subsets)
+    arrays = (features, rows.labels, rows.groups)
     if leave_out is not None:
         name = f"{name}: linear, {leave_out} left out"
-        return [array_probes.leave_groups_out(*arrays, name=name, scaling=scaling, **options)]
-    options |= {"protocol": protocol, "seeds": seeds}
-    linear = array_probes.linear_probe(*arrays, rows.split, name=f"{name}: linear", scaling=scaling, **options)
-    return [linear, array_probes.knn_probe(*arrays, rows.split, name=f"{name}: kNN", **options)]
+        return [array_probes.leave_groups_out(*arrays, name=name, scaling=scaling, subsets=subsets)]
+    options: dict[str, Any] = {"protocol": protocol, "seeds": seeds, "subsets": subsets}
+    probes = {"linear": ProbeHead("linear", scaling), "kNN": ProbeHead("knn")}
+    return [
+        array_probes.probe_features(*arrays, rows.split, head, name=f"{name}: {kind}", **options)
+        for kind, head in probes.items()
+    ]
 
 
 def probe_tasks(
-    models: Paths, data: Paths, tasks: Sequence[str] | Literal["all"] = "all", *, features: Paths = (),
+    models: Paths, data: Paths, tasks: Sequence[str | Task] | Literal["all"] = "all", *, features: Paths = (),
     heads: Sequence[HeadName] = ("linear",), seeds: int = 5, protocol: Protocol = "honest", frames: int | None = None,
-    pooling: Pooling = "class", join: Join = "mean", order: Order = "right", train_sensors: Names = None,
-    test_sensors: Names = None, train_units: Names = None, test_units: Names = None, max_rows: int | None = None,
-    controls: bool = True, cache: Path | None = None, out: Path | None = None, log: Log = print,
+    pooling: Pooling = "class", join: Join = "mean", order: Order = "right", max_rows: int | None = None,
+    universal: bool = False, recipe: GradientRecipe | None = None, paper: float | None = None, controls: bool = True,
+    cache: Path | None = None, out: Path | None = None, log: Log = print, **sides: Names,
 ) -> dict[str, Any]:  # fmt: skip
     """Probe named tasks with features of every model, of features files, and of the controls.
 
-    `protocol` "published" reports both protocols. `order` shuffles the frames of clips, or repeats the last one.
-    `train_sensors` and its siblings name sensors and units (patterns) to fit on and to test on. `out` writes JSON.
-    Tasks that cannot be probed are left out with their reason. Print the result with `task_table`. Raises UserError.
+    Parameters are those of `score_tasks`. `protocol` "published" reports both protocols. `paper`: the accuracy that the
+    report names. `out` writes JSON. Tasks that cannot be probed are left out with their reason. Print the "results"
+    with `probe_table`. Raises UserError.
     """
-    table, sides = _read(data), _Sides(train_sensors, test_sensors, train_units, test_units)
+    table = manifests.read([str(path) for path in data])
     plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log)
     if order != "right" and (features or all(plan.frames == 1 for plan in plans)):
         raise UserError("--order has no effect on stills or on --features. Leave it out, or give --frames.")
-    sources = _sources(table, models, features, controls, frames or 1, cache, pooling=pooling, join=join, order=order)
+    encoding: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
+    sources = _sources(table, models, features, controls, cache, _rows_by_length(plans), least=frames or 1, **encoding)
     if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
         raise UserError("--join has no effect without --frames longer than a clip of the model.")
     protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else ("honest",)
-    settings = _Settings(seeds, heads, protocols, GradientRecipe(), order)
-    return _report(table, data, sources, plans, settings, sides, left_out, None, out, log)
+    results = []
+    for source in sources:
+        scored = _run_plans(source, plans, seeds, heads, protocols, recipe, order)
+        results += [{"features": source.name} | row for row in scored]
+        log(f"probed {source.name}")
+    configs = {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder}
+    report = {
+        "manifest": table.content_hash, "data": [str(path) for path in data], "paper": paper, "seeds": seeds,
+        "sides": {name: list(sides.get(name) or ()) or None for name in SIDES}, "runs": configs, "left_out": left_out,
+        "results": results,
+    }  # fmt: skip
+    if out is not None:
+        atomic_write(out, json.dumps(report, indent=2, allow_nan=False))
+    return report
 
 
-def probe_benchmark(
-    models: Paths, data: Paths, benchmark: str, *, features: Paths = (), seeds: int = 5, train_sensors: Names = None,
-    test_sensors: Names = None, train_units: Names = None, test_units: Names = None, max_rows: int | None = None,
-    controls: bool = True, cache: Path | None = None, out: Path | None = None, log: Log = print,
-) -> dict[str, Any]:  # fmt: skip
+def probe_benchmark(models: Paths, data: Paths, benchmark: str, **options: Any) -> dict[str, Any]:
     """Probe a public benchmark with the authors' pooling, head and settings, by both protocols.
 
-    `out` writes JSON. Print the result with `task_table`. Raises UserError.
+    `options` are the others of `probe_tasks`, which returns the result. Raises UserError.
     """
     setting = tasks.find_benchmark(benchmark)
-    table = _read(data)
-    sides = _Sides(train_sensors, test_sensors, train_units, test_units)
-    plans = [_plan(table, setting.task, None, sides, max_rows)]
-    encoding: dict[str, Any] = {"pooling": setting.pooling, "universal": setting.universal}
-    sources = _sources(table, models, features, controls, setting.task.frames, cache, **encoding)
-    settings = _Settings(seeds, ("gradient",), ("published", "honest"), setting.recipe, "right")
-    return _report(table, data, sources, plans, settings, sides, {}, setting.paper, out, log)
+    return probe_tasks(
+        models, data, [setting.task], heads=("gradient",), protocol="published", pooling=setting.pooling,
+        universal=setting.universal, recipe=setting.recipe, paper=setting.paper, **options,
+    )  # fmt: skip
 
 
 def score_tasks(
@@ -219,8 +208,9 @@ def score_tasks(
     groups (tested); classes; chance, the score of the most frequent class or the mean of train; chosen options; frames;
     order; notes. A regression also has mae, mae_low, mae_high and chance_mae in `unit`.
 
-    `frames` replaces that of each task. `universal`: universal tokens for all sensors. `sides`: train_sensors,
-    test_sensors, train_units, test_units. Raises UserError.
+    `frames` replaces that of each task. `order` shuffles the frames of clips, or repeats the last. `universal`: the
+    universal tokens for all sensors. `sides`: train_sensors, test_sensors, train_units and test_units, names or
+    patterns to fit on and to test on. Raises UserError.
     """
     if encoder is None:
         source = _Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common")
@@ -229,25 +219,31 @@ def score_tasks(
     else:
         options: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
         source = _Source("encoder", feature_cache.encoder_features(encoder, table, folder=cache, **options), encoder)
-    plans = [_plan(table, tasks.find_task(name), frames, _Sides(**sides), max_rows) for name in names]
-    return _run_plans(source, plans, _Settings(seeds, head_names, protocols, recipe or GradientRecipe(), order))
+    plans = [_plan(table, tasks.find_task(name), frames, sides, max_rows) for name in names]
+    return _run_plans(source, plans, seeds, head_names, protocols, recipe, order)
 
 
 def _sources(
-    table: Manifest, models: Paths, features: Paths, controls: bool, frames: int, cache: Path | None,
-    order: Order = "right", **encoding: Any,
+    table: Manifest, models: Paths, features: Paths, controls: bool, cache: Path | None, rows: dict[int, Array],
+    order: Order = "right", least: int = 1, **encoding: Any,
 ) -> list[_Source]:  # fmt: skip
-    """Return models, the random encoder, features files and raw pixels, in this order."""
+    """Return models, the random encoder, features files and raw pixels, in this order.
+
+    `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of every clip.
+    """
     encoders = {str(path): load_encoder(path) for path in models}
     if controls:
         first = next(iter(encoders.values()), None)
         encoders[RANDOM] = random_encoder(first.config if first else preset("tiny"))
     sources = []
     for name, encoder in encoders.items():
-        check_frames(encoder.config.model, frames)
+        check_frames(encoder.config.model, least)
         store = feature_cache.encoder_features(encoder, table, order=order, folder=cache, **encoding)
         sources.append(_Source(name, store, encoder))
-    sources += [_Source(str(path), feature_cache.file_features(Path(path), table)) for path in features]
+    for path in features:
+        sources.append(_Source(str(path), feature_cache.file_features(Path(path), table)))
+        for frames, ids in rows.items():
+            sources[-1].store.add(ids, frames)
     if controls:
         sources.append(_Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common"))
     if not sources:
@@ -256,8 +252,9 @@ def _sources(
 
 
 def _plan_tasks(
-    table: Manifest, names: Sequence[str], frames: int | None, sides: _Sides, max_rows: int | None, log: Log
-) -> tuple[list[_Plan], dict[str, str]]:
+    table: Manifest, names: Sequence[str | Task], frames: int | None, sides: dict[str, Names], max_rows: int | None,
+    log: Log,
+) -> tuple[list[_Plan], dict[str, str]]:  # fmt: skip
     """Return the plans of the tasks that can be probed, and why the others cannot. Raises UserError if none can."""
     plans, left_out = list[_Plan](), dict[str, str]()
     if names == "all" or list(names) == ["all"]:
@@ -265,27 +262,27 @@ def _plan_tasks(
         left_out = {name: "The manifest has no such label." for name in tasks.TASKS if name not in names}
     if not names:
         raise UserError("The manifest has no label of any task. `anytouch probe label` takes any column.")
+    errors = []
     for task in map(tasks.find_task, names):
         try:
             plans.append(_plan(table, task, frames, sides, max_rows))
         except UserError as error:
             left_out[task.name] = str(error).removeprefix(f"Task {task.name}: ")
+            errors.append(f"Task {task.name}: {left_out[task.name]}")
     if not plans:
-        raise UserError(" ".join(f"Task {name}: {left_out[name]}" for name in names))
+        raise UserError(" ".join(errors))
     for name, reason in left_out.items():
         log(f"{name}: not probed ({reason})")
     return plans, left_out
 
 
-def _read(data: Paths) -> Manifest:
-    return manifests.read([str(path) for path in data])
-
-
-def _plan(table: Manifest, task: Task, frames: int | None, sides: _Sides, max_rows: int | None) -> _Plan:
+def _plan(table: Manifest, task: Task, frames: int | None, sides: dict[str, Names], max_rows: int | None) -> _Plan:
     """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them. Raises UserError."""
     for name, count in (("max_rows", max_rows), ("frames", frames)):
         if count is not None and count < 1:
             raise UserError(f"{name} must be at least 1, not {count}.")
+    if unknown := sides.keys() - set(SIDES):
+        raise TypeError(f"Unknown options {', '.join(sorted(unknown))}.")
     rows = tasks.select(table, task, frames)
     rows = rows.take(np.flatnonzero(np.logical_or(*_side_masks(rows, sides))))
     used = np.flatnonzero(splits.split_scheme(_roles(task, rows, sides)[0])[1])
@@ -293,20 +290,20 @@ def _plan(table: Manifest, task: Task, frames: int | None, sides: _Sides, max_ro
     roles, names = _roles(task, rows, sides)
     scheme, _, why = splits.split_scheme(roles)
     notes = [*rows.notes, why]
-    notes += [f"{name.replace('_', ' ')} {', '.join(some)}" for name, some in sides._asdict().items() if some]
+    notes += [f"{name.replace('_', ' ')} {', '.join(patterns)}" for name in SIDES if (patterns := sides.get(name))]
     if scheme == "split" and not roles.measured:
         notes += array_probes.unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
     return _Plan(task, rows, roles, names, frames or task.frames, [note for note in notes if note])
 
 
-def _side_masks(rows: TaskRows, sides: _Sides) -> list[Array]:
+def _side_masks(rows: TaskRows, sides: dict[str, Names]) -> list[Array]:
     """Return which rows may be fitted on and which may be tested. Raises UserError for an unknown sensor or unit."""
     masks = []
-    for sensors, units in ((sides.train_sensors, sides.train_units), (sides.test_sensors, sides.test_units)):
+    for side in ("train", "test"):
         mask = np.ones(len(rows.labels), bool)
-        for patterns, column, kind in ((sensors, rows.sensors, "sensor"), (units, rows.units, "unit")):
-            known = np.unique(column)
-            for pattern in patterns or ():
+        for kind, column in (("sensor", rows.sensors), ("unit", rows.units)):
+            patterns, known = sides.get(f"{side}_{kind}s") or (), np.unique(column)
+            for pattern in patterns:
                 if not any(fnmatch(name, pattern) for name in known):
                     raise UserError(f"No row has the {kind} {pattern!r}. There are {', '.join(known) or 'none'}.")
             if patterns:
@@ -315,7 +312,7 @@ def _side_masks(rows: TaskRows, sides: _Sides) -> list[Array]:
     return masks
 
 
-def _roles(task: Task, rows: TaskRows, sides: _Sides) -> tuple[RowRoles, Array]:
+def _roles(task: Task, rows: TaskRows, sides: dict[str, Names]) -> tuple[RowRoles, Array]:
     """Return the roles of the rows and the class names. Raises UserError if nothing is left to fit on or to test."""
     measured = task.kind == "regression"
     names, y = (np.array([], str), rows.labels) if measured else np.unique(rows.labels, return_inverse=True)
@@ -332,30 +329,21 @@ def _roles(task: Task, rows: TaskRows, sides: _Sides) -> tuple[RowRoles, Array]:
     return roles, names
 
 
-def _report(
-    table: Manifest, data: Paths, sources: Sequence[_Source], plans: Sequence[_Plan], settings: _Settings,
-    sides: _Sides, left_out: dict[str, str], paper: float | None, out: Path | None, log: Log,
-) -> dict[str, Any]:  # fmt: skip
-    for source in (source for source in sources if source.is_file):
-        _add_rows(source, plans)  # a file that lacks rows is reported before the work
-    results = []
-    for source in sources:
-        results += [{"features": source.name} | row for row in _run_plans(source, plans, settings)]
-        log(f"probed {source.name}")
-    configs = {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder}
-    report = {
-        "manifest": table.content_hash, "data": [str(path) for path in data], "paper": paper, "seeds": settings.seeds,
-        "sides": sides._asdict(), "runs": configs, "left_out": left_out, "results": results,
-    }  # fmt: skip
-    if out is not None:
-        atomic_write(out, json.dumps(report, indent=2, allow_nan=False))
-    return report
+def _rows_by_length(plans: Sequence[_Plan]) -> dict[int, Array]:
+    """Return the rows of all tasks by length of clip: one pass computes their features."""
+    lengths = sorted({plan.frames for plan in plans})
+    return {n: np.concatenate([plan.rows.rows.ravel() for plan in plans if plan.frames == n]) for n in lengths}
 
 
-def _run_plans(source: _Source, plans: Sequence[_Plan], settings: _Settings) -> list[dict[str, Any]]:
-    if settings.seeds < 1:
-        raise UserError(f"seeds must be at least 1, not {settings.seeds}.")
-    _add_rows(source, plans)
+def _run_plans(
+    source: _Source, plans: Sequence[_Plan], seeds: int, heads: Sequence[HeadName], protocols: Sequence[Protocol],
+    recipe: GradientRecipe | None, order: Order,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return the rows of `score_tasks`."""
+    if seeds < 1:
+        raise UserError(f"seeds must be at least 1, not {seeds}.")
+    for length, ids in _rows_by_length(plans).items():
+        source.store.add(ids, length)
     results = []
     for plan in plans:
         x = source.store.get(plan.rows.rows, plan.frames)
@@ -371,22 +359,17 @@ def _run_plans(source: _Source, plans: Sequence[_Plan], settings: _Settings) -> 
             trained = encoder.config.model.sensors if encoder.trained_sensors is None else encoder.trained_sensors
             unknown = sorted(set(plan.rows.sensors) - set(trained))
             notes += [f"universal tokens for {', '.join(unknown)}"] if unknown else []
-        about = {"frames": plan.frames, "order": settings.order if plan.frames > 1 else "right"}
-        for name, protocol in itertools.product(settings.heads, settings.protocols):
-            head = ProbeHead(name, source.scaling, recipe=settings.recipe)
-            scored = _score(labelled, plan, head, protocol, settings.seeds)
+        about = {"frames": plan.frames, "order": order if plan.frames > 1 else "right"}
+        for name, protocol in itertools.product(heads, protocols):
+            head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
+            scored = _score(labelled, plan, head, protocol, seeds)
             names = {"task": plan.task.name, "head": name, "protocol": protocol}
             results.append(names | scored | about | {"notes": notes + scored["notes"]})
     return results
 
 
-def _add_rows(source: _Source, plans: Sequence[_Plan]) -> None:
-    for length in sorted({plan.frames for plan in plans}):  # one pass over the rows of all tasks
-        source.store.add(np.concatenate([p.rows.rows.ravel() for p in plans if p.frames == length]), length)
-
-
 def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Protocol, seeds: int) -> dict[str, Any]:
-    """Score a head on all splits of all seeds: a row of the result."""
+    """Score a head on all splits of all seeds."""
     roles, chosen, sizes, unfinished = plan.roles, list[float](), list[int](), 0
     runs, baselines = list[GroupSums](), list[GroupSums]()
     for seed in range(seeds):
@@ -399,13 +382,18 @@ def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Proto
             option, predicted, finished = _predict(data, cut, dataclasses.replace(head, seed=seed), protocol)
             unfinished += not finished
             fitted = roles.y[cut.fit]
-            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else heads.majority_class(fitted)))
+            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else majority_class(fitted)))
             predictions.append(predicted)
             chosen.append(option)
             sizes.append(len(cut.fit))
         tested = np.concatenate([cut.test for cut in cuts])
-        runs.append(_sums(roles, tested, np.concatenate(predictions)))
-        baselines.append(_sums(roles, tested, np.concatenate(constants)))
+        truth, groups = roles.y[tested], roles.groups[tested]
+        for several, parts in ((runs, predictions), (baselines, constants)):
+            if roles.measured:
+                sums = statistics.regression_sums(np.concatenate(parts) - truth, truth - roles.y.mean(), groups)
+            else:
+                sums = statistics.classification_sums(np.concatenate(parts) == truth, groups)
+            several.append(sums)
 
     def values(of: Callable[[Array], Array], several: Sequence[GroupSums] = runs) -> list[float]:
         return [float(of(run.sums.sum(0))) for run in several]
@@ -432,14 +420,6 @@ def _predict(data: LabelledFeatures, cut: Split, head: ProbeHead, protocol: Prot
     assert fitted is not None  # an honest cut has rows of val
     if head.name != "gradient" and len(cut.fit) > splits.SELECT_ROWS:
         start = fitted.models[index] if fitted.models else None
-        head, index = dataclasses.replace(head, options=(selected.option,)), 0
-        fitted = heads.fit_head(head, data.x[cut.fit], data.y[cut.fit], len(data.names), start=start)
+        fitted, index = data.fit(dataclasses.replace(head, options=(selected.option,)), cut.fit, start=start), 0
     finished = all(model.finished for model in fitted.models[index : index + 1])
     return selected.option, fitted.predict(data.x[cut.test])[index], finished
-
-
-def _sums(roles: RowRoles, tested: Array, predicted: Array) -> GroupSums:
-    truth, groups = roles.y[tested], roles.groups[tested]
-    if not roles.measured:
-        return statistics.classification_sums(predicted == truth, groups)
-    return statistics.regression_sums(predicted - truth, truth - roles.y.mean(), groups)

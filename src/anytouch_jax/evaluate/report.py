@@ -25,8 +25,10 @@ from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, geometry, plots, probe_results, retrieval, statistics
+from anytouch_jax.evaluate import array_probes, geometry, plots, retrieval, statistics
+from anytouch_jax.evaluate.array_probes import ProbeResult
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
+from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.reconstruction import pixel_scores, reconstruction_panels, write_png
 from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
 from anytouch_jax.files import atomic_write
@@ -320,7 +322,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
         features[PIXELS] = principal_components(study.pixels, study.split == "train")
     objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
     groups = np.where(objects == "", sequences, objects)
-    results: dict[str, list[probe_results.Result]] = {}
+    results: dict[str, list[ProbeResult]] = {}
     for label in (*LABELS, *QUANTITIES):
         name = f"label.{label}"
         if name not in table.table.column_names:
@@ -338,12 +340,10 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     return probes_section(results, notes, out), {"found": results, "notes": notes}
 
 
-def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> probe_results.Result:
-    if measured:
-        return array_probes.regression_probe(x, labels, groups, split, name=name)
+def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> ProbeResult:
     # Principal components share one scale: unit spread for each would amplify the smallest.
-    scaling: Literal["common", "column"] = "common" if name == PIXELS else "column"
-    return array_probes.linear_probe(x, labels, groups, split, name=name, seeds=0, scaling=scaling)
+    head = ProbeHead("linear", "common" if name == PIXELS and not measured else "column")
+    return array_probes.probe_features(x, labels, groups, split, head, measured=measured, name=name, seeds=0)
 
 
 # Sections -----------------------------------------------------------------------------------------------------------
@@ -544,17 +544,15 @@ def matching_section(scores: Sequence[retrieval.MatchScore], notes: Sequence[str
     return Section("Cross-sensor matching", text, table, notes=_listed(notes))
 
 
-def probes_section(
-    results: Mapping[str, Sequence[probe_results.Result]], notes: Sequence[str], folder: Path
-) -> Section:
+def probes_section(results: Mapping[str, Sequence[ProbeResult]], notes: Sequence[str], folder: Path) -> Section:
     """Return probes {label: results}: accuracy of classes and R2 of quantities on held-out objects."""
     parts: list[str] = []
     panels: dict[str, dict[str, plots.ShareBar]] = {}
     for label, several in results.items():
-        parts.append(f"### {label}\n\n{probe_results.probe_table(several).strip()}")
+        parts.append(f"### {label}\n\n{array_probes.probe_table(several).strip()}")
         bars = {
             result.probe: plots.ShareBar(result.accuracy, result.low, result.high, result.baseline)
-            for result in several if isinstance(result, probe_results.ProbeResult)
+            for result in several if not result.measured
         }  # fmt: skip
         panels |= {label: bars} if bars else {}
     path = folder / "figures" / "probes.png"

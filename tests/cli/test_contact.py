@@ -126,3 +126,19 @@ def test_a_place_that_cannot_be_written_is_named_before_the_work(anytouch, press
     monkeypatch.setattr(contact, "contact_scores", lambda *a, **k: pytest.fail("hours of work began"))
     done = anytouch("data", "contact", pressed, "--out", tmp_path / out)
     assert done.status == 2 and words in done.err and len(done.err.strip().splitlines()) == 1
+
+
+def test_backgrounds_are_named_on_the_command_line(anytouch, mistake, pressed, tmp_path):
+    table = manifests.read(pressed).table.slice(6)  # pressed frames only, without any background
+    columns = {name: table[name].to_pylist() for name in table.column_names if name != "background_path"}
+    manifests.write(manifests.from_columns({**columns, "unit": ["u"] * 4}, pressed), pressed)
+    done = anytouch("data", "contact", pressed, "--drop")
+    assert done.status == 0 and "0 of 1 recordings" in done.out and "--background" in done.out
+    assert contacts(pressed.with_name("touch_contact.parquet")) == [None] * 4
+    for words in (["0.png"], [f"u={tmp_path / '0.png'}"]):
+        words = [str(tmp_path / words[0])] if "=" not in words[0] else words
+        assert anytouch("data", "contact", pressed, "--out", tmp_path / "m.csv", "--background", *words).status == 0
+        assert contacts(tmp_path / "m.csv") == [1] * 4
+        (tmp_path / "m.csv").unlink()
+    cv2.imwrite(str(tmp_path / "wide.png"), cv2.imread(str(tmp_path / "0.png"))[:40])
+    assert "wide.png" in mistake("data", "contact", pressed, "--background", tmp_path / "wide.png")

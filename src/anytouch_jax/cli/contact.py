@@ -34,6 +34,8 @@ class ContactOptions:
     drop: bool = False  # Drop frames without contact. The split background and unknown frames stay.
     threshold: tuple[tuple[str, float], ...] = ()
     """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
+    background: tuple[str, ...] = ()
+    """Picture of the untouched gel for recordings without one: FILE for all, or UNIT=FILE for each sensor unit."""
     share: float = 0.0
     """Also require this share (0 to 1) of the highest score of the recording. This removes the start and end of a
     contact. --picture and --check ignore it."""
@@ -70,8 +72,11 @@ def run(options: ContactOptions) -> int:
     if options.check:
         contact.reference_contact(manifest, options.reference)
     if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
-        refuse_unused(options, ("threshold", "share"), "on rows that all have a label.contact, which is kept")
-    scores = contact.contact_scores(manifest, workers=options.threads)
+        refuse_unused(
+            options, ("threshold", "share", "background"), "on rows that all have a label.contact, which is kept"
+        )
+    backgrounds = contact.read_backgrounds(manifest, options.background)
+    scores = contact.contact_scores(manifest, backgrounds=backgrounds, workers=options.threads)
     marked, report = contact.mark_contact(
         manifest, scores, thresholds=thresholds, share=options.share, drop=options.drop
     )

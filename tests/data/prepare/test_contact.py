@@ -5,10 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from press_films import gel_frame, press_film
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.prepare import contact as c
+from anytouch_jax.data.prepare.untouched_gel import estimate_untouched_gel, scale_picture
 from anytouch_jax.errors import UserError
 
 SHAPE = (96, 128)
@@ -36,7 +38,7 @@ def naive(frame, background):
 
 
 def score(frame, background):
-    return c._score(c.scale_and_close(frame), c.scale_and_close(background))
+    return c.UntouchedGel(background).score(frame)
 
 
 def test_a_press_counts_and_an_untouched_gel_does_not():
@@ -75,11 +77,9 @@ def test_the_score_does_not_depend_on_the_resolution_or_on_which_side_is_long():
 
 def test_the_background_is_found_among_presses_at_changing_places():
     frames = [gel(50, at=(20 + 8 * k, 20 + 12 * k)) for k in range(8)] + [gel(noise=k + 1) for k in range(6)]
-    stack = np.stack([c.scale_and_close(one) for one in frames])
-    found = c.estimate_background(stack)
-    clean = c.scale_and_close(gel())
-    assert c.gel_difference(found, clean).max() < 4
-    assert min(c.gel_difference(one, clean).max() for one in stack[:8]) > 20
+    untouched, _ = estimate_untouched_gel([scale_picture(frame) for frame in frames])
+    assert untouched.score(gel()) < 2
+    assert min(untouched.score(frame) for frame in frames[:8]) > c.DEFAULT_THRESHOLD
 
 
 @pytest.fixture
@@ -126,21 +126,84 @@ def test_backgrounds_are_estimated_by_unit_then_by_sequence(world):
     free = [(f"f{k}.png", gel(noise=k + 1), {"unit": "u", "sequence": f"s{k}"}) for k in range(5)]
     presses = [(f"p{k}.png", gel(60, at=(20 + 10 * k, 30)), {"unit": "u", "sequence": f"t{k}"}) for k in range(3)]
     lock = [("alone.png", gel(60), {"sequence": "x"})]
-    other = [(f"o{k}.png", gel(noise=k + 9, tint=(60, 0, 0), dots=False), {"sequence": "y"}) for k in range(5)]
+    other = [(f"o{k}.png", gel(90 * (k > 3), tint=(60 - k, 0, 0)), {"sequence": "y"})
+             for k in range(6)]  # fmt: skip
     scores = c.contact_scores(world(free + presses + lock + other))
     assert (scores.score[:5] < c.DEFAULT_THRESHOLD).all() and (scores.score[5:8] > c.DEFAULT_THRESHOLD).all()
-    assert np.isnan(scores.score[8]) and "fewer than 5 frames" in scores.reasons[8]
-    assert (scores.score[9:] < c.DEFAULT_THRESHOLD).all()
-    assert scores.counts["estimated"] == 13
+    assert np.isnan(scores.score[8]) and "fewer than two frames" in scores.reasons[8]
+    assert (scores.score[9:] > c.DEFAULT_THRESHOLD).tolist() == [False] * 4 + [True] * 2
+    assert scores.counts["estimated"] == 14
+    assert (scores.recordings, scores.decided) == (3, 2)  # stills of a unit count as one recording
 
 
 def test_background_rows_of_a_unit_are_its_untouched_gel(world):
     pressed = [(f"p{k}.png", gel(60, noise=k + 1), {"unit": "u"}) for k in range(6)]  # held all the time
-    assert (c.contact_scores(world(pressed)).score < c.DEFAULT_THRESHOLD).all()  # as the module's docstring warns
+    assert np.isnan(c.contact_scores(world(pressed)).score).all()
     row = [("free.png", gel(), {"unit": "u", "split": "background"})]
     scores = c.contact_scores(world(pressed + row))
     assert (scores.score[:6] > c.DEFAULT_THRESHOLD).all()
     assert scores.score[6] < 1
+
+
+def film(name, share, shape="ball", look="dotted", **cells):
+    """Rows of a film for `world`, a gel pressed for a share of 20 frames, and whether each is pressed."""
+    pictures, contact = press_film(look, share, shape, 20)
+    return [(f"{name}{k}.png", one, {"sequence": name, **cells}) for k, one in enumerate(pictures)], contact.tolist()
+
+
+def test_recordings_of_a_unit_decide_for_its_undecided_ones(world):
+    first, contact = film("a", 0.5, unit="u")
+    second, more = film("b", 0.75, "pins", unit="u")
+    always, yes = film("c", 1.0, unit="u")
+    alone, _ = film("d", 1.0, unit="v")
+    manifest = world([*first, *second, *always, *alone])
+    scores = c.contact_scores(manifest)
+    assert (scores.score[:60] > c.DEFAULT_THRESHOLD).tolist() == contact + more + yes
+    assert np.isnan(scores.score[60:]).all()
+    assert scores.counts["estimated from other recordings of the unit"] == 20
+    assert (scores.recordings, scores.decided) == (4, 3)
+    marked, report = c.mark_contact(manifest, scores, drop=True)
+    assert marked.column("sequence").to_pylist().count("d") == 20  # unknown frames stay
+    assert set(marked.column("label.contact").to_pylist()) == {1, None}
+    assert report.unknown == 20 and "3 of 4 recordings (75%)" in "\n".join(report.lines())
+    assert "--background" in "\n".join(report.lines())
+
+
+def test_a_recording_that_contradicts_its_unit_is_undecided(world):
+    first, contact = film("a", 0.5, unit="u")
+    second, more = film("b", 0.5, "bar", unit="u")
+    odd, _ = film("c", 0.5, look="coloured", unit="u")
+    odd = [(name, 255 - picture, cells) for name, picture, cells in odd]  # another gel
+    for gel_frames, decided in ((first + second, 2), (first, 0)):  # one against one decides nothing
+        assert c.contact_scores(world(gel_frames)).decided == len(gel_frames) / 20
+        scores = c.contact_scores(world(gel_frames + odd))
+        assert scores.decided == decided
+        assert np.isnan(scores.score[-20:]).all()
+        assert "different untouched gels" in scores.reasons[-1]
+    assert contact == more
+
+
+def test_a_picture_of_the_untouched_gel_decides_what_the_frames_cannot(world, tmp_path):
+    always, _ = film("a", 1.0, unit="u")
+    other, _ = film("b", 1.0, "bar", unit="v")
+    manifest = world([*always, *other, ("c.png", gel(), {"background_path": "bg.png", "unit": "w"})])
+    free = str(tmp_path / "free=1.png")
+    cv2.imwrite(free, gel_frame("dotted", 0, seed=5)[..., ::-1])
+    scores = c.contact_scores(manifest, backgrounds=c.read_backgrounds(manifest, [free]))
+    assert (scores.score[:40] > c.DEFAULT_THRESHOLD).all() and scores.recordings == 0
+    assert scores.counts == {"--background": 40, "given": 1}
+    cv2.imwrite(str(tmp_path / "bg2.png"), gel_frame("dotted", 0)[..., ::-1])
+    scores = c.contact_scores(manifest, backgrounds=c.read_backgrounds(manifest, [f"v={tmp_path / 'bg2.png'}"]))
+    assert np.isnan(scores.score[:20]).all() and (scores.score[20:40] > c.DEFAULT_THRESHOLD).all()
+    turned = str(tmp_path / "turned.png")
+    cv2.imwrite(turned, np.rot90(gel()))
+    for words, named in (
+        ([turned], "proportions"), ([f"u={turned}"], "row 0 of"), ([f"w={turned}"], "unit w"), ([f"x={free}"], "x"),
+        ([turned, turned], "UNIT=FILE"), (["gone.png"], "gone.png"),
+        ([f"u={tmp_path / 'bg2.png'}", f"u={tmp_path / 'bg2.png'}"], "UNIT=FILE"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=named):
+            c.read_backgrounds(manifest, words)
 
 
 def _marked(manifest, scores, **kwargs):

@@ -1,19 +1,19 @@
 """Contact filter: which frames are touched, by difference from the background image (AnyTouch, appendix A.1).
 
 The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel. Other changes
-are removed first. Dark marker dots, which shear moves, are closed in both images. A change of exposure or tint is
-subtracted as the median of each colour. Noise is blurred. Lengths are in pixels of an image scaled to 160 on its long
-side, so thresholds do not depend on the camera's resolution.
+are removed first. Marker dots, which shear moves, are closed in both images if the untouched gel has them. A change of
+exposure or tint is subtracted as the median of each colour. Noise is blurred. Lengths are in pixels of an image scaled
+to 160 on its long side, so thresholds do not depend on the camera's resolution.
 
-Without a `background_path`, the background is estimated from the frames of the same unit, or else the same sequence.
-It is the median of the quarter of the frames that is nearest to the median of all. This needs a gel that is free, at
-each place, in most of these frames. A recording that never releases the gel shows no background.
+The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or else sequence), or a
+picture that the user names. Otherwise it is estimated from the frames of its recording, and compared with the estimates
+of other recordings of the unit (see `untouched_gel`). Where it cannot be decided, the score stays empty.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -27,11 +27,18 @@ import pyarrow.compute as pc
 
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
+from anytouch_jax.data.prepare.untouched_gel import (
+    ALIKE,
+    EDGE,
+    UntouchedGel,
+    estimate_untouched_gel,
+    gel_of_unit,
+    scale_picture,
+)
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
-_LONG_SIDE, _DOT, _BLUR, _EDGE, _PERCENTILE = 160, 13, 1.5, 4, 98
-_MIN_FRAMES, _MAX_FRAMES = 5, 64  # frames from which a background is estimated
+_MAX_FRAMES, _MAX_RECORDINGS = 48, 48  # of a recording, and of a unit, from which the untouched gel is estimated
 _Scored = tuple[int, float, str]  # row, score, reason
 
 # Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without dots), gelslim and
@@ -45,10 +52,15 @@ TILE, PER_ROW = 120, 10  # of contact_sheet
 
 @dataclass(frozen=True, eq=False)
 class ContactScores:
-    """Scores f32 (rows,), NaN if unknown. `reasons` (rows,) names the source of the background, or why it failed."""
+    """Scores f32 (rows,), NaN if unknown. `reasons` (rows,) names the source of the background, or why it failed.
+
+    `recordings` have no background picture, and for `decided` of them the untouched gel was estimated.
+    """
 
     score: np.ndarray
     reasons: np.ndarray
+    recordings: int = 0
+    decided: int = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -58,7 +70,10 @@ class ContactScores:
 
 @dataclass(frozen=True)
 class ContactReport:
-    """Numbers of rows by result, of rows dropped, of rows labelled before, and of rows by source of the background."""
+    """Numbers of rows by result, of rows dropped, of rows labelled before, and of rows by source of the background.
+
+    `recordings` and `decided` are those of ContactScores.
+    """
 
     rows: int
     contact: int
@@ -68,15 +83,27 @@ class ContactReport:
     labelled: int
     backgrounds: dict[str, int]
     thresholds: dict[str, float]
+    recordings: int = 0
+    decided: int = 0
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         limits = ", ".join(f"{sensor} {limit:g}" for sensor, limit in self.thresholds.items())
         labelled = f"; {self.labelled:,} rows keep the label.contact that they had" if self.labelled else ""
+        shares = []
+        if self.recordings:
+            share = self.decided / self.recordings
+            shares = [f"untouched gel estimated for {self.decided:,} of {self.recordings:,} recordings ({share:.0%})"]
+        if self.decided < self.recordings:
+            shares[0] += (
+                ". The labels of the others stay empty. To decide them, pass --background with a picture of the "
+                "untouched gel"
+            )
         return [
             f"{self.rows:,} rows: contact {self.contact:,}, no contact {self.free:,}, unknown {self.unknown:,}; "
             f"dropped {self.dropped:,}",
             "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.backgrounds.items()),
+            *shares,
             f"contact is a score above: {limits}{labelled}",
         ]
 
@@ -119,54 +146,20 @@ class ContactQuality:
         ]  # fmt: skip
 
 
-# Images -----------------------------------------------------------------------------------------------------------
-
-
-def scale_and_close(image: np.ndarray) -> np.ndarray:
-    """Return an image RGB u8 (h, w, 3) scaled to 160 on its long side, with dark dots and thin dark lines closed."""
-    height, width = image.shape[:2]
-    shrink = _LONG_SIDE / max(height, width)
-    size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    scaled = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
-    return cv2.morphologyEx(scaled, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_DOT, _DOT)))
-
-
-def gel_difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Return the colour difference f32 (h, w) of two images from `scale_and_close`, without tint and noise."""
-    change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
-    change -= np.median(change[::2, ::2], axis=(0, 1))  # every other pixel is enough for a median
-    red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), _BLUR)))
-    return cv2.max(cv2.max(red, green), blue)
-
-
-def _score(frame: np.ndarray, background: np.ndarray) -> float:
-    """Return the distance, 0 to 255, of two images from `scale_and_close`. Raises ValueError."""
-    if max(abs(a - b) for a, b in zip(frame.shape, background.shape, strict=True)) > 2:
-        raise ValueError("its background has other proportions")
-    if frame.shape != background.shape:
-        background = cv2.resize(background, frame.shape[1::-1])
-    inner = gel_difference(frame, background)[_EDGE:-_EDGE, _EDGE:-_EDGE]
-    if not inner.size:
-        raise ValueError("it is too thin a strip")
-    return float(np.percentile(inner, _PERCENTILE))
-
-
-def estimate_background(images: np.ndarray) -> np.ndarray:
-    """Return the untouched gel u8 (h, w, 3): the median of the quarter of `images` u8 (n, h, w, 3) nearest to the
-    median of all."""
-    middle = np.median(images, axis=0).astype(np.uint8)
-    distances = [_score(image, middle) for image in images]  # a mean would sort by noise: a press is small
-    nearest = np.argsort(distances, kind="stable")[: max(3, len(images) // 4)]
-    return np.median(images[nearest], axis=0).astype(np.uint8)
-
-
 # Scores -----------------------------------------------------------------------------------------------------------
 
 
-def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, workers: int = 2) -> ContactScores:
+def contact_scores(
+    manifest: Manifest,
+    rows: np.ndarray | None = None,
+    *,
+    backgrounds: Mapping[str, UntouchedGel] | None = None,
+    workers: int = 2,
+) -> ContactScores:
     """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
 
-    A frame or background that cannot be read has the score NaN and a reason. It raises nothing.
+    `backgrounds` are pictures from `read_backgrounds` for rows without one. A frame or background that cannot be read,
+    or an untouched gel that cannot be decided, gives the score NaN and a reason. It raises nothing.
     """
     if workers < 1:
         raise UserError(f"--threads (workers) must be at least 1, not {workers}")
@@ -174,6 +167,7 @@ def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, worker
     score = np.full(len(manifest), np.nan, np.float32)
     reasons = np.full(len(manifest), "not asked for", dtype=object)
     has_background = manifest.present("background_path")[rows]
+    recordings = decided = 0
     with ThreadPoolExecutor(workers) as pool:
 
         def assign(score_row: Callable[[int], _Scored], some: np.ndarray) -> None:
@@ -181,28 +175,60 @@ def contact_scores(manifest: Manifest, rows: np.ndarray | None = None, *, worker
                 for row, value, reason in pool.map(score_row, some[start : start + 1024].tolist()):
                     score[row], reasons[row] = value, reason
 
-        cached = lru_cache(256)(_load)
+        cached = lru_cache(256)(lambda path: UntouchedGel(decode(path)))
         assign(partial(_score_row, manifest, lambda row: cached(manifest.file(row, "background_path")), "given"),
                rows[has_background])  # fmt: skip
         for group in _groups(manifest, rows[~has_background]):
-            estimate = _estimate(manifest, group, pool)
-            if estimate is None:
-                reasons[group] = f"none: no background and fewer than {_MIN_FRAMES} frames to estimate it from"
+            gel, source = _gel_of_group(manifest, group, pool, backgrounds or {})
+            if gel is not None:
+                assign(partial(_score_row, manifest, gel, source), group)
                 continue
-            assign(partial(_score_row, manifest, estimate, "estimated"), group)
-    return ContactScores(score, reasons)
+            for recording, gel, source in _estimates(manifest, group, pool):
+                recordings += 1
+                decided += gel is not None
+                if gel is None:
+                    reasons[recording] = f"none: {source}"
+                else:
+                    assign(partial(_score_row, manifest, gel, source), recording)
+    return ContactScores(score, reasons, recordings, decided)
 
 
-def _load(path: Path) -> np.ndarray:
-    return scale_and_close(decode(path))
+def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedGel]:
+    """Return the pictures of --background by unit: FILE, for all rows (unit ""), or UNIT=FILE words.
+
+    Raises UserError for a file that cannot be read, a unit without rows that need it, and a picture of another shape.
+    """
+    waiting = np.flatnonzero(~manifest.present("background_path"))
+    units, sensors = manifest.column("unit").to_pylist(), manifest.codes("sensor")
+    gels: dict[str, UntouchedGel] = {}
+    for word in words:
+        is_file = "=" not in word or (len(words) == 1 and Path(word).exists())
+        unit, _, file = ("", "", word) if is_file else word.partition("=")
+        if unit in gels or (not unit and len(words) > 1):
+            raise UserError(f"--background {word}: give one picture for all recordings, or one UNIT=FILE for each unit")
+        path = Path(file).expanduser()
+        gels[unit] = UntouchedGel(decode(path))
+        rows = waiting if not unit else waiting[[units[row] == unit for row in waiting]]
+        if not len(rows):
+            kind = f"of unit {unit} " if unit else ""
+            raise UserError(f"--background {word}: the manifest has no row {kind}without a background picture")
+        for row in rows[np.unique(sensors[rows], return_index=True)[1]]:
+            picture = _load_or_none(manifest, row)
+            try:
+                if picture is not None:
+                    gels[unit].score(picture)
+            except ValueError:
+                raise UserError(
+                    f"--background {path} has other proportions than {manifest.where(int(row))}. "
+                    "Pass a picture of the same camera and cut, or name the unit as in UNIT=FILE."
+                ) from None
+    return gels
 
 
-def _score_row(
-    manifest: Manifest, background: np.ndarray | Callable[[int], np.ndarray], source: str, row: int
-) -> _Scored:
+def _score_row(manifest: Manifest, gel: UntouchedGel | Callable[[int], UntouchedGel], source: str, row: int) -> _Scored:
     try:
-        frame = _load(manifest.file(row))
-        return row, _score(frame, background(row) if callable(background) else background), source
+        frame = decode(manifest.file(row))
+        return row, (gel if isinstance(gel, UntouchedGel) else gel(row)).score(frame), source
     except UserError:
         return row, np.nan, "none: the frame or its background cannot be read"
     except ValueError as error:
@@ -214,34 +240,76 @@ def _groups(manifest: Manifest, rows: np.ndarray) -> Iterator[np.ndarray]:
     unit, sequence = manifest.codes("unit", own=True), manifest.codes("sequence", own=True)
     dataset, sensor = manifest.codes("dataset"), manifest.codes("sensor")
     no_unit = unit < 0
-    key = np.stack([no_unit, np.where(no_unit, sequence, unit), np.where(no_unit, 0, dataset), sensor], 1)[rows]
-    if len(rows):
-        _, groups = np.unique(key, axis=0, return_inverse=True)
-        order = np.argsort(groups.ravel(), kind="stable")
-        yield from np.split(rows[order], np.flatnonzero(np.diff(groups.ravel()[order])) + 1)
+    yield from _split(rows, np.stack([no_unit, np.where(no_unit, sequence, unit), np.where(no_unit, 0, dataset),
+                                      sensor], 1)[rows])  # fmt: skip
 
 
-def _estimate(manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor) -> np.ndarray | None:
-    """Return the background of a group from `scale_and_close`, or None if too few frames can be read.
+def _split(rows: np.ndarray, keys: np.ndarray) -> list[np.ndarray]:
+    """Return `rows` by equal rows of `keys`, each in row order."""
+    if not len(rows):
+        return []
+    _, groups = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(groups.ravel(), kind="stable")
+    return np.split(rows[order], np.flatnonzero(np.diff(groups.ravel()[order])) + 1)
 
-    Rows of the split `background` show the untouched gel, so a group with such rows uses only them.
-    """
+
+def _gel_of_group(
+    manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor, backgrounds: Mapping[str, UntouchedGel]
+) -> tuple[UntouchedGel | None, str]:
+    """Return the untouched gel by rows of the split `background`, or else by `backgrounds`."""
     free = group[np.asarray(pc.equal(manifest.table["split"].take(group), "background"))]
-    if len(free):
-        group = free
-    chosen = group[np.unique(np.linspace(0, len(group) - 1, _MAX_FRAMES).astype(int))]
-    loaded = pool.map(partial(_load_or_none, manifest), chosen)
-    images = [image for image in loaded if image is not None and min(image.shape[:2]) > 2 * _EDGE]
-    shapes = Counter(image.shape for image in images)
-    if not shapes:
-        return None
-    images = [image for image in images if image.shape == shapes.most_common(1)[0][0]]
-    return estimate_background(np.stack(images)) if len(images) >= (1 if len(free) else _MIN_FRAMES) else None
+    pictures = _pictures(manifest, free, pool)
+    if pictures:
+        return UntouchedGel(np.median(pictures, axis=0).astype(np.uint8)), "rows of split background"
+    unit = manifest.column("unit")[int(group[0])].as_py()
+    return backgrounds.get(unit or "", backgrounds.get("")), "--background"
+
+
+def _estimates(
+    manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor
+) -> Iterator[tuple[np.ndarray, UntouchedGel | None, str]]:
+    """Yield the rows, untouched gel and reason of each recording of a group.
+
+    The estimates of other recordings of the unit decide where its own frames do not. Stills count as one recording.
+    """
+
+    def estimate(rows: np.ndarray) -> tuple[UntouchedGel | None, str, tuple[int, ...]]:
+        pictures = _pictures(manifest, rows, pool)
+        return *estimate_untouched_gel(pictures), pictures[0].shape if pictures else ()
+
+    sequence = manifest.codes("sequence", own=True)[group]
+    _, number, frames = np.unique(sequence, return_inverse=True, return_counts=True)
+    recordings = _split(group, np.where(frames[number] < 3, -2, sequence))
+    voters = np.unique(np.linspace(0, len(recordings) - 1, _MAX_RECORDINGS).astype(int)).tolist()
+    estimates = {voter: estimate(recordings[voter]) for voter in voters}
+    by_shape: dict[tuple[int, ...], list[UntouchedGel]] = {}
+    for gel, _, shape in estimates.values():
+        by_shape.setdefault(shape, []).extend([] if gel is None else [gel])
+    common = {shape: gel_of_unit(gels) for shape, gels in by_shape.items()}
+    for place, recording in enumerate(recordings):
+        gel, reason, shape = estimates.get(place) or estimate(recording)
+        agreed = common.get(shape)
+        rivals = by_shape.get(shape, []) if agreed is None else [agreed]
+        if gel is None and agreed is not None:
+            yield recording, agreed, "estimated from other recordings of the unit"
+        elif gel is not None and any(rival.score(gel.picture) >= ALIKE for rival in rivals):
+            yield recording, None, "recordings of its unit show different untouched gels"
+        else:
+            yield recording, gel, reason
+
+
+def _pictures(manifest: Manifest, rows: np.ndarray, pool: ThreadPoolExecutor) -> list[np.ndarray]:
+    """Return at most _MAX_FRAMES evenly spaced frames from `scale_picture`, those of the most common shape."""
+    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, _MAX_FRAMES).astype(int))] if len(rows) else rows
+    loaded = pool.map(partial(_load_or_none, manifest), chosen.tolist())
+    pictures = [picture for picture in loaded if picture is not None and min(picture.shape[:2]) > 2 * EDGE + 2]
+    shapes = Counter(picture.shape for picture in pictures)
+    return [picture for picture in pictures if picture.shape == shapes.most_common(1)[0][0]]
 
 
 def _load_or_none(manifest: Manifest, row: int) -> np.ndarray | None:
     try:
-        return _load(manifest.file(row))
+        return scale_picture(decode(manifest.file(row)))
     except UserError:
         return None
 
@@ -284,7 +352,8 @@ def mark_contact(
     used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
     unknown = int(np.isnan(contact).sum())
     report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
-                           int(np.isfinite(known).sum()), scores.counts, used)  # fmt: skip
+                           int(np.isfinite(known).sum()), scores.counts, used, scores.recordings,
+                           scores.decided)  # fmt: skip
     return select_rows(marked, np.flatnonzero(stays)), report
 
 

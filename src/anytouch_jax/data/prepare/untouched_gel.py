@@ -1,0 +1,165 @@
+"""Pictures of the untouched gel: background images, and estimates of them from the frames of a recording.
+
+Frames of the untouched gel have two properties. They are alike, since nothing moves. And they have less structure than
+every frame in which something presses: an object adds edges to the picture. The estimate is the group of alike frames
+that has less structure than all frames that differ from it. This holds however long the press lasts. Where no group
+stands out, the background cannot be known from the frames, and the estimate says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+LONG_SIDE = 160  # pixels of the long side on which all lengths below are measured
+DOT, DOT_DEPTH, FEWEST_DOTS = 13, 12, 20  # widest marker dot, its darkness in grey levels, dots that a marked gel shows
+BLUR, EDGE, PERCENTILE = 1.5, 4, 98  # of the difference image: blur, cut edge, score
+ALIKE, DIFFERENT = 3.0, 6.5  # grey levels: frames of one state, and frames of two
+MARGIN = 0.1  # least excess of structure, as a share of the sum; measured on real and simulated recordings
+
+
+def scale_picture(picture: np.ndarray) -> np.ndarray:
+    """Scale a picture to LONG_SIDE pixels on its long side."""
+    height, width = picture.shape[:2]
+    shrink = LONG_SIDE / max(height, width)
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
+
+
+def close_dots(picture: np.ndarray) -> np.ndarray:
+    """Fill dark dots and thin dark lines, which shear moves without any change of contact."""
+    return cv2.morphologyEx(picture, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT)))
+
+
+def has_dots(picture: np.ndarray) -> bool:
+    """Return whether a scaled picture of the untouched gel shows marker dots."""
+    depth = cv2.GaussianBlur(cv2.subtract(close_dots(picture), picture).max(2), (0, 0), 1)
+    _, _, stats, _ = cv2.connectedComponentsWithStats((depth > DOT_DEPTH).astype(np.uint8))
+    _, _, width, height, area = stats[1:].T
+    is_round = (area >= 4) & (area <= DOT * DOT) & (width <= 2.5 * height) & (height <= 2.5 * width)
+    return int(np.sum(is_round)) >= FEWEST_DOTS
+
+
+def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BLUR) -> np.ndarray:
+    """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without overall tint and noise."""
+    change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
+    change -= np.median(change[::2, ::2], axis=(0, 1))  # every other pixel is enough for a median
+    red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), blur)))
+    return cv2.max(cv2.max(red, green), blue)
+
+
+class UntouchedGel:
+    """A picture of the untouched gel u8 (h, w, 3), which scores frames.
+
+    Dots are closed only on a gel that has dots itself. A small dark dent looks like a dot.
+    """
+
+    def __init__(self, picture: np.ndarray) -> None:
+        self.picture = scale_picture(picture)
+        self.has_dots = has_dots(self.picture)
+        self._compared = close_dots(self.picture) if self.has_dots else self.picture
+
+    def score(self, frame: np.ndarray) -> float:
+        """Return the difference, 0 to 255, of a frame u8 (h, w, 3) from the gel. Raises ValueError for its shape."""
+        frame = scale_picture(frame)
+        if max(abs(a - b) for a, b in zip(frame.shape, self.picture.shape, strict=True)) > 2:
+            raise ValueError("its background has other proportions")
+        if min(frame.shape[:2]) <= 2 * EDGE:
+            raise ValueError("it is too thin a strip")
+        if frame.shape != self.picture.shape:
+            frame = cv2.resize(frame, self.picture.shape[1::-1])
+        return _distance(close_dots(frame) if self.has_dots else frame, self._compared)
+
+
+def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
+    """Return the untouched gel of one recording, or None, and the reason.
+
+    `pictures` u8 (h, w, 3) are frames from `scale_picture`, all of one size.
+    """
+    reason = ""
+    for marked in (False, True):
+        frames = [close_dots(picture) for picture in pictures] if marked else list(pictures)
+        group, reason = _least_structured_group(frames)
+        if group is not None:
+            gel = UntouchedGel(_median([pictures[frame] for frame in group]))
+            if gel.has_dots == marked:
+                return gel, "estimated"
+            reason = "free and pressed gel look alike"
+    return None, reason
+
+
+def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
+    """Return the untouched gel that most estimates of one unit agree on, all of one size.
+
+    Return None if fewer than two agree, or if as many agree on another.
+    """
+    if len(gels) < 2:
+        return None
+    groups = _alike([gel.score(other.picture) for gel, other in combinations(gels, 2)])
+    groups.sort(key=len, reverse=True)
+    centres = [UntouchedGel(_median([gels[i].picture for i in group])) for group in groups]
+    rivals = [gel for gel, group in zip(centres[1:], groups[1:], strict=True) if len(group) == len(groups[0])]
+    if len(groups[0]) < 2 or any(centres[0].score(rival.picture) >= ALIKE for rival in rivals):
+        return None
+    return centres[0]
+
+
+def _median(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    return np.asarray(np.median(pictures, axis=0)).astype(np.uint8)
+
+
+def _alike(distances: Sequence[float]) -> list[np.ndarray]:
+    """Return groups of numbers within ALIKE of each other, from condensed distances."""
+    from scipy.cluster.hierarchy import fcluster, linkage  # 0.3 s, which training has no use for
+
+    labels = fcluster(linkage(np.asarray(distances), "complete"), ALIKE, "distance")
+    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
+
+
+def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None, str]:
+    """Return the frame numbers of the group that has less structure than all frames that differ from it."""
+    halves = [cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames]
+    distances = [_distance(frame, other, BLUR / 2) for frame, other in combinations(halves, 2)]
+    if not distances:
+        return None, "fewer than two frames can be read"
+    if max(distances) < DIFFERENT:
+        return None, "all frames are alike: always free, or always pressed"
+    groups = _alike(distances)
+    centres = [_median([frames[i] for i in group]) for group in groups]
+    best, best_margin = None, MARGIN
+    for number, group in enumerate(groups):
+        if len(group) < 2:
+            continue
+        margin = np.inf
+        for other in centres:
+            if _distance(centres[number], other) >= DIFFERENT:
+                margin = min(margin, _excess_structure(centres[number], other))
+                if margin < best_margin:
+                    break
+        if best_margin <= margin < np.inf:
+            best, best_margin = group, margin
+    return best, "" if best is not None else "no frames stand out as the untouched gel"
+
+
+def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float:
+    edge = round(EDGE * blur / BLUR)
+    return float(np.percentile(difference_image(frame, other, blur)[edge:-edge, edge:-edge], PERCENTILE))
+
+
+def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:
+    """Return how much more edges `pressed` has where the two differ, -1 to 1."""
+    change = difference_image(free, pressed)
+    region = change > max(0.35 * float(np.percentile(change, 99)), 1.0)
+    region = cv2.dilate(region.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    less, more = (float(_edges(picture)[region].sum()) for picture in (free, pressed))
+    return (more - less) / (more + less + 1e-6)
+
+
+def _edges(picture: np.ndarray) -> np.ndarray:
+    """Return the length of the colour gradient, f32 (h, w), after a blur that removes noise."""
+    smooth = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR)
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
+    return np.asarray(np.sqrt((across**2 + down**2).sum(2)))

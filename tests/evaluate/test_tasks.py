@@ -187,6 +187,16 @@ def test_frames_after_the_grasp_keep_the_label_and_split_of_it():
     assert any("after" in note for note in selected.notes)
 
 
+@pytest.mark.parametrize("empty", ["", " ", "n/a", "NaN", "None", "null", "-", "?"])
+def test_an_empty_label_takes_no_part(manifest, empty):
+    full = manifests.read(manifest)
+    some, empties = ["Wood", "wood", *[empty] * (len(full) - 2)], [empty] * len(full)
+    selected = select(manifests.replace_column(full, "label.kind", some), Task("kind", "label.kind", which="all"))
+    assert len(selected.rows) == 2 and "'Wood' and 'wood' differ only by" in selected.notes[-1]
+    with pytest.raises(UserError, match=r"has a label|has no label"):
+        select(manifests.replace_column(full, "label.kind", empties), Task("kind", "label.kind", which="all"))
+
+
 def test_available_tasks_have_a_label():
     assert available_tasks(WORLD) == ("material", "object", "slip", "force", "twist", "slide")
     assert available_tasks(table(grasps())) == ("grasp", "grasp_after", "object")  # from the column of that name

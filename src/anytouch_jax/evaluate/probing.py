@@ -89,6 +89,8 @@ def probe_label(
         table, label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames
     )
     log(f"{len(rows.rows)} of {len(table)} rows take part")
+    for note in rows.notes:
+        log(note)
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest.manifest import KEYS, Manifest
+from anytouch_jax.data.manifest.schema import EMPTY, spellings
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.embed import Pooling, text_column
 from anytouch_jax.errors import UserError
@@ -246,16 +247,23 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
             f"Task {task.name}: no row of split train, val or test has a label in {task.label!r}{lacking}. "
             "Check the filters and the splits."
         )
+    if labels.dtype.kind == "U":
+        alike = [" and ".join(map(repr, group)) for group in spellings(labels[first].tolist())]
+        sentence = (
+            "Classes {} differ only by spaces, letter case or Unicode form. They are probed as different classes."
+        )
+        notes = (*notes, *(sentence.format(group) for group in alike))
     sensors, units = (text_column(table, name)[first] for name in ("sensor", "unit"))
     return TaskRows(rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes)
 
 
 def label_text(value: Any, source: str = "The label") -> str:
-    """Return a class label as text, "" for None and NaN. Raises UserError for a measured quantity."""
+    """Return a class label as text, "" for None, NaN and texts such as "n/a". Raises UserError for a quantity."""
     if value is None or value != value:
         return ""
     if not isinstance(value, float | np.floating):
-        return str(value)
+        text = str(value)
+        return "" if text.strip().lower() in EMPTY else text
     if not np.isfinite(value) or value != int(value):
         raise UserError(f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number.")
     return str(int(value))

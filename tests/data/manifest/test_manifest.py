@@ -87,7 +87,9 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
         (GOOD.replace("s,2,train", "s,1_0,train"), ["row 1", "'frame_index'", "'1_0'"]),
         (GOOD.replace("s,2,train", "s,,train"), ["row 1", "'frame_index' is empty"]),
         (GOOD.replace("c.png", "  "), ["row 2", "'path' is empty"]),
-        (GOOD.replace("test", "tset"), ["row 2", "'split'", "tset", "background"]),
+        (GOOD.replace("test", "tset"), ["row 2", "'split'", "'tset'", "background", "did you mean test?"]),
+        (GOOD.replace("test", "Validation"), ["row 2", "'split'", "'Validation'", "did you mean val?"]),
+        (GOOD.replace("test", "te st"), ["row 2", "'split'", "'te st'", "did you mean test?"]),
         (GOOD.replace("train,2,t,0", "train,0,t,0"), ["row 1", "'stride'", "at least 1, is 0"]),
         (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["row 0", "'commercial'", "0 or 1", "'yes'"]),
         (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["cannot be read as a csv", "Expected 11 columns"]),
@@ -191,6 +193,11 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
     for bad in ("link.png", "out/x.png"):
         with pytest.raises(m.ManifestError, match=r"leaves the folder .*, by a link; put the files there, or"):
             m.resolve_path(root, bad)
+    for bad in ("in\\a.png", r"C:\data\a.png", r".\in\a.png"):
+        with pytest.raises(m.ManifestError, match=r"as on Windows; write it relative .* forward slashes"):
+            m.resolve_path(root, bad)
+    (root / r"odd\name.png").write_bytes(b"x")
+    assert m.resolve_path(root, r"odd\name.png").is_file()
     for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name"), (str(root / "a.png"), "absolute")):
         with pytest.raises(m.ManifestError, match=words):
             m.resolve_path(root, bad)
@@ -295,6 +302,34 @@ def test_columns_of_any_kind_are_carried_along(tmp_path):
     with pytest.raises(m.ManifestError, match="cannot be written"):
         m.write(one, tmp_path / "m.csv")
     assert not (tmp_path / "m.csv").exists()
+
+
+def test_a_csv_reads_one_class_from_spaces_unicode_forms_and_empty_spellings(tmp_path):
+    head = "path,sensor,sequence,frame_index,split,object,label.kind,label.force"
+    cells = [
+        ("train ", "mug", "oak wood", "1"), (" train", " mug", "oak  wood ", "n/a"), ("train", "mug\u00a0", "", "NaN"),
+        ("train", "-", "?", "-"), ("train", "None", "caf\u00e9", "none"), ("train", "null", "cafe\u0301", "2"),
+    ]  # fmt: skip
+    lines = [f"{i}.png, digit,s,{i},{','.join(line)}" for i, line in enumerate(cells)]
+    got = m.read(_file(tmp_path, "\n".join([head, *lines]) + "\n"))
+    assert set(got.column("split").to_pylist()) == {"train"} and set(got.column("sensor").to_pylist()) == {"digit"}
+    assert got.column("object").to_pylist() == ["mug"] * 3 + [None] * 3
+    assert got.column("label.kind").to_pylist() == ["oak wood"] * 2 + [None] * 2 + ["caf\u00e9"] * 2
+    assert got.column("label.force").to_pylist() == [1, None, None, None, None, 2]  # a column of numbers
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        (["Wood", "clay", "wood"], "row 2: column 'label.x' has 'wood', and .* row 0 has 'Wood'"),
+        ([*map(str, range(9)), "12,5"], "row 9: column 'label.x' has '12,5' among numbers"),
+    ],
+)
+def test_a_label_column_of_a_csv_that_contradicts_itself_names_its_rows(tmp_path, cells, words):
+    lines = [f'{i}.png,digit,s,{i},train,"{cell}"' for i, cell in enumerate(cells)]
+    head = "path,sensor,sequence,frame_index,split,label.x"
+    with pytest.raises(m.ManifestError, match=words):
+        m.read(_file(tmp_path, "\n".join([head, *lines]) + "\n"))
 
 
 def test_labels_of_a_csv_keep_what_they_say(tmp_path):

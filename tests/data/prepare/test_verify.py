@@ -233,6 +233,14 @@ def test_another_spelling_of_a_known_sensor_is_an_error(make):
     }
 
 
+def test_one_class_in_several_spellings_is_named(make):
+    values = ["Wood", "wood", "wood ", "caf\u00e9", "cafe\u0301", "clay"]
+    report = verify(make([{"sequence": f"s{i}", "label.kind": value} for i, value in enumerate(values)]))
+    found = [finding for finding in report.findings if finding.kind == "spelling"]
+    assert report.ok and [finding.rows.tolist() for finding in found] == [[0, 1, 2], [3, 4]]
+    assert found[0].column == "label.kind" and "'wood ' (1 rows)" in found[0].sentence
+
+
 def test_frames_out_of_order_and_frames_twice(make):
     frames = [0, 2, 1, 3, 3, 0]
     rows = [{"sequence": "s" if i < 5 else "r", "frame_index": frame} for i, frame in enumerate(frames)]

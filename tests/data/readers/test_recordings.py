@@ -122,6 +122,18 @@ def test_labels_are_joined_by_object_and_sequence(tmp_path, read):
     }  # fmt: skip
 
 
+def test_labels_match_in_any_spelling_of_empty_spaces_and_unicode(tmp_path, read):
+    names = ("a\u0301", "b", "c", "d", "e")  # the first as macOS writes it
+    fill(tmp_path, [f"{name}/0.png" for name in names])
+    labels = tmp_path / "labels.csv"
+    lines = ("\u00e1,oak  wood,1.5", "b, oak\u00a0wood ,NaN", "c,n/a,?", "d,None,2", "e,u\u0308ber,-")
+    labels.write_text("\n".join(["object,kind,weight", *lines]) + "\n", encoding="utf-8")
+    rows = read("recordings", sensor="digit", val=0, test=0, labels=labels).rows.values()
+    of = {row["object"]: (row["label.kind"], row["label.weight"]) for row in rows}
+    expected = (("oak wood", 1.5), ("oak wood", None), (None, None), (None, 2.0), ("\u00fcber", None))
+    assert of == dict(zip(names, expected, strict=True))
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -130,8 +142,10 @@ def test_labels_are_joined_by_object_and_sequence(tmp_path, read):
             "no column object or sequence, by which labels are joined; it has name, material",
         ),
         ("object,a,a\nmug,1,2\n", "has the column 'a' twice"),
-        ("object,a\nmug,1\nmug,2\n", "row 1: mug is there twice"),
-        ("object,a\n,1\n", "row 0: there is neither an object nor a sequence"),
+        ("object,a\nmug,1\nmug,2\n", "line 3: mug is there twice"),
+        ("object,a\n\nmug,1,2\n", "line 3: it has 3 cells for 2 columns"),
+        ("object,a\nmug,Wood\n\nball,wood\n", "line 4: column 'a' has 'wood', and .* line 2 has 'Wood'"),
+        ("object,a\n,1\n", "line 2: there is neither an object nor a sequence"),
     ],
 )
 def test_tables_of_labels_that_cannot_be_joined(tmp_path, read, text, says):

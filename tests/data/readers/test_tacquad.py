@@ -61,6 +61,16 @@ def test_missing_items_frames_photographs_and_tac3d_are_counted(tmp_path, read):
     assert reasons["photograph missing (kept without)"] >= 1
 
 
+def test_the_wrong_name_in_the_list_is_mended_and_noted(tmp_path, read):
+    _tree(tmp_path, items=("apple", "yumaoqiu"))
+    (tmp_path / "data_indoor/yumaoqiu").rename(tmp_path / "data_indoor/shuttlecock")
+    table = read("tacquad", val=0, test=0)
+    row = table.rows["data_indoor/shuttlecock/digit/4.png"]
+    assert (row["object"], row["label.contact"], row["caption_id"]) == ("shuttlecock", 1, "tacquad_indoor_1")
+    assert any("shuttlecock" in note and "yumaoqiu" in note for note in table.report.notes)
+    assert not any("list" in reason or "contact_indoor" in reason for reason in table.reasons)
+
+
 @pytest.mark.parametrize("line", ["apple,1,2,3,4", "apple,1,2,3,4,5,x", "tea towel,0,1,0,1,0,1\ntea towel,0,1,0,1,0,1"])
 def test_a_broken_list_names_its_line(tmp_path, read, line):
     _tree(tmp_path)

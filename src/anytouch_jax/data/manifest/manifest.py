@@ -366,6 +366,11 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
     path = f"{_real_folder(root, head)}/{name}"
     if name in ("", ".", "..") or os.path.islink(path):
         path = os.path.realpath(path)
+    if "\\" in relative and not os.path.lexists(path):
+        raise ManifestError(
+            f"the path {relative!r} is written as on Windows; write it relative to the manifest's folder, with forward "
+            "slashes (touch/0.png)"
+        )
     if relative[0] == "/":
         raise ManifestError(f"the path {relative!r} is absolute; write it relative to the manifest's folder, {root}")
     if not path.startswith(root if root[-1] == "/" else f"{root}/"):

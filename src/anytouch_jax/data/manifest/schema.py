@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Sequence
+import difflib
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,9 +21,13 @@ SPLITS = ("train", "val", "test", "background", "unused")
 REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
 PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 
+EMPTY = ("", "na", "n/a", "nan", "none", "null", "-", "?")  # spellings of an unknown value, in small letters
+
+_SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"
 _READERS = 2  # columns of a Parquet file that are read at once: more need more memory
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
 _TEXT_COLUMNS = (*REQUIRED, *PATHS, "dataset", "unit", "touch", "object", "text", "license")
+_NAMES = ("dataset", "unit", "object", "license")  # text columns with values that a hand-written table may misspell
 SCHEMA: dict[str, pa.DataType] = {
     **dict.fromkeys(_TEXT_COLUMNS, _TEXT),
     "frame_index": _WHOLE,
@@ -64,7 +70,11 @@ def load_table(path: Path) -> pa.Table:
     table = read_text_csv(path)
     for position, name in enumerate(table.column_names):
         if name.startswith("label."):
-            table = table.set_column(position, name, typed_label(table[name]))
+            column = typed_label(table[name])
+            check_label(name, column, lambda row: f"{path}, row {row}")
+            table = table.set_column(position, name, column)
+        elif name in (*_NAMES, "sensor", "split"):
+            table = table.set_column(position, name, clean_text(table[name]))
     return typed(table, str(path))
 
 
@@ -122,8 +132,7 @@ def typed(table: pa.Table, where: str) -> pa.Table:
 
 def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter."""
-    column = pc.utf8_trim_whitespace(column)
-    column = pc.if_else(pc.equal(column, ""), pa.scalar(None, _TEXT), column)
+    column = clean_text(column)
     if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py():
         return column
     for kind in (pa.int64(), pa.float64(), pa.bool_()):
@@ -132,6 +141,59 @@ def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
         except pa.ArrowInvalid:
             continue
     return column
+
+
+def clean_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return a text column in Unicode form NFC with single spaces, where every spelling of EMPTY is null."""
+    column = pc.utf8_trim(pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " ")
+    is_empty = pc.is_in(pc.utf8_lower(column), value_set=pa.array(EMPTY))
+    return pc.if_else(is_empty, pa.scalar(None, _TEXT), column)
+
+
+def spellings(values: Iterable[str]) -> list[list[str]]:
+    """Return the groups of values that differ by spaces, letter case or Unicode form only."""
+    groups: dict[str, list[str]] = {}
+    for value in dict.fromkeys(values):
+        groups.setdefault(" ".join(unicodedata.normalize("NFKC", value).casefold().split()), []).append(value)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]) -> None:
+    """Raise ManifestError if a label column has a class in two spellings, or a text among nine times as many numbers.
+
+    `where` names a row of the column.
+    """
+    if not pa.types.is_string(column.type):
+        return
+    cells = column.to_pylist()
+    for first, other, *_ in spellings(cell for cell in cells if cell is not None):
+        raise ManifestError(
+            f"{where(cells.index(other))}: column {name!r} has {other!r}, and {where(cells.index(first))} has "
+            f"{first!r}; write one class in one way"
+        )
+    numbers, words = 0, []
+    for row, cell in enumerate(cells):
+        if cell is not None and _is_number(cell):
+            numbers += 1
+        elif cell is not None:
+            words.append(row)
+    # 007 is a name, and names may have letters too.
+    if (
+        words
+        and numbers >= 9 * len(words)
+        and not any(cell and cell[0] == "0" and cell[1:2].isdigit() for cell in cells)
+    ):
+        raise ManifestError(
+            f"{where(words[0])}: column {name!r} has {cells[words[0]]!r} among numbers; write a number or nothing"
+        )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _check_names(names: Sequence[str], rows: int, where: str) -> None:
@@ -160,7 +222,14 @@ def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
         refuse(pc.is_null(column), lambda _: "is empty")
     if name == "split":
         unknown, choices = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS))), ", ".join(SPLITS)
-        refuse(unknown, lambda row: f"must be one of {choices}, is the unknown split {column[row]}")
+
+        def problem(row: int) -> str:
+            value = column[row].as_py()
+            near = difflib.get_close_matches(value.strip().lower().replace("validation", "val"), SPLITS, 1)
+            guess = f"; did you mean {near[0]}?" if near else ""
+            return f"must be one of {choices}, is the unknown split {value!r}{guess}"
+
+        refuse(unknown, problem)
     if name == "stride":
         column = pc.fill_null(column, 1)
         refuse(pc.less(column, 1), lambda row: f"must be at least 1, is {column[row]}")

@@ -22,7 +22,7 @@ from anytouch_jax.data.prepare.verify import (
 from anytouch_jax.errors import UserError
 
 _OF_ROWS = {f"leak_{name}" for name in ("sequence", "touch", "grasp_group", "object")}
-_OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict"}  # faults that dropping rows can repair
+_OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict", "spelling"}  # faults that dropping rows can repair
 
 
 class Repaired(NamedTuple):

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.data.manifest.manifest import Manifest, misspelt_sensors
-from anytouch_jax.data.manifest.schema import SPLITS
+from anytouch_jax.data.manifest.schema import SPLITS, spellings
 from anytouch_jax.data.prepare.licences import NO, YES, Licence, commercial_use, licences
 from anytouch_jax.data.prepare.scan import OK, STATES, Scan, scan
 
@@ -151,6 +151,7 @@ def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding
     yield from _split_leaks(manifest, objects)
     yield from _frame_order(manifest)
     yield from _licence_conflicts(manifest)
+    yield from _label_spellings(manifest)
 
 
 def _shares(manifest: Manifest) -> dict[str, dict[str, float]]:
@@ -342,6 +343,20 @@ def _licence_conflicts(manifest: Manifest) -> Iterator[Finding]:
         sentence = f"{rows.size} rows are marked commercial although their licence is not"
         examples = _quoted(manifest, rows, "license")
         yield Finding("licence_conflict", "warning", sentence, rows, examples, "commercial")
+
+
+def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
+    """Yield label values, objects and units that differ by spaces, letter case or Unicode form only."""
+    for name in manifest.table.column_names:
+        column = manifest.table[name]
+        if not pa.types.is_string(column.type) or not (name in ("object", "unit") or name.startswith("label.")):
+            continue
+        for group in spellings(column.unique().drop_null().to_pylist()):
+            rows = [np.flatnonzero(np.asarray(pc.fill_null(pc.equal(column, value), False))) for value in group]
+            several = " and ".join(f"{value!r} ({ids.size} rows)" for value, ids in zip(group, rows, strict=True))
+            sentence = f"{name} has {several}, which differ only by spaces, letter case or Unicode form"
+            examples = tuple(f"{manifest.where(ids[0])}: {value!r}" for value, ids in zip(group, rows, strict=True))
+            yield Finding("spelling", "warning", sentence, np.sort(np.concatenate(rows)), examples[:_EXAMPLES], name)
 
 
 class SwapVerdict(NamedTuple):

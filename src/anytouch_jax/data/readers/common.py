@@ -228,9 +228,16 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
 
 def read_csv(path: Path) -> list[list[str]]:
     """Return the rows of a CSV file (UTF-8, with or without BOM) without blank lines. Raises DatasetError."""
+    return [row for _, row in read_lines(path)]
+
+
+def read_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows as `read_csv` does, each with the number of its last line in the file, from 1."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            return [[cell.strip() for cell in row] for row in csv.reader(file) if any(cell.strip() for cell in row)]
+            rows = csv.reader(file)
+            lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
+            return [(line, row) for line, row in lines if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DatasetError(f"{path} cannot be read as a CSV list: {error}") from None
 

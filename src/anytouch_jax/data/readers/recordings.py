@@ -15,6 +15,7 @@ objects, or recordings without objects, are held out. With `--split-by recording
 from __future__ import annotations
 
 import hashlib
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,8 @@ import pyarrow as pa
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
-from anytouch_jax.data.manifest.schema import typed_label
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, Frames, IndexOptions, read_csv
+from anytouch_jax.data.manifest.schema import EMPTY, check_label, typed_label
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, Frames, IndexOptions, read_lines
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder
 
@@ -182,8 +183,8 @@ def _write_frames(index: DatasetIndex, video: Path) -> None:
 def _join_labels(index: DatasetIndex, path: Path) -> None:
     """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
 
-    Lines without a recording, and recordings without a line, are skipped. Raises DatasetError for a table that is
-    missing, has no key, or has a column or a key twice.
+    Names match in any Unicode form. Lines without a recording, and recordings without a line, are skipped. Raises
+    DatasetError for a table that is missing, has no key, or has a column or a key twice.
     """
     names, lines = _read_labels(path)
     table, size = index.table, len(index.table["path"])
@@ -191,10 +192,11 @@ def _join_labels(index: DatasetIndex, path: Path) -> None:
     used: set[tuple[str | None, str | None]] = set()
     unlabelled: dict[str, None] = {}
     for row, (obj, sequence) in enumerate(zip(table["object"], table["sequence"], strict=True)):
-        keys = [key for key in ((obj, None), (None, sequence), (obj, sequence)) if any(key) and key in lines]
+        names_of = _plain(obj), _plain(sequence)
+        keys = [key for key in ((names_of[0], None), (None, names_of[1]), names_of) if any(key) and key in lines]
         used.update(keys)
         for name, cell in (item for key in keys for item in lines[key].items()):
-            labels[name][row] = cell or labels[name][row]
+            labels[name][row] = labels[name][row] if cell.lower() in EMPTY else cell
         if not keys:
             unlabelled[sequence] = None
     for key in (key for key in lines if key not in used):
@@ -212,8 +214,8 @@ def _join_labels(index: DatasetIndex, path: Path) -> None:
 
 def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | None], dict[str, str]]]:
     """Return the columns of the table, and (object, sequence) -> the other cells; an empty key cell is None."""
-    rows = read_csv(path)
-    names = rows[0] if rows else []
+    rows = read_lines(path)
+    names = rows[0][1] if rows else []
     if not set(LABEL_KEYS) & set(names):
         raise DatasetError(
             f"{path} has no column object or sequence, by which labels are joined; it has {', '.join(names)}"
@@ -221,15 +223,27 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
     if repeated := [name for name in names if names.count(name) > 1]:
         raise DatasetError(f"{path} has the column {repeated[0]!r} twice")
     lines: dict[tuple[str | None, str | None], dict[str, str]] = {}
-    for number, row in enumerate(rows[1:]):
+    for line, row in rows[1:]:
+        if any(row[len(names) :]):
+            raise DatasetError(
+                f"{path}, line {line}: it has {len(row)} cells for {len(names)} columns; quote its commas"
+            )
         cells = dict(zip(names, row, strict=False))
-        key = (cells.pop("object", None) or None, cells.pop("sequence", None) or None)
+        key = (_plain(cells.pop("object", None)), _plain((cells.pop("sequence", "") or "").replace("\\", "/")))
         if not any(key):
-            raise DatasetError(f"{path}, row {number}: there is neither an object nor a sequence")
+            raise DatasetError(f"{path}, line {line}: there is neither an object nor a sequence")
         if key in lines:
-            raise DatasetError(f"{path}, row {number}: {', '.join(part for part in key if part)} is there twice")
+            raise DatasetError(f"{path}, line {line}: {', '.join(part for part in key if part)} is there twice")
         lines[key] = {name: cell for name, cell in cells.items() if name}
+    for name in (name for name in names if name not in (*LABEL_KEYS, *PLAIN_COLUMNS, "")):
+        column = typed_label(pa.chunked_array([pa.array([cells.get(name) for cells in lines.values()], pa.string())]))
+        check_label(name, column, lambda row: f"{path}, line {rows[row + 1][0]}")
     return [name for name in names if name], lines
+
+
+def _plain(name: str | None) -> str | None:
+    """Return a name in Unicode form NFC, None for an empty one; file systems of macOS have another form."""
+    return unicodedata.normalize("NFC", name) if name else None
 
 
 READER = DatasetReader(

@@ -8,6 +8,7 @@ fields is unknown: they are counted and left out. No data licence was found.
 
 * Contact frames get the item's split, the others `background` (label.contact 0). The first frame of a recording is
   its background if contact begins later.
+* One item of the indoor list has another name on disk (ON_DISK).
 * `touch` is the item, equal for all sensors. The photograph is that of the same fraction of the recording.
 * The fine subset is `unused`: the paper reserves it for cross-sensor generation.
 * `caption_id` is the name of the item's caption in the authors' download: its line in the CSV.
@@ -21,6 +22,7 @@ from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, Dataset
 
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
 COARSE = ("indoor", "outdoor")
+ON_DISK = {"shuttlecock": "yumaoqiu"}  # folder -> its name in the list, the Chinese word
 
 
 def read(index: DatasetIndex) -> None:
@@ -36,10 +38,13 @@ def read(index: DatasetIndex) -> None:
         subset = folder.removeprefix("data_")
         contact = _contact_spans(index, subset)
         for item in index.listing(folder)[0]:
-            if item not in contact:
+            listed = item if item in contact else ON_DISK.get(item, item)
+            if listed not in contact:
                 index.skip(f"item that is not in contact_{subset}.csv", f"{folder}/{item}")
                 continue
-            line, spans = contact.pop(item)
+            if listed != item:
+                index.notes.append(f"{folder}/{item} is {listed!r} in contact_{subset}.csv: its lines are used")
+            line, spans = contact.pop(listed)
             split = index.split_of(item) if subset in COARSE else "unused"
             cells = {"object": item, "touch": f"{subset}/{item}", "subset": subset, "split": split,
                      "caption_id": f"tacquad_{subset}_{line}"}  # fmt: skip

@@ -163,7 +163,8 @@ def step_of(config: Config, mesh: Mesh | None = None) -> Callable[..., Any]:
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
     loss_fn: Callable[..., Any] = partial(loss, net=build(config.model), config=config)
     loss_fn = loss_fn if mesh is None else gathering(loss_fn, mesh)
-    return make_step(loss_fn, optimizer(config), total_steps=config.run.steps)
+    trained = partial(objectives.trained_by, config=config)
+    return make_step(loss_fn, optimizer(config), total_steps=config.run.steps, trained=trained)
 
 
 def embed_of(config: Config) -> Callable[..., jax.Array]:

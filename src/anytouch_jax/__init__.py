@@ -26,7 +26,7 @@ _HOMES = {
     "ops.tokens": ["patchify", "unpatchify"],
     "ops.masking": ["random_mask"],
     "ops.losses": ["alignment_loss", "info_nce", "matching_loss", "reconstruction_loss"],
-    "objectives": ["stage1_loss", "stage1_terms", "stage2_loss", "stage2_terms"],
+    "objectives": ["stage1_loss", "stage1_terms", "stage2_loss", "stage2_terms", "trained_by"],
     "train.step": ["TrainState", "init_state", "make_step"],
     "train.optim": ["optimizer"],
     "train.loop": ["fit"],

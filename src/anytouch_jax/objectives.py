@@ -98,6 +98,32 @@ def stage1_loss(
     return loss, metrics | {"p_u": p_u}
 
 
+def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tuple[str, bool], ...]:
+    """Return rules (regex over parameter names, trained?) for a batch of `stage1_loss` or `stage2_loss`.
+
+    The first match decides. A parameter that is not trained has no gradient, and PyTorch's optimiser skips it.
+    """
+    align, match = (None, None) if isinstance(batch, TouchBatch) else batch
+    pixels = batch if isinstance(batch, TouchBatch) else align if config.recipe == "release" else None
+    frames = 0 if pixels is None else pixels.clip.shape[1]
+    has_image = align is not None and align.image.shape[0] > 0
+    has_text = align is not None and align.text.shape[0] > 0
+    cosine = config.model.match_head == "cosine"
+    embeds = has_image or has_text or match is not None
+    return (
+        ("^touch/post_norm/", embeds),
+        ("^touch/", embeds or frames > 0),
+        ("^decoder/still_head/", frames == 1),
+        ("^decoder/clip_head/", frames > 1),
+        ("^decoder/", frames > 0),
+        ("^(image|lora)/", has_image),
+        ("^text/", has_text),
+        ("^logit_scale$", has_image or has_text or (match is not None and cosine)),
+        ("^matcher/", match is not None and not cosine),
+        ("", True),
+    )
+
+
 class Embeddings(NamedTuple):
     """Unit-norm embeddings of a batch: touch (B, E); image, text (B, E) with rows that may be absent, or None."""
 

@@ -96,6 +96,7 @@ def pretrain(
             loss_fn=partial(loss, net=net, config=config),
             batches=loader.stream,
             run_dir=run,
+            trained=partial(objectives.trained_by, config=config),
             stop_after=stop_after,
             on_report=partial(_draw_reconstructions, run=run, net=net, config=config),
             metadata=metadata,

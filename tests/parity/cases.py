@@ -20,6 +20,7 @@ import numpy as np
 import optax
 
 from anytouch_jax import objectives
+from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.functional import Net, build
@@ -142,7 +143,10 @@ def _optimizer(case: Case) -> None:
     def loss(p: Params, batch: Any, key: Any, progress: Any) -> Any:
         return objectives.stage1_terms(p, *batch, net=net, config=config)
 
-    step = jax.jit(make_step(loss, optimizer(config), total_steps=config.run.steps))
+    def trained(batch: Any) -> Any:
+        return objectives.trained_by(TouchBatch(*batch[:2]), config=config)
+
+    step = jax.jit(make_step(loss, optimizer(config), total_steps=config.run.steps, trained=trained))
     state, values, rates = init_state(params, config), [], []
     for i, epoch in enumerate(epochs):
         state = state._replace(step=jnp.asarray(round(epoch * per_epoch), jnp.int32))

@@ -15,9 +15,10 @@ from anytouch_jax.config import Config
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, masking
-from anytouch_jax.train.step import merge, split, used_parameters
+from anytouch_jax.train.step import merge, split
 from anytouch_jax.weights import convert
 from tests.parity.golden_files import GRADIENT, KEY_BIAS, Case, channel_last, golden_config, golden_params, read_arrays
+from tests.support.used_parameters import used_parameters
 
 Params = dict[str, Any]
 Value = Callable[..., jax.Array]  # (params, inputs, *, net, config) -> scalar

@@ -64,6 +64,12 @@ def toy_loss(params, batch, key, progress):
     return loss, {"reconstruction": loss, "p_u": 0.75 * progress}
 
 
+def toy_trained(batch):
+    """The rules of which parameters a batch trains."""
+    still = batch.clip.shape[1] == 1
+    return (("still_head", still), ("clip_head", not still), ("idle", False), ("", True))
+
+
 def toy_batch(step: int, *, rows: int = ROWS, bad: bool = False) -> TouchBatch:
     """Stills on even steps, clips on odd ones; a function of the step alone."""
     rng = np.random.default_rng((7, step))

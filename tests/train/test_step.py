@@ -8,7 +8,7 @@ import jaxlib
 import numpy as np
 import optax
 import pytest
-from train_toy import toy_batch, toy_config, toy_loss, toy_params
+from train_toy import toy_batch, toy_config, toy_loss, toy_params, toy_trained
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
 from anytouch_jax.config import preset
@@ -28,7 +28,7 @@ def quiet_loss(params, batch, key, progress):
 def build(config=None, loss=toy_loss, **more):
     config = config or toy_config()
     return init_state(toy_params(), config), jax.jit(
-        make_step(loss, optimizer(config), total_steps=config.run.steps, **more)
+        make_step(loss, optimizer(config), total_steps=config.run.steps, trained=toy_trained, **more)
     )
 
 
@@ -112,7 +112,7 @@ def test_a_kind_of_batch_leaves_the_head_it_does_not_use():
 
 def test_jit_equals_no_jit():
     state, step = build()
-    plain = make_step(toy_loss, optimizer(toy_config()), total_steps=8)
+    plain = make_step(toy_loss, optimizer(toy_config()), total_steps=8, trained=toy_trained)
     for index in range(2):
         slow, slow_metrics = plain(state, toy_batch(index), KEY)
         state, metrics = step(state, toy_batch(index), KEY)

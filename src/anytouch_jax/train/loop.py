@@ -31,7 +31,7 @@ from anytouch_jax.train.mesh import (
 from anytouch_jax.train.metrics import Record, alone_in, continues, open_run, writing
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.progress import Log, RunDisplay, progress, signals, silent, to_stderr
-from anytouch_jax.train.step import LossFn, TrainState, init_state, make_step, merge
+from anytouch_jax.train.step import LossFn, TrainedFn, TrainState, init_state, make_step, merge
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
 Tree = Any
@@ -70,6 +70,7 @@ def fit(
     loss_fn: LossFn,
     batches: Batches,
     run_dir: Path | str,
+    trained: TrainedFn | None = None,
     stop_after: int | None = None,
     on_report: Report | None = None,
     metadata: Mapping[str, Any] | None = None,
@@ -78,7 +79,8 @@ def fit(
 ) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
-    `params` are the first parameters. When a run continues, only their shapes matter. `stop_after` ends the run after
+    `params` are the first parameters. When a run continues, only their shapes matter. `loss_fn` and `trained` are those
+    of `make_step`. `stop_after` ends the run after
     that many steps in all, without changing the schedule. `on_report(step, params, batch)` draws figures and must not
     keep the arrays. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal,
     all stop a step later. Raises UserError for settings that changed since the start, too many skipped steps in a row,
@@ -116,7 +118,7 @@ def fit(
         bar = stack.enter_context(progress(start, stop, log))
         loop = _Loop(config, mesh, checkpoints, record, bar, on_report)
         interrupt = stack.enter_context(signals())
-        return loop.run(state, start, stop, batches, loss_fn, interrupt)
+        return loop.run(state, start, stop, batches, loss_fn, trained, interrupt)
 
 
 class _Loop:
@@ -148,11 +150,12 @@ class _Loop:
         stop: int,
         batches: Batches,
         loss_fn: LossFn,
+        trained: TrainedFn | None,
         interrupt: list[signal.Signals],
     ) -> FitResult:
         """Run steps `start` to `stop`, or until a signal arrives."""
         every, figures = self.config.run.save_every, self.config.run.figure_every
-        step_fn, sharding = self.compile(state, loss_fn), batch_sharding(self.mesh)
+        step_fn, sharding = self.compile(state, loss_fn, trained), batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
         done, saved, reported, placed = start, start, start, None
@@ -200,11 +203,18 @@ class _Loop:
         """Return the signal that ends the run: of this process, or the shared one of several."""
         return self.shared_signal if self.ballot else next(iter(interrupt), None)
 
-    def compile(self, state: TrainState, loss_fn: LossFn) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
+    def compile(
+        self, state: TrainState, loss_fn: LossFn, trained: TrainedFn | None
+    ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
         """Return the jitted step, which keeps the sharding of the state and is traced once a batch structure."""
         config = self.config
-        loss_fn = gathering(loss_fn, self.mesh)
-        step = make_step(loss_fn, optimizer(config), total_steps=config.run.steps, accumulate=config.optim.accumulate)
+        step = make_step(
+            gathering(loss_fn, self.mesh),
+            optimizer(config),
+            total_steps=config.run.steps,
+            accumulate=config.optim.accumulate,
+            trained=trained,
+        )
 
         @functools.wraps(step)
         def counted(*args: Any) -> Any:

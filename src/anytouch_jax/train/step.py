@@ -14,16 +14,15 @@ from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.optim import match_rules, optimizer
 from anytouch_jax.train.pack import global_norm, packing
-from anytouch_jax.train.usage import used_parameters
 from anytouch_jax.weights.tree import flatten, nest
-
-__all__ = ["TrainState", "init_state", "make_step", "merge", "split", "used_parameters"]
 
 Array = jax.Array
 Tree = Any
 # (params, batch, key, progress) -> scalar loss and a dict of scalar metrics
 LossAndMetrics = tuple[Array, dict[str, Array]]
 LossFn = Callable[[Tree, Any, Array, Array], LossAndMetrics]
+# batch -> rules (regex over parameter names, trained?)
+TrainedFn = Callable[[Any], Sequence[tuple[str, bool]]]
 StepFn = Callable[["TrainState", Any, Array], tuple["TrainState", dict[str, Array]]]
 
 
@@ -63,13 +62,21 @@ def init_state(params: Tree, config: Config) -> TrainState:
     return TrainState(jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable))
 
 
-def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps: int, accumulate: int = 1) -> StepFn:
+def make_step(
+    loss_fn: LossFn,
+    tx: optax.GradientTransformation,
+    *,
+    total_steps: int,
+    accumulate: int = 1,
+    trained: TrainedFn | None = None,
+) -> StepFn:
     """Return `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
-    differentiated, and those that the batch does not use are skipped (golden H_mixed). If the loss or the gradient
-    norm is not finite, the update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: those
-    of the loss, loss, grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
+    differentiated. Those that a batch does not train by the rules of `trained` (`objectives.trained_by`) are skipped,
+    as in PyTorch (golden H_mixed). Without rules all are updated. If the loss or the gradient norm is not finite, the
+    update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss,
+    grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
 
     `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses, gradients and metrics are
     averaged. For a mean over rows this equals the large batch. InfoNCE compares rows of one micro-batch only. Raises
@@ -87,8 +94,7 @@ def make_step(loss_fn: LossFn, tx: optax.GradientTransformation, *, total_steps:
             return value.astype(jnp.float32), {k: jnp.asarray(v, jnp.float32) for k, v in metrics.items()}
 
         parts = batch if accumulate == 1 else micro_batches(batch, accumulate)
-        one = batch if accumulate == 1 else jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), parts)
-        used = used_parameters(loss, state.trainable, state.frozen, one, key, progress)
+        used = nest(match_rules(trained(batch), flatten(state.trainable))) if trained else None
 
         def gradients(part: Any, key: Array) -> tuple[Array, dict[str, Array], Tree]:
             function = jax.value_and_grad(loss, has_aux=True)

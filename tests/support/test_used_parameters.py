@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from anytouch_jax.train import usage
-from anytouch_jax.train.usage import used_parameters
+import used_parameters as usage
+from used_parameters import used_parameters
 
 X = np.ones(3, np.float32)
 

@@ -8,6 +8,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from faulty_camera import FaultyCamera, write_uneven_video
 
 from anytouch_jax.encoder import stream as streams
 
@@ -120,24 +121,41 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
     np.testing.assert_allclose(found["lying.avi"], found["upright.avi"], atol=1e-2 * np.abs(found["upright"]).max())
 
 
-def test_a_camera_tells_when_it_began(anytouch, tmp_path, tiny_run, monkeypatch):
-    class Camera:
-        count = 0
-
-        def grab(self):
-            self.count += 1
-            return self.count < 3
-
-        def retrieve(self):
-            return True, np.zeros((32, 32, 3), np.uint8)
-
-        def release(self):
-            pass
-
-    monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
+@pytest.mark.parametrize("out", ["f.npz", "-"])
+def test_a_camera_that_is_lost_keeps_the_features_and_fails(anytouch, tmp_path, tiny_run, monkeypatch, out):
+    monkeypatch.setattr(streams, "open_source", lambda name: (FaultyCamera("grab", frames=30), True))
+    monkeypatch.setattr(streams, "RETRY", 0.05)
     before = time.time()
-    done = anytouch("stream", "--model", tiny_run, "--data", 0, "--out", tmp_path / "f.npz")
-    assert done.status == 0, done
-    with np.load(tmp_path / "f.npz") as file:
+    target = out if out == "-" else tmp_path / out
+    done = anytouch("stream", "--model", tiny_run, "--data", 0, "--out", target)
+    assert done.status == 2 and "after 29 frames" in done.err.splitlines()[-1] and "Traceback" not in done.err
+    assert "1 missed reads" in done.err
+    if out == "-":
+        lines = [json.loads(line) for line in done.out.splitlines()]
+        assert lines[-1]["missed"] == 1 and {line["picture"] for line in lines} == {"ok"}
+        return
+    with np.load(target) as file:
+        assert file["key/frame_index"][-1] == 28 and str(file["about/missed"]) == "1"
         clock = float(str(file["about/started"])) + file["key/time"]
     assert (before <= clock).all() and (clock <= time.time()).all()
+
+
+def test_a_camera_that_never_shows_a_frame_is_one_sentence(mistake, tmp_path, tiny_run, monkeypatch):
+    monkeypatch.setattr(streams, "open_source", lambda name: (FaultyCamera(frames=0), True))
+    monkeypatch.setattr(streams, "RETRY", 0.0)
+    done = mistake("stream", "--model", tiny_run, "--data", 0, "--sensor", "digit", "--out", tmp_path / "f.npz")
+    assert "camera" in done and not (tmp_path / "f.npz").exists()
+
+
+@pytest.mark.parametrize("command", ["stream", "embed"])
+def test_times_and_the_cut_of_a_video(anytouch, tmp_path, tiny_run, command):
+    """Both commands use each frame's time stamp, and both report a video that is cut short."""
+    stamps = [0, 30, 60, 500, 510, 1500]
+    video, out = write_uneven_video(tmp_path / "uneven.mkv", stamps), tmp_path / "f.npz"
+    assert anytouch(command, "--model", tiny_run, "--data", video, "--out", out).status == 0
+    with np.load(out) as file:
+        np.testing.assert_allclose(file["key/time"], np.array(stamps) / 1000, atol=1e-6)
+    cut = write_uneven_video(tmp_path / "cut.mkv", [100 * i for i in range(30)])
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
+    done = anytouch(command, "--model", tiny_run, "--data", cut, "--out", out)
+    assert done.status == 0 and "cut.mkv reports 30 frames and" in done.err

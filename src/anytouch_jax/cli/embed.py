@@ -206,39 +206,47 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
 
 def _embed_frames(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Features:
     """Embed every clip of consecutive frames of a folder or a video, keyed by its last frame."""
+    import numpy as np
+
     from anytouch_jax.encoder.embed import embed_frames
 
-    data = options.data[0]
+    data, times = options.data[0], list[float]()
     row, preprocess = encoder.sensor_row(options.sensor or UNIVERSAL, log), preprocess_of(encoder, options, data)
     features = embed_frames(
-        encoder, _numbered_frames(data, options.on_bad_sample), row, preprocess, length=options.frames,
+        encoder, _numbered_frames(data, options.on_bad_sample, times), row, preprocess, length=options.frames,
         pooling=pooling, join=options.join, batch=options.batch,
     )  # fmt: skip
     if "path" not in features.keys:
-        log_if_cut(data, int(features.rows[-1]) + 1)
+        log_if_cut(data, len(times))
+        features.keys["time"] = np.asarray(times)[features.rows]
     return features
 
 
-def _numbered_frames(data: Path, on_bad_sample: str) -> Iterator[tuple[int, str, np.ndarray | None]]:
+def _numbered_frames(
+    data: Path, on_bad_sample: str, times: list[float]
+) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
 
-    A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped.
+    A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped. The
+    time stamps of a video's frames are appended to `times`.
     """
     from anytouch_jax.data.images import (
         SUFFIXES,
         ImageError,
         decode,
         frame_numbers,
-        frames_from_video,
         list_images,
         split_series,
+        timed_frames,
     )
 
     if data.suffix.lower() in SUFFIXES and data.is_file():
         yield 0, data.name, decode(data)
         return
     if not data.is_dir():
-        yield from ((number, "", frame) for number, frame in enumerate(frames_from_video(data)))
+        for number, (seconds, frame) in enumerate(timed_frames(data)):
+            times.append(seconds)
+            yield number, "", frame
         return
     files, others = list_images(data)
     if others:

@@ -23,7 +23,8 @@ class StreamOptions(embed.FrameOptions):
 
     Example: anytouch stream --model runs/stage2 --data 0 --sensor digit --out -
 
-    A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save.
+    A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save. A camera that delivers no
+    frame for 2 seconds ends the stream with an error, after the features are saved.
     """
 
     data: str  # Number of a camera, such as 0, or a video file.
@@ -44,7 +45,6 @@ def run(options: StreamOptions) -> int:
     from anytouch_jax.encoder.embed import Features, save_npz
 
     source, live = stream.open_source(data)
-    rate = 0.0 if live else stream.rate_of(data)
     embedded = stream.stream(
         encoder,
         source,
@@ -55,16 +55,21 @@ def run(options: StreamOptions) -> int:
         stride=options.stride,
         pooling=pooling,
         join=options.join,
+        log=log,
     )
-    result = stream.collect(embedded, (lambda frame: _print_line(frame, rate, head)) if lines else None)
+    result = stream.collect(embedded, (lambda frame: _print_line(frame, live, head)) if lines else None)
+    if result.error is not None and not result.total:
+        raise result.error
     if not live and not result.interrupted:
         if not len(result.numbers):
             raise UserError(f"{data} has too few frames for a clip of {options.frames} at stride {options.stride}")
         embed.log_if_cut(data, int(result.numbers[-1]) + 1)
     if not lines:
-        keys = {"frame_index": result.numbers, "time": result.numbers / rate if rate else result.at}
+        keys = {"frame_index": result.numbers, "time": result.time}
         about = embed.frames_metadata(encoder, options, pooling, data) | {"stride": str(options.stride)}
-        about |= {"started": f"{result.started:.6f}"} if live and len(result.numbers) else {}
+        if live and len(result.numbers):
+            about |= {"started": f"{result.started:.6f}"}
+            about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
         features = Features(result.values, result.numbers, keys)
         save_npz(options.out, embed.with_labels(features, head if len(result.numbers) else None), about)
     embed.log_universal(encoder, options)
@@ -72,12 +77,16 @@ def run(options: StreamOptions) -> int:
         log(line)
     if not lines:
         print(f"{options.out}: {len(result.values)} features of {result.values.shape[1]} values")
+    if result.error is not None:
+        raise result.error
     return 0
 
 
-def _print_line(frame: Embedded, rate: float, head: LinearHead | None) -> None:
+def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     values = [float(str(value)) for value in frame.values]  # the shortest digits of the same float32
-    line: dict[str, Any] = {"frame": frame.number, "time": round(frame.number / rate if rate else frame.at, 6)}
+    line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
+    if live:
+        line |= {"picture": frame.picture, "missed": frame.missed}
     if head is not None:
         (label,), p = head(frame.values[None])
         line |= {"label": str(label), "p": round(float(p.max()), 6)}

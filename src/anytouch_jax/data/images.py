@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import cv2
 import numpy as np
@@ -44,6 +44,13 @@ _WIDTH, _HEIGHT, _BITS, _ALPHA = 256, 257, 258, 338  # tags of a TIFF; _ALPHA is
 _NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
 cv2.setNumThreads(1)  # the loader has threads already
+
+
+class Video(Protocol):
+    """An opened video: the part of cv2.VideoCapture that knows its times."""
+
+    def get(self, propId: int, /) -> float:
+        """Return a property."""
 
 
 class ImageError(UserError):
@@ -198,32 +205,57 @@ def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
 
 def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
     """Yield the frames of a video as RGB u8 (h, w, 3). Raises ImageError if it cannot be read or has no frame."""
+    return (frame for _, frame in timed_frames(path))
+
+
+def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
+    """Yield (time stamp in seconds, RGB u8 (h, w, 3)) of the frames of a video. Raises ImageError as above."""
     path = Path(path)
     if not path.is_file():
         raise ImageError(f"there is no video {path}")
-    video = _open_video(path)
+    video = open_video(path)
+    number, last = 0, -1.0
     try:
-        success, frame = video.read()
-        if not success:
-            raise ImageError(f"{path} is not a video that can be read, or has no frame")
-        while success:
-            yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-            success, frame = video.read()
+        while True:
+            try:
+                whole, frame = video.read()
+            except cv2.error as error:
+                raise ImageError(f"frame {number} of {path} cannot be decoded: {' '.join(str(error).split())}") from None
+            if not whole or frame is None:
+                break
+            last = frame_time(video, number, last)
+            yield last, np.ascontiguousarray(to_rgb(frame, path)[..., ::-1])
+            number += 1
     finally:
         video.release()
+    if not number:
+        raise ImageError(f"{path} is not a video that can be read, or has no frame")
+
+
+def frame_time(video: Video, number: int, last: float) -> float:
+    """Return the time stamp in seconds of frame `number`, which was just read, later than `last`.
+
+    Without a stamp, the number is divided by the frame rate.
+    """
+    seconds = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    if math.isfinite(seconds) and seconds > last:
+        return seconds
+    rate = video.get(cv2.CAP_PROP_FPS)
+    return max(last, number / rate if math.isfinite(rate) and rate > 0 else float(number))
 
 
 def count_frames(path: str | Path) -> int:
     """Return the number of frames in a video's header, 0 if it has none."""
-    video = _open_video(path)
+    video = open_video(path)
     try:
         return max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     finally:
         video.release()
 
 
-def _open_video(path: str | Path) -> cv2.VideoCapture:
-    return cv2.VideoCapture(os.path.abspath(path))  # FFmpeg takes the part before a colon for a protocol
+def open_video(path: str | Path) -> cv2.VideoCapture:
+    """Open a video. FFmpeg takes the part of a relative name before a colon for a protocol."""
+    return cv2.VideoCapture(os.path.abspath(path))
 
 
 def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:

@@ -2,7 +2,8 @@
 
 A thread reads and preprocesses frames, and a mailbox of one slot holds the newest clip. A camera is never waited for:
 frames that arrive while the encoder is busy are dropped, and a clip still has consecutive frames. Of a video, which
-can wait, every frame is embedded.
+can wait, every frame is embedded. The end of a video ends the stream. A camera has no end: a missed read is tried
+again, and the stream fails if no frame comes.
 """
 
 from __future__ import annotations
@@ -11,24 +12,30 @@ import contextlib
 import signal
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.encoder.embed import Join, Pooling
+from anytouch_jax.data.images import frame_time, open_video, to_rgb
+from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
 from anytouch_jax.encoder.encoder import Encoder, check_frames, touch_features
 from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 
 PARTS = ("decode", "resize", "copy", "encoder")
 KEPT = 100_000  # last frames whose times are stored if their features are not
-_PATIENCE = 2.0  # seconds to wait for a camera after the last frame
+RETRY = 2.0  # seconds in which a missed read of a camera is tried again
+HANG = 20.0  # seconds to wait for a read that does not return; V4L2 itself gives up after 10
+STUCK = 0.3  # seconds of the same bytes, or of black, until they are reported: the noise of a sensor never repeats
+BLACK = 8.0  # mean pixel below which a picture is black; untouched gels have 30 and more
+_PATIENCE = 2.0  # seconds to wait for the reader after the last frame
+_PAUSE = 0.01  # seconds from a missed read to the next
 
 
 class Source(Protocol):
@@ -37,20 +44,41 @@ class Source(Protocol):
     def grab(self) -> bool:
         """Wait for the next frame. Return False at the end."""
 
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        """Return whether the frame could be decoded, and its pixels BGR u8 (h, w, 3)."""
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        """Return whether the frame could be decoded, and its pixels BGR u8 (h, w, 3) or grey (h, w)."""
+
+    def get(self, propId: int, /) -> float:
+        """Return a property of a video, such as the time stamp of a frame. It is not called for cameras."""
 
     def release(self) -> None:
         """Release the device or the file."""
 
 
-class Clip(NamedTuple):
-    """Frames u8 (T, H, W, 3) up to frame `number`, the time when it was `read`, and the seconds of two parts."""
+class CameraError(UserError):
+    """A camera that delivers no frames any more."""
+
+
+class Frame(NamedTuple):
+    """Pixels RGB u8 (h, w, 3) of frame `number`, the clock when it was `read`, and the seconds of decoding.
+
+    `time`: its time stamp in a video, None for a camera. `picture`: "ok", "frozen" or "black". `missed`: missed reads
+    of the camera up to here.
+    """
 
     number: int
-    frames: np.ndarray
+    pixels: np.ndarray
     read: float
     decode: float
+    time: float | None = None
+    picture: str = "ok"
+    missed: int = 0
+
+
+class Clip(NamedTuple):
+    """Frames u8 (T, H, W, 3) up to frame `last`, and the seconds of resizing it."""
+
+    last: Frame
+    frames: np.ndarray
     resize: float
 
 
@@ -58,7 +86,8 @@ class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
     `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`: seconds from the grabbed
-    frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds.
+    frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds. `time`: the time
+    stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`.
     """
 
     number: int
@@ -67,6 +96,9 @@ class Embedded(NamedTuple):
     seconds: tuple[float, float, float, float]
     age: float
     started: float = 0.0
+    time: float = 0.0
+    picture: str = "ok"
+    missed: int = 0
 
 
 class Mailbox:
@@ -76,7 +108,16 @@ class Mailbox:
         self._replace, self._done = replace, False
         self._clip: Clip | None = None
         self._error: BaseException | None = None
-        self._changed = threading.Condition()
+        self._changed, self._alive = threading.Condition(), time.perf_counter()
+
+    @property
+    def is_closed(self) -> bool:
+        """Return whether one of the sides has ended the stream."""
+        return self._done
+
+    def report_alive(self) -> None:
+        """Note that the reader has come back from the camera."""
+        self._alive = time.perf_counter()
 
     def put(self, clip: Clip) -> bool:
         """Leave a clip, after waiting for an empty slot unless it may be replaced. Return False once it is closed."""
@@ -87,10 +128,15 @@ class Mailbox:
             self._changed.notify_all()
             return not self._done
 
-    def take(self) -> Clip | None:
-        """Wait for a clip and return it, None after the last one. Raises the error of the reader."""
+    def take(self, hang: float | None = None) -> Clip | None:
+        """Wait for a clip and return it, None after the last one.
+
+        Raises the error of the reader, and CameraError after `hang` seconds in which the reader did not come back.
+        """
         with self._changed:
-            self._changed.wait_for(lambda: self._clip is not None or self._done)
+            while not self._changed.wait_for(lambda: self._clip is not None or self._done, hang):
+                if hang is not None and time.perf_counter() - self._alive > hang:
+                    raise CameraError(f"the camera has not answered for {hang:g} s. Check its cable, and start again.")
             clip, self._clip = self._clip, None
             self._changed.notify_all()
             if clip is None and self._error is not None:
@@ -109,21 +155,12 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
     live = str(name).isdecimal() and not Path(name).exists()
     if not live and not Path(name).is_file():
         raise UserError(f"there is no video {name}; give a video file, or the number of a camera, such as 0")
-    source = cv2.VideoCapture(int(str(name)) if live else str(name))
+    source = cv2.VideoCapture(int(str(name))) if live else open_video(name)
     if not source.isOpened():
         raise UserError(f"camera {name} cannot be opened" if live else f"{name} is not a video that can be read")
     if live:
         source.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the driver's own queue would hold old frames
     return source, live
-
-
-def rate_of(video: str | Path) -> float:
-    """Return the frames per second of a video, 0 if its header has no rate."""
-    source, _ = open_source(video)
-    try:
-        return max(0.0, float(cast(cv2.VideoCapture, source).get(cv2.CAP_PROP_FPS)))
-    finally:
-        source.release()
 
 
 def stream(
@@ -137,18 +174,20 @@ def stream(
     stride: int = 1,
     pooling: Pooling = "class",
     join: Join = "mean",
+    log: Log = warn,
 ) -> Generator[Embedded]:
     """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
 
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
-    `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy. Close the iterator to
-    stop and to release the source. Raises UserError for a wrong length.
+    `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy, and `log` gets one
+    sentence each about a missed read, a frozen and a black picture. Close the iterator to stop and to release the
+    source. Raises UserError for a wrong length, and CameraError if no frame can be read for RETRY seconds.
     """
     check_frames(encoder.config.model, frames)
     if stride < 1:
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
     embed = compile_for_one(encoder, sensor, frames, pooling, join)
-    return _stream(embed, source, live, preprocess or Preprocess(encoder), frames, stride)
+    return _stream(embed, source, live, preprocess or Preprocess(encoder), frames, stride, log)
 
 
 def compile_for_one(
@@ -171,62 +210,150 @@ def _stream(
     preprocess: Preprocess,
     frames: int,
     stride: int,
+    log: Log,
 ) -> Generator[Embedded]:
     mailbox = Mailbox(replace=live)
     started, start = time.time(), time.perf_counter()
-    reader = threading.Thread(target=_read, args=(source, live, preprocess, frames, stride, mailbox), daemon=True)
-    reader.start()
+    arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
+    reader = threading.Thread(target=_read, args=(arrived, preprocess, frames, stride, mailbox), daemon=True)
     try:
-        while (clip := mailbox.take()) is not None:
+        reader.start()  # Ctrl-C may come already while the thread starts
+        while (clip := mailbox.take(HANG if live else None)) is not None:
             begin = time.perf_counter()
             there = jax.device_put(clip.frames[None]).block_until_ready()
             copied = time.perf_counter()
             values = np.asarray(embed(there))[0]
             end = time.perf_counter()
-            seconds = (clip.decode, clip.resize, copied - begin, end - copied)
-            yield Embedded(clip.number, clip.read - start, values, seconds, end - clip.read, started)
+            last, at = clip.last, clip.last.read - start
+            seconds = (last.decode, clip.resize, copied - begin, end - copied)
+            stamp = at if last.time is None else last.time
+            age = end - last.read
+            yield Embedded(last.number, at, values, seconds, age, started, stamp, last.picture, last.missed)
     finally:
         mailbox.close()
-        reader.join(_PATIENCE)
+        if reader.ident is not None:
+            reader.join(_PATIENCE)
         if not reader.is_alive():  # releasing a camera that hangs would hang, too
             source.release()
 
 
-def _read(source: Source, live: bool, preprocess: Preprocess, frames: int, stride: int, mailbox: Mailbox) -> None:
-    """Read frames into a ring, and put the newest clip into the mailbox: the reader's thread."""
+def _read(arrived: Iterator[Frame], preprocess: Preprocess, frames: int, stride: int, mailbox: Mailbox) -> None:
+    """Put the newest clip of preprocessed frames into the mailbox: the reader's thread. No clip has a missed read."""
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
-    number = 0
+    missed = 0
     try:
-        wanted = True
-        while wanted:
+        for frame in arrived:
+            if frame.missed > missed:
+                ring.clear()
+                missed = frame.missed
             begin = time.perf_counter()
-            if not source.grab():
+            ring.append(preprocess(frame.pixels))
+            resize = time.perf_counter() - begin
+            if len(ring) == ring.maxlen and not mailbox.put(Clip(frame, np.stack(list(ring)[::stride]), resize)):
                 break
-            grabbed = time.perf_counter()  # waiting for a camera is not decoding
-            there, frame = source.retrieve()
-            if not there:
-                break
-            decoded = time.perf_counter()
-            if frame.ndim != 3 or frame.shape[2] != 3:
-                raise UserError(f"frame {number} has shape {frame.shape}; colour frames (height, width, 3) are wanted")
-            ring.append(preprocess(frame[..., ::-1]))
-            resized = time.perf_counter()
-            if len(ring) == ring.maxlen:
-                decode = decoded - (grabbed if live else begin)
-                came = grabbed if live else begin  # the latency starts here: decoding is part of it
-                clip = Clip(number, np.stack(list(ring)[::stride]), came, decode, resized - decoded)
-                wanted = mailbox.put(clip)
-            number += 1
         mailbox.close()
     except BaseException as error:
         mailbox.close(error)
 
 
+def _video_frames(source: Source) -> Iterator[Frame]:
+    """Yield the frames of a video with their time stamps. Raises UserError for pixels that cannot be used."""
+    number, last = 0, -1.0
+    while True:
+        begin = time.perf_counter()
+        try:
+            whole, pixels = source.retrieve() if source.grab() else (False, None)
+        except cv2.error as error:
+            raise UserError(f"frame {number} of the video cannot be decoded: {' '.join(str(error).split())}") from None
+        if not whole or pixels is None:
+            return
+        last = frame_time(source, number, last)
+        pixels = to_rgb(pixels, f"frame {number}")[..., ::-1]
+        yield Frame(number, pixels, begin, time.perf_counter() - begin, last)  # decoding is part of the latency
+        number += 1
+
+
+def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]:
+    """Yield the frames of a camera until the mailbox is closed.
+
+    A read without a picture, one that raises cv2.error, and a picture of another shape than the first are missed and
+    tried again. Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
+    """
+    number, missed, failing, fault = 0, 0, None, ""
+    shape: tuple[int, ...] | None = None
+    watch = _Watch(log)
+    while True:
+        pixels, reason = None, "the camera delivers nothing"
+        grabbed = time.perf_counter()
+        try:
+            if source.grab():
+                grabbed = time.perf_counter()  # waiting for a camera is not decoding
+                whole, pixels = source.retrieve()
+                pixels = pixels if whole else None
+        except cv2.error as error:
+            reason = " ".join(str(error).split())
+        decoded = time.perf_counter()
+        mailbox.report_alive()
+        if mailbox.is_closed:
+            return
+        if pixels is not None and shape is not None and pixels.shape != shape:
+            reason = f"its pictures have shape {pixels.shape}, and the first had {shape}"
+            pixels = None
+        if pixels is None:
+            missed += 1
+            failing = decoded if failing is None else failing
+            fault = reason
+            if decoded - failing > RETRY:
+                raise CameraError(
+                    f"no frame of the camera could be read for {RETRY:g} s after {number} frames: {reason}. "
+                    "Check its cable and other programs that use it, and start again."
+                )
+            time.sleep(_PAUSE)
+            continue
+        if failing is not None:
+            watch.report("missed", f"a read of the camera was missed after {number} frames and tried again: {fault}")
+        failing, shape = None, pixels.shape
+        picture = watch.look(number, pixels, decoded)
+        rgb = to_rgb(pixels, f"frame {number}")[..., ::-1]
+        yield Frame(number, rgb, grabbed, decoded - grabbed, None, picture, missed)
+        number += 1
+
+
+class _Watch:
+    """Whether the pictures of a camera are frozen or black. Each kind of fault is logged once."""
+
+    def __init__(self, log: Log) -> None:
+        self._log, self._last = log, b""
+        self._logged: set[str] = set()
+        self._since: dict[str, float] = {}
+
+    def report(self, kind: str, sentence: str) -> None:
+        """Log the first sentence of its kind."""
+        if kind not in self._logged:
+            self._logged.add(kind)
+            self._log(sentence)
+
+    def look(self, number: int, pixels: np.ndarray, now: float) -> str:
+        """Return "black" or "frozen" if the picture has been so for STUCK seconds, else "ok"."""
+        data = pixels.tobytes()
+        faults = {"black": bool(pixels[::8, ::8].mean() < BLACK), "frozen": data == self._last}
+        self._last = data
+        advice = {"black": "Check its light and its cover.", "frozen": "It repeats the same bytes: check its cable."}
+        for kind, is_true in faults.items():
+            if not is_true:
+                self._since.pop(kind, None)
+            elif now - self._since.setdefault(kind, now) >= STUCK:
+                self.report(kind, f"the picture of the camera is {kind} at frame {number}. {advice[kind]}")
+                return kind
+        return "ok"
+
+
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 
-    `total` frames were embedded; the arrays may have only the last of them. `interrupted`: Ctrl-C or SIGTERM ended the
-    stream.
+    `total` frames were embedded, `frozen` and `black` count those of such pictures, and `missed` reads gave nothing;
+    the arrays may have only the last frames. `interrupted`: Ctrl-C or SIGTERM ended the stream. `error`: a camera that
+    delivers nothing did.
     """
 
     values: np.ndarray
@@ -237,25 +364,34 @@ class Result(NamedTuple):
     total: int
     interrupted: bool
     started: float = 0.0
+    time: np.ndarray = np.zeros(0)
+    missed: int = 0
+    frozen: int = 0
+    black: int = 0
+    error: CameraError | None = None
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
-    """Return the frames of a stream up to its end, Ctrl-C or SIGTERM.
+    """Return the frames of a stream up to its end, Ctrl-C, SIGTERM or the failure of the camera.
 
     With `on_each`, features go there and are not stored, and only the last KEPT times are: a stream may run for weeks.
     """
     stored: deque[Embedded] = deque(maxlen=KEPT if on_each else None)
-    total, interrupted = 0, False
+    total, interrupted, failure = 0, False, None
+    pictures: Counter[str] = Counter()
     try:
         with contextlib.closing(embedded), _sigterm_as_ctrl_c():
             for frame in embedded:
                 total += 1
+                pictures[frame.picture] += 1
                 if on_each is not None:
                     on_each(frame)
                     frame = frame._replace(values=np.zeros(0, np.float32))
                 stored.append(frame)
     except KeyboardInterrupt:
         interrupted = True
+    except CameraError as error:
+        failure = error
     return Result(
         np.stack([frame.values for frame in stored]) if stored else np.zeros((0, 0), np.float32),
         np.asarray([frame.number for frame in stored], np.int64),
@@ -265,6 +401,11 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         total,
         interrupted,
         stored[-1].started if stored else 0.0,
+        np.asarray([frame.time for frame in stored]),
+        stored[-1].missed if stored else 0,
+        pictures["frozen"],
+        pictures["black"],
+        failure,
     )
 
 
@@ -292,4 +433,6 @@ def budget(result: Result) -> list[str]:
     rate = (count - 1) / np.ptp(result.at + result.age) if count > 1 else np.nan
     dropped = int(np.ptp(result.numbers)) + 1 - count if count else 0
     last = "," if result.total == count else f"; of the last {count}:"
-    return [*lines, f"{result.total} frames embedded{last} {dropped} dropped, {rate:.1f} frames/s"]
+    faults = {"missed reads": result.missed, "frozen pictures": result.frozen, "black pictures": result.black}
+    known = "".join(f", {count} {name}" for name, count in faults.items() if count)
+    return [*lines, f"{result.total} frames embedded{last} {dropped} dropped, {rate:.1f} frames/s{known}"]

@@ -220,7 +220,9 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
             try:
                 whole, frame = video.read()
             except cv2.error as error:
-                raise ImageError(f"frame {number} of {path} cannot be decoded: {' '.join(str(error).split())}") from None
+                raise ImageError(
+                    f"frame {number} of {path} cannot be decoded: {' '.join(str(error).split())}"
+                ) from None
             if not whole or frame is None:
                 break
             last = frame_time(video, number, last)

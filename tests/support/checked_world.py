@@ -11,6 +11,13 @@ def finding_rows(report):
     return {finding.kind: finding.rows.tolist() for finding in report.findings}
 
 
+def patterned(picture):
+    """The picture u8 (h, w, 3) with a faint ramp over it."""
+    height, width = picture.shape[:2]
+    ramp = np.add.outer(np.arange(height) * 30 // height, np.arange(width) * 20 // width)[..., None]
+    return np.clip(picture + ramp, 0, 255).astype(np.uint8)
+
+
 def plain_rows(count=6, **extra):
     """`count` rows of one dataset, in sequences of three frames."""
     return [{"sequence": f"s{i // 3}", "frame_index": i % 3, "dataset": "d", **extra} for i in range(count)]

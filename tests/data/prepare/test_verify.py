@@ -5,7 +5,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from checked_world import finding_rows, image_pairs, plain_rows
+from checked_world import finding_rows, image_pairs, patterned, plain_rows
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
@@ -14,7 +14,7 @@ from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.data.prepare.verify import split_hash, verify
 
-IMAGE = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
+IMAGE = cv2.resize(np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8), (50, 40))
 
 
 def _encoded(suffix, image=IMAGE):
@@ -154,11 +154,11 @@ def test_a_size_that_is_not_the_sensors_is_found(make):
     rows = [{"dataset": "d", "sensor": "digit" if i < 5 else "gelslim", "path": f"{i}.png"} for i in range(9)]
     loose = make(rows)
     for row, shape in ((2, (20, 20, 3)), (7, (16, 12, 3)), *((row, (40, 50, 3)) for row in (5, 6, 8))):
-        cv2.imwrite(str(loose.file(row)), np.full(shape, row, np.uint8))
+        cv2.imwrite(str(loose.file(row)), patterned(np.full(shape, row, np.uint8)))
     report = verify(loose)
     assert finding_rows(report) == {"wrong_size": [2, 7]} and report.ok
-    assert "20 x 20, where most of its sensor are 16 x 12" in report.findings[0].examples[0]
-    assert "12 x 16, where most of its sensor are 50 x 40" in report.findings[0].examples[1]
+    assert "20 x 20, where most of its sensor or sequence are 16 x 12" in report.findings[0].examples[0]
+    assert "12 x 16, where most of its sensor or sequence are 50 x 40" in report.findings[0].examples[1]
 
 
 # Rows -------------------------------------------------------------------------------------------------------------

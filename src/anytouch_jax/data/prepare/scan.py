@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import zlib
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -21,7 +22,9 @@ from anytouch_jax.errors import UserError
 
 STATES = ("ok", "missing", "outside", "empty", "truncated", "unreadable")
 OK = STATES.index("ok")
-_SIDE = 4  # colours are the means of 4 x 4 fields
+FIELDS = 4  # colours are the means of 4 x 4 fields
+SPREAD, BOTTOM, BORDER, CHROMA, NOISE = range(5)  # columns of Scan.looks
+_CROP = 128  # side of the middle of a picture where noise is measured
 _MAX_REASONS = 1000  # a million broken files must not fill the memory
 
 
@@ -29,7 +32,8 @@ class Scan(NamedTuple):
     """The state of every distinct file i of n.
 
     `state` u8 (n,) indexes STATES. `size` i32 (n, 2) is width and height, 0 if not decoded. `digest` S32 (n,) is the
-    first half of the SHA-256 in hex. `colours` is u8 (n, 48). `reasons` explains the first thousand bad files.
+    first half of the SHA-256 in hex. `colours` is u8 (n, 48). `looks` f32 (n, 5) are the measures of `_looks`, and
+    `pixels` u32 (n,) is a checksum of the pixels. `reasons` explains the first thousand bad files.
     """
 
     files: Files
@@ -37,6 +41,8 @@ class Scan(NamedTuple):
     size: np.ndarray
     digest: np.ndarray
     colours: np.ndarray
+    looks: np.ndarray
+    pixels: np.ndarray
     reasons: dict[int, str]
 
     def states(self, column: str) -> np.ndarray:
@@ -50,6 +56,8 @@ class _FileState(NamedTuple):
     size: tuple[int, int] = (0, 0)
     digest: bytes = b""
     colours: np.ndarray | None = None
+    looks: np.ndarray | None = None
+    pixels: int = 0
     reason: str = ""
 
 
@@ -68,7 +76,8 @@ def scan(
     count = len(files)
     result = Scan(
         files, np.zeros(count, np.uint8), np.zeros((count, 2), np.int32), np.zeros(count, "S32"),
-        np.zeros((count, 3 * _SIDE * _SIDE), np.uint8), {},
+        np.zeros((count, 3 * FIELDS * FIELDS), np.uint8), np.zeros((count, 5), np.float32),
+        np.zeros(count, np.uint32), {},
     )  # fmt: skip
 
     def inspect(file: int) -> _FileState:
@@ -87,7 +96,8 @@ def scan(
             result.state[file] = STATES.index(state.state)
             result.size[file], result.digest[file] = state.size, state.digest
             if state.colours is not None:
-                result.colours[file] = state.colours
+                result.colours[file], result.looks[file] = state.colours, state.looks
+                result.pixels[file] = state.pixels
             if state.reason and len(result.reasons) < _MAX_REASONS:
                 result.reasons[file] = state.reason
             if log and (file + 1) % 100_000 == 0:
@@ -123,5 +133,33 @@ def _read(path: Path, is_image: bool) -> _FileState:
         reason = str(error).removeprefix(f"{path} ").removeprefix("cannot be read: ")
         return _FileState("truncated" if "cut short" in reason else "unreadable", digest=digest, reason=reason)
     height, width = pixels.shape[:2]
-    colours = cv2.resize(pixels, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).reshape(-1)
-    return _FileState("ok", (width, height), digest, colours)
+    colours = cv2.resize(pixels, (FIELDS, FIELDS), interpolation=cv2.INTER_AREA).reshape(-1)
+    return _FileState("ok", (width, height), digest, colours, _looks(pixels), zlib.crc32(pixels.data))
+
+
+def _looks(pixels: np.ndarray) -> np.ndarray:
+    """Return measures of RGB u8 (h, w, 3) as f32 (5,).
+
+    They are the standard deviation, the share of rows at the bottom that are of one colour but black, the share of the
+    largest black border, the mean range of a pixel's channels, and how much of the variance is noise from pixel to
+    pixel (1: all of it).
+    """
+    lines = pixels.max(axis=1), pixels.max(axis=0)
+    black = [_leading(line.max(axis=1) <= 16) for way in lines for line in (way, way[::-1])]
+    same = (pixels == pixels[-1, 0]).all(axis=(1, 2))[::-1]  # JPEG fills what is lost with exactly one grey
+    bottom = 0.0 if black[1] else _leading(same)
+    height, width = pixels.shape[:2]
+    top, left = max(0, (height - _CROP) // 2), max(0, (width - _CROP) // 2)
+    grey = pixels[top : top + _CROP, left : left + _CROP].mean(axis=2, dtype=np.float32)
+    variance = float(grey.var())
+    noise = 0.0
+    if variance > 100 and min(grey.shape) > 1:
+        noise = min(float((np.diff(grey, axis=axis) ** 2).mean()) / (2 * variance) for axis in (0, 1))
+    spread = float(max(channel.std() for channel in pixels.reshape(-1, 3).T))
+    chroma = float((pixels.max(axis=2) - pixels.min(axis=2)).mean())
+    return np.array([spread, bottom, max(black), chroma, noise], np.float32)
+
+
+def _leading(flags: np.ndarray) -> float:
+    """Return the share of flags bool (n,) before the first that is false, 0 if none is false."""
+    return float(np.argmin(flags)) / len(flags)

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 
 from anytouch_jax.data.manifest.manifest import Manifest, misspelt_sensors
 from anytouch_jax.data.manifest.schema import SPLITS, spellings
+from anytouch_jax.data.prepare.appearance import picture_faults
 from anytouch_jax.data.prepare.licences import NO, YES, Licence, commercial_use, licences
 from anytouch_jax.data.prepare.scan import OK, STATES, Scan, scan
 
@@ -127,6 +128,10 @@ def verify(
         *_wrong_sizes(manifest, scanned),
         *_duplicates(manifest, scanned),
         *_swapped(manifest, scanned),
+        *(
+            Finding(kind, "warning", sentence, rows, _quoted(manifest, rows, column), column)
+            for kind, sentence, rows, column in picture_faults(manifest, scanned)
+        ),
         *row_faults(manifest, objects=objects),
         *(Finding("unknown_sensor", *fault, (), "sensor") for fault in misspelt_sensors(manifest)),
     ]
@@ -205,29 +210,35 @@ def _bad_files(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 
 
 def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    """Yield touch images of another size than most of their dataset, sensor and unit."""
+    """Yield touch images of another size than most of their dataset, sensor and unit, or than their sequence."""
     size = scanned.size[scanned.files.code["path"]].astype(np.int64)
     rows = np.flatnonzero(size[:, 0] > 0)
     if not rows.size:
         return
-    keys = np.stack([manifest.codes(name)[rows] for name in ("dataset", "sensor", "unit")], 1)
-    _, group = np.unique(keys, axis=0, return_inverse=True)
     sizes, kind = np.unique(size[rows], axis=0, return_inverse=True)
-    group, kind = group.ravel(), kind.ravel()
+    kind = kind.ravel()
+    keys = np.stack([manifest.codes(name)[rows] for name in ("dataset", "sensor", "unit")], 1)
+    usual = _most_frequent(np.unique(keys, axis=0, return_inverse=True)[1].ravel(), kind)
+    in_sequence = _most_frequent(np.unique(manifest.codes("sequence", own=True)[rows], return_inverse=True)[1], kind)
+    usual = np.where(usual != kind, usual, in_sequence)
+    odd = rows[usual != kind]
+    if odd.size:
+        examples = tuple(
+            f"{manifest.where(row)}: {manifest.value(row, 'path')!r} is {size[row][0]} x {size[row][1]}, "
+            f"where most of its sensor or sequence are {sizes[main][0]} x {sizes[main][1]}"
+            for row, main in zip(odd[:_EXAMPLES], usual[usual != kind], strict=False)
+        )
+        sentence = f"{odd.size} touch images of another size than most of their dataset, sensor and unit, or sequence"
+        yield Finding("wrong_size", "warning", sentence, odd, examples, "path")
+
+
+def _most_frequent(group: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Return the most frequent kind i64 (rows,) in the group of each row."""
     pairs, counts = np.unique(np.stack([group, kind], 1), axis=0, return_counts=True)
     order = np.lexsort((-counts, pairs[:, 0]))
     usual = np.full(pairs[:, 0].max() + 1, -1)
     usual[pairs[order[::-1], 0]] = pairs[order[::-1], 1]  # the last one written is the most frequent
-    is_odd = usual[group] != kind
-    odd = rows[is_odd]
-    if odd.size:
-        examples = tuple(
-            f"{manifest.where(row)}: {size[row][0]} x {size[row][1]}, "
-            f"where most of its sensor are {sizes[main][0]} x {sizes[main][1]}"
-            for row, main in zip(odd[:_EXAMPLES], usual[group[is_odd]], strict=False)
-        )
-        sentence = f"{odd.size} touch images of another size than most of their dataset, sensor and unit"
-        yield Finding("wrong_size", "warning", sentence, odd, examples, "path")
+    return usual[group]
 
 
 def content_ids(scanned: Scan, column: str = "path") -> np.ndarray:

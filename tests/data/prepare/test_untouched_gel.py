@@ -38,6 +38,13 @@ def test_a_film_that_is_always_free_or_always_pressed_is_undecided(look, depth):
     assert gel is None and "always" in reason
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("look", LOOKS)
+def test_a_press_that_moves_and_gets_deeper_and_never_ends_is_undecided(look, shape):
+    frames, _ = press_film(look, 1.0, shape, 20)  # its lightest frames look like the untouched gel of the others
+    assert estimate(frames)[0] is None
+
+
 def test_too_few_frames_are_undecided():
     assert estimate([]) == estimate([gel_frame("coloured", 1)]) == (None, "fewer than two frames can be read")
 

@@ -3,7 +3,7 @@
 Frames of the untouched gel have two properties. They are alike, since nothing moves. And they have less structure than
 every frame in which something presses: an object adds edges to the picture. The estimate is the group of alike frames
 that has less structure than all frames that differ from it. This holds however long the press lasts. Where no group
-stands out, the background cannot be known from the frames, and the estimate says so.
+stands out, or the group shows a light press itself, the background cannot be known from the frames.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 LONG_SIDE = 160  # pixels of the long side on which all lengths below are measured
 DOT, DOT_DEPTH, FEWEST_DOTS = 13, 12, 20  # widest marker dot, its darkness in grey levels, dots that a marked gel shows
 BLUR, EDGE, PERCENTILE = 1.5, 4, 98  # of the difference image: blur, cut edge, score
+WIDE = 8  # blur of the gel's slow changes of light
 ALIKE, DIFFERENT = 3.0, 6.5  # grey levels: frames of one state, and frames of two
 MARGIN = 0.1  # least excess of structure, as a share of the sum; measured on real and simulated recordings
 
@@ -141,7 +142,14 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
                     break
         if best_margin <= margin < np.inf:
             best, best_margin = group, margin
-    return best, "" if best is not None else "no frames stand out as the untouched gel"
+    if best is None:
+        return None, "no frames stand out as the untouched gel"
+    free = _median([frames[i] for i in best])
+    presses = [_press_of(free, other) for other in centres if _distance(free, other) >= DIFFERENT]
+    # Measured: below 0.5 for untouched gel, 3 for a faint touch (score 5), 11 for a bar that is pressed all the time.
+    if np.median(presses) >= ALIKE:
+        return None, "the frames with the least structure are pressed themselves"
+    return best, ""
 
 
 def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float:
@@ -151,15 +159,36 @@ def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float
 
 def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:
     """Return how much more edges `pressed` has where the two differ, -1 to 1."""
-    change = difference_image(free, pressed)
-    region = change > max(0.35 * float(np.percentile(change, 99)), 1.0)
-    region = cv2.dilate(region.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    less, more = (float(_edges(picture)[region].sum()) for picture in (free, pressed))
+    region = _changed(free, pressed)
+    less, more = (
+        float(np.sqrt((_gradient(_smooth(picture))[region] ** 2).sum(1)).sum()) for picture in (free, pressed)
+    )
     return (more - less) / (more + less + 1e-6)
 
 
-def _edges(picture: np.ndarray) -> np.ndarray:
-    """Return the length of the colour gradient, f32 (h, w), after a blur that removes noise."""
-    smooth = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR)
-    across, down = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
-    return np.asarray(np.sqrt((across**2 + down**2).sum(2)))
+def _press_of(free: np.ndarray, pressed: np.ndarray) -> float:
+    """Return the score of the press that `free` shows itself: its share of the edges that change, times their score.
+
+    A press that gets deeper strengthens edges that are there already. Edges of the untouched gel are others.
+    """
+    region = _changed(free, pressed)
+    before, after = (_gradient(_smooth(picture) - _smooth(picture, WIDE))[region] for picture in (free, pressed))
+    change = after - before
+    return _distance(free, pressed) * float((before * change).sum() / ((change**2).sum() + 1e-6))
+
+
+def _changed(free: np.ndarray, pressed: np.ndarray) -> np.ndarray:
+    """Return where two pictures differ, bool (h, w)."""
+    change = difference_image(free, pressed)
+    region = change > max(0.35 * float(np.percentile(change, 99)), 1.0)
+    return np.asarray(cv2.dilate(region.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+
+
+def _smooth(picture: np.ndarray, blur: float = BLUR) -> np.ndarray:
+    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), blur))
+
+
+def _gradient(picture: np.ndarray) -> np.ndarray:
+    """Return the colour gradient, f32 (h, w, 6)."""
+    sides = [cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
+    return np.concatenate(sides, axis=2)

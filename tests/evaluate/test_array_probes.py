@@ -184,7 +184,7 @@ def test_a_group_that_gives_the_label_away_does_not_help_on_other_groups() -> No
     assert honest.n_test == 240
 
 
-def test_groups_left_out_still_find_what_generalises() -> None:
+def test_groups_left_out_generalise() -> None:
     features, labels, groups, _ = table(groups=24, apart=9.0)
     for folds in (5, None):
         result = leave_groups_out(features, labels, groups, folds=folds)
@@ -192,7 +192,7 @@ def test_groups_left_out_still_find_what_generalises() -> None:
         assert result.baseline < 0.4
 
 
-def test_groups_left_out_are_told_apart_by_what_was_described() -> None:
+def test_groups_left_out_are_reported_by_subset() -> None:
     features, labels, groups, _ = table(groups=24, apart=0.8)
     named = np.isin(groups, np.unique(groups)[:8])
     result = leave_groups_out(features, labels, groups, subsets={"named": named, "others": ~named})
@@ -292,7 +292,7 @@ def test_regression_of_a_linear_quantity() -> None:
     assert 0.3 < noisy.r2 < 0.85
 
 
-def test_regression_on_nothing_is_no_better_than_the_mean() -> None:
+def test_regression_on_noise_is_no_better_than_the_mean() -> None:
     features, force, groups, split = measured(0.0)
     result = regression_probe(features, np.random.default_rng(0).permutation(force), groups, split)
     assert result.r2 < 0.1
@@ -366,7 +366,7 @@ def test_one_group_without_a_choice_has_no_interval() -> None:
     assert result.low is None and result.chosen_on == "given"
 
 
-def test_an_unfinished_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfinished_fit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     features, labels, groups, split = table(apart=1.0)
     monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 2)
     assert any("limit of iterations" in note for note in linear_probe(features, labels, groups, split).notes)

@@ -44,8 +44,8 @@ def planted(values: Any) -> FeatureStore:
     return FeatureStore(lambda rows, frames: np.asarray(values(rows), np.float32))
 
 
-def telling(world: Manifest, task: str, noise: float = 0.3) -> Any:
-    """Features that say the label of the task, in a linear code under noise."""
+def labelled_features(world: Manifest, task: str, noise: float = 0.3) -> Any:
+    """Features that contain the label of the task, in a linear code under noise."""
     rows = select(world, TASKS[task])
     labels = rows.labels[:, None]
     code = labels if labels.dtype.kind == "f" else labels == np.unique(labels)
@@ -62,8 +62,8 @@ def noise(rows: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("task", ["material", "slip", "twist", "slide", "object"])
 @pytest.mark.parametrize("head", ["linear", "knn"])
-def test_a_label_in_the_features_is_found(task, head):
-    store = planted(telling(MANY, task, 0.02))
+def test_a_label_in_the_features_is_predicted(task, head):
+    store = planted(labelled_features(MANY, task, 0.02))
     (one,) = score_tasks(store, MANY, [task], seeds=3, head_names=(head,))
     assert one["mean"] > 0.98 and one["high"] == 1.0
     assert one["chance"] < 0.75 and len(one["values"]) == 3
@@ -72,14 +72,14 @@ def test_a_label_in_the_features_is_found(task, head):
 
 
 @pytest.mark.parametrize("task", ["material", "twist", "slide"])
-def test_noise_is_chance_within_its_interval(monkeypatch, task):
+def test_noise_is_chance_within_its_interval(task):
     store = planted(noise)
     (one,) = score_tasks(store, MANY, [task], seeds=5)
     assert one["low"] <= 1 / len(one["classes"]) <= one["high"]
     assert one["high"] - one["low"] < 0.4
 
 
-def test_the_optimism_of_the_published_protocol_shows_on_noise(monkeypatch):
+def test_the_optimism_of_the_published_protocol_shows_on_noise():
     store = planted(noise)
     recipe = heads.GradientRecipe(epochs=30, batch=32, rate=0.03)
     results = score_tasks(store, MANY, ["material", "twist"], seeds=5, protocols=("published", "honest"),
@@ -90,8 +90,8 @@ def test_the_optimism_of_the_published_protocol_shows_on_noise(monkeypatch):
     assert min(scores[t, "gradient", "published"] - scores[t, "gradient", "honest"] for t in ("material", "twist")) > 0
 
 
-def test_a_number_in_the_features_is_found(monkeypatch):
-    store = planted(telling(MANY, "force", 0.05))
+def test_a_number_in_the_features_is_predicted():
+    store = planted(labelled_features(MANY, "force", 0.05))
     (one,) = score_tasks(store, MANY, ["force"], seeds=2)
     assert one["metric"] == "r2" and one["unit"] == "N" and one["classes"] == []
     assert 0.97 < one["low"] <= one["mean"] <= one["high"] < 1
@@ -99,21 +99,21 @@ def test_a_number_in_the_features_is_found(monkeypatch):
     assert abs(one["chance"]) < 0.05
 
 
-def test_a_number_that_is_not_there_has_no_r2(monkeypatch):
+def test_a_number_that_is_not_there_has_no_r2():
     store = planted(noise)
     (one,) = score_tasks(store, MANY, ["force"], seeds=2)
     assert one["mean"] < 0.05 and one["mae"] == pytest.approx(one["chance_mae"], rel=0.1)
 
 
-def test_objects_never_trained_on_are_told_apart_by_other_touches(monkeypatch):
-    store = planted(telling(MANY, "object", 0.01))
+def test_new_objects_are_distinguished_by_their_other_touches():
+    store = planted(labelled_features(MANY, "object", 0.01))
     (one,) = score_tasks(store, MANY, ["object"], seeds=2)
     assert one["test"] == 15 * 4 * 2 and one["groups"] == 60  # objects of the test split, both sensors; touches
     assert len(one["classes"]) == 15
     assert any("folds" in note for note in one["notes"])
 
 
-def test_a_split_that_shares_objects_is_not_honest(monkeypatch):
+def test_a_split_that_shares_objects_is_not_honest():
     """Features that know the object, not its material: a split by picture rewards them, the honest one does not."""
     shared = simulated(objects=40, each=4, shared=True)
     names = shared.codes("object")
@@ -126,8 +126,8 @@ def test_a_split_that_shares_objects_is_not_honest(monkeypatch):
 
 
 def test_sensors_and_units_learned_from_and_tested(monkeypatch):
-    codes, mark = MANY.codes("sensor"), telling(MANY, "material", 0.02)
-    store = planted(lambda rows: np.concatenate([mark(rows), codes[rows][:, None]], 1))
+    codes, labelled = MANY.codes("sensor"), labelled_features(MANY, "material", 0.02)
+    store = planted(lambda rows: np.concatenate([labelled(rows), codes[rows][:, None]], 1))
     fits: list[tuple[Any, Any]] = []
     plain = heads.fit_head
 
@@ -146,32 +146,32 @@ def test_sensors_and_units_learned_from_and_tested(monkeypatch):
     assert any("*_0" in note for note in one["notes"])
 
 
-def test_two_fingers_are_joined_row_by_row(monkeypatch):
-    """Success is the exclusive or of what the fingers feel: only the right pair in the right order can tell."""
-    rng, rows, felt = np.random.default_rng(0), [], []
+def test_two_fingers_are_joined_row_by_row():
+    """Success is the bit of finger B: only the right pair in the right order predicts it."""
+    rng, rows, bits = np.random.default_rng(0), [], []
     for grasp in range(200):
         a, b = rng.integers(2, size=2)
         for finger, bit in rng.permutation([["A", a], ["B", b]]):
-            felt.append((finger == "B", int(bit)))
+            bits.append((finger == "B", int(bit)))
             rows.append(row(path=f"{len(rows)}.png", sequence=f"g{grasp}/during/{finger}", unit=str(finger),
                             split=("train", "test")[grasp % 2], object=f"o{grasp}", touch=f"g{grasp}",
                             label__success=int(b)))  # fmt: skip
-    # A finger says its own bit in a place of its own: features (bit, is B); success is the bit of finger B.
-    store = planted(lambda rows: np.array([[felt[one][1], felt[one][0]] for one in rows], float))
+    # Features of a finger: (bit, is B).
+    store = planted(lambda rows: np.array([[bits[one][1], bits[one][0]] for one in rows], float))
     (one,) = score_tasks(store, table(rows), ["grasp"], seeds=1)
     assert one["mean"] == 1.0 and one["train"] == 80 and one["test"] == 100
-    store = planted(lambda rows: np.array([[felt[one][1] * (not felt[one][0]), 0] for one in rows], float))
+    store = planted(lambda rows: np.array([[bits[one][1] * (not bits[one][0]), 0] for one in rows], float))
     (blind,) = score_tasks(store, table(rows), ["grasp"], seeds=1)
     assert blind["mean"] < 0.7
 
 
-def test_max_rows_is_a_fixed_chance(monkeypatch):
+def test_max_rows_is_a_fixed_chance():
     store = planted(noise)
     first, again = (score_tasks(store, MANY, ["material"], seeds=1, max_rows=200)[0] for _ in range(2))
     assert first == again and 100 < first["train"] + first["test"] <= 200
 
 
-def test_what_cannot_be_probed_is_refused():
+def test_mistakes_are_refused():
     train = table([row(path=f"{i}.png", sequence=f"{i}", label__material="ab"[i % 2]) for i in range(4)])
     for word, world, task, options in (
         ("seeds", WORLD, "material", {"seeds": 0}),
@@ -236,13 +236,13 @@ def test_nothing_is_encoded_twice(monkeypatch, encoder, pictures, tmp_path):
     assert len(passes) == 3 and len(list(tmp_path.iterdir())) == 2  # clips are something else
 
 
-def test_a_sensor_that_training_never_saw_is_noted(encoder, pictures):
+def test_an_untrained_sensor_is_reported(encoder, pictures):
     some = replace(encoder, trained_sensors=("digit",))  # the table of the model has it
     (results,) = score_tasks(some, pictures, ["material"], seeds=1)
     assert any("duragel" in note for note in results["notes"])
 
 
-def test_classes_that_were_never_learned_are_told(monkeypatch):
+def test_classes_that_train_lacks_are_reported():
     store = planted(noise)
     rows = [
         row(path=f"{i}.png", sequence=f"{i}", object=f"o{i // 2}", split="train" if i < 40 else "test",
@@ -407,8 +407,8 @@ def test_a_task_that_cannot_be_probed_leaves_the_others(tmp_path):
         probe_tasks([], [data], ("slide",), frames=1, **shared)
 
 
-def test_a_fit_that_does_not_converge_is_told_of(monkeypatch):
-    store = planted(telling(MANY, "material", noise=1.0))
+def test_a_fit_that_does_not_converge_is_reported(monkeypatch):
+    store = planted(labelled_features(MANY, "material", noise=1.0))
     (one,) = score_tasks(store, MANY, ["material"], seeds=2)
     assert not any("converge" in note for note in one["notes"])
     monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 1)

@@ -43,10 +43,10 @@ def test_a_split_that_parts_the_groups_is_kept():
     assert len(cut.val) == len(np.flatnonzero(roles.train)) // FOLDS
 
 
-def test_objects_left_out_are_dealt_within_the_test_rows():
+def test_new_classes_are_folded_within_the_test_rows():
     roles = rows("new")
-    how, used, _ = split_scheme(roles)
-    assert how == "folds"
+    scheme, used, _ = split_scheme(roles)
+    assert scheme == "folds"
     np.testing.assert_array_equal(used, roles.test)
     for protocol in ("honest", "published"):
         cuts = seeded_splits(roles, 0, protocol)
@@ -55,12 +55,12 @@ def test_objects_left_out_are_dealt_within_the_test_rows():
 
 
 @pytest.mark.parametrize("protocol", ["honest", "published"])
-def test_what_only_test_has_is_dealt_within_test(protocol):
+def test_a_sensor_of_test_alone_is_folded_within_test(protocol):
     """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its class has."""
     roles = rows()
     roles = roles._replace(y=np.linspace(0, 1, N), measured=True, may_fit=roles.test, may_test=roles.test)
-    how, used, _ = split_scheme(roles)
-    assert how == "folds"
+    scheme, used, _ = split_scheme(roles)
+    assert scheme == "folds"
     np.testing.assert_array_equal(used, roles.test)
     cuts = seeded_splits(roles, 0, protocol)
     assert len(cuts) == FOLDS and all(len(cut.fit) and roles.test[one].all() for cut in cuts for one in cut)
@@ -126,10 +126,10 @@ def test_folds_keep_groups_whole_and_spread_classes(count):
 
 def test_bootstraps_draw_whole_groups():
     groups, rows = np.arange(60) // 4, np.arange(12, 60)
-    for kept, weights in splits.group_bootstraps(rows, groups, 3):
-        assert set(kept) <= set(rows) and weights.sum() == len(rows)
-        for group in np.unique(groups[kept]):
-            assert np.sum(groups[kept] == group) == 4 and len(set(weights[groups[kept] == group])) == 1
+    for drawn, weights in splits.group_bootstraps(rows, groups, 3):
+        assert set(drawn) <= set(rows) and weights.sum() == len(rows)
+        for group in np.unique(groups[drawn]):
+            assert np.sum(groups[drawn] == group) == 4 and len(set(weights[groups[drawn] == group])) == 1
     assert not list(splits.group_bootstraps(rows, groups, 0))
 
 

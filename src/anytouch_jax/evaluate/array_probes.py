@@ -160,7 +160,12 @@ def probe_features(
     data, rows, notes = check_rows(features, labels, groups, split, measured=measured)
     head = head or ProbeHead()
     selected = select_option(head, data, rows, protocol)
-    notes += _selection_notes(selected, head)
+    if selected.chosen_on == "test":
+        notes += ("chosen on test, as the authors' code does: an upper estimate",)
+    scores = np.asarray(selected.scores)
+    at_edge = len(scores) and selected.place in (0, len(scores) - 1) and np.sum(scores == scores.max()) == 1
+    if at_edge and head.name == "linear":
+        notes += (f"the chosen penalty {selected.option:g} lies at the edge of those tried",)
     head = replace(head, options=(selected.option,))
     best = data.fit(head, rows.fit)
     model = best.models[0] if best.models else None
@@ -212,16 +217,6 @@ def leave_groups_out(
     return replace(result, baseline=float(np.mean(baseline[used] == y[used])))
 
 
-def _selection_notes(selected: Selection, head: ProbeHead) -> Notes:
-    notes: Notes = ()
-    if selected.chosen_on == "test":
-        notes += ("chosen on test, as the authors' code does: an upper estimate",)
-    alone = len(selected.scores) and np.count_nonzero(np.asarray(selected.scores) == np.max(selected.scores)) == 1
-    if alone and head.name == "linear" and selected.place in (0, len(selected.scores) - 1):
-        notes += (f"the chosen penalty {selected.option:g} lies at the edge of those tried",)
-    return notes
-
-
 def _result(
     name: str, protocol: Protocol, data: LabelledFeatures, rows: Split, predicted: Array, selected: Selection | None,
     notes: Notes, subsets: Subsets | None,
@@ -270,7 +265,7 @@ def check_rows(
     sizes = {"features": len(x), "labels": len(labels), "groups": len(groups), "split": len(split)}
     if x.ndim != 2 or len(set(sizes.values())) != 1:
         raise UserError(f"A probe needs features (n, d) and n labels, groups and splits, not {x.shape} and {sizes}.")
-    y, names, has_label = _measured_labels(labels) if measured else _class_labels(labels)
+    y, names, has_label = _parse_labels(labels, measured)
     rows = Split(*(np.flatnonzero((split == part) & has_label) for part in ("train", "val", "test")))
     for part, ids in (("train", rows.fit), ("test", rows.test))[: 1 + tested]:
         if not len(ids):
@@ -309,20 +304,19 @@ def unlearned_note(tested: Array, learned: Array, names: Array) -> list[str]:
     return [f"{len(unknown)} test rows of classes that train lacks count as errors: {listed}"] if len(unknown) else []
 
 
-def _class_labels(labels: Any) -> tuple[Array, Array, Array]:
-    """Return class numbers (-1: no label), the sorted names, and which rows have a label."""
-    texts = np.array([label_text(value) for value in np.asarray(labels, object)], dtype=str)
+def _parse_labels(labels: Any, measured: bool) -> tuple[Array, Array, Array]:
+    """Return class numbers (-1: no label) or floats, the sorted class names, and which rows have a label."""
+    values = np.asarray(labels, object)
+    if measured:
+        try:
+            y = np.array([np.nan if value in (None, "") else float(value) for value in values], np.float64)
+        except ValueError as error:
+            raise UserError(f"The label is not a number ({error}). Use the linear probe for classes.") from None
+        return y, np.array([], str), np.isfinite(y)
+    texts = np.array([label_text(value) for value in values], dtype=str)
     has_label, y = texts != "", np.full(len(texts), -1)
     names, y[has_label] = np.unique(texts[has_label], return_inverse=True)
     return y, names, has_label
-
-
-def _measured_labels(labels: Any) -> tuple[Array, Array, Array]:
-    try:
-        y = np.array([np.nan if v in (None, "") else float(v) for v in np.asarray(labels, object)], np.float64)
-    except ValueError as error:
-        raise UserError(f"The label is not a number ({error}). Use the linear probe for classes.") from None
-    return y, np.array([], str), np.isfinite(y)
 
 
 def _listed(items: Array) -> str:
@@ -364,7 +358,8 @@ def probe_table(results: Sequence[ProbeResult | Mapping[str, Any]], paper: float
             lines += _result_lines(result)
             notes += [f"- {result.probe} ({result.protocol}): {note}" for note in result.notes]
         else:
-            lines.append(_task_line(result))
+            names = {name: result.get(name, "") for name in ("features", "task", "head", "protocol")}
+            lines.append(names | _score_cells(result))
             notes += [f"- {result['task']}: {note}" for note in result["notes"]]
     if paper is not None:
         notes.append(f"- the paper reports {100 * paper:.2f} % for AnyTouch, its epoch chosen on test")
@@ -375,42 +370,33 @@ def probe_table(results: Sequence[ProbeResult | Mapping[str, Any]], paper: float
 
 def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
     """Return the cells of a result, and of its parts, by column."""
-    line = {"probe": result.probe, "protocol": result.protocol}
+    line = {"probe": result.probe, "protocol": result.protocol} | _score_cells({
+        "metric": "r2" if result.measured else "accuracy", "mean": result.r2 if result.measured else result.accuracy,
+        "low": result.low, "high": result.high, "chance": result.baseline, "mae": result.mae, "unit": "",
+        "chance_mae": result.baseline_mae, "train": result.n_train, "test": result.n_test, "groups": result.test_groups,
+    })  # fmt: skip
     if result.measured:
-        line |= _score_cells("r2", result.r2, result.low, result.high, result.baseline_mae, result.mae)
         line["MAE 95 %"] = _interval(result.mae_low, result.mae_high, 1.0, 3)
     else:
-        refits = f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}"
-        line |= _score_cells("accuracy", result.accuracy, result.low, result.high, result.baseline)
-        line |= {"balanced": _share(result.balanced_accuracy), "refits": refits if result.seeds else "-"}
-    line |= {"train": str(result.n_train), "test (groups)": f"{result.n_test} ({result.test_groups})"}
-    line |= {} if result.measured else {"classes": str(len(result.classes))}
+        refits = f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}" if result.seeds else "-"
+        line |= {"balanced": _share(result.balanced_accuracy), "refits": refits, "classes": str(len(result.classes))}
     line["penalty or k"] = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
-    parts = []
-    for part in result.parts:
-        cells = {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol}
-        cells |= {"score": _share(part.accuracy), "95 %": _interval(part.low, part.high)}
-        parts.append(cells | {"test (groups)": str(part.n_test)})
+    parts = [
+        {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol, "score": _share(part.accuracy),
+         "95 %": _interval(part.low, part.high), "test (groups)": str(part.n_test)}
+        for part in result.parts
+    ]  # fmt: skip
     return [line, *parts]
 
 
-def _task_line(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return the cells of a row of `score_tasks` by column."""
-    mae, chance = (row["mae"], row["chance_mae"]) if row["metric"] == "r2" else (None, row["chance"])
-    line = {"features": row.get("features", ""), **{name: row[name] for name in ("task", "head", "protocol")}}
-    line |= _score_cells(row["metric"], row["mean"], row["low"], row["high"], chance, mae, row.get("unit", ""))
-    return line | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
-
-
-def _score_cells(
-    metric: str, value: float, low: float | None, high: float | None, chance: float, mae: float | None = None,
-    unit: str = "",
-) -> dict[str, str]:  # fmt: skip
-    """Return the cells of a score, its interval and chance; errors in `unit`."""
-    if metric != "r2":
-        return {"score": _share(value), "95 %": _interval(low, high), "chance": _share(chance)}
-    score = f"R2 {value:.3f}, {mae:.3g} {unit}".strip()
-    return {"score": score, "95 %": _interval(low, high, 1.0, 3), "chance": f"{chance:.3g} {unit}".strip()}
+def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
+    """Return the cells of a row of `score_tasks` that every table has."""
+    cells = {"score": _share(row["mean"]), "95 %": _interval(row["low"], row["high"]), "chance": _share(row["chance"])}
+    if row["metric"] == "r2":
+        mae, chance = (f"{row[name]:.3g} {row['unit']}".strip() for name in ("mae", "chance_mae"))
+        interval = _interval(row["low"], row["high"], 1.0, 3)
+        cells = {"score": f"R2 {row['mean']:.3f}, {mae}", "95 %": interval, "chance": chance}
+    return cells | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
 
 
 def _share(value: float | None) -> str:

@@ -38,7 +38,7 @@ COMPONENTS = 200  # principal components of raw pixels
 
 
 class FeatureStore:
-    """Features by row and length of clip, each computed once and, with a `folder`, kept in one .npz a content.
+    """Features by row and length of clip, each computed once and, with a `folder`, stored in an .npz named by content.
 
     `describe()` names everything else that they depend on. It is called only if there is a folder.
     """
@@ -54,7 +54,11 @@ class FeatureStore:
     def add(self, rows: Array, frames: int) -> None:
         """Compute the missing features of these rows (any shape) in one pass."""
         if frames not in self._rows:
-            self._load(frames)
+            self._rows[frames], self._values[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
+            broken = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)  # such a file is written again
+            if self._folder is not None and self.file(frames).exists():
+                with contextlib.suppress(*broken), self.file(frames).open("rb") as file, np.load(file) as arrays:
+                    self._rows[frames], self._values[frames] = arrays["rows"], arrays["features"]
         missing = np.setdiff1d(rows, self._rows[frames])
         if not len(missing):
             return
@@ -65,8 +69,8 @@ class FeatureStore:
         self._rows[frames], self._values[frames] = every[order], np.concatenate(known)[order]
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
-            about = {"about": json.dumps(self._about | {"frames": frames}, sort_keys=True)}
-            save_npz(self.file(frames), Features(self._values[frames], self._rows[frames], {}), about)
+            features = Features(self._values[frames], self._rows[frames], {})
+            save_npz(self.file(frames), features, {"about": self._text(frames)})
 
     def get(self, rows: Array, frames: int) -> Array:
         """Return features f32 (n, k * d) of `rows` (n, k), those of a row joined."""
@@ -76,29 +80,16 @@ class FeatureStore:
 
     def file(self, frames: int) -> Path:
         """Return the file of features of clips of this length."""
-        text = json.dumps(self._about | {"frames": frames}, sort_keys=True)
-        return Path(self._folder or ".") / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
+        return Path(self._folder or ".") / f"{hashlib.sha256(self._text(frames).encode()).hexdigest()[:32]}.npz"
 
-    def _load(self, frames: int) -> None:
-        self._rows[frames], self._values[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
-        if self._folder is None or not self.file(frames).exists():
-            return
-        broken = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-        with contextlib.suppress(*broken), self.file(frames).open("rb") as file, np.load(file) as arrays:
-            self._rows[frames], self._values[frames] = arrays["rows"], arrays["features"]
+    def _text(self, frames: int) -> str:
+        return json.dumps(self._about | {"frames": frames}, sort_keys=True)
 
 
 def encoder_features(
-    encoder: Encoder,
-    table: Manifest,
-    *,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    order: Order = "right",
-    universal: bool = False,
-    folder: Path | None = None,
-    log: Callable[[str], None] = lambda _: None,
-) -> FeatureStore:
+    encoder: Encoder, table: Manifest, *, pooling: Pooling = "class", join: Join = "mean", order: Order = "right",
+    universal: bool = False, folder: Path | None = None, log: Callable[[str], None] = lambda _: None,
+) -> FeatureStore:  # fmt: skip
     """Return the features of an encoder; `universal`: the universal tokens for every sensor.
 
     An unknown sensor gets these too, which is reported by `log`.
@@ -179,15 +170,13 @@ def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
         return np.repeat(clips[:, -1:], frames, axis=1)
     if order != "shuffled":
         raise UserError(f"Unknown order {order!r}. Choose right, shuffled or repeated.")
-    return np.stack([clip[_derangement(frames, int(row))] for clip, row in zip(clips, rows, strict=True)])
-
-
-def _derangement(frames: int, row: int) -> Array:
-    rng = np.random.default_rng([13, row])
-    while True:
-        order = rng.permutation(frames)
-        if (order != np.arange(frames)).any():
-            return order
+    shuffled = np.empty_like(clips)
+    for place, row in enumerate(rows):
+        rng, drawn = np.random.default_rng([13, int(row)]), np.arange(frames)
+        while (drawn == np.arange(frames)).all():
+            drawn = rng.permutation(frames)
+        shuffled[place] = clips[place, drawn]
+    return shuffled
 
 
 def _content(table: Manifest, parameters: str, order: Order) -> dict[str, Any]:

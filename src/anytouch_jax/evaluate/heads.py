@@ -108,7 +108,8 @@ def fit_head(
 ) -> FittedHead:
     """Fit all options of a head on features f32 (n, d) and class numbers below `classes` (0: y are numbers).
 
-    `weights` (n,): how often each row counts, whole times but in logistic regression. `start` is where that starts.
+    `weights` (n,): how often each row counts, a whole number except in logistic regression. `start`: a fit that it
+    starts from.
     """
     defaults = {
         "linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": range(1, head.recipe.epochs + 1)
@@ -135,14 +136,9 @@ def head_score(predicted: Array, truth: Array, classes: int) -> float:
 
 
 def linear_path(
-    x: Array,
-    y: Array,
-    penalties: Sequence[float],
-    *,
-    scaling: Scaling = "column",
-    weights: Array | None = None,
+    x: Array, y: Array, penalties: Sequence[float], *, scaling: Scaling = "column", weights: Array | None = None,
     start: LinearModel | None = None,
-) -> list[LinearModel]:
+) -> list[LinearModel]:  # fmt: skip
     """Return logistic regression of `y` (n,) for each penalty, strongest first, each started from the one before.
 
     `weights` (n,): how often each row counts. `start`: a fit of the same classes to start from.
@@ -195,7 +191,7 @@ def _fit_neighbours(x: Array, y: Array, classes: int, options: Sequence[float]) 
     def unit(rows: Array) -> Array:
         return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12))
 
-    z_train, numbers = unit(x), [int(k) for k in options]
+    z_train, numbers = unit(x), list(map(int, options))
 
     def predict(rows: Array) -> list[Array]:
         near, cosines = nearest(z_train, unit(rows), max(numbers))
@@ -262,7 +258,7 @@ def _fit_gradient(
     )
     init, step = _gradient_step(recipe, classes)
     state, batch, epochs = init(params), min(recipe.batch, n), list[tuple[Array, Array]]()
-    steps = n // batch
+    steps = n // batch  # the last, smaller batch of an epoch is left out
     for epoch in range(recipe.epochs):
         for number, rows in enumerate(rng.permutation(n)[: steps * batch].reshape(steps, batch), epoch * steps):
             rate = recipe.rate * 0.5 * (1 + np.cos(np.pi * number / (steps * recipe.epochs)))

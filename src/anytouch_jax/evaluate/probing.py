@@ -24,18 +24,10 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, feature_cache, logistic, splits, statistics, tasks
+from anytouch_jax.evaluate import array_probes, feature_cache, heads, logistic, splits, statistics, tasks
 from anytouch_jax.evaluate.array_probes import LabelledFeatures, ProbeResult
 from anytouch_jax.evaluate.feature_cache import FeatureStore, Order
-from anytouch_jax.evaluate.heads import (
-    GradientRecipe,
-    HeadName,
-    ProbeHead,
-    Scaling,
-    linear_head,
-    majority_class,
-    save_head,
-)
+from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, ProbeHead, Scaling
 from anytouch_jax.evaluate.splits import RowRoles, Split
 from anytouch_jax.evaluate.statistics import GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
@@ -104,7 +96,7 @@ def probe_label(
         if save is not None and source.encoder is not None and source.name != RANDOM and (tested := results[0].outcome):
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             assert tested.fitted is not None
-            save_head(save, linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint))
+            heads.save_head(save, heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint))
             log(f"{save}: the linear head")
     if leave_out is None:
         results.append(array_probes.majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
@@ -338,7 +330,7 @@ def _rows_by_length(plans: Sequence[_Plan]) -> dict[int, Array]:
 
 
 def _run_plans(
-    source: _Source, plans: Sequence[_Plan], seeds: int, heads: Sequence[HeadName], protocols: Sequence[Protocol],
+    source: _Source, plans: Sequence[_Plan], seeds: int, head_names: Sequence[HeadName], protocols: Sequence[Protocol],
     recipe: GradientRecipe | None, order: Order,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Return the rows of `score_tasks`."""
@@ -362,7 +354,7 @@ def _run_plans(
             unknown = sorted(set(plan.rows.sensors) - set(trained))
             notes += [f"universal tokens for {', '.join(unknown)}"] if unknown else []
         about = {"frames": plan.frames, "order": order if plan.frames > 1 else "right"}
-        for name, protocol in itertools.product(heads, protocols):
+        for name, protocol in itertools.product(head_names, protocols):
             head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
             scored = _score(labelled, plan, head, protocol, seeds)
             names = {"task": plan.task.name, "head": name, "protocol": protocol}
@@ -384,7 +376,7 @@ def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Proto
             option, predicted, finished = _predict(data, cut, dataclasses.replace(head, seed=seed), protocol)
             unfinished += not finished
             fitted = roles.y[cut.fit]
-            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else majority_class(fitted)))
+            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else heads.majority_class(fitted)))
             predictions.append(predicted)
             chosen.append(option)
             sizes.append(len(cut.fit))

@@ -26,10 +26,9 @@ class Split(NamedTuple):
 
 
 class RowRoles(NamedTuple):
-    """Labels `y` (n,), `groups` (n,), and boolean masks (n,) of what a row may be used for.
+    """Labels `y` (n,), numbers if `measured`; `groups` (n,); and boolean masks (n,) of the use of a row.
 
     `train`, `test`: by the manifest's split (val counts as train). `may_fit`, `may_test`: by sensor and unit.
-    `measured`: y is a number, not a class.
     """
 
     y: Array
@@ -103,10 +102,10 @@ def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str
     The manifest's split is kept if it keeps groups apart. If no class of test is in train, the test rows are cut into
     folds. If a group is in both, all rows are.
     """
-    if roles.measured and not roles.fitted.any():
-        return "folds", roles.test, "no row to fit on is in train: folds over the test rows, whole groups left out"
-    if not roles.measured and not np.isin(roles.y[roles.tested], roles.y[roles.fitted]).any():
-        return "folds", roles.test, "no class of test is in train: folds over the test rows, whole groups left out"
+    missing = "row to fit on" if roles.measured else "class of test"
+    fitted, tested = roles.y[roles.fitted], roles.y[roles.tested]
+    if not (len(fitted) if roles.measured else np.isin(tested, fitted).any()):
+        return "folds", roles.test, f"no {missing} is in train: folds over the test rows, whole groups left out"
     shared = np.intersect1d(roles.groups[roles.fitted], roles.groups[roles.tested])
     if len(shared):
         why = f"{len(shared)} groups are in train and test: folds over all rows instead, whole groups left out"

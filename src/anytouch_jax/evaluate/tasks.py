@@ -1,15 +1,14 @@
 """Probing tasks: which rows of a manifest, which label, which groups never stand on both sides of a split.
 
-A flip of a picture changes a direction label. Pre-training flips touches (`data.flip`, as the release), and flips the
-positive of a matching pair independently of its anchor. This teaches the encoder to overlook directions. Probes read
-every frame unflipped. To train with direction labels, set `--data.flip 0`, or change the label with `mirrored`.
+Probes read every frame unflipped, as a flip changes a direction label. Pre-training flips touches (`data.flip`), and
+the positive of a matching pair independently, which teaches the encoder to overlook directions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +23,11 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import GradientRecipe
 
 Array = npt.NDArray[Any]
+T = TypeVar("T")
 Which = Literal["all", "press", "contact", "moving"]
 
 FORCE, SCORE = 0.05, 7.0  # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
 GROUPS = ("grasp_group", "object", "touch")  # of a label probe: the first with a value that is not the label
-_TURNED = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
-_ACROSS, _DOWN = {"right": "left", "left": "right"}, {"up": "down", "down": "up"}
 
 
 @dataclass(frozen=True)
@@ -137,27 +135,25 @@ class TaskRows(NamedTuple):
 
 def find_task(task: str | Task) -> Task:
     """Return the task with that name. Raises UserError."""
-    if isinstance(task, Task):
-        return task
-    if task not in TASKS:
-        raise UserError(f"There is no task {task!r}. Choose among {', '.join(TASKS)}.")
-    return TASKS[task]
+    return task if isinstance(task, Task) else _choose(TASKS, task, "task")
 
 
 def find_benchmark(name: str) -> Benchmark:
     """Return the benchmark with that name. Raises UserError."""
-    if name not in BENCHMARKS:
-        raise UserError(f"There is no benchmark {name!r}. Choose among {', '.join(BENCHMARKS)}.")
-    return BENCHMARKS[name]
+    return _choose(BENCHMARKS, name, "benchmark")
+
+
+def _choose(known: Mapping[str, T], name: str, kind: str) -> T:
+    if name not in known:
+        raise UserError(f"There is no {kind} {name!r}. Choose among {', '.join(known)}.")
+    return known[name]
 
 
 def available_tasks(table: Manifest) -> tuple[str, ...]:
     """Return the tasks for which the manifest has a label on some row."""
-    columns = {name: _label_column(table, task) for name, task in TASKS.items()}
     paired = _has_values(table, _grasp_column(table)) and _has_values(table, "unit")
-    return tuple(
-        name for name, task in TASKS.items() if _has_values(table, columns[name]) and (paired or not task.fingers)
-    )
+    labelled = {name: task for name, task in TASKS.items() if _has_values(table, _label_column(table, task))}
+    return tuple(name for name, task in labelled.items() if paired or not task.fingers)
 
 
 def label_task(
@@ -212,16 +208,6 @@ def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> d
     return {f"{name} with a photograph or caption": mask, f"{name} without": ~mask}
 
 
-def mirrored(label: str, value: str, *, across: bool = False, down: bool = False) -> str:
-    """Return a direction label (column `label`) after the picture is flipped left to right or upside down."""
-    if label == "label.twist" and across != down:
-        return _TURNED.get(value, value)
-    if label == "label.slide":
-        value = _ACROSS.get(value, value) if across else value
-        value = _DOWN.get(value, value) if down else value
-    return value
-
-
 def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     """Return the rows of a task in the manifest's order; `frames` above the task's selects rows that end such a clip.
 
@@ -231,7 +217,12 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     if not _has_values(table, task.label):
         known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
         raise UserError(f"Task {task.name}: the manifest has no label in column {task.label!r}. It has {known}.")
-    labels, split = _labels(table, task), _split(table, task)
+    labels, split = _labels(table, task), text_column(table, "split")
+    if task.test_list is not None:  # whichever list decided the split of this manifest
+        if "downstream_test" not in table.table.column_names:
+            raise UserError(f"Task {task.name} needs the column downstream_test. Index the data set again.")
+        listed = [task.test_list in name.split("+") for name in text_column(table, "downstream_test")]
+        split = np.where(listed, "test", "train")
     used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
     used &= np.isin(split, ("train", "val", "test")) & ~np.isin(text_column(table, "sensor"), FIELD_SENSORS)
     for column, value in task.where:
@@ -298,16 +289,6 @@ def _numbers(table: Manifest, name: str) -> Array:
         return table.column(name).cast(pa.float64()).to_numpy().astype(np.float64)
     except pa.ArrowException:
         raise UserError(f"Column {name!r} contains text. This task needs numbers.") from None
-
-
-def _split(table: Manifest, task: Task) -> Array:
-    split = text_column(table, "split")
-    if task.test_list is None:
-        return split
-    if "downstream_test" not in table.table.column_names:
-        raise UserError(f"Task {task.name} needs the column downstream_test. Index the data set again.")
-    listed = [task.test_list in name.split("+") for name in text_column(table, "downstream_test")]
-    return np.where(listed, "test", "train")  # whichever list decided the split of this manifest
 
 
 def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
@@ -391,18 +372,13 @@ def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Arra
     notes = [f"{len(starts) - len(whole)} grasps without two fingers left out"] if len(starts) > len(whole) else []
     labelled = pairs[:, 0]
     if task.phase == "after":
-        pairs = _rows_after(table, pairs)
+        sequence, source = text_column(table, "sequence"), table.source  # of the form <grasp>/after/<finger>
+        after = {(source[row], sequence[row]): row for row in range(len(table)) if "/after/" in sequence[row]}
+        keys = [(source[row], sequence[row].replace("/during/", "/after/")) for row in pairs.ravel()]
+        pairs = np.array([after.get(key, -1) for key in keys], np.int64).reshape(pairs.shape)
         complete = (pairs >= 0).all(1)
         pairs, labelled = pairs[complete], labelled[complete]
         if not complete.all():
             notes.append(f"{np.sum(~complete)} grasps without both frames after left out")
     order = np.argsort(labelled)
     return pairs[order], labelled[order], tuple(notes)
-
-
-def _rows_after(table: Manifest, during: Array) -> Array:
-    """Return the rows after the grasp of rows during it, sequence <grasp>/after/<finger>; -1 for a missing one."""
-    sequence, source = text_column(table, "sequence"), table.source
-    places = {(source[row], sequence[row]): row for row in range(len(table)) if "/after/" in sequence[row]}
-    keys = [(source[row], sequence[row].replace("/during/", "/after/")) for row in during.ravel()]
-    return np.array([places.get(key, -1) for key in keys], np.int64).reshape(during.shape)

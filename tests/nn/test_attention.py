@@ -85,9 +85,9 @@ def test_a_masked_or_causal_call_takes_the_plain_form(monkeypatch):
     monkeypatch.setattr(module, "mapped", lambda *_: pytest.fail("mapped knows no mask"))
     q, k, v, _ = draw((2, 5, 2, 4))
     mask = jnp.asarray([[True] * 5, [True, True, False, False, False]])
-    out = attention(q, k, v, how="mapped", mask=mask)
+    out = attention(q, k, v, implementation="mapped", mask=mask)
     np.testing.assert_allclose(out[1], plain(q[1:, :, :], k[1:, :2], v[1:, :2])[0], rtol=1e-5, atol=1e-6)
-    causal = attention(q, k, v, how="auto", causal=True)
+    causal = attention(q, k, v, implementation="auto", causal=True)
     np.testing.assert_allclose(causal[:, 0], v[:, 0], rtol=1e-6)
 
 
@@ -98,7 +98,7 @@ def test_auto_maps_on_one_cpu_and_nowhere_else(monkeypatch):
     for devices, wanted in ((1, 1), (4, 0)):
         calls.clear()
         monkeypatch.setattr(jax, "device_count", lambda n=devices: n)
-        attention(q, k, v, how="auto")
+        attention(q, k, v, implementation="auto")
         assert len(calls) == wanted
 
 
@@ -117,5 +117,5 @@ def test_cudnn_does_what_it_can_and_xla_the_rest(monkeypatch, dtype, length, mas
         jax.nn, "dot_product_attention", lambda q, *_, implementation, **__: told.append(implementation) or q
     )
     q = jnp.zeros((1, length, 2, 4), dtype)
-    attention(q, q, q, how="cudnn", mask=jnp.ones((1, length), bool) if masked else None)
+    attention(q, q, q, implementation="cudnn", mask=jnp.ones((1, length), bool) if masked else None)
     assert told == [asked]

@@ -97,8 +97,8 @@ def test_the_callers_parameters_survive(tmp_path, devices, donates):
 def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monkeypatch, donates):
     states, seen, compiled = [], [], loop._Loop.compile
 
-    def watched(self, state, loss_fn):
-        step = compiled(self, state, loss_fn)
+    def watched(self, *args):
+        step = compiled(self, *args)
         return lambda state, *rest: states.append(state) or step(state, *rest)
 
     def report(step, params, batch):
@@ -317,8 +317,8 @@ def test_nothing_but_the_late_fetch_looks_at_a_result(tmp_path, monkeypatch):
     hide, show = (lambda tree: jax.tree.map(Unread, tree)), (lambda tree: jax.tree.map(lambda x: x.value, tree))
     fetch, compiled = jax.device_get, loop._Loop.compile
 
-    def hidden(self, state, loss_fn):
-        step = compiled(self, state, loss_fn)
+    def hidden(self, state, *args):
+        step = compiled(self, state, *args)
         first = iter([state])
         return lambda state, *rest: hide(step(next(first, None) or show(state), *rest))
 

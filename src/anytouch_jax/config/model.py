@@ -84,8 +84,7 @@ class ModelConfig:
     activation: Literal["gelu", "quick_gelu"] = "gelu"  # Activation of the encoders. OpenAI CLIP needs quick_gelu.
     norm_eps: float = 1e-5  # Epsilon of layer norms.
     decoder_norm_eps: float = 1e-12  # Epsilon of the decoder's layer norms.
-    # The authors' weights need it (golden C).
-    decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding.
+    decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
     lora_rank: int = 0  # Rank of the image tower's LoRA. 0: off.

@@ -14,21 +14,23 @@ from anytouch_jax.config import ModelConfig
 CACHE = 1_700_000  # bytes of logits that fit in a core's cache: six heads of a still at 262 tokens
 
 
-def attention(q: Array, k: Array, v: Array, *, how: str, causal: bool = False, mask: Array | None = None) -> Array:
+def attention(
+    q: Array, k: Array, v: Array, *, implementation: str, causal: bool = False, mask: Array | None = None
+) -> Array:
     """Return softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool marks keys to read.
 
-    `how` is "xla", "cudnn", "mapped", or "auto": mapped where one CPU does the work, XLA's own form elsewhere. A causal
-    or masked call is never mapped (text is short), nor one of few queries. cuDNN does what it can: 16 bits, an even Q,
-    no mask; XLA the rest.
+    `implementation` is "xla", "cudnn", "mapped" or "auto". "auto" is mapped on a single CPU device, else XLA. A causal
+    or masked call is never mapped (text is short), nor one with few queries. cuDNN needs 16 bits, an even Q and no
+    mask. XLA does the rest.
     """
     free = mask is None and not causal and q.shape == k.shape
-    if how == "auto":
-        how = "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
-    if how == "mapped" and free:
+    if implementation == "auto":
+        implementation = "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
+    if implementation == "mapped" and free:
         return mapped(q, k, v)
     keys = None if mask is None else mask[:, None, None, :]
     fit = mask is None and q.shape[1] % 2 == 0 and q.dtype in (jnp.bfloat16, jnp.float16)
-    known: Literal["cudnn", "xla"] = "cudnn" if how == "cudnn" and fit else "xla"
+    known: Literal["cudnn", "xla"] = "cudnn" if implementation == "cudnn" and fit else "xla"
     return jax.nn.dot_product_attention(q, k, v, mask=keys, is_causal=causal, implementation=known)
 
 

@@ -111,7 +111,7 @@ class Attention(nnx.Module):
 
     def __init__(self, stack: Stack, model: ModelConfig) -> None:
         self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
-        self.heads, self.how = stack.heads, model.attention
+        self.heads, self.implementation = stack.heads, model.attention
 
     def project(self, asks: Array, x: Array) -> tuple[Array, Array, Array]:
         parts = (self.query(asks), self.key(x), self.value(x))
@@ -120,7 +120,7 @@ class Attention(nnx.Module):
 
     def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:
         """Return (B, Q, H, D / H). `mask` (B, S) bool marks the keys to read."""
-        return attention(q, k, v, how=self.how, causal=causal, mask=mask)
+        return attention(q, k, v, implementation=self.implementation, causal=causal, mask=mask)
 
 
 class Mlp(nnx.Module):

@@ -1,7 +1,8 @@
 """Packing of small arrays into one vector, so that the optimiser has a few large kernels.
 
 A ViT has about twenty parameters a stack, and most are vectors. Updated one by one, they take longer to compile than
-the whole backward pass.
+the whole backward pass. `optax.adamw` on the packed vectors would need one state for each kind of batch, since a batch
+trains some parameters only.
 """
 
 from __future__ import annotations

@@ -236,6 +236,50 @@ def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
             list(images.frames_from_video(tmp_path / name))
 
 
+@pytest.mark.parametrize("kind", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_is_turned_as_its_tag_says(tmp_path, kind, orientation):
+    from PIL import Image, ImageOps
+
+    stored = Image.fromarray(np.add.outer(np.arange(40) * 2, np.arange(60)).astype(np.uint8)).convert("RGB")
+    tags = Image.Exif()
+    tags[274] = orientation
+    path = tmp_path / f"x.{kind}"
+    stored.save(path, exif=tags, **{"lossless": True} if kind == "webp" else {})
+    shown = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB")).astype(int)
+    got = images.decode(path)
+    assert got.shape == shown.shape == ((60, 40, 3) if orientation > 4 else (40, 60, 3))
+    assert np.abs(got - shown).max() < 3
+
+
+ODD = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x63\0\0\0\0\0\0"  # orientation 99
+
+
+@pytest.mark.parametrize("tags", [b"Exif\0\0", ODD])
+def test_an_odd_orientation_tag_leaves_the_picture(tmp_path, tags):
+    whole = _encoded(".jpg")
+    data = whole[:2] + b"\xff\xe1" + (len(tags) + 2).to_bytes(2) + tags + whole[2:]
+    np.testing.assert_array_equal(decode_bytes(data, "x"), decode_bytes(whole, "x"))
+
+
+def test_a_video_is_turned_as_its_tag_says(tmp_path):
+    path = tmp_path / "v.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 48))
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:24, :32] = 255  # white at the upper left
+    for _ in range(3):
+        writer.write(picture)
+    writer.release()
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44  # its matrix: by 90 degrees clockwise
+    data[at : at + 36] = b"".join(
+        (number % 2**32).to_bytes(4) for number in (0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30)
+    )
+    path.write_bytes(data)
+    frame = next(images.frames_from_video(path))
+    assert frame.shape == (64, 48, 3) and frame[5, 40].min() > 200 and frame[5, 5].max() < 50
+
+
 REAL = SHARED / "real_touch"
 
 

@@ -28,7 +28,7 @@ _COUNTED = {"frame", "frames", "frm", "f", "img", "image", "i", "picture", "pic"
 _COUNTED |= {"index", "idx", "no", "nr", "num", "n", "t", "time", "ts"}  # words before the number of a frame
 _SIDE = re.compile(r"\d|(?<![^\W_])(?:left|right|l|r|thumb|index|middle|ring|little|pinky)(?![^\W_])", re.IGNORECASE)
 
-# Since OpenCV 4.11; orientation tags are ignored as for other files.
+# Since OpenCV 4.11. Orientation tags are obeyed by `_upright`, as versions of OpenCV do it for other formats.
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
 if hasattr(cv2, "IMREAD_COLOR_RGB"):
     _JPEG_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -40,6 +40,7 @@ _HEADERS: dict[bytes, type[ImageFile.ImageFile]] = {
     b"BM": BmpImagePlugin.BmpImageFile,
     b"RIFF": WebPImagePlugin.WebPImageFile,
 }
+_ORIENTATION = 274  # a tag of EXIF and of a TIFF
 _WIDTH, _HEIGHT, _BITS, _ALPHA = 256, 257, 258, 338  # tags of a TIFF; _ALPHA is 2 for unassociated alpha
 _NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
@@ -61,8 +62,8 @@ def decode(path: str | Path) -> np.ndarray:
     """Return the image in `path`, a file or a row of a shard (`manifest.files`), as RGB u8 (h, w, 3).
 
     Grey becomes RGB, an alpha channel is dropped, 16 bits are scaled to 8, and floats are taken as 0..1. Reads PNG,
-    JPEG, TIFF, BMP, WebP and .npy, and ignores orientation tags. Raises ImageError for a missing, broken or too large
-    file, and for pixels that are NaN or outside 0..1.
+    JPEG, TIFF, BMP, WebP and .npy, and obeys orientation tags, as for a video. Raises ImageError for a missing, broken
+    or too large file, and for pixels that are NaN or outside 0..1.
     """
     path = path if isinstance(path, Path) else Path(path)  # copying a Path takes as long as reading the file
     try:
@@ -114,7 +115,7 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
 def _unpack(data: bytes) -> np.ndarray:
     if data[:6] == b"\x93NUMPY":
         return _unpack_npy(data)
-    _check_header(data)
+    orientation = _check_header(data)
     jpeg = data.startswith(_JPEG) and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
@@ -126,7 +127,16 @@ def _unpack(data: bytes) -> np.ndarray:
         if pixels.dtype not in (np.uint8, np.uint16, np.float32):  # of a TIFF; cvtColor refuses these types
             return pixels[..., 2::-1]
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
-    return pixels
+    return _upright(pixels, orientation)
+
+
+def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Return stored pixels (h, w) or (h, w, c) as they are to be shown; EXIF's orientations are 1 to 8."""
+    if orientation > 4:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    return pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
 
 
 def _unpack_npy(data: bytes) -> np.ndarray:
@@ -145,16 +155,20 @@ def _unpack_npy(data: bytes) -> np.ndarray:
     return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
-def _check_header(data: bytes) -> None:
-    """Raise ValueError unless `data` is whole and declares an image that OpenCV unpacks safely and correctly."""
+def _check_header(data: bytes) -> int:
+    """Return the EXIF orientation of a picture, 1 for a TIFF, which OpenCV turns itself.
+
+    Raises ValueError unless `data` is whole and declares an image that OpenCV unpacks safely and correctly.
+    """
     header = next((header for start, header in _HEADERS.items() if data.startswith(start)), None)
     if header is None and not data.startswith(_TIFF):
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
     if data.startswith(_PNG):
         _check_png(data)
-    stream = io.BytesIO(data)
+    stream, image = io.BytesIO(data), None
     try:
-        width, height = header(stream).size if header is not None else _tiff_size(stream)
+        image = header(stream) if header is not None else None
+        width, height = image.size if image is not None else _tiff_size(stream)
     except ValueError:
         raise
     except Exception as error:  # Pillow raises many types for a corrupt header, and its own for a bomb
@@ -165,6 +179,15 @@ def _check_header(data: bytes) -> None:
     # OpenCV fills the lost part of some cut JPEG files with grey. The stream is now behind the last header.
     if data.startswith(_JPEG) and data.find(b"\xff\xd9", stream.tell()) < 0:
         raise ValueError("the file is cut short")
+    return _orientation(image) if image is not None and "exif" in image.info else 1
+
+
+def _orientation(image: ImageFile.ImageFile) -> int:
+    try:
+        value = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # a corrupt tag; the picture itself may be whole
+        return 1
+    return value if value in range(1, 9) else 1
 
 
 def _check_png(data: bytes) -> None:

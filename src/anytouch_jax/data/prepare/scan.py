@@ -144,19 +144,27 @@ def _looks(pixels: np.ndarray) -> np.ndarray:
     largest black border, the mean range of a pixel's channels, and how much of the variance is noise from pixel to
     pixel (1: all of it).
     """
-    lines = pixels.max(axis=1), pixels.max(axis=0)
-    black = [_leading(line.max(axis=1) <= 16) for way in lines for line in (way, way[::-1])]
-    same = (pixels == pixels[-1, 0]).all(axis=(1, 2))[::-1]  # JPEG fills what is lost with exactly one grey
-    bottom = 0.0 if black[1] else _leading(same)
+    # OpenCV needs a tenth of NumPy's time for these.
+    rows, columns = (cv2.reduce(pixels, dim, cv2.REDUCE_MAX).reshape(-1, 3) for dim in (1, 0))
+    black = [
+        _leading(side) for most in (rows, columns) for dark in [most.max(axis=1) <= 16] for side in (dark, dark[::-1])
+    ]
+    least = cv2.reduce(pixels, 1, cv2.REDUCE_MIN).reshape(-1, 3)
+    same = ((rows == pixels[-1, 0]) & (least == pixels[-1, 0])).all(
+        axis=1
+    )  # a cut JPEG is filled with exactly one grey
+    bottom = 0.0 if black[1] else _leading(same[::-1])
     height, width = pixels.shape[:2]
     top, left = max(0, (height - _CROP) // 2), max(0, (width - _CROP) // 2)
-    grey = pixels[top : top + _CROP, left : left + _CROP].mean(axis=2, dtype=np.float32)
+    grey = cv2.cvtColor(pixels[top : top + _CROP, left : left + _CROP], cv2.COLOR_RGB2GRAY).astype(np.float32)
     variance = float(grey.var())
     noise = 0.0
     if variance > 100 and min(grey.shape) > 1:
         noise = min(float((np.diff(grey, axis=axis) ** 2).mean()) / (2 * variance) for axis in (0, 1))
-    spread = float(max(channel.std() for channel in pixels.reshape(-1, 3).T))
-    chroma = float((pixels.max(axis=2) - pixels.min(axis=2)).mean())
+    spread = float(cv2.meanStdDev(pixels)[1].max())
+    red, green, blue = cv2.split(pixels)
+    ranges = cv2.subtract(cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue))
+    chroma = float(cv2.mean(ranges)[0])
     return np.array([spread, bottom, max(black), chroma, noise], np.float32)
 
 

@@ -1,15 +1,19 @@
-"""Atomic writes and file locks."""
+"""Atomic writes, file locks, and .npz files read with limits."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
+
+import numpy as np
 
 
 @contextlib.contextmanager
@@ -56,6 +60,60 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         os.replace(part, path)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def placeholder(path: str | Path) -> str | None:
+    """Return the kind of a text file that takes the place of data ("a web page"); None for any other file."""
+    with open(path, "rb") as file:
+        start = file.read(512).removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if start.startswith((b"<!doctype html", b"<html", b"<?xml")):
+        return "a web page"
+    if start.startswith(b"version https://git-lfs"):
+        return "a Git LFS pointer"
+    return None
+
+
+def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = lambda _: True) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file by name. Raises OSError, or ValueError for a file that is not one.
+
+    Every header is read before any array. Pickled objects, sizes that the file does not have, and more than 1 GiB in a
+    file a quarter as large are refused. Arrays whose names are not `only` are zeros of their shape that take no memory.
+    """
+    if isinstance(file, str | Path) and (kind := placeholder(file)):
+        raise ValueError(f"it is {kind}; download the file itself")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = [(info, info.filename.removesuffix(".npy")) for info in archive.infolist()]
+            if len({name for _, name in members}) < len(members):
+                raise ValueError("two of its arrays have one name")
+            arrays = {name: _check_header(archive, info, name) for info, name in members}
+            total = sum(array.nbytes for name, array in arrays.items() if only(name))
+            stored = sum(info.compress_size for info, _ in members)
+            if total > max(1 << 30, 4 * stored):
+                raise ValueError(f"its arrays take {total:,} bytes in a file of {stored:,}")
+            for info, name in members:
+                if only(name):
+                    with archive.open(info) as member:
+                        arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+            return arrays
+    except (OSError, ValueError):
+        raise
+    except Exception as error:  # damaged bytes raise any type of error
+        raise ValueError(f"it is damaged or not an .npz file ({type(error).__name__}: {str(error)[:200]})") from error
+
+
+def _check_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> np.ndarray:
+    """Return zeros of the form of an array. Raises ValueError if it does not have the bytes that its header gives."""
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+        if read is None:
+            raise ValueError(f"its array {name[:80]} has an unknown form")
+        shape, _, dtype = read(member)
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or min(shape, default=0) < 0 or size != info.file_size - member.tell():
+            raise ValueError(f"its array {name[:80]} of shape {shape} has other bytes than its header says")
+    return np.broadcast_to(np.zeros((), dtype), shape)
 
 
 def _part(path: Path) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 
 import numpy as np
@@ -95,5 +97,15 @@ def test_an_adapted_run_and_an_export(anytouch, tiny_run, world, tmp_path):
     done = anytouch("info", tmp_path / "new").out
     assert f"the run {tiny_run}, with tokens of my_gel fitted to 0 frames" in done and "step" not in done
     (tmp_path / "encoder.bin").write_bytes(b"x")
-    (tmp_path / "encoder.bin.json").write_text('{"frames": 3}')
+    about = {"format": "anytouch_jax.export.1", "bytes": 1, "sha256": hashlib.sha256(b"x").hexdigest(), "frames": 3}
+    about |= {"image_size": 28, "features": 12, "platforms": ["cpu"], "sensors": {"universal": 0}}
+    about |= dict.fromkeys(("jax", "background", "pooling", "join", "dtype"), "x")
+    (tmp_path / "encoder.bin.json").write_text(json.dumps(about))
     assert "an exported encoder" in anytouch("info", tmp_path / "encoder.bin").out
+    for wrong in ({"frames": "3"}, {"sensors": {"digit": 5}}, {"bytes": 10**1000}, {"bytes": 2}):
+        (tmp_path / "encoder.bin.json").write_text(json.dumps(about | wrong))
+        done = anytouch("info", tmp_path / "encoder.bin")
+        assert done.status == 2 and "encoder.bin" in done.err and done.err.count("\n") == 1
+    (tmp_path / "encoder.bin.json").write_text(json.dumps(about))
+    (tmp_path / "encoder.bin").write_bytes(b"y")  # flipped
+    assert "is damaged" in anytouch("info", tmp_path / "encoder.bin").err

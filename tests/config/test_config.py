@@ -136,7 +136,7 @@ def test_wrong_json_is_an_error_that_names_the_key():
     assert "config.model.sensors must be a list" in spoilt(put("model", "sensors", "digit"))
     assert "twice" in spoilt(put("model", "sensors", ["digit", "digit", "universal"]))
     for text in ("{", "", "[1,"):
-        with pytest.raises(ConfigError, match="not a JSON configuration"):
+        with pytest.raises(ConfigError, match="configuration is not JSON"):
             from_json(text)
     with pytest.raises(ConfigError, match="config must be an object"):
         from_json("[]")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from runs import run_config
 from tiny_models import touch_model
+from weights_world import write_heads
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config, DataConfig, from_json, to_json
@@ -127,7 +128,7 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
 
 
 def test_an_encoder_of_a_weights_file(tmp_path):
-    """The shapes of the authors' files tell heads of width 64, unless our own metadata tells the model."""
+    """Our metadata stores the head counts; a file without it needs a config.json beside it."""
     wide = replace(touch_model().touch, width=64, heads=1)
     model = touch_model(touch=wide, decoder=replace(touch_model().decoder, width=32, heads=1))
     for heads, about in ((1, False), (4, True)):
@@ -137,6 +138,10 @@ def test_an_encoder_of_a_weights_file(tmp_path):
         metadata = {safetensors.MODEL_KEY: to_json(here)} if about else {}
         path = tmp_path / f"{heads}.safetensors"
         safetensors.write_safetensors(path, convert.to_release(params, here), metadata)
+        if not about:
+            with pytest.raises(UserError, match=r"1\.safetensors.*heads of .*touch \(width 64\)"):
+                load_encoder(path)
+            write_heads(tmp_path, here)
         found = load_encoder(path)
         np.testing.assert_array_equal(found.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
         assert found.config.model.touch == here.touch
@@ -150,6 +155,7 @@ def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_
     stored = np.asarray(params["touch"]["sensor_tokens"])
     authors, ours = convert.to_release(params, touch_model()), {safetensors.MODEL_KEY: to_json(touch_model())}
     safetensors.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
+    write_heads(tmp_path, touch_model())
     safetensors.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
     encoder, untold = (load_encoder(tmp_path / f"{name}.safetensors") for name in ("authors", "untold"))
     assert (
@@ -180,7 +186,7 @@ def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
     with pytest.raises(UserError, match="unknown type"):
         load_encoder(world)
     np.savez(tmp_path / "features.npz", values=np.zeros((2, 3), np.float32), path=np.array(["a.png", "b.png"]))
-    with pytest.raises(UserError, match=r"features\.npz has no weights: path is <U5, not numbers"):
+    with pytest.raises(UserError, match=r"features\.npz has no weights: path is <U5, not real numbers"):
         load_encoder(tmp_path / "features.npz")
 
 
@@ -189,7 +195,7 @@ def test_weights_that_are_not_finite_embed_nothing(tmp_path, tiny_run):
     params["touch"]["class_token"] = np.full_like(params["touch"]["class_token"], np.nan)
     about = {safetensors.MODEL_KEY: to_json(from_json(text).model)}
     safetensors.export_safetensors(tmp_path / "w.safetensors", params, about)
-    with pytest.raises(UserError, match="weights that are not finite: its training diverged"):
+    with pytest.raises(UserError, match=r"w\.safetensors: touch/class_token has values that are not finite"):
         load_encoder(tmp_path / "w.safetensors")
 
 

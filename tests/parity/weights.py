@@ -145,7 +145,7 @@ def checkpoint(case: Case) -> None:
     stored = read_arrays(case.folder / f"stage{stage}_params.npz")
     extra = {key for key in stored if key not in weights and key.endswith("sensor_token_proj.weight")}
     expected = {key: value for key, value in stored.items() if key not in extra}
-    ours, theirs = (flatten(convert.to_params(w, convert.detect_model(w))) for w in (weights, expected))
+    ours, theirs = (flatten(convert.to_params(w, convert.detect_form(w, {})[0])) for w in (weights, expected))
     _equal(case, "parameters", ours, theirs)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,13 +58,22 @@ def save_run(folder: Path, config: Config, params: Any, **metadata: Any) -> Path
 
 
 def save_clip(folder: Path, model: ModelConfig, params: Any) -> Path:
-    """The image and text towers of a model as a folder with HF CLIP weights."""
+    """The image and text towers of a model as a folder with HF CLIP weights and their head counts."""
     plain = replace(model, lora_rank=0)
     arrays = to_release({n: p for n, p in params.items() if n != "lora"}, plain, allow_extra=True)
     keys = release_names(plain, "clip")
     folder.mkdir(exist_ok=True)
     write_safetensors(folder / "model.safetensors", {key: arrays[key] for key in keys}, {"format": "pt"})
+    write_heads(folder, model)
     return folder
+
+
+def write_heads(folder: Path, model: ModelConfig) -> None:
+    """The config.json beside weights, with the head counts of a model alone."""
+    heads = {name: stack.heads for name in ("touch", "decoder", "image") if (stack := getattr(model, name))}
+    heads |= {"text": model.text.stack.heads} if model.text else {}
+    settings = {name: {"heads": count} for name, count in heads.items()}
+    (folder / "config.json").write_text(json.dumps({"model": settings}))
 
 
 def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:

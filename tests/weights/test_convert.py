@@ -251,15 +251,14 @@ def test_a_probe_file_gives_encoder_and_classifier():
 def test_detects_the_model(layout):
     model = {"stage1": DECODER_TOKENS, "stage2": STAGE2}.get(layout, STAGE2)
     weights = weights_of(model, layout) if layout != "openclip" else openclip_of(params_of(model), model)
-    detected = detect_model(weights, heads=4, decoder_heads=2)
+    detected = detect_model(weights, {"touch": 4, "image": 4, "decoder": 2, "text": 2})
     decoder = Stack(512, 8, 16, 2048) if layout in ("clip", "openclip", "probe") else model.decoder
-    text = replace(model.text, stack=Stack(10, 2, 1, 14)) if model.text else None
     if layout in ("clip", "openclip"):
-        expected = replace(model, decoder=decoder, text=text, match_head="none", lora_rank=0)
+        expected = replace(model, decoder=decoder, match_head="none", lora_rank=0)
     elif layout == "probe":
         expected = replace(STAGE1, decoder=decoder)
     else:
-        expected = replace(model, text=text)
+        expected = model
     assert detected == expected
     to_params(weights, detected)
 
@@ -268,6 +267,19 @@ def test_detects_heads_as_clip_and_the_authors_choose_them():
     shapes = release_shapes(preset("large").model)
     weights = {key: np.broadcast_to(np.float32(0), shape) for key, shape in shapes.items()}
     assert detect_model(weights) == preset("large").model
+
+
+@pytest.mark.parametrize("name", ["tiny", "small", "base", "large"])
+def test_head_counts_are_right_or_refused_for_every_preset(name):
+    model = preset(name, stage=2, recipe="release").model
+    weights = {key: np.broadcast_to(np.float32(0), shape) for key, shape in release_shapes(model).items()}
+    if name == "tiny":  # 192 wide with 6 heads: width / 64 would be 3
+        with pytest.raises(UserError, match=r"touch \(width 192\).*config\.json"):
+            detect_model(weights)
+    else:
+        assert detect_model(weights) == model
+    heads = {"touch": model.touch.heads, "image": model.image.heads, "decoder": model.decoder.heads}
+    assert detect_model(weights, {**heads, "text": model.text.stack.heads}) == model
 
 
 def test_foreign_weights_are_named():

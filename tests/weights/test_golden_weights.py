@@ -9,7 +9,7 @@ import pytest
 from places import SHARED
 
 from anytouch_jax.config import Stack
-from anytouch_jax.weights.convert import detect_model, release_names, to_params, to_release
+from anytouch_jax.weights.convert import detect_form, detect_model, release_names, to_params, to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.load import read_weights
 from anytouch_jax.weights.tree import flatten
@@ -30,7 +30,7 @@ def same(first, second) -> None:
 def test_the_authors_checkpoint_holds_the_golden_parameters(stage):
     from_torch = read_weights(GOLDEN / f"{stage}_tiny_checkpoint-0.pth")
     arrays = read_weights(GOLDEN / f"{stage}_params.npz")
-    model = detect_model(from_torch)
+    model, _ = detect_form(from_torch, {})
     params = to_params(from_torch, model)
     same(params, to_params(arrays, model, ignore={"sensor_token_proj.weight"}))
     assert {name: leaf.shape for name, leaf in flatten(params).items()} == param_shapes(model)
@@ -42,21 +42,20 @@ def test_the_authors_checkpoint_holds_the_golden_parameters(stage):
 
 def test_the_detected_model_has_the_recorded_sizes():
     sizes = json.loads((GOLDEN / "stage2_params.json").read_text())["config"]
-    model = detect_model(
-        read_weights(GOLDEN / "stage2_params.npz"), heads=sizes["heads"], decoder_heads=sizes["dheads"]
-    )
+    heads = {"touch": sizes["heads"], "image": sizes["heads"], "decoder": sizes["dheads"], "text": sizes["heads"]}
+    model = detect_model(read_weights(GOLDEN / "stage2_params.npz"), heads)
     tower = Stack(sizes["hidden"], sizes["layers"], sizes["heads"], sizes["mlp"])
     assert model.touch == model.image == tower
     assert model.decoder == Stack(sizes["dh"], sizes["dl"], sizes["dheads"], sizes["dmlp"])
     assert (model.image_size, model.patch, model.embed) == (sizes["image"], sizes["patch"], sizes["proj"])
     assert (model.lora_rank, model.match_head, model.frames) == (sizes["lora_r"], "linear", 3)
     assert (model.text.vocab, model.text.length) == (sizes["vocab"], sizes["maxpos"])
-    assert detect_model(read_weights(GOLDEN / "stage1_params.npz")).decoder_sensor_tokens
+    assert detect_form(read_weights(GOLDEN / "stage1_params.npz"), {})[0].decoder_sensor_tokens
 
 
 def test_clip_parameters_fill_both_towers():
     weights = read_weights(GOLDEN / "J_clip_params.npz")
-    model = detect_model(weights)
+    model, _ = detect_form(weights, {})
     params = to_params(weights, model)
     expected = {
         name: shape for name, shape in param_shapes(model).items() if name.split("/")[0] not in ("touch", "decoder")

@@ -18,6 +18,7 @@ from weights_world import (
     save_clip,
     save_run,
     weights_of,
+    write_heads,
 )
 
 from anytouch_jax.config import SENSORS, UNIVERSAL
@@ -82,6 +83,7 @@ def test_the_authors_weights_are_known_by_their_table(tmp_path):
     params = params_of(config.model)
     path = tmp_path / "authors.safetensors"
     write_safetensors(path, to_release(params, config.model), {"format": "pt"})
+    write_heads(tmp_path, config.model)
     tokens = load_model(path).params["touch"]["sensor_tokens"]
     for row in range(len(SENSORS)):
         np.testing.assert_array_equal(tokens[row], params["touch"]["sensor_tokens"][row if row < 5 else -1])
@@ -183,10 +185,14 @@ def test_a_start_that_does_not_fit_names_the_options(stage1, tmp_path):
     small = replace(tiny_config(2, touch=wide), preset="small")
     with pytest.raises(UserError, match=r"add --preset tiny$"):
         start(small, init=run)
-    # A file without our metadata: its head counts are guessed, and not compared.
-    file = tmp_path / "authors.safetensors"
+    file = tmp_path / "authors.safetensors"  # without metadata
     write_safetensors(file, to_release(params, config.model), {})
-    start(tiny_config(2, touch=replace(touch, heads=1)), init=file)
+    with pytest.raises(UserError, match=r"heads of .*touch \(width 16\).*config\.json"):
+        start(tiny_config(2), init=file)
+    write_heads(tmp_path, config.model)
+    start(tiny_config(2), init=file)
+    with pytest.raises(UserError, match=r"--model\.touch\.heads 2$"):
+        start(tiny_config(2, touch=replace(touch, heads=1)), init=file)
     export_safetensors(tmp_path / "half.safetensors", {"touch": params["touch"]}, load_model(run).export_metadata())
     with pytest.raises(UserError, match="no touch encoder and decoder"):
         start(tiny_config(2), init=tmp_path / "half.safetensors")
@@ -305,17 +311,19 @@ def test_stage2_takes_each_part_from_its_source():
     ],
 )
 def test_the_activation_of_clip_is_read_from_its_folder(tmp_path, beside, activation):
-    for name, content in beside.items():
-        (tmp_path / name).write_text(json.dumps(content))
+    heads = {"model": {name: {"heads": 2} for name in ("touch", "decoder", "image", "text")}}
+    for name, content in (("config.json", {}), *beside.items()):
+        (tmp_path / name).write_text(json.dumps(content | heads))
     assert model_of_file(tmp_path / "clip.bin", weights_of(STAGE2, "clip")).activation == activation
     assert model_of_file(tmp_path / "x.bin", weights_of(STAGE1)).activation == "gelu"  # the authors' own
 
 
 def test_an_activation_that_the_network_lacks_is_refused(tmp_path):
     file, clip = tmp_path / "config.json", weights_of(STAGE2, "clip")
+    heads = '{"model": {"image": {"heads": 2}, "text": {"heads": 2}}, '
     for text, word in (
-        ('{"vision_config": {"hidden_act": "relu"}}', "relu"),
-        ('{"vision_config": {"hidden_act": "gelu"}, "text_config": {"hidden_act": "quick_gelu"}}', "gelu and quick"),
+        (heads + '"vision_config": {"hidden_act": "relu"}}', "relu"),
+        (heads + '"vision_config": {"hidden_act": "gelu"}, "text_config": {"hidden_act": "quick_gelu"}}', "gelu and q"),
         ("{", "not JSON"),
     ):
         file.write_text(text)

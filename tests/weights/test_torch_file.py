@@ -73,7 +73,7 @@ def test_opens_the_usual_wrappings(torch_files, wrapper):
     content = (
         {wrapper: state, "optimizer": {"state": {0: ordered}}, "args": namespace, "epoch": 3} if wrapper else state
     )
-    assert list(read_torch(torch_files.write(content))) == ["a", "b"]
+    assert list(read_weights(torch_files.write(content))) == ["a", "b"]
 
 
 def test_a_parameter_is_its_tensor(torch_files):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
 from anytouch_jax.errors import UserError
 
 _TABLES = (".csv", ".parquet")
-_WEIGHTS = (".safetensors", ".pth", ".pt", ".bin", ".npz")
+_WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 
 @dataclass(frozen=True)
@@ -40,14 +39,17 @@ def _lines(path: Path) -> list[str]:
         raise UserError(f"there is no {path}")
     if path.is_dir():
         return _folder(path)
-    description = path.with_name(f"{path.name}.json")  # `export.describes`, without its import of jax
+    description = path.with_name(f"{path.name}.json")
     if description.is_file():
+        from anytouch_jax.encoder.export import read_checked
+
+        read_checked(path)
         return [f"{path}: an exported encoder", description.read_text("utf-8").strip()]
     if path.suffix.lower() in _TABLES:
         return _manifest(path)
-    if path.suffix == ".npz" and (lines := _features(path) or _head(path)):
+    if path.suffix.lower() == ".npz" and (lines := _features(path) or _head(path)):
         return lines
-    if path.suffix in _WEIGHTS:
+    if path.suffix.lower() in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path)
     known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
     raise UserError(f"{path} has no known format. Known are {known}.")
@@ -102,10 +104,11 @@ def _run(path: Path) -> list[str]:
     ]
 
 
-def _model(model: ModelConfig) -> str:
+def _model(model: ModelConfig, *, heads_known: bool = True) -> str:
     touch = model.touch
+    heads = f"{touch.heads} heads" if heads_known else "heads unknown"
     return (
-        f"touch encoder: width {touch.width}, depth {touch.depth}, {touch.heads} heads, images of {model.image_size} "
+        f"touch encoder: width {touch.width}, depth {touch.depth}, {heads}, images of {model.image_size} "
         f"pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} features"
     )
 
@@ -127,14 +130,17 @@ def _weights(path: Path) -> list[str]:
     owners = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
     layout = detect_layout(weights)
     names = owners.get(layout, f"the authors' ({layout})")
-    model = load.model_of_file(path, weights)
+    model, unknown = load.form_of_file(path, weights)
     count = sum(array.size for array in weights.values())
-    finite = all(np.isfinite(array).all() for array in weights.values() if array.dtype.kind == "f")
+    infinite = [name for name, array in weights.items() if not np.isfinite(array).all()]
+    activation = load.clip_activation(path) if layout in ("clip", "openclip") else model.activation
     return [
         f"{path}: {len(weights)} arrays of {count:,} numbers, with {names} names",
-        _model(model),
+        _model(model, heads_known=not unknown.keys() & {"touch", "image"}),
+        *([] if activation else ["The activation is unknown. OpenAI's CLIP wants quick_gelu."]),
+        *([f"Its head counts are unknown ({', '.join(unknown)}): a config.json gives them."] if unknown else []),
         *([] if layout in ("clip", "openclip") else [_sensors(model, load.trained_sensors(metadata, model))]),
-        *([] if finite else ["Some of them are not finite, so that they cannot embed anything."]),
+        *([f"{infinite[0]} is not finite, so that these weights cannot embed anything."] if infinite else []),
     ]
 
 
@@ -165,19 +171,22 @@ def _manifest(path: Path) -> list[str]:
 
 
 def _features(path: Path) -> list[str]:
-    """Return lines about features of `anytouch embed`; [] for another .npz."""
-    import numpy as np
+    """Return lines about features of `anytouch embed`; [] for another .npz. Raises UserError for a damaged file."""
+    from anytouch_jax.files import read_arrays
 
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        return []
+        arrays = read_arrays(path, only=lambda name: name.startswith("about/"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}") from None
     if not {"features", "rows"} <= arrays.keys():
         return []
-    values = arrays["features"]
+    values, rows = arrays["features"], arrays["rows"]
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or rows.shape != values.shape[:1]:
+        raise UserError(f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}.")
     keys = [name.removeprefix("key/") for name in arrays if name.startswith("key/")]
-    metadata = [f"{name.removeprefix('about/')}: {arrays[name]}" for name in arrays if name.startswith("about/")]
+    metadata = [
+        f"{name.removeprefix('about/')}: {str(arrays[name])[:200]}" for name in arrays if name.startswith("about/")
+    ]
     return [
         f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}",
         *metadata,
@@ -187,11 +196,11 @@ def _features(path: Path) -> list[str]:
 def _head(path: Path) -> list[str]:
     """Return lines about a head of `anytouch probe label --save`; [] for another .npz."""
     from anytouch_jax.evaluate.heads import load_head
+    from anytouch_jax.files import read_arrays
 
-    try:
-        head = load_head(path)
-    except UserError:
+    if not {"format", "mark", "classes"} <= read_arrays(path, only=lambda _: False).keys():
         return []
+    head = load_head(path)
     options = f"--pooling {head.pooling} --frames {head.frames}"
     return [
         f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",

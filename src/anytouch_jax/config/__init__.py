@@ -11,6 +11,7 @@ from anytouch_jax.config.model import (
     TextTower,
     check_spelling,
 )
+from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.config.presets import preset
 from anytouch_jax.config.train import (
     CLIP_MEAN,
@@ -54,6 +55,7 @@ __all__ = [
     "Towers",
     "check_spelling",
     "from_json",
+    "parse_json",
     "preset",
     "to_json",
 ]

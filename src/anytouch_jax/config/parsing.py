@@ -1,10 +1,12 @@
-"""Strict reading of dataclasses from JSON, with ranges and choices of their fields."""
+"""Strict reading of JSON and of dataclasses from it, with ranges and choices of their fields."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
+import re
 import types
 import typing
 from typing import Any, Literal, NamedTuple
@@ -28,6 +30,53 @@ NORMAL = Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")
 SHARE = Range(0, 1, "0 to 1")
 SEED = Range(0, 2**32 - 1, "0 to 4294967295")
 BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
+_HALF_PAIR = re.compile("[\ud800-\udfff]")
+
+
+_JSON_BYTES, _JSON_DEPTH, _JSON_DIGITS = 1 << 26, 64, 40
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of JSON of at most 64 MiB, 64 levels and 40 digits a number.
+
+    Raises ConfigError with a clause such as "is not JSON" for other text, and for values that no file of ours has: NaN,
+    infinite numbers, and halves of a Unicode pair. All readers of JSON use it.
+    """
+    if len(text) > _JSON_BYTES:
+        raise ConfigError(f"has {len(text):,} bytes of JSON, more than {_JSON_BYTES:,}")
+
+    def number(digits: str, kind: type[int] | type[float] = int) -> float:
+        if len(digits) > _JSON_DIGITS:
+            raise ConfigError(f"has a number of {len(digits)} digits")
+        if not math.isfinite(value := kind(digits)):
+            raise ConfigError(f"has the number {digits}, which is out of range")
+        return value
+
+    try:
+        text = text.decode("utf-8") if isinstance(text, bytes) else text
+        numbers: Any = {"parse_int": number, "parse_float": functools.partial(number, kind=float)}
+        value = json.loads(text, parse_constant=functools.partial(number, kind=float), **numbers)
+    except RecursionError:
+        raise ConfigError(f"has more than {_JSON_DEPTH} levels of JSON") from None
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"is not JSON ({str(error)[:200]})") from None
+    level = [value]
+    for _ in range(_JSON_DEPTH):
+        inner: list[Any] = []
+        for item in level:
+            if isinstance(item, str):
+                if not item.isascii() and _HALF_PAIR.search(item):
+                    raise ConfigError("has half of a Unicode pair in a text")
+            elif isinstance(item, dict):
+                inner += [*item, *item.values()]
+            elif isinstance(item, list):
+                inner += item
+        if not inner:
+            return value
+        level = inner
+    raise ConfigError(f"has more than {_JSON_DEPTH} levels of JSON")
 
 
 def in_range(prefix: str, settings: Any, **ranges: Range) -> None:

@@ -223,9 +223,9 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
     the run cannot be continued. Raises ConfigError, which names an unknown, missing, mistyped or retired setting.
     """
     try:
-        data = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise ConfigError(f"not a JSON configuration: {error}") from None
+        data = parse_json(text)
+    except ConfigError as error:
+        raise ConfigError(f"the configuration {error}") from None
     if cls is Config and isinstance(data, dict):
         data = _modern(data, allow_retired)
     elif isinstance(data, dict):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jax import export as jax_export
 
-from anytouch_jax.config import UNIVERSAL
+from anytouch_jax.config import UNIVERSAL, parse_json
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
 
@@ -81,7 +81,7 @@ def describes(path: Path) -> Path:
 def load(path: str | Path) -> Exported:
     """Load the encoder that `export` wrote to `path`. Raises UserError if it is damaged or for another platform."""
     path = Path(path)
-    data, about = _read(path)
+    data, about = read_checked(path)
     if _here() not in about["platforms"]:
         raise UserError(f"{path} was exported for {', '.join(about['platforms'])}; this machine runs jax on {_here()}")
     try:
@@ -204,21 +204,45 @@ def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: J
     return worst, width
 
 
-def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """Return the bytes of an artefact and its description, after comparing them."""
+def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """Return the bytes of an artefact and its description, after comparing them. Raises UserError."""
     try:
-        data, text = path.read_bytes(), describes(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        data, text = path.read_bytes(), describes(path).read_bytes()
+    except OSError as error:
         missing = describes(path) if path.is_file() else path
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{missing} cannot be read: {reason}; an artefact is two files, FILE and FILE.json") from None
+        raise UserError(
+            f"{missing} cannot be read: {error.strerror or error}; an artefact is two files, FILE and FILE.json"
+        ) from None
     try:
-        about = json.loads(text)
+        about = parse_json(text)
         known = about["format"] == FORMAT
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{describes(path)} is not the description of an exported encoder; export it again") from None
     if not known:
-        raise UserError(f"{describes(path)} has format {about['format']!r}; this program reads {FORMAT!r}")
-    if len(data) != about.get("bytes") or hashlib.sha256(data).hexdigest() != about.get("sha256"):
+        raise UserError(f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}")
+    if wrong := [name for name, valid in _SCHEMA.items() if name not in about or not valid(about[name])]:
+        raise UserError(f"{describes(path)} is damaged: {wrong[0]} is missing or of another type; export it again")
+    if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:
         raise UserError(f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again")
     return data, about
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 < value < 1 << 40
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_rows(value: Any) -> bool:
+    return isinstance(value, dict) and bool(value) and list(value.values()) == list(range(len(value)))
+
+
+# The fields of a description that a caller needs, and the check of each.
+_SCHEMA: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("bytes", "frames", "image_size", "features"), _is_count),
+    **dict.fromkeys(("sha256", "jax", "background", "pooling", "join", "dtype"), _is_text),
+    "platforms": lambda value: isinstance(value, list) and bool(value) and all(map(_is_text, value)),
+    "sensors": _is_rows,
+}

@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -25,6 +24,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, save_npz, text_column
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 
 Array = npt.NDArray[Any]
 Order = Literal["right", "shuffled", "repeated"]
@@ -131,9 +131,8 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     clips of another length (by `about/frames`) and for missing rows.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # a foreign file raises whatever its bytes suggest
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
         raise UserError(f"{path} is not an npz file of plain arrays: {error}") from error
     if not {"features", "rows"} <= arrays.keys():
         raise UserError(f"{path} needs the arrays features (n, d) and rows (n,). It has {', '.join(arrays) or 'none'}.")
@@ -141,9 +140,13 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
     if values.ndim != 2 or not numeric or not len(rows) or rows.shape != values.shape[:1]:
         raise UserError(f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}.")
+    if not values.shape[1] or not np.isfinite(values).all():
+        raise UserError(f"{path}: the array features has no columns, or values that are not finite (NaN or infinite).")
     if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
         raise UserError(f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}.")
     paths = arrays.get("key/path")
+    if any(array.shape != rows.shape for name, array in arrays.items() if name.startswith("key/")):
+        raise UserError(f"{path}: its keys (key/path and others) must be one for each of the {len(rows)} rows.")
     if paths is not None and (paths != text_column(table, "path")[rows]).any() and len(table.files) == 1:
         raise UserError(f"{path} holds features of another manifest. Its paths differ from those of these rows.")
     order = np.argsort(rows)

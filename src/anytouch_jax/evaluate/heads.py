@@ -7,7 +7,6 @@ numbers of neighbours (kNN) or epochs (the authors' gradient-trained layer).
 from __future__ import annotations
 
 import functools
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from scipy.special import expit, softmax
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import logistic
 from anytouch_jax.evaluate.logistic import Logistic
-from anytouch_jax.files import atomic_path
+from anytouch_jax.files import atomic_path, read_arrays
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Pooling
@@ -361,11 +360,40 @@ def load_head(path: str | Path) -> LinearHead:
     if not Path(path).is_file():
         raise UserError(f"There is no head {path}. `anytouch probe label --save` writes one.")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(path)
         if str(arrays.pop("format")) != FORMAT:
-            raise KeyError("format")
-        words: dict[str, Any] = {name: str(arrays.pop(name)) for name in ("label", "pooling")}
-        return LinearHead(frames=int(arrays.pop("frames")), fingerprint=str(arrays.pop("mark")), **words, **arrays)
-    except (OSError, ValueError, TypeError, KeyError, EOFError, AttributeError, zipfile.BadZipFile):
-        raise UserError(f"{path} is not the head of a probe. `anytouch probe label --save` writes one.") from None
+            raise ValueError("it has no format of a head")
+        words: dict[str, Any] = {name: _text(arrays.pop(name)) for name in ("label", "pooling")}
+        frames, fingerprint = int(arrays.pop("frames")), _text(arrays.pop("mark"))
+        words |= arrays
+        head = LinearHead(frames=frames, fingerprint=fingerprint, **words)
+        _check_head(head)
+        return head
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise UserError(
+            f"{path} is not the head of a probe ({reason}). `anytouch probe label --save` writes one."
+        ) from None
+
+
+def _text(array: Array) -> str:
+    if array.shape != () or array.dtype.kind != "U" or array.dtype.itemsize > 4096:
+        raise ValueError("a text has another type")
+    return str(array)
+
+
+def _check_head(head: LinearHead) -> None:
+    """Raise ValueError for arrays of a head that do not fit together or are not finite."""
+    count, width = len(head.classes), len(head.mean)
+    columns = 1 if count == 2 else count
+    shapes = {"classes": (count,), "weights": (width, columns), "bias": (columns,), "mean": (width,), "scale": (width,)}
+    for name, shape in shapes.items():
+        array = getattr(head, name)
+        if array.shape != shape or array.dtype.kind != ("U" if name == "classes" else "f"):
+            raise ValueError(f"{name} is {array.dtype} {array.shape}, not of shape {shape}")
+        if name != "classes" and not np.isfinite(array).all():
+            raise ValueError(f"{name} has values that are not finite")
+    if count < 2 or not width or not (head.scale > 0).all():
+        raise ValueError("it needs two classes, features, and scales above 0")
+    if head.pooling not in ("class", "mean", "both") or not 0 < head.frames < 1 << 20:
+        raise ValueError(f"it has pooling {head.pooling[:40]} and {head.frames} frames")

@@ -33,6 +33,7 @@ import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
+from anytouch_jax.config import parse_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights.tree import flatten, nest
 
@@ -157,6 +158,7 @@ class Checkpoints:
         record = checked(folder)
         wanted = {name: _abstract(leaf) for name, leaf in flatten(abstract_state).items()}
         _compare(folder, wanted, _forms(record))
+        _check_stored(folder, wanted)
         arrays = _load(folder, {name: like for name, like in wanted.items() if math.prod(like.shape)})
         leaves = [
             arrays[name] if name in arrays else jax.device_put(np.zeros(like.shape, like.dtype), like.sharding)
@@ -247,13 +249,12 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
 
 def _params_of(target: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     record = checked(target)
-    wanted = {
-        name: np.zeros(like.shape, like.dtype)
-        for name, like in _forms(record).items()
-        if name.startswith(("trainable/", "frozen/", _AVERAGE))
-    }
-    if not wanted:
+    parts = ("trainable/", "frozen/", _AVERAGE)
+    forms = {name: like for name, like in _forms(record).items() if name.startswith(parts)}
+    if not forms:
         raise CheckpointError(f"checkpoint {target} has no parameters (nothing under trainable/ or frozen/)")
+    _check_stored(target, forms)
+    wanted = {name: np.zeros(like.shape, like.dtype) for name, like in forms.items()}
     arrays = wanted | _load(target, {name: like for name, like in wanted.items() if like.size})
     trained = {name.split("/", 1)[1]: leaf for name, leaf in arrays.items() if not name.startswith(_AVERAGE)}
     averaged = {name.removeprefix(_AVERAGE): leaf for name, leaf in arrays.items() if name.startswith(_AVERAGE)}
@@ -292,6 +293,19 @@ def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
     except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
         reason = " ".join(str(error).split())[:300]
         raise CheckpointError(f"could not read checkpoint {folder} ({type(error).__name__}: {reason})") from error
+
+
+def _check_stored(folder: Path, forms: Mapping[str, Any]) -> None:
+    """Raise CheckpointError if arrays on disk have other shapes than the record, before memory is taken for them."""
+    try:
+        with _ORBAX:
+            stored = flatten(ocp.metadata(folder).metadata)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"could not read checkpoint {folder} ({type(error).__name__}: {reason})") from error
+    for name, like in forms.items():
+        if math.prod(like.shape) and (name not in stored or tuple(stored[name].shape) != like.shape):
+            raise CheckpointError(f"checkpoint {folder} is damaged: {name} is not stored in shape {like.shape}")
 
 
 def _forms(record: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
@@ -350,6 +364,11 @@ def steps(folder: str | Path) -> list[int]:
     return sorted(int(entry.name) for entry in folder.iterdir() if _STEP.fullmatch(entry.name) and entry.is_dir())
 
 
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a run, of checkpoints or of one checkpoint."""
+    return (folder / "checkpoints").is_dir() or bool(steps(folder) or _STEP.fullmatch(folder.absolute().name))
+
+
 def resolve(folder: Path, step: int | None) -> Path:
     """Return the folder of one checkpoint, from a run, a folder of checkpoints or that folder itself."""
     folder = folder.absolute()
@@ -391,16 +410,60 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{folder} is not a checkpoint of this program: it has no {RECORD}")
     try:
-        outer = json.loads(path.read_text(encoding="utf-8"))
+        outer = parse_json(path.read_bytes())
         record = outer["record"]
         whole = outer["checksum"] == zlib.crc32(json.dumps(record, sort_keys=True).encode())
     except (ValueError, KeyError, TypeError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} cannot be read") from None
     if not whole:
         raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} was altered")
-    if record.get("format") != FORMAT:
-        raise CheckpointError(f"checkpoint {folder} has format {record.get('format')!r}; this program reads {FORMAT!r}")
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        stored = repr(record.get("format"))[:100] if isinstance(record, dict) else "none"
+        raise CheckpointError(f"checkpoint {folder} has format {stored}; this program reads {FORMAT!r}")
+    if wrong := [name for name, valid in _SCHEMA.items() if name not in record or not valid(record[name])]:
+        raise CheckpointError(f"checkpoint {folder} is damaged: {wrong[0]} in {RECORD} is missing or of another type")
     return record
+
+
+def _is_size(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 1 << 48
+
+
+def _is_metric(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _is_form(value: Any) -> bool:
+    """Return whether a value is the shape and type of an array, of less than 2^48 bytes."""
+    if not (isinstance(value, list) and len(value) == 2 and isinstance(value[0], list) and isinstance(value[1], str)):
+        return False
+    return (
+        len(value[0]) <= 16
+        and all(map(_is_size, value[0]))
+        and math.prod(value[0]) < 1 << 45
+        and re.fullmatch(r"bool|key<\w+>|u?int(4|8|16|32|64)|b?float\d\w*|complex(64|128)", value[1]) is not None
+    )
+
+
+def _is_file(name: str, value: Any) -> bool:
+    """Return whether a name stays in the folder, and a value is a size and a checksum."""
+    inside = not Path(name).is_absolute() and ".." not in Path(name).parts and "\0" not in name
+    return inside and isinstance(value, list) and len(value) == 2 and all(map(_is_size, value))
+
+
+def _has_values(valid: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, dict) and all(map(valid, value.values()))
+
+
+# The fields of a record, and the check of each.
+_SCHEMA: dict[str, Callable[[Any], bool]] = {
+    "config": lambda value: isinstance(value, str),
+    "metadata": lambda value: isinstance(value, dict),
+    "step": _is_size,
+    "metrics": _has_values(_is_metric),
+    "arrays": _has_values(_is_form),
+    "files": lambda value: isinstance(value, dict) and bool(value) and all(_is_file(*item) for item in value.items()),
+}
 
 
 def checked(folder: Path) -> dict[str, Any]:

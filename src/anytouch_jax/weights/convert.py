@@ -13,7 +13,7 @@ import numpy as np
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
 from anytouch_jax.weights.compatible import match_sensors, resize_position
-from anytouch_jax.weights.keymaps import SAME, Entry, KeyMap, Shape, Weights, param_shapes
+from anytouch_jax.weights.keymaps import SAME, Entry, Heads, KeyMap, Shape, UnknownHeads, Weights, param_shapes
 from anytouch_jax.weights.keymaps.anytouch import PROBE, STAGE1, STAGE2
 from anytouch_jax.weights.keymaps.hf_clip import HF_CLIP
 from anytouch_jax.weights.keymaps.openclip import OPENCLIP
@@ -28,7 +28,7 @@ _LISTED = 6  # names in one error message
 _HEAD = frozenset(("head.weight", "head.bias"))
 
 
-def _no_model(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
+def _no_model(weights: Weights, heads: Heads) -> ModelConfig:
     raise WeightsError("a file in our names does not store its model; use the configuration it was saved with")
 
 
@@ -54,34 +54,60 @@ def detect_layout(weights: Weights) -> str:
     raise WeightsError(f"these are not weights of AnyTouch, HF CLIP or OpenCLIP: the file has {names}")
 
 
-def detect_model(weights: Weights, *, heads: int | None = None, decoder_heads: int | None = None) -> ModelConfig:
-    """Return the model that a file was made for, from the shapes of its arrays.
+def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, int]]:
+    """Return the model that a file was made for, from the shapes of its arrays, and stacks of unknown head counts.
 
-    Head counts leave no trace. `heads` of the touch and image towers is width / 64 unless given, as in CLIP.
-    `decoder_heads` is width / 32, as in the authors' decoder. A CLIP file gets the authors' decoder sizes.
-    Raises WeightsError.
+    Head counts leave no trace: those that neither `heads` nor a published width gives are 1 in the model, and the
+    second value has the widths of these stacks. A CLIP file gets the authors' decoder sizes. Raises WeightsError.
     """
-    layout = detect_layout(weights)
-    try:
-        return KEYMAPS[layout].detect(weights, heads, decoder_heads)
-    except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
+    layout, unknown = detect_layout(weights), dict[str, int]()
+    while True:
+        try:
+            return KEYMAPS[layout].detect(weights, {**heads, **dict.fromkeys(unknown, 1)}), unknown
+        except UnknownHeads as error:
+            unknown[error.stack] = error.width
+        except WeightsError:
+            raise
+        except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
+            raise WeightsError(
+                f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
+            ) from None
+
+
+def detect_model(weights: Weights, heads: Heads | None = None) -> ModelConfig:
+    """Return the model that a file was made for, see `detect_form`. Raises WeightsError for unknown head counts."""
+    model, unknown = detect_form(weights, heads or {})
+    refuse_unknown(unknown)
+    return model
+
+
+def refuse_unknown(stacks: Mapping[str, int]) -> None:
+    """Raise WeightsError that names stacks of unknown head counts, by their widths."""
+    if stacks:
+        names = " and ".join(f"{name} (width {width})" for name, width in stacks.items())
+        example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
-            f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
-        ) from None
+            f"the weights do not store the number of attention heads of {names}; write it to a config.json beside the "
+            f'file, as {{"model": {{{example}}}}}, or write the file by `anytouch export --to safetensors`, which '
+            "stores it"
+        )
 
 
-def to_params(weights: Weights, model: ModelConfig, *, ignore: Collection[str] = ()) -> Params:
+def to_params(
+    weights: Weights, model: ModelConfig, *, ignore: Collection[str] = (), optional: Collection[str] = ()
+) -> Params:
     """Return the parameters of a file as a nested dict of float32 arrays under our names.
 
     The key map is detected. Left out are towers and heads that `model` lacks, buffers, the authors' unused arrays
     (golden Q2) and the keys in `ignore`. Position tables of another image size are resized. A probe file gives its
-    classifier as `head`. Raises WeightsError.
+    classifier as `head`. A file may lack the parameters named in `optional`. Raises WeightsError.
     """
     layout, shapes = detect_layout(weights), param_shapes(model)
     entries = KEYMAPS[layout].entries(model)
     if layout == "own":  # a file of stage 1 has no towers
         parts = {key.split("/")[0] for key in weights}
         entries = [entry for entry in entries if entry.name.split("/")[0] in parts]
+    entries = [entry for entry in entries if entry.key in weights or entry.name not in optional]
     head = _HEAD if layout == "probe" and weights.keys() >= _HEAD else frozenset()
     first = {entry.key: entry for entry in entries}
     arrays = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, to_json
+from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import checkpoint, compatible
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
-from anytouch_jax.weights.convert import check_arrays, detect_layout, detect_model, to_params
+from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
 from anytouch_jax.weights.keymaps import Weights
 from anytouch_jax.weights.safetensors import (
     BACKGROUND_KEY,
@@ -27,13 +27,17 @@ from anytouch_jax.weights.safetensors import (
     read_npz,
     read_safetensors,
 )
+from anytouch_jax.weights.state_dict import strip_prefixes
 from anytouch_jax.weights.torch_file import read_torch
 from anytouch_jax.weights.tree import flatten
 
 Params = dict[str, Any]
 
 _RELEASE_SENSORS = SENSORS[:5]  # the authors' weights were trained on these, and on the universal tokens
-_PATTERNS = ("*.safetensors", "*.bin", "*.pth", "*.pt")
+_TORCH = (".pth", ".pt", ".ckpt", ".bin")
+_INDEX = ".index.json"  # of weights in several files
+_PATTERNS = ("*.safetensors", f"*.safetensors{_INDEX}", "*.bin", f"*.bin{_INDEX}", "*.pth", "*.pt", "*.ckpt")
+_SHARD = re.compile(r"(.+)-\d{5}-of-(\d{5})(\.\w+)")
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool =
     if not path.exists():
         raise UserError(f"there is no run folder or weights file at {path}; give another path")
     trained: Any
-    if path.is_dir() and not any(path.glob("*.pth")):
+    if path.is_dir() and not any(path.glob("*.pth")) and (checkpoint.is_run(path) or not _weights_files(path)):
         params, text, metadata = checkpoint.load_params(path, step)
         config: Config = from_json(text)
         trained = metadata.get("seen")
@@ -94,6 +98,7 @@ def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool =
         # A run without universal tokens was exported with the mean of its sensors in their place.
         trained, drawn, from_run = trained_sensors(file_metadata, model), True, False
         metadata = dict(file_metadata)
+    check_finite(path, flatten(params))
     if trained is not None and "touch" in params and (from_run or not stored_rows):
         params |= {"touch": serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
     return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)
@@ -130,8 +135,10 @@ def load_init(
         file = find_weights_file(Path(clip))
         compatible.check_activation(file, clip_activation(file), config)
         towers = read_weights(file)
+        check_finite(file, towers)
         if detect_layout(towers) in ("clip", "openclip"):
-            compatible.check_clip(file, detect_model(towers), config, touch=init is None)
+            compatible.check_clip(file, model_of_file(file, towers), config, touch=init is None)
+            notes += _clip_notes(file, towers, config, touch=init is None)
     return Start(first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained)
 
 
@@ -143,9 +150,7 @@ def _check_init(loaded: Loaded, config: Config) -> None:
     compatible.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
     if "touch" not in loaded.params or "decoder" not in loaded.params:
         raise UserError(f"{path} has no touch encoder and decoder; give a stage-1 run or the authors' weights")
-    # The head counts of a file without our metadata are guesses.
-    exact = loaded.from_run or MODEL_KEY in loaded.metadata
-    compatible.check_form(path, model, config, (*compatible.SHAPED, *(compatible.SHAPELESS if exact else ())))
+    compatible.check_form(path, model, config)
 
 
 def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[str]:
@@ -168,6 +173,31 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     if loaded.config.model.patches != config.model.patches:
         notes.append(f"the positions of {path} are resized for images of {config.model.image_size} pixels")
     return notes
+
+
+def _clip_notes(path: Path, weights: Weights, config: Config, *, touch: bool) -> list[str]:
+    """Return sentences on an unknown activation and a missing projection of CLIP weights."""
+    notes, activation = [], config.model.activation
+    if clip_activation(path) is None:
+        other = "quick_gelu" if activation == "gelu" else "gelu"
+        notes.append(
+            f"the activation of {path} is not stored, this run uses {activation}: OpenAI's CLIP wants quick_gelu, most "
+            f"others gelu; put the config.json of the weights beside the file, or add --model.activation {other}"
+        )
+    if touch and not weights.keys() & {"visual_projection.weight", "visual.proj"}:
+        notes.append(f"{path} has no projection: that of the touch encoder starts untrained")
+    return notes
+
+
+def check_finite(path: str | Path, arrays: Mapping[str, Any]) -> None:
+    """Raise WeightsError that names the first of these arrays with NaN or infinite values."""
+    wrong = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+    if wrong:
+        others = f" and {len(wrong) - 1} other arrays have" if len(wrong) > 1 else " has"
+        raise WeightsError(
+            f"{path}: {wrong[0]}{others} values that are not finite (NaN or infinite); its training diverged or the "
+            "file is damaged, so take an earlier checkpoint or another file"
+        )
 
 
 def _fit(loaded: Loaded, config: Config) -> Params:
@@ -202,10 +232,12 @@ def clip_to_touch(weights: Weights, model: ModelConfig, params: Params) -> Param
     """Return `params` with the touch encoder from CLIP's vision tower.
 
     The 2-D patch kernel is repeated over the frames, as the authors do, and not divided by their number (golden Q1).
-    The response to a still is then three times CLIP's. Raises WeightsError.
+    The response to a still is then three times CLIP's. A tower without a projection leaves that of `params`. Raises
+    WeightsError.
     """
     tower = replace(model, image=model.touch, text=None, match_head="none", lora_rank=0)
-    return inflate(params, to_params(weights, tower)["image"])
+    image = to_params(weights, tower, optional=("image/projection/kernel", "logit_scale"))["image"]
+    return inflate(params, {"projection": params["touch"]["projection"], **image})
 
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
@@ -237,42 +269,133 @@ def find_weights_file(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_dir():
         return path
-    files = [file for pattern in _PATTERNS for file in sorted(path.glob(pattern))]
+    files = _weights_files(path)
     if not files:
-        raise UserError(f"there are no weights (*.safetensors, *.bin, *.pth) in {path}; give another path")
+        raise UserError(f"there are no weights (*.safetensors, *.bin, *.pth, *.ckpt) in {path}; give another path")
     return files[0]
 
 
-def read_weights(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a .safetensors, .npz, .pth, .pt or .bin file under their names, floats as float32.
+def _weights_files(folder: Path) -> list[Path]:
+    files = [file for pattern in _PATTERNS for file in sorted(folder.glob(pattern))]
+    whole = [file for file in files if not _SHARD.fullmatch(file.name)]
+    return whole or files
 
-    No code in a pickle is run. Raises WeightsError for a missing, truncated, foreign or unsafe file.
+
+def read_weights(path: str | Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file by name, floats as float32.
+
+    An index of several files (`model.safetensors.index.json`) stands for all of them. Prefixes that a training
+    framework added to the names are removed. No code in a pickle is run. Raises WeightsError for a missing, truncated,
+    foreign or unsafe file.
     """
     path = existing_file(path)
-    if path.suffix == ".safetensors":
-        arrays = read_safetensors(path)[0]
-    elif path.suffix == ".npz":
-        arrays = read_npz(path)
-    elif path.suffix in (".pth", ".pt", ".bin"):
-        arrays = read_torch(path)
-    else:
-        raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt or .bin file")
-    if words := [name for name, array in arrays.items() if array.dtype.kind in "USOMm"]:
-        raise WeightsError(f"{path} has no weights: {words[0]} is {arrays[words[0]].dtype}, not numbers")
+    if shard := _SHARD.fullmatch(path.name):
+        index = path.with_name(f"{shard[1]}{shard[3]}{_INDEX}")
+        if not index.is_file():
+            raise WeightsError(f"{path} is one of {int(shard[2])} parts; put them and {index.name} into one folder")
+        path = index
+    arrays = strip_prefixes(_read_parts(path) if path.name.endswith(_INDEX) else _read_file(path))
+    # numpy calls bfloat16 and float8 a "V" too, as it does records.
+    kinds = {name: array.dtype for name, array in arrays.items()}
+    if words := [name for name, dtype in kinds.items() if dtype.kind in "USOMmc" or dtype.type is np.void]:
+        raise WeightsError(f"{path} has no weights: {words[0]} is {kinds[words[0]]}, not real numbers")
     return {name: array if array.dtype.kind in "iub" else as_float32(array) for name, array in arrays.items()}
 
 
-def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
-    """Return the model of a weights file, from its metadata if it is ours, else from its shapes (`detect_model`).
+def _read_file(path: Path) -> dict[str, np.ndarray]:
+    suffix = path.suffix.lower()
+    if suffix == ".safetensors":
+        return read_safetensors(path)[0]
+    if suffix == ".npz":
+        return read_npz(path)
+    if suffix in _TORCH:
+        return read_torch(path)
+    raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt, .ckpt or .bin file")
 
-    The activation of CLIP weights comes from the configuration in their folder. Raises WeightsError.
+
+def _read_parts(index: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of all files that an index names. Raises WeightsError for missing files and arrays."""
+    homes = _read_json(index).get("weight_map")
+    plain = isinstance(homes, dict) and all(isinstance(x, str) and Path(x).name == x for x in homes.values())
+    if not isinstance(homes, dict) or not homes or not plain:
+        raise WeightsError(f"{index} is no index of weights: it needs weight_map, the file of each array")
+    arrays: dict[str, np.ndarray] = {}
+    for part in sorted(set(homes.values())):
+        if not (index.parent / part).is_file():
+            raise WeightsError(f"{index} names the file {part}, which is not there; download all parts")
+        content = _read_file(index.parent / part)
+        arrays |= {name: array for name, array in content.items() if homes.get(name) == part}
+    if missing := sorted(homes.keys() - arrays.keys()):
+        raise WeightsError(f"{index} names {missing[0]} in {homes[missing[0]]}, which lacks it; download it again")
+    return arrays
+
+
+def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
+    """Return the model of a weights file, see `form_of_file`. Raises WeightsError for unknown head counts."""
+    model, unknown = form_of_file(path, weights)
+    try:
+        refuse_unknown(unknown)
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from None
+    return model
+
+
+def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[str, int]]:
+    """Return the model of a weights file, and the widths of its stacks of unknown head counts.
+
+    It comes from the metadata if the file is ours, else from shapes and the configuration in the folder, which gives
+    head counts and the activation. Raises WeightsError.
     """
     if text := read_file_metadata(path).get(MODEL_KEY):
-        stored: ModelConfig = from_json(text, ModelConfig)
-        return stored
-    activation: Any = clip_activation(path) if detect_layout(weights) in ("clip", "openclip") else None
-    model = detect_model(weights)
-    return model if activation is None else replace(model, activation=activation)
+        return from_json(text, ModelConfig), {}
+    model, unknown = detect_form(weights, stored_heads(path))
+    activation: Any = _object(_read_json(Path(path).with_name("config.json")), "model").get("activation")
+    if detect_layout(weights) in ("clip", "openclip"):  # CLIP's configuration says nothing of the authors' weights
+        activation = clip_activation(path)
+    return (model if activation is None else replace(model, activation=activation)), unknown
+
+
+def stored_heads(path: str | Path) -> dict[str, int]:
+    """Return the head counts of the stacks of weights, from the configuration in their folder.
+
+    A config.json is that of a run (`model.touch.heads`) or HF's. open_clip_config.json is OpenCLIP's. Raises
+    WeightsError for a count that is no positive integer.
+    """
+    path = Path(path)
+    config, heads = _read_json(path.with_name("config.json")), dict[str, Any]()
+    openclip = _object(_read_json(path.with_name("open_clip_config.json")), "model_cfg")
+    tower = _object(openclip, "vision_cfg")
+    if isinstance(tower.get("width"), int) and isinstance(size := tower.get("head_width", 64), int) and size > 0:
+        heads["image"] = tower["width"] // size
+    heads["text"] = _object(openclip, "text_cfg").get("heads")
+    theirs = _vision_config(config) or {}
+    heads["image"] = theirs.get("num_attention_heads", heads.get("image"))
+    heads["text"] = _object(config, "text_config").get("num_attention_heads", heads["text"])
+    ours = _object(config, "model")
+    stacks = {name: _object(ours, name) for name in ("touch", "decoder", "image")}
+    stacks["text"] = _object(_object(ours, "text"), "stack")
+    stacks["text"] = stacks["text"] or _object(ours, "text")
+    heads |= {name: stack["heads"] for name, stack in stacks.items() if "heads" in stack}
+    heads = {name: count for name, count in heads.items() if count is not None}
+    wrong = [name for name, count in heads.items() if type(count) is not int or not 0 < count <= 1024]
+    if wrong:
+        raise WeightsError(
+            f"the configuration in the folder of {path} gives {wrong[0]} {str(heads[wrong[0]])[:40]} heads; correct it"
+        )
+    return heads
+
+
+def _object(value: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return an object in a JSON object, {} for another value."""
+    inner = value.get(name)
+    return inner if isinstance(inner, dict) else {}
+
+
+def _vision_config(config: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the settings of the vision tower in HF's config.json, which may be of that tower alone."""
+    if isinstance(config.get("vision_config"), dict):
+        return _object(config, "vision_config")
+    return config if config.get("model_type") == "clip_vision_model" else None
 
 
 def clip_activation(path: str | Path) -> str | None:
@@ -284,10 +407,12 @@ def clip_activation(path: str | Path) -> str | None:
     path, names = Path(path), set()
     if text := read_file_metadata(path).get(MODEL_KEY):
         return str(from_json(text, ModelConfig).activation)
-    towers = _read_json(path.with_name("config.json"))
-    for tower in ("text_config", "vision_config"):
-        if isinstance(towers.get(tower), dict):
-            names.add(towers[tower].get("hidden_act", "quick_gelu"))  # HF's default
+    config = _read_json(path.with_name("config.json"))
+    for tower in (config.get("text_config"), _vision_config(config)):
+        if isinstance(tower, dict):
+            names.add(str(tower.get("hidden_act", "quick_gelu")))  # HF's default
+    if "activation" in (ours := _object(config, "model")):
+        names.add(str(ours["activation"]))
     model = _read_json(path.with_name("open_clip_config.json")).get("model_cfg")
     if not names and isinstance(model, dict):
         names.add("quick_gelu" if model.get("quick_gelu") else "gelu")
@@ -304,7 +429,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        raise WeightsError(f"{path} is not JSON; correct it, or move the weights to a folder without it") from None
+        value = parse_json(path.read_bytes())
+    except ValueError as error:
+        raise WeightsError(f"{path} {error}; correct it, or move the weights to a folder without it") from None
     return value if isinstance(value, dict) else {}

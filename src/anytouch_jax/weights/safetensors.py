@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path
+from anytouch_jax.files import atomic_path, placeholder, read_arrays
 from anytouch_jax.weights.tree import flatten
 
 # Metadata of our files: heads, activation and training data leave no trace in shapes.
@@ -57,7 +57,7 @@ def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str,
 
 def read_file_metadata(path: str | Path) -> dict[str, str]:
     """Return the metadata of a safetensors file without its arrays; {} for a file of another type."""
-    if Path(path).suffix != ".safetensors":
+    if Path(path).suffix.lower() != ".safetensors":
         return {}
     with _opened(path) as file:
         return dict(file.metadata() or {})
@@ -80,9 +80,8 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     """Return the arrays of an npz file; pickled objects are refused. Raises WeightsError."""
     path = existing_file(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except Exception as error:
+        return read_arrays(path)
+    except (OSError, ValueError) as error:
         raise WeightsError(f"{path} is not a whole npz file of plain arrays: {error}") from error
 
 
@@ -91,8 +90,11 @@ def existing_file(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_file():
         raise WeightsError(
-            f"there is no weights file {path}; give the path of a .safetensors, .npz, .pth, .pt or .bin file"
+            f"there is no weights file {path}; give the path of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file"
         )
+    if kind := placeholder(path):
+        advice = "run `git lfs pull`" if "LFS" in kind else "download the file itself"
+        raise WeightsError(f"{path} is {kind}, not the data that its name promises; {advice}")
     return path
 
 

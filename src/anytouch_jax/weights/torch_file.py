@@ -1,4 +1,4 @@
-"""PyTorch files (.pth, .pt, .bin) read without torch, in the zip form and in the form before torch 1.6.
+"""PyTorch files (.pth, .pt, .ckpt, .bin) read without torch, in the zip form and in the form before torch 1.6.
 
 A pickle is a program for a stack machine. It is run by the standard library's `pickle._Unpickler`, cut down to data:
 a class or function in it is only a name, looked up in `_BUILDERS` and never imported. Anything else is an error.
@@ -22,6 +22,7 @@ from typing import IO, Any, Literal
 import numpy as np
 
 from anytouch_jax.weights.safetensors import WeightsError, existing_file
+from anytouch_jax.weights.state_dict import unwrap
 
 # Storages of torch, as the numpy type of their bytes; bfloat16 is widened by `_Tensor.read`.
 _STORAGES = {
@@ -29,13 +30,12 @@ _STORAGES = {
     "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
 }  # fmt: skip
 _REPEATS = 1 << 20  # a tensor larger than its storage (stride 0) may have this many elements
-_GROWTH, _SPARE = 8, 1 << 26  # the tensors of a file may take 8 times its bytes, and 64 MiB more
+_GROWTH, _SPARE = 3, 1 << 26  # the tensors of a file may take 3 times its bytes, and 64 MiB more
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
-_WRAPPERS = ("model", "state_dict", "model_state_dict")
 
 
 def read_torch(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the state_dict of a torch file; `{'model': ...}` and `{'state_dict': ...}` are opened.
+    """Return the state_dict of a torch file, out of its wrappings.
 
     bfloat16 becomes float32, other types are unchanged. No code in the file is run. Raises WeightsError for a
     truncated or foreign file, and for an object that is neither a tensor nor a plain container.
@@ -46,7 +46,7 @@ def read_torch(path: str | Path) -> dict[str, np.ndarray]:
             zipped, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
             file.seek(0)
             reader = _Zip(file, size) if zipped else _Legacy(file)
-            tensors = _state(reader.content)
+            tensors = _state(unwrap(reader.content, path))
             if sum(tensor.nbytes for tensor in tensors.values()) > _GROWTH * size + _SPARE:
                 raise ValueError("its tensors are many times larger than the file")
             return {name: tensor.read(reader.load, reader.byteorder) for name, tensor in tensors.items()}
@@ -92,8 +92,8 @@ class _Tensor:
 
     @property
     def nbytes(self) -> int:
-        """The bytes of the values."""
-        return math.prod(self.shape) * self.storage.dtype.itemsize
+        """The bytes of the values, bfloat16 as float32."""
+        return math.prod(self.shape) * (4 if self.storage.kind == "BFloat16Storage" else self.storage.dtype.itemsize)
 
     def read(self, load: Callable[[_Storage], bytes], byteorder: Literal["<", ">"] = "<") -> np.ndarray:
         """Return the values, given the bytes of the storage. Raises ValueError if the view leaves its storage."""
@@ -167,11 +167,7 @@ class _Legacy:
 
 
 def _state(content: Any) -> dict[str, _Tensor]:
-    """Return the tensors by name, out of the usual wrappings of a state_dict."""
-    for wrapper in _WRAPPERS:
-        if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
-            content = content[wrapper]
-            break
+    """Return the tensors by name. Raises WeightsError for an object that is no state_dict."""
     if not isinstance(content, dict) or not content:
         raise WeightsError(f"it has no state_dict, but {type(content).__name__}")
     others = [
@@ -180,8 +176,6 @@ def _state(content: Any) -> dict[str, _Tensor]:
     if others:
         verb = "is" if len(others) == 1 else "are"
         raise WeightsError(f"it has no state_dict: {', '.join(others[:5])} {verb} no tensor")
-    if all(name.startswith("module.") for name in content):  # DistributedDataParallel
-        content = {name.removeprefix("module."): value for name, value in content.items()}
     return content
 
 

@@ -21,6 +21,7 @@ from anytouch_jax.weights.tree import flatten
 
 Weights = Mapping[str, np.ndarray]
 Shape = tuple[int, ...]
+Heads = Mapping[str, int]  # head counts of "touch", "decoder", "image" and "text"
 PROJECTIONS = ("query", "key", "value", "out")
 
 
@@ -48,7 +49,7 @@ class KeyMap:
     """A kind of weights file.
 
     `matches` detects it. `entries` lists the arrays that fill a model. `detect` returns the model that made the file;
-    its last arguments are the head counts of the towers and the decoder, which leave no trace in shapes.
+    its last argument has the known head counts, which leave no trace in shapes.
     `unused` maps a key that no code reads to the key it is made from: a copy, or the mean over frames if it has fewer
     axes (golden Q2). `towers` matches the keys of each part that a model may lack.
     """
@@ -56,7 +57,7 @@ class KeyMap:
     name: str
     matches: Callable[[Weights], bool]
     entries: Callable[[ModelConfig], list[Entry]]
-    detect: Callable[[Weights, int | None, int | None], ModelConfig]
+    detect: Callable[[Weights, Heads], ModelConfig]
     unused: Mapping[str, str] = field(default_factory=dict)
     towers: Mapping[str, str] = field(default_factory=dict)
 
@@ -105,10 +106,25 @@ def stacked(theirs: str, ours: str, depth: int, block: Iterable[Entry]) -> Itera
             yield Entry(f"{theirs}.{layer}.{entry.key}", f"{ours}/{entry.name}", entry.conversion, layer, entry.part)
 
 
-def detect_stack(weights: Weights, prefix: str, head_width: int, heads: int | None = None) -> Stack:
+# Heads of the published towers by width: OpenAI's CLIP and the authors (width / 64), OpenCLIP's larger towers (16).
+VISION_HEADS = {384: 6, 512: 8, 768: 12, 896: 14, 1024: 16, 1280: 16, 1408: 16, 1664: 16}
+TEXT_HEADS = {384: 6, 512: 8, 640: 10, 768: 12, 1024: 16, 1280: 20}
+DECODER_HEADS = {512: 16}  # the authors'
+
+
+class UnknownHeads(Exception):
+    """The head count of a stack, which leaves no trace in its arrays: `stack` is its name, `width` its width."""
+
+    def __init__(self, stack: str, width: int) -> None:
+        super().__init__(stack, width)
+        self.stack, self.width = stack, width
+
+
+def detect_stack(weights: Weights, prefix: str, name: str, heads: Heads, published: Mapping[int, int]) -> Stack:
     """Return the sizes of the blocks under `prefix`, from the kernels of their feed-forward layers.
 
-    `heads` is width / `head_width` unless given. Raises KeyError if there are no blocks.
+    The head count is `heads[name]`, else that of a published tower of this width. Raises KeyError if there are no
+    blocks, and UnknownHeads.
     """
     pattern = re.compile(
         re.escape(prefix) + r"\.(?:encoder\.|base_model\.model\.|layers\.|transformer\.|resblocks\.)*(\d+)\."
@@ -118,14 +134,18 @@ def detect_stack(weights: Weights, prefix: str, head_width: int, heads: int | No
     if not shapes:
         raise KeyError(f"{prefix} blocks")
     mlp, width = shapes[0]
-    return Stack(width, max(shapes) + 1, heads or max(1, width // head_width), mlp)
+    count = heads.get(name) or published.get(width)
+    if count is None:
+        raise UnknownHeads(name, width)
+    return Stack(width, max(shapes) + 1, count, mlp)
 
 
-def detect_text(weights: Weights, blocks: str, token: str, position: str) -> TextTower | None:
+def detect_text(weights: Weights, blocks: str, token: str, position: str, heads: Heads) -> TextTower | None:
     """Return the sizes of a text tower from the keys of its tables; None if the file has no such tower."""
     if token not in weights:
         return None
-    return TextTower(detect_stack(weights, blocks, 64), vocab=len(weights[token]), length=len(weights[position]))
+    stack = detect_stack(weights, blocks, "text", heads, TEXT_HEADS)
+    return TextTower(stack, vocab=len(weights[token]), length=len(weights[position]))
 
 
 def image_sizes(weights: Weights, patch: str, position: str) -> dict[str, Any]:

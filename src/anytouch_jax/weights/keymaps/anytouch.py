@@ -8,7 +8,20 @@ from typing import Any
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, detect_stack, hf_clip, layer_norm, linear
+from anytouch_jax.weights.keymaps import (
+    DECODER_HEADS,
+    LINEAR,
+    SAME,
+    VISION_HEADS,
+    Entry,
+    Heads,
+    KeyMap,
+    Weights,
+    detect_stack,
+    hf_clip,
+    layer_norm,
+    linear,
+)
 
 _STAGE2 = "touch_mae_model."
 _CLIP_PATCH = "video_patch_embedding.weight"
@@ -54,9 +67,7 @@ def _stage2(model: ModelConfig) -> list[Entry]:
     return entries
 
 
-def _detect(
-    weights: Weights, heads: int | None, decoder_heads: int | None, *, prefix: str = "", patch: str = _CLIP_PATCH
-) -> ModelConfig:
+def _detect(weights: Weights, heads: Heads, *, prefix: str = "", patch: str = _CLIP_PATCH) -> ModelConfig:
     position = f"{prefix}touch_model.embeddings.position_embedding.weight"
     tokens, blocks = weights[f"{prefix}sensor_token"], f"{prefix}touch_decoder_blocks"
     numbered = (*(f"sensor{row}" for row in range(len(tokens) - 1)), UNIVERSAL)
@@ -65,16 +76,19 @@ def _detect(
         ranks = [array.shape[0] for key, array in weights.items() if "lora_A" in key]
         heads_of_match = [name for name, key in _MATCH_HEADS.items() if key in weights]
         sizes |= {
-            "image": detect_stack(weights, "vision_model", 64, heads),
-            "text": hf_clip.detect_text_tower(weights),
+            "image": detect_stack(weights, "vision_model", "image", heads, VISION_HEADS),
+            "text": hf_clip.detect_text_tower(weights, heads),
             "match_head": heads_of_match[0] if heads_of_match else "none",
             "lora_rank": ranks[0] if ranks else 0,
         }
+    decoder = hf_clip.DECODER
+    if patch != _PROBE_PATCH:
+        decoder = detect_stack(weights, blocks, "decoder", heads, DECODER_HEADS)
     return ModelConfig(
         **sizes,
         embed=weights[f"{prefix}touch_projection.weight"].shape[0],
-        touch=detect_stack(weights, f"{prefix}touch_model", 64, heads),
-        decoder=hf_clip.DECODER if patch == _PROBE_PATCH else detect_stack(weights, blocks, 32, decoder_heads),
+        touch=detect_stack(weights, f"{prefix}touch_model", "touch", heads, VISION_HEADS),
+        decoder=decoder,
         frames=weights[f"{prefix}{patch}"].shape[1],
         sensors=SENSORS if len(tokens) == len(SENSORS) else numbered,
         sensor_tokens=tokens.shape[1],

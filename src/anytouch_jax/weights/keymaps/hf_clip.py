@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from anytouch_jax.config import ModelConfig, Stack, TextTower
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, layer_norm, linear
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, Heads, KeyMap, Weights, layer_norm, linear
 
 _ATTENTION = tuple(zip(("q_proj", "k_proj", "v_proj", "out_proj"), keymaps.PROJECTIONS, strict=True))
 _LORA_BLOCK = [
@@ -55,22 +55,23 @@ def towers(model: ModelConfig, *, lora: bool = False) -> Iterator[Entry]:
         yield Entry("logit_scale", "logit_scale", SAME)
 
 
-def detect_text_tower(weights: Weights) -> TextTower | None:
+def detect_text_tower(weights: Weights, heads: Heads) -> TextTower | None:
     """Return the sizes of the text tower; None if there is none."""
     table = "text_model.embeddings.{}_embedding.weight"
-    return keymaps.detect_text(weights, "text_model", table.format("token"), table.format("position"))
+    return keymaps.detect_text(weights, "text_model", table.format("token"), table.format("position"), heads)
 
 
-def _detect(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
+def _detect(weights: Weights, heads: Heads) -> ModelConfig:
     inner = "vision_model.embeddings.{}_embedding.weight"
-    tower = keymaps.detect_stack(weights, "vision_model", 64, heads)
+    tower = keymaps.detect_stack(weights, "vision_model", "image", heads, keymaps.VISION_HEADS)
+    projection = weights.get("visual_projection.weight")
     return ModelConfig(
         **keymaps.image_sizes(weights, inner.format("patch"), inner.format("position")),
-        embed=weights["visual_projection.weight"].shape[0],
+        embed=tower.width if projection is None else projection.shape[0],  # a vision tower alone has none
         touch=tower,
         decoder=DECODER,
         image=tower,
-        text=detect_text_tower(weights),
+        text=detect_text_tower(weights, heads),
     )
 
 

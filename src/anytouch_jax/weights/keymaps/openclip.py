@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, KeyMap, Weights, layer_norm, linear
+from anytouch_jax.weights.keymaps import LINEAR, SAME, Entry, Heads, KeyMap, Weights, layer_norm, linear
 from anytouch_jax.weights.keymaps.hf_clip import DECODER
 
 _BLOCK = [
@@ -39,15 +39,15 @@ def _entries(model: ModelConfig) -> Iterator[Entry]:
     yield Entry("logit_scale", "logit_scale", SAME)
 
 
-def _detect(weights: Weights, heads: int | None, decoder_heads: int | None) -> ModelConfig:
-    tower = keymaps.detect_stack(weights, "visual", 64, heads)
+def _detect(weights: Weights, heads: Heads) -> ModelConfig:
+    tower = keymaps.detect_stack(weights, "visual", "image", heads, keymaps.VISION_HEADS)
     return ModelConfig(
         **keymaps.image_sizes(weights, "visual.conv1.weight", "visual.positional_embedding"),
         embed=weights["visual.proj"].shape[1],
         touch=tower,
         decoder=DECODER,
         image=tower,
-        text=keymaps.detect_text(weights, "transformer", "token_embedding.weight", "positional_embedding"),
+        text=keymaps.detect_text(weights, "transformer", "token_embedding.weight", "positional_embedding", heads),
     )
 
 

@@ -21,6 +21,7 @@ from anytouch_jax.config.parsing import (
     SHARE,
     chosen,
     in_range,
+    parse_json,
     read_value,
 )
 from anytouch_jax.errors import ConfigError

@@ -114,6 +114,11 @@ def _check_settings(config: Config) -> None:
         raise UserError("--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out")
     if model.dtype == "float64" and not jax.config.read("jax_enable_x64"):
         raise UserError("--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32")
+    if model.dtype != "float64" and jax.config.read("jax_enable_x64"):
+        raise UserError(
+            "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: unset it, or add "
+            "--model.dtype float64"
+        )
     if config.stage == 2 and config.optim.accumulate > 1 and (model.image or model.text):
         raise UserError(
             "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "

@@ -129,6 +129,10 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         advice = ". Free some space." if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         return _report(program, f"{error.filename or 'a file'}: {error.strerror or error}{advice}")
     except (MemoryError, RuntimeError) as error:
+        if "Unable to initialize backend" in str(error) or "Unknown backend" in str(error):  # jax's, for JAX_PLATFORMS
+            value = os.environ.get("JAX_PLATFORMS", "")
+            advice = f"JAX_PLATFORMS is {value!r}: unset it, or install jax for that device" if value else error
+            return _report(program, f"jax cannot use this machine's devices. {advice}.")
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's is a RuntimeError
             raise
         less = "Use a smaller --batch, --size, --gallery or --preset, or --model.remat in training."

@@ -55,9 +55,10 @@ class FeatureStore:
         """Compute the missing features of these rows (any shape) in one pass."""
         if frames not in self._rows:
             self._rows[frames], self._values[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
-            broken = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)  # such a file is written again
             if self._folder is not None and self.file(frames).exists():
-                with contextlib.suppress(*broken), self.file(frames).open("rb") as file, np.load(file) as arrays:
+                # a damaged file is written again
+                with contextlib.suppress(OSError, ValueError, KeyError), self.file(frames).open("rb") as file:
+                    arrays = read_arrays(file)
                     self._rows[frames], self._values[frames] = arrays["rows"], arrays["features"]
         missing = np.setdiff1d(rows, self._rows[frames])
         if not len(missing):

@@ -285,6 +285,7 @@ def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
     """Return the named arrays, of the types of their abstract leaves; other arrays are not read."""
     if not abstract:
         return {}
+    jax.local_devices()  # a wrong JAX_PLATFORMS is no fault of the checkpoint
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     try:
@@ -297,6 +298,7 @@ def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
 
 def _check_stored(folder: Path, forms: Mapping[str, Any]) -> None:
     """Raise CheckpointError if arrays on disk have other shapes than the record, before memory is taken for them."""
+    jax.local_devices()  # see `_load`
     try:
         with _ORBAX:
             stored = flatten(ocp.metadata(folder).metadata)

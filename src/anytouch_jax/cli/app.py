@@ -131,7 +131,7 @@ def guarded(program: str, run: Callable[[], int]) -> int:
     except (MemoryError, RuntimeError) as error:
         if "Unable to initialize backend" in str(error) or "Unknown backend" in str(error):  # jax's, for JAX_PLATFORMS
             value = os.environ.get("JAX_PLATFORMS", "")
-            advice = f"JAX_PLATFORMS is {value!r}: unset it, or install jax for that device" if value else error
+            advice = f"JAX_PLATFORMS is {value!r}: unset it, or install jax for that device" if value else str(error)
             return _report(program, f"jax cannot use this machine's devices. {advice}.")
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's is a RuntimeError
             raise

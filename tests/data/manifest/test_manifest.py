@@ -318,6 +318,17 @@ def test_a_csv_reads_one_class_from_spaces_unicode_forms_and_empty_spellings(tmp
     assert got.column("label.force").to_pylist() == [1, None, None, None, None, 2]  # a column of numbers
 
 
+def test_empty_spellings_of_a_parquet_are_unknown_and_other_spellings_stay(tmp_path):
+    columns = {"path": ["a.png", "b.png", "c.png"], "sensor": ["digit"] * 3, "sequence": ["s"] * 3}
+    columns |= {"frame_index": [0, 1, 2], "split": ["train"] * 3, "object": ["mug", "N/A", " "]}
+    columns |= {"label.x": ["wood ", "None", "-"], "note": ["-", "n/a", ""]}
+    pa.parquet.write_table(pa.table(columns), tmp_path / "m.parquet")
+    got = m.read(tmp_path / "m.parquet")
+    assert got.column("object").to_pylist() == ["mug", None, None]
+    assert got.column("label.x").to_pylist() == ["wood ", None, None]  # verify names other spellings
+    assert got.column("note").to_pylist() == ["-", "n/a", ""]
+
+
 @pytest.mark.parametrize(
     ("cells", "words"),
     [
@@ -360,6 +371,9 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     got, notes = attach_text(loose, tmp_path / "t.csv")
     assert got.column("text").to_pylist() == ['soft, "very" and round'] * 3 + [None] * 3
     assert notes == ["3 rows got a caption by 'sequence'", "1 of 2 keys of t.csv are not in the manifest"]
+    (tmp_path / "u.csv").write_text("object,text\n cafe\u0301  noir,smooth\n", encoding="utf-8")
+    drinks = replace_column(loose, "object", ["caf\u00e9 noir"] * 2 + ["tea"] * 4)
+    assert attach_text(drinks, tmp_path / "u.csv")[0].column("text").to_pylist() == ["smooth"] * 2 + [None] * 4
     table = pa.table({"frame_index": [0, 1], "words": ["new", "one"], "n": [1, 2]})
     pa.parquet.write_table(table, tmp_path / "t.parquet")
     more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")

@@ -28,6 +28,7 @@ from anytouch_jax.data.manifest.schema import (
     SCHEMA,
     SPLITS,
     ManifestError,
+    clean_text,
     load_table,
     read_text_csv,
     reading,
@@ -414,7 +415,7 @@ def attach_text(
         keys = manifest.column(key).cast(pa.string())
     except pa.ArrowException:
         raise UserError(f"column {key!r} of the manifest is no key: it is {manifest.column(key).type}") from None
-    at = pc.index_in(keys, value_set=pa.array(list(caption_of), pa.string()))
+    at = pc.index_in(clean_text(keys), value_set=pa.array(list(caption_of), pa.string()))
     new = pa.chunked_array([pa.array(list(caption_of.values()), pa.string())]).take(at.combine_chunks())
     matched = pc.sum(pc.is_valid(new)).as_py()
     if not matched:
@@ -449,7 +450,7 @@ def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, st
     if repeated := [name for name in (key, text) if names.count(name) > 1]:
         raise UserError(f"{path} has the column {repeated[0]!r} twice")
     try:
-        keys, texts = table[key].cast(pa.string()).to_pylist(), table[text].cast(pa.string()).to_pylist()
+        keys, texts = (clean_text(table[key].cast(pa.string())).to_pylist(), table[text].cast(pa.string()).to_pylist())
     except pa.ArrowException:
         kinds = f"{table[key].type} and {table[text].type}"
         raise UserError(f"{path}: {key!r} and {text!r} must be plain columns, are {kinds}") from None

@@ -18,6 +18,19 @@ def patterned(picture):
     return np.clip(picture + ramp, 0, 255).astype(np.uint8)
 
 
+def with_patterns(make):
+    """The fixture `make`, with a pattern over every picture, because pictures of one colour are a finding."""
+
+    def build(rows, folder="."):
+        manifest = make(rows, folder)
+        names = [name for name in ("path", "image_path", "image2_path") if name in manifest.table.column_names]
+        for file in {manifest.file(row, name) for name in names for row in np.flatnonzero(manifest.present(name))}:
+            cv2.imwrite(str(file), patterned(cv2.imread(str(file))))
+        return manifest
+
+    return build
+
+
 def plain_rows(count=6, **extra):
     """`count` rows of one dataset, in sequences of three frames."""
     return [{"sequence": f"s{i // 3}", "frame_index": i % 3, "dataset": "d", **extra} for i in range(count)]

@@ -1,11 +1,16 @@
 import numpy as np
 import pytest
-from checked_world import finding_rows
+from checked_world import finding_rows, with_patterns
 
 from anytouch_jax.data.manifest.manifest import select_rows
 from anytouch_jax.data.prepare.licences import NO, UNKNOWN, YES, allows, commercial_only, commercial_use, licences
 from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.errors import UserError
+
+
+@pytest.fixture
+def make(make):
+    return with_patterns(make)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,17 @@
 import numpy as np
 import pytest
-from checked_world import finding_rows, image_pairs, plain_rows
+from checked_world import finding_rows, image_pairs, plain_rows, with_patterns
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import replace_column, select_rows
 from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.errors import UserError
+
+
+@pytest.fixture
+def make(make):
+    return with_patterns(make)
 
 
 @pytest.mark.parametrize("witness", [True, False])

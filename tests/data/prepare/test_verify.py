@@ -5,7 +5,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from checked_world import finding_rows, image_pairs, patterned, plain_rows
+from checked_world import finding_rows, image_pairs, patterned, plain_rows, with_patterns
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
@@ -13,6 +13,12 @@ from anytouch_jax.data.manifest.manifest import replace_column, select_rows
 from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.data.prepare.verify import split_hash, verify
+
+
+@pytest.fixture
+def make(make):
+    return with_patterns(make)
+
 
 IMAGE = cv2.resize(np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8), (50, 40))
 

@@ -1,11 +1,15 @@
 """A file is written whole or not at all."""
 
+import io
 import os
 import stat
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from anytouch_jax import files
 from anytouch_jax.cli.app import main
 from anytouch_jax.files import atomic_path, atomic_write, lock
 
@@ -79,3 +83,33 @@ def test_a_lock_is_exclusive_and_ends_with_its_block(tmp_path):
         assert first and not second
     with lock(path) as again:
         assert again and path.read_text() == "kept"
+
+
+def npz_of(header: dict, data: bytes = b"") -> io.BytesIO:
+    """An .npz file with one array of this header and these bytes."""
+    member, file = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(member, header)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("x.npy", member.getvalue() + data)
+    file.seek(0)
+    return file
+
+
+def test_arrays_are_read_only_if_they_are_as_their_headers_say(tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.arange(6).reshape(2, 3), about=np.array("words"))
+    arrays = files.read_arrays(tmp_path / "a.npz", only=lambda name: name == "about")
+    assert str(arrays["about"]) == "words" and arrays["x"].shape == (2, 3)
+    np.testing.assert_array_equal(files.read_arrays(tmp_path / "a.npz")["x"], [[0, 1, 2], [3, 4, 5]])
+    np.savez(tmp_path / "objects.npz", x=np.array([{}], object))
+    huge = npz_of({"descr": "<f4", "fortran_order": False, "shape": (1 << 30, 1 << 10)})
+    short = npz_of({"descr": "<f4", "fortran_order": False, "shape": (2,)}, b"abc")
+    for file in (tmp_path / "objects.npz", huge, short):
+        with pytest.raises(ValueError, match="array x"):
+            files.read_arrays(file)
+    bomb = io.BytesIO()
+    np.savez_compressed(bomb, x=np.broadcast_to(np.uint8(0), ((1 << 20) * 5,)))
+    assert files.read_arrays(bomb)["x"].nbytes == 5 << 20
+    whole = (tmp_path / "a.npz").read_bytes()
+    for damaged in (whole[:-30], whole[:80] + b"\xff" * 60 + whole[140:], b"", b"PK"):
+        with pytest.raises(ValueError):
+            files.read_arrays(io.BytesIO(damaged))

@@ -279,6 +279,11 @@ def test_settings_without_effect_are_one_sentence(world, tmp_path):
         config = run_config(world, stage, model=model)
         config = replace(config, objective=replace(config.objective, **objective))
         assert words in refused(config, tmp_path / "r") and not (tmp_path / "r").exists()
+    jax.config.update("jax_enable_x64", True)
+    try:
+        assert "unset it, or add --model.dtype float64" in refused(run_config(world), tmp_path / "r")
+    finally:
+        jax.config.update("jax_enable_x64", False)
     config = run_config(world, 2)
     config = replace(config, optim=replace(config.optim, accumulate=2))
     assert "--optim.accumulate must be 1 in stage 2" in refused(config, tmp_path / "r")

@@ -14,6 +14,7 @@ import pytest
 
 from anytouch_jax.cli import arguments
 from anytouch_jax.cli.app import COMMANDS, GROUPS, guarded, main
+from anytouch_jax.errors import UserError
 
 HELP = """
 import contextlib, io, json, sys
@@ -121,6 +122,17 @@ def test_errors_of_the_machine_and_interrupts_are_one_line(capsys, error, status
     assert guarded("anytouch train", run) == status
     message = capsys.readouterr().err
     assert words in message and len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("error", [AssertionError(), UserError("could not read checkpoint"), RuntimeError("x")])
+def test_a_platform_that_jax_lacks_is_one_sentence(capsys, monkeypatch, error):
+    def run(*_):
+        raise error
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr("jax.devices", run)
+    assert guarded("anytouch embed", run) == 2
+    assert capsys.readouterr().err.startswith("anytouch embed: JAX_PLATFORMS is 'cuda', which jax cannot use here")
 
 
 def test_a_programming_error_keeps_its_traceback():

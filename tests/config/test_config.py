@@ -20,6 +20,7 @@ from anytouch_jax.config import (
     Stack,
     TextTower,
     from_json,
+    parse_json,
     preset,
     to_json,
 )
@@ -378,3 +379,20 @@ def test_a_retired_setting_with_an_effect_stops_a_run_but_not_an_encoder(change)
     section, _, name = next(iter(change)).partition("__")
     with pytest.raises(ConfigError, match=f"^the run sets {section}.{name} to .*, which this version no longer has"):
         from_json(text, allow_retired=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 100_000, "levels"), ("[" * 65 + "]" * 65, "levels"), ("1" * 5000, "5000 digits"), ("1e999", "range"),
+        ("NaN", "range"), ('{"a": -Infinity}', "range"), ('"\\ud800"', "Unicode"), (b"\xff", "not JSON"),
+        ("{", "not JSON"),
+    ],
+)  # fmt: skip
+def test_json_has_limits(text, words):
+    with pytest.raises(ConfigError, match=words):
+        parse_json(text)
+
+
+def test_json_within_the_limits_is_read():
+    assert parse_json(b'{"a": [1, 2.5, null, true, "\\ud83d\\ude00"]}') == {"a": [1, 2.5, None, True, "\U0001f600"]}

@@ -245,6 +245,14 @@ def test_heads_of_the_first_release_still_load(tmp_path):
     for name in ("other.npz", "gone.npz"):
         with pytest.raises(UserError, match=name):
             heads.load_head(tmp_path / name)
+    for name, value in (
+        ("weights", np.full((2, 1), np.nan)), ("weights", np.ones((3, 1))), ("scale", np.zeros(2)),
+        ("mean", np.zeros(0)), ("classes", np.zeros(2)), ("bias", np.array("0")), ("frames", np.zeros(3)),
+        ("pooling", "sum"), ("mark", 3), ("extra", 1),
+    ):  # fmt: skip
+        np.savez(tmp_path / "h.npz", **{"format": "anytouch_jax.head.1", **arrays, name: value})
+        with pytest.raises(UserError, match=r"h\.npz is not the head of a probe"):
+            heads.load_head(tmp_path / "h.npz")
 
 
 def test_the_middle_of_equals_is_selected():

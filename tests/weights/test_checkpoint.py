@@ -505,3 +505,26 @@ def test_of_a_failed_write_only_the_first_error_is_printed():
         hook(type(error), error, None)
     assert printed == ["no such thing", "Event loop is closed"]
     assert "quiet_hook" in sys.excepthook.__qualname__
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("arrays", None), ("arrays", {"trainable/w": [[10**10], "float33x"]}),
+        ("arrays", {"trainable/w": [["3"], "f"]}),
+        ("arrays", {"trainable/w": [[10**10], "float32"]}), ("files", {"../x": [1, 2]}), ("files", []), ("step", "1"),
+        ("metrics", {"loss": "low"}), ("metadata", 3), ("config", {}), ("format", None),
+    ],
+)  # fmt: skip
+def test_a_damaged_record_is_one_sentence(tmp_path, name, value):
+    saver = Checkpoints(tmp_path, keep=1, config_json="{}", metadata={})
+    saver.save(1, {"trainable": {"w": np.zeros(3, np.float32)}}, {"loss": 1.0})
+    saver.close()
+    path = tmp_path / "00000001" / "checkpoint.json"
+    record = json.loads(path.read_text())["record"]
+    record = {key: item for key, item in record.items() if key != name} if value is None else record | {name: value}
+    body = json.dumps(record, sort_keys=True)
+    path.write_text(json.dumps({"checksum": zlib.crc32(body.encode()), "record": record}))
+    with pytest.raises(CheckpointError, match="00000001") as caught:
+        checkpoint.load_params(tmp_path)
+    assert "\n" not in str(caught.value)

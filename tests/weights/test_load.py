@@ -21,7 +21,7 @@ from weights_world import (
     write_heads,
 )
 
-from anytouch_jax.config import SENSORS, UNIVERSAL
+from anytouch_jax.config import SENSORS, UNIVERSAL, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.compatible import resize_position
@@ -341,3 +341,80 @@ def test_files_of_every_kind_hold_the_same(torch_files, tmp_path):
     for name in ("w.safetensors", "w.npz", "w.pth", "w.bin"):
         assert_same(to_params(read_weights(tmp_path / name), STAGE1), params)
     assert not list(tmp_path.glob(".*"))  # no leftovers of the atomic write
+
+
+# Files of other programs ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod.", "model.", "model._orig_mod."])
+def test_prefixes_are_removed_in_every_format(torch_files, tmp_path, prefix):
+    weights = {f"{prefix}{key}": value for key, value in weights_of(STAGE1).items()}
+    write_safetensors(tmp_path / "w.safetensors", weights, {})
+    np.savez(tmp_path / "w.npz", **weights)
+    content = {"state_dict_ema": {key: torch_files.tensor(value) for key, value in weights.items()}, "epoch": 3}
+    torch_files.write(content, "w.ckpt")
+    for name in ("w.safetensors", "w.npz"):
+        assert_same(read_weights(tmp_path / name), weights_of(STAGE1))
+    with pytest.warns(UserWarning, match=r"w\.ckpt has no plain weights.*state_dict_ema"):
+        assert_same(read_weights(tmp_path / "w.ckpt"), weights_of(STAGE1))
+
+
+def test_plain_weights_come_before_averages(torch_files):
+    plain, average = ({"x": torch_files.tensor(np.full(2, value, "f4"))} for value in (1, 2))
+    path = torch_files.write({"teacher": average, "student": {"state_dict": plain}})
+    np.testing.assert_array_equal(read_weights(path)["x"], [1, 1])
+
+
+def test_weights_in_parts_are_read_by_their_index(tmp_path):
+    weights = weights_of(STAGE1)
+    homes = {key: f"model-0000{1 + i % 2}-of-00002.safetensors" for i, key in enumerate(weights)}
+    for part in set(homes.values()):
+        write_safetensors(tmp_path / part, {key: weights[key] for key in weights if homes[key] == part}, {})
+    with pytest.raises(UserError, match=r"one of 2 parts.*model\.safetensors\.index\.json"):
+        read_weights(tmp_path / "model-00001-of-00002.safetensors")
+    index = tmp_path / "model.safetensors.index.json"
+    index.write_text(json.dumps({"metadata": {"total_size": 1}, "weight_map": homes}))
+    write_heads(tmp_path, STAGE1)
+    for path in (index, tmp_path / "model-00002-of-00002.safetensors"):
+        assert_same(read_weights(path), weights)
+    assert_same(load_model(tmp_path, stored_rows=True).params, to_params(weights, STAGE1))
+    (tmp_path / "model-00002-of-00002.safetensors").unlink()
+    with pytest.raises(UserError, match=r"model-00002-of-00002\.safetensors, which is not there"):
+        load_model(tmp_path)
+
+
+def test_a_vision_tower_of_clip_alone_starts_stage_one(tmp_path):
+    config = tiny_config()
+    model = tiny_config(2, "paper", "pretrained").model
+    clip = params_of(model, seed=9)
+    folder = save_clip(tmp_path / "clip", model, clip)
+    arrays = read_weights(folder / "model.safetensors")
+    vision = {key: array for key, array in arrays.items() if key.startswith("vision_model.")}
+    write_safetensors(folder / "model.safetensors", vision, {})
+    fresh, params, notes, _ = start(config, clip=folder)
+    assert_same({"b": params["touch"]["blocks"]}, {"b": clip["image"]["blocks"]})
+    assert_same({"p": params["touch"]["projection"]}, {"p": fresh["touch"]["projection"]})
+    assert any("no projection" in note for note in notes)
+    assert any("activation" in note and "--model.activation quick_gelu" in note for note in notes)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("form", ["run", "file"])
+def test_weights_that_are_not_finite_are_refused_by_name(tmp_path, form, value):
+    config = tiny_config()
+    params = params_of(config.model)
+    params["decoder"]["mask_token"].flat[0] = value
+    path = save_run(tmp_path / "run", config, params) if form == "run" else tmp_path / "w.safetensors"
+    if form == "file":
+        export_safetensors(path, params, {MODEL_KEY: to_json(config.model)})
+    with pytest.raises(UserError, match="decoder/mask_token has values that are not finite"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("name", ["w.pth", "w.safetensors", "w.npz"])
+def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
+    texts = {"a web page": "\n<!DOCTYPE html><html>", "a Git LFS pointer": "version https://git-lfs.github.com/spec/v1"}
+    for kind, text in texts.items():
+        (tmp_path / name).write_text(text)
+        with pytest.raises(UserError, match=f"is {kind}"):
+            load_model(tmp_path / name)

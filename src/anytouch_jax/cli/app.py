@@ -113,7 +113,12 @@ def guarded(program: str, run: Callable[[], int]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = partial(_show_warning, warnings.showwarning)
-            status = run()
+            try:
+                status = run()
+            except Exception as error:
+                if missing := _missing_devices():
+                    raise missing from error
+                raise
         sys.stdout.flush()
         return status
     except SystemExit as stop:  # the parser's, after --help or a usage error
@@ -129,10 +134,6 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         advice = ". Free some space." if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         return _report(program, f"{error.filename or 'a file'}: {error.strerror or error}{advice}")
     except (MemoryError, RuntimeError) as error:
-        if "Unable to initialize backend" in str(error) or "Unknown backend" in str(error):  # jax's, for JAX_PLATFORMS
-            value = os.environ.get("JAX_PLATFORMS", "")
-            advice = f"JAX_PLATFORMS is {value!r}: unset it, or install jax for that device" if value else str(error)
-            return _report(program, f"jax cannot use this machine's devices. {advice}.")
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's is a RuntimeError
             raise
         less = "Use a smaller --batch, --size, --gallery or --preset, or --model.remat in training."
@@ -140,6 +141,18 @@ def guarded(program: str, run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def _missing_devices() -> UserError | None:
+    """Return the error of a JAX_PLATFORMS that jax cannot use, which it raises as one of many types; None otherwise."""
+    platforms, jax = os.environ.get("JAX_PLATFORMS", ""), sys.modules.get("jax")
+    if platforms in ("", "cpu") or jax is None:
+        return None
+    try:
+        jax.devices()
+    except Exception:
+        return UserError(f"JAX_PLATFORMS is {platforms!r}, which jax cannot use here: unset it, or install jax for it")
+    return None
 
 
 def _report(program: str, sentence: str, status: int = 2) -> int:

@@ -443,7 +443,8 @@ def _is_form(value: Any) -> bool:
         len(value[0]) <= 16
         and all(map(_is_size, value[0]))
         and math.prod(value[0]) < 1 << 45
-        and re.fullmatch(r"bool|key<\w+>|u?int(4|8|16|32|64)|b?float\d\w*|complex(64|128)", value[1]) is not None
+        and re.fullmatch(r"bool|u?int(4|8|16|32|64)|b?float(16|32|64)|float[48]_e\dm\d\w*|complex(64|128)", value[1])
+        is not None
     )
 
 

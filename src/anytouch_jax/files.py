@@ -11,9 +11,10 @@ import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextlib.contextmanager
@@ -79,6 +80,8 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
     Every header is read before any array. Pickled objects, sizes that the file does not have, and more than 1 GiB in a
     file a quarter as large are refused. Arrays whose names are not `only` are zeros of their shape that take no memory.
     """
+    import numpy as np
+
     if isinstance(file, str | Path) and (kind := placeholder(file)):
         raise ValueError(f"it is {kind}; download the file itself")
     try:
@@ -104,6 +107,8 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
 
 def _check_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> np.ndarray:
     """Return zeros of the form of an array. Raises ValueError if it does not have the bytes that its header gives."""
+    import numpy as np
+
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)

@@ -254,7 +254,9 @@ def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):
 
 @pytest.mark.parametrize(("change", "words"), [
     ({"rows": None}, "rows"), ({"rows": np.arange(12) + 1000}, "rows"), ({"rows": np.zeros(12, int)}, "rows"),
-    ({"features": np.array(["a"] * 12)}, "features"), ({"key/path": np.array(["x.png"] * 12)}, "manifest"),
+    ({"features": np.array(["a"] * 12)}, "features"), ({"features": np.full((12, 4), np.nan)}, "not finite"),
+    ({"features": np.ones((12, 0))}, "no columns"), ({"key/path": np.array(["x.png"] * 3)}, "keys"),
+    ({"key/path": np.array(["x.png"] * 12)}, "manifest"),
     ({"about/frames": np.array("3")}, "--frames 3"), ({}, "lacks 3 "),
 ])  # fmt: skip
 def test_a_features_file_that_does_not_fit_is_refused(pictures, tmp_path, change, words):

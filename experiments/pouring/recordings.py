@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.config import parse_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -25,7 +25,7 @@ from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_write
+from anytouch_jax.files import atomic_write, read_arrays
 from experiments.pouring.bounds import blind_inputs, imitate_plainly
 from experiments.pouring.physics import ACTIONS, STAND, Task
 from experiments.pouring.policy import Head, Learning, Touch, forward
@@ -218,14 +218,17 @@ def load_policy(folder: Path | str) -> Touch:
     folder = Path(folder)
     encoder = load_encoder(folder / WEIGHTS)
     try:
-        with np.load(io.BytesIO((folder / POLICY).read_bytes()), allow_pickle=False) as file:
-            arrays, metadata = dict(file), json.loads(str(file["about"]))
+        arrays = read_arrays(folder / POLICY)
+        metadata = dict(parse_json(str(arrays["about"])))
         stills, sensor, mark = bool(metadata["stills"]), str(metadata["sensor"]), metadata["encoder"]
         pooling, votes = metadata.get("pooling", "class"), int(metadata.get("votes", 1))  # of earlier policies
         count = sum(name.startswith("w/") for name in arrays)
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
         head = Head(arrays["mean"], arrays["basis"], layers)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        numbers = {name: array for name, array in arrays.items() if name != "about"}
+        if wrong := [name for name, x in numbers.items() if x.dtype.kind != "f" or not np.isfinite(x).all()]:
+            raise ValueError(f"{wrong[0]} has values that are not finite numbers")
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{folder / POLICY} is no pouring policy ({error})") from None
     if mark != encoder.fingerprint:
         raise UserError(

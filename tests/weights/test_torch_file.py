@@ -270,3 +270,10 @@ def test_a_declared_size_of_2_to_the_62_takes_no_memory(tmp_path, size, legacy):
             archive.writestr("archive/data.pkl", body)
     with pytest.raises(UserError, match=r"weights\.pth"):
         read_torch(path)
+
+
+def test_many_tensors_over_one_storage_are_refused_before_memory_is_taken(torch_files):
+    data = np.zeros(1, "f4")
+    views = {f"x{i}": torch_files.Tensor(data, shape=(1024, 1024), stride=(0, 0)) for i in range(100)}
+    with pytest.raises(UserError, match="many times larger than the file"):
+        read_torch(torch_files.write(views))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from anytouch_jax.encoder.embed import embed_frames, run_in_batches
+from anytouch_jax.encoder.embed import embed_frames, run_in_batches, spread_lines
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 
@@ -51,3 +51,16 @@ def test_no_clip_spans_a_gap_or_an_unreadable_frame(encoder):
     assert embed_frames(encoder, named, 1, length=3).rows.tolist() == [6, 7]
     with pytest.raises(UserError, match="too few for clips of 5"):
         embed_frames(encoder, named, 1, length=5)
+
+
+@pytest.mark.parametrize(("noise", "is_constant"), [(0.02, True), (1.0, False)])
+def test_the_spread_is_the_mean_cosine_of_pairs(noise, is_constant):
+    rng = np.random.default_rng(0)
+    values = (rng.standard_normal(16) + noise * rng.standard_normal((40, 16))).astype(np.float32)
+    unit = values / np.linalg.norm(values, axis=1, keepdims=True)
+    wanted = np.mean([unit[i] @ unit[j] for i in range(40) for j in range(40) if i != j])
+    lines = spread_lines(values)
+    assert f"{wanted:.4f}" in lines[0] and len(lines) == 1 + is_constant
+    assert not is_constant or ("Train longer" in lines[1] and "background subtraction" in lines[1])
+    assert spread_lines(values[:1]) == [] and spread_lines(np.zeros((0, 0), np.float32)) == []
+    assert len(spread_lines(np.repeat(values, 100, axis=0))) == 1 + is_constant, "more rows than are compared"

@@ -58,7 +58,7 @@ class EmbedOptions(FrameOptions):
 
 def run(options: EmbedOptions) -> int:
     """Write the features as .npz."""
-    from anytouch_jax.encoder.embed import save_npz
+    from anytouch_jax.encoder.embed import save_npz, spread_lines
 
     is_manifest = all(path.suffix.lower() in (".csv", ".parquet") for path in options.data)
     if is_manifest:
@@ -84,6 +84,8 @@ def run(options: EmbedOptions) -> int:
         about = frames_metadata(encoder, options, pooling, options.data[0])
         log_universal(encoder, options)
     save_npz(options.out, with_labels(features, head), about)
+    for line in spread_lines(features.values):
+        log(line)
     skipped = f", {features.skipped} skipped" if features.skipped else ""
     print(f"{options.out}: {len(features.values)} features of {features.values.shape[1]} values{skipped}")
     return 0

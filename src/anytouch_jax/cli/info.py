@@ -12,6 +12,7 @@ from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
 from anytouch_jax.errors import UserError
 
 _TABLES = (".csv", ".parquet")
+_SPREAD_BYTES = 1 << 28  # the features of larger files are not read
 _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 
@@ -172,10 +173,12 @@ def _manifest(path: Path) -> list[str]:
 
 def _features(path: Path) -> list[str]:
     """Return lines about features of `anytouch embed`; [] for another .npz. Raises UserError for a damaged file."""
+    from anytouch_jax.encoder.embed import spread_lines
     from anytouch_jax.files import read_arrays
 
+    is_small = path.stat().st_size < _SPREAD_BYTES
     try:
-        arrays = read_arrays(path, only=lambda name: name.startswith("about/"))
+        arrays = read_arrays(path, only=lambda name: name.startswith("about/") or (is_small and name == "features"))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}") from None
     if not {"features", "rows"} <= arrays.keys():
@@ -190,6 +193,7 @@ def _features(path: Path) -> list[str]:
     return [
         f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}",
         *metadata,
+        *(spread_lines(values) if is_small else []),
     ]
 
 

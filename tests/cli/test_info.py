@@ -35,6 +35,7 @@ def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
     for words in (str(world), *recordings, "image_path 1, text 4, touch 12, object 12", "labels: object"):
         assert words in manifest
     assert f"{features}: 12 features of 12" in lines and "frame_index, object, label.object" in lines
+    assert "spread: the mean cosine of two features is" in lines
     assert f"encoder: {tiny_run}" in lines and anytouch("info", world.parent).out.startswith(str(world))
 
 

@@ -253,8 +253,9 @@ def label_text(value: Any, source: str = "The label") -> str:
     if value is None or value != value:
         return ""
     if not isinstance(value, float | np.floating):
-        text = str(value)
-        return "" if text.strip().lower() in EMPTY else text
+        text = str(value).strip()
+        # "none" is a class of the simulator (no slide, no twist); "None" is what Python prints for a missing value.
+        return "" if text == "None" or (text != "none" and text.lower() in EMPTY) else str(value)
     if not np.isfinite(value) or value != int(value):
         raise UserError(f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number.")
     return str(int(value))

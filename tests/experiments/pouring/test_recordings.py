@@ -118,7 +118,7 @@ def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder,
 def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_path):
     seen = ("digit", "gelsight_mini")
     touch = serve_unseen(encoder.params["touch"], encoder.config.model, seen, universal_drawn=True)  # as it is loaded
-    encoder = replace(encoder, seen=seen, params={"touch": touch})
+    encoder = replace(encoder, trained_sensors=seen, params={"touch": touch})
     recordings.save_policy(tmp_path, pouring_policy.learn_frozen(encoder, shown, FAST, stills=True))
     assert recordings.load_policy(tmp_path).encoder.trained_sensors == seen
 

@@ -145,13 +145,9 @@ def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 def clean_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return a text column in Unicode form NFC with single spaces, where every spelling of EMPTY is null."""
-    return _without_empty(pc.utf8_trim(pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " "))
-
-
-def _without_empty(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a text column where every spelling of EMPTY is null."""
-    is_empty = pc.is_in(pc.utf8_lower(pc.utf8_trim_whitespace(column)), value_set=pa.array(EMPTY))
-    return pc.if_else(is_empty, pa.scalar(None, _TEXT), column) if pc.any(is_empty).as_py() else column
+    column = pc.utf8_trim(pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " ")
+    is_empty = pc.is_in(pc.utf8_lower(column), value_set=pa.array(EMPTY))
+    return pc.if_else(is_empty, pa.scalar(None, _TEXT), column)
 
 
 def spellings(values: Iterable[str]) -> list[list[str]]:
@@ -244,11 +240,9 @@ def _converted(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArra
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     wanted = SCHEMA.get(name)
-    is_text = any(kind(column.type) for kind in (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view))
-    if is_text and (name == "object" or name.startswith("label.")):
-        column = _without_empty(column.cast(_TEXT))
     if wanted is None:
         return column
+    is_text = any(kind(column.type) for kind in (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view))
     if pa.types.is_null(column.type):
         return column.cast(wanted)
     if is_text:

@@ -135,7 +135,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     assert all("sensor 'gelslim' was not in training" in words for words in said)
     np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
-    assert "the first frame is taken for that" in capsys.readouterr().err
+    assert "the first frame is the background (see --background)" in capsys.readouterr().err
     assert np.abs(np.load(tmp_path / "b.npz")["features"] - wanted).max() > 1e-3
 
 
@@ -196,8 +196,8 @@ def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder):
 
 def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
     frames = RNG.integers(100, 150, (3, 2, 28, 28, 3), np.uint8)
-    shown = policy.seen(encoder, frames, frames[0])
+    shown = policy.subtracted(encoder, frames, frames[0])
     assert (shown[0] == 128).all() and shown.dtype == np.uint8
     np.testing.assert_array_equal(shown[2, 1], frames[2, 1].astype(int) - frames[0, 1] + 128)
     plain = Encoder(replace(encoder.config, data=DataConfig()), encoder.params, "")
-    assert policy.seen(plain, frames, frames[0]) is frames
+    assert policy.subtracted(plain, frames, frames[0]) is frames

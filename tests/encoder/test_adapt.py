@@ -248,7 +248,7 @@ def test_the_command(run, data, tmp_path, capsys, compiled_once):
     args = ["adapt", "--model", run, "--data", data, "--sensor", "gelslim", "--labels", "hardness", "--frames", 8]
     args += ["--steps", 40, "--out"]
     assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 0
-    assert "tokens of gelslim fitted to 8 frames; The loss on frames of split val" in capsys.readouterr().out
+    assert "tokens of gelslim fitted to 8 frames. The loss on frames of split val" in capsys.readouterr().out
     assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 2
     assert "is not empty" in capsys.readouterr().err
     args[args.index("--frames") + 1] = 0

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ProcessPoolExecutor
+import subprocess
+import sys
 
 import pytest
+from places import ROOT
 
 from anytouch_jax.errors import UserError
 from experiments.records import read_records, write_record
-
-
-def write_several(path, writer):
-    for number in range(10):
-        write_record(path, f"{writer}-{number}", {"value": number})
 
 
 def test_what_is_written_is_read_in_the_order_of_the_keys(tmp_path):
@@ -34,8 +31,10 @@ def test_a_reader_may_change_what_it_read(tmp_path):
 
 def test_processes_lose_no_record(tmp_path):
     path = tmp_path / "study.jsonl"
-    with ProcessPoolExecutor(3) as pool:
-        list(pool.map(write_several, [path] * 3, "abc"))
+    code = "import sys; from pathlib import Path; from experiments.records import write_record\n"
+    code += "for number in range(10): write_record(Path(sys.argv[1]), f'{sys.argv[2]}{number}', {'value': number})"
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(path), name], cwd=ROOT) for name in "abc"]
+    assert [writer.wait() for writer in writers] == [0, 0, 0]
     assert len(read_records(path)) == 30
 
 

@@ -58,7 +58,8 @@ class EmbedOptions(FrameOptions):
 
 def run(options: EmbedOptions) -> int:
     """Write the features as .npz."""
-    from anytouch_jax.encoder.embed import save_npz, spread_lines
+    from anytouch_jax.encoder.embed import save_npz
+    from anytouch_jax.encoder.spread import spread_lines
 
     is_manifest = all(path.suffix.lower() in (".csv", ".parquet") for path in options.data)
     if is_manifest:

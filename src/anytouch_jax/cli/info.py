@@ -173,7 +173,7 @@ def _manifest(path: Path) -> list[str]:
 
 def _features(path: Path) -> list[str]:
     """Return lines about features of `anytouch embed`; [] for another .npz. Raises UserError for a damaged file."""
-    from anytouch_jax.encoder.embed import spread_lines
+    from anytouch_jax.encoder.spread import spread_lines
     from anytouch_jax.files import read_arrays
 
     is_small = path.stat().st_size < _SPREAD_BYTES

@@ -7,6 +7,7 @@ import itertools
 import math
 import os
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, Protocol
@@ -20,6 +21,9 @@ from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
 
 MAX_PIXELS = 1 << 26  # a small file can declare an image that would fill the memory
+MAX_CODED = 16 * MAX_PIXELS  # pixels times scans of a JPEG: each scan goes over the whole picture
+MAX_PARTS = 1 << 12  # chunks or segments of a header, which Pillow reads one by one
+MAX_PADDING = 1 << 16  # bytes between the segments of a JPEG, which Pillow reads one by one
 MAX_ASPECT = 100  # a longer strip would fill the memory when its short side is resized
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
 BACKGROUND, PHOTO = "background", "photo"  # names of images in a recording that are not frames
@@ -44,7 +48,14 @@ _ORIENTATION = 274  # a tag of EXIF and of a TIFF
 _WIDTH, _HEIGHT, _BITS, _ALPHA = 256, 257, 258, 338  # tags of a TIFF; _ALPHA is 2 for unassociated alpha
 _NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
+_MARKER = re.compile(rb"\xff([^\0\xff\xd0-\xd7])")  # of a JPEG, not inside its coded data
+_SCAN, _END = b"\xda", b"\xd9"
+_DECODED_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+
 cv2.setNumThreads(1)  # the loader has threads already
+if "OPENCV_LOG_LEVEL" not in os.environ:  # our errors say what is wrong; OpenCV's log would hide them
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")
 
 
 class Video(Protocol):
@@ -115,10 +126,11 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
 def _unpack(data: bytes) -> np.ndarray:
     if data[:6] == b"\x93NUMPY":
         return _unpack_npy(data)
+    chunks = _decoded_chunks(data) if data.startswith(_PNG) else data
     orientation = _check_header(data)
     jpeg = data.startswith(_JPEG) and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(chunks, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(error.err) from None
     if pixels is None:
@@ -163,8 +175,8 @@ def _check_header(data: bytes) -> int:
     header = next((header for start, header in _HEADERS.items() if data.startswith(start)), None)
     if header is None and not data.startswith(_TIFF):
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
-    if data.startswith(_PNG):
-        _check_png(data)
+    if data.startswith(_JPEG):
+        _check_segments(data)
     stream, image = io.BytesIO(data), None
     try:
         image = header(stream) if header is not None else None
@@ -176,9 +188,11 @@ def _check_header(data: bytes) -> int:
         raise ValueError(f"{reason} ({error})") from None
     if width * height > MAX_PIXELS:
         raise ValueError(f"it declares {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
-    # OpenCV fills the lost part of some cut JPEG files with grey. The stream is now behind the last header.
-    if data.startswith(_JPEG) and data.find(b"\xff\xd9", stream.tell()) < 0:
-        raise ValueError("the file is cut short")
+    if data.startswith(_JPEG):
+        # OpenCV fills the lost part of some cut JPEG files with grey. The stream is now behind the last header.
+        if data.find(b"\xff\xd9", stream.tell()) < 0:
+            raise ValueError("the file is cut short")
+        _check_scans(data, max(width * height, 1 << 16))
     return _orientation(image) if image is not None and "exif" in image.info else 1
 
 
@@ -190,17 +204,55 @@ def _orientation(image: ImageFile.ImageFile) -> int:
     return value if value in range(1, 9) else 1
 
 
-def _check_png(data: bytes) -> None:
-    """Walk over the chunks: OpenCV allocates what a chunk declares, up to 4 GB."""
-    at, kind, headers = 8, b"", 0
+def _decoded_chunks(data: bytes) -> bytes:
+    """Return a PNG without what adds nothing to its pixels, and much to time and to libpng's warnings.
+
+    OpenCV allocates what a chunk declares, up to 4 GB, so the chunks are walked first.
+    """
+    at, kind, headers, count, parts = 8, b"", 0, 0, [data[:8]]
     while kind != b"IEND":
         length, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
-        at += 12 + length
-        if at > len(data):
+        if at + 12 + length > len(data):
             raise ValueError("the picture is corrupt or cut short")
+        if kind in _DECODED_CHUNKS:
+            parts.append(data[at : at + 12 + length])
+        at += 12 + length
         headers += kind == b"IHDR"
+        if (count := count + 1) > MAX_PARTS + at // 256:
+            raise ValueError(f"it has more than {MAX_PARTS} chunks of a few bytes")
     if headers != 1 or data[12:16] != b"IHDR":
         raise ValueError("the picture is corrupt")
+    return b"".join(parts) if len(parts) <= count else data
+
+
+def _segments(data: bytes) -> Iterator[tuple[bytes, int]]:
+    """Yield (kind, bytes skipped before it) of the segments of a JPEG up to its end, as decoders walk them."""
+    at = 2
+    while (marker := _MARKER.search(data, at)) and marker[1] != _END:
+        yield marker[1], marker.start() - at
+        at = marker.end() + max(2, int.from_bytes(data[marker.end() : marker.end() + 2]))
+
+
+def _check_segments(data: bytes) -> None:
+    """Bound the header of a JPEG."""
+    padding = 0
+    for count, (kind, skipped) in enumerate(_segments(data)):
+        padding += skipped
+        if padding > MAX_PADDING or count > MAX_PARTS:
+            raise ValueError(f"its header has more than {MAX_PADDING} bytes of padding or {MAX_PARTS} segments")
+        if kind == _SCAN:
+            return
+
+
+def _check_scans(data: bytes, pixels: int) -> None:
+    """Bound the time to decode a JPEG; a count of bytes, which may stand elsewhere too, is enough for most."""
+    most = MAX_CODED // pixels
+    if data.count(b"\xff" + _SCAN) > most:
+        scans = 0
+        for count, (kind, _) in enumerate(_segments(data)):
+            scans += kind == _SCAN
+            if scans > most or count > 16 * MAX_PARTS:
+                raise ValueError(f"it has more than {most} scans, which would take minutes; save it as a plain JPEG")
 
 
 def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:

@@ -1,0 +1,99 @@
+"""Pictures that are made to take minutes, or to print millions of lines, are refused before they are decoded."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from anytouch_jax.data import images
+from anytouch_jax.data.images import ImageError, decode_bytes
+
+RGB = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
+
+
+def _saved(kind: str, **options: object) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(RGB).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def _many_scans(count: int) -> bytes:
+    """Return a progressive JPEG whose last scan comes `count` times more."""
+    data = _saved("JPEG", progressive=True)
+    return data[:-2] + data[data.rindex(b"\xff\xda") : -2] * count + data[-2:]
+
+
+def _padded(padding: bytes) -> bytes:
+    data = _saved("JPEG")
+    return data[:20] + padding + data[20:]
+
+
+def _chunk(kind: bytes, body: bytes = b"") -> bytes:
+    return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+
+
+def _many_chunks(chunk: bytes, count: int, at: int = 33) -> bytes:
+    data = _saved("PNG")
+    return data[:at] + chunk * count + data[at:]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (_many_scans(20_000), "more than 16384 scans"),
+        (_padded(b"\xff" * 100_000), "bytes of padding"),
+        (_padded(b"\0" * 100_000), "bytes of padding"),
+        (_padded(b"\xff\xd0" * 50_000), "bytes of padding"),
+        (_padded(b"\xff\xfe\0\2" * 5000), "4096 segments"),
+        (_padded(b"\xff\xe1\0\0" * 5000), "4096 segments"),
+        (_many_chunks(_chunk(b"gAMA", b"\0\0\0\1"), 9000), "more than 4096 chunks"),
+        (_many_chunks(_chunk(b"IDAT"), 9000), "more than 4096 chunks"),
+        (_many_chunks(_chunk(b"tEXt", b"a\0b"), 9000, -12), "more than 4096 chunks"),
+    ],
+    ids=["scans", "fill", "zeros", "restarts", "comments", "exif", "gamma", "data", "text"],
+)
+def test_a_picture_that_would_take_minutes_is_refused(data, words, monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(ImageError, match=f"hostile cannot be read: .*{words}"):
+        decode_bytes(data, "hostile")
+
+
+def test_the_limit_of_scans_falls_with_the_size(monkeypatch):
+    monkeypatch.setattr(images, "MAX_CODED", 20 * (1 << 16))
+    plain = decode_bytes(_many_scans(0), "x")
+    trailer = b"\xff\xda" * 1000  # a film behind the picture, as phones append it, has markers by chance
+    np.testing.assert_array_equal(decode_bytes(_many_scans(0) + trailer, "x"), plain)
+    with pytest.raises(ImageError, match="more than 20 scans"):
+        decode_bytes(_many_scans(30), "x")
+    hidden = _many_scans(0)[:-2] + b"\xff\xfe\0\4\xff\xd9" + _many_scans(30)[len(_many_scans(0)) - 2 :]
+    with pytest.raises(ImageError, match="more than 20 scans"):  # an end inside a comment is none
+        decode_bytes(hidden, "x")
+
+
+@pytest.mark.parametrize(
+    "chunk",
+    [_chunk(b"gAMA", b"\0\0\0\0"), _chunk(b"sBIT", b"\0\0\0"), _chunk(b"iCCP", b"x\0\0y"), _chunk(b"tIME", b"")],
+)
+def test_a_png_with_odd_chunks_is_decoded_without_a_word(chunk, capfd):
+    np.testing.assert_array_equal(decode_bytes(_many_chunks(chunk, 300), "x"), RGB)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_broken_tiff_or_bmp_prints_nothing_of_opencv(capfd):
+    data = _saved("TIFF", compression="tiff_lzw")
+    with contextlib.suppress(ImageError):
+        decode_bytes(data[:200] + bytes(len(data) - 400) + data[-200:], "x")
+    with pytest.raises(ImageError, match="x cannot be read"):
+        decode_bytes(_saved("BMP")[:-40], "x")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_animation_gives_its_first_picture():
+    moving = _saved("PNG", save_all=True, append_images=[Image.fromarray(255 - RGB)])
+    np.testing.assert_array_equal(decode_bytes(moving, "x"), RGB)

@@ -43,7 +43,8 @@ def clip(**change):
         "unit": unit._replace(**change.pop("unit", {})),
         "seed": np.uint32(1),
     }
-    return ClipInput(**(values | change))
+    values |= change
+    return ClipInput(**values, drift=np.zeros((len(values["depth"]), 3, 3), np.float32))
 
 
 def grid(n=30, pitch=0.2):
@@ -157,8 +158,7 @@ def test_a_camera_gives_pictures_and_the_fields_asked_for(takes):
         assert take.background.shape == (43, 32, 3)
         assert take.field.shape == (5, 43, 32, 3)  # at the pixels of the picture
         changed = np.abs(take.image.astype(float) - take.background).mean((1, 2, 3))
-        assert changed[2] > 1.2 * changed[0]  # pressed beside barely touched
-        assert recording.depth[2] > 5 * recording.depth[0]
+        assert changed[recording.depth > 0.3].min() > 1.2 * changed[recording.depth <= 0].max(initial=0)
 
 
 def test_a_sensor_of_fields_gives_no_picture(takes):
@@ -195,21 +195,22 @@ def test_a_field_is_felt_where_the_load_is_and_its_points_give_way_to_the_sides(
 def test_labels_agree_with_the_pressure(takes):
     for recording, take in takes["digit"]:
         pressure, unit = take.field[..., 0], recording.unit
-        np.testing.assert_allclose(take.labels["depth"][0], recording.depth[0], rtol=1e-5)
+        total = np.maximum(pressure.sum((1, 2)), 1e-9)
+        np.testing.assert_allclose(take.labels["depth"][0], max(recording.depth[0], 0), rtol=1e-5)
         pitch = float(unit.zoom) * DIGIT.field[1] / 32  # mm of a pixel
         edge = pressure[:, [0, -1]].sum((1, 2)) + pressure[:, :, [0, -1]].sum((1, 2))
-        whole = edge < 1e-2 * pressure.sum((1, 2))  # the picture shows all of the contact
+        touching = recording.depth > 0
+        whole = touching & (edge < 1e-2 * pressure.sum((1, 2)))  # the picture shows all of the contact
         force = pressure.sum((1, 2)) * pitch**2 * 1e-3
         np.testing.assert_allclose(take.labels["force"][whole], force[whole], rtol=0.1)
         shown = (np.arange(32) + 0.5 - 16) * pitch
-        middle = (pressure.sum(1) * shown).sum(1) / pressure.sum((1, 2))
+        middle = (pressure.sum(1) * shown).sum(1) / total
         np.testing.assert_allclose(take.labels["x"][whole], middle[whole], atol=0.3 * pitch)
-        assert (take.labels["force"] > 0).all() and take.labels["force"][2] > take.labels["force"][0]
+        np.testing.assert_array_equal(take.labels["force"] > 0, touching)
+        assert not take.field[~touching].any()
         assert ((take.labels["slip"] >= 0) & (take.labels["slip"] <= 1)).all()
         if recording.gesture.motion == "hold":
-            assert not take.field[..., 1:].any() and not take.labels["slip"].any()
-        else:
-            assert np.abs(take.field[-1, ..., 1:]).max() > np.abs(take.field[1, ..., 1:]).max()
+            assert np.abs(take.field[..., 1:]).max() < 0.4 * recording.depth.max()  # only squeezed to the sides
 
 
 def test_an_object_that_turns_about_itself_does_not_slide():

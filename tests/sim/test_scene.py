@@ -135,23 +135,52 @@ def test_shares_of_photographs_and_captions():
     assert not any(r.has_photo for r in none) and all(r.has_text for r in none)
 
 
+def gesture(motion, slide=(0.0, 0.0), twist=0.0, shown=1.0, middle=0.5, lift=-1.0):
+    """A gesture whose phases lift 10 %, press 20 %, pause 10 %, move 30 %, pause 10 %, release 10 % and lift 10 %."""
+    phases = np.array([1, 2, 1, 3, 1, 1, 1]) / 10
+    return Gesture(0.8, motion, np.asarray(slide), twist, phases, shown, middle, lift, np.array([1.0, 0.0, 0.1]))
+
+
 @pytest.mark.parametrize("motion", ["hold", "slide", "twist"])
-@pytest.mark.parametrize("pace", [0.6, 1.0, 1.5])
-def test_a_gesture_presses_then_moves_then_lets_go(motion, pace):
+def test_a_gesture_presses_then_moves_then_lets_go(motion):
     slide, twist = np.array([1.5, -0.5]) * (motion == "slide"), 0.2 * (motion == "twist")
-    moved, depth = scene.trajectory(40, Gesture(0.8, motion, slide, twist, pace))
-    assert moved.shape == (40, 3) and depth.shape == (40,)
-    assert depth[0] == pytest.approx(0.08) and depth.max() == pytest.approx(0.8, rel=0.02)
-    assert (np.diff(depth[: np.argmax(depth)]) >= 0).all() and np.abs(np.diff(depth)).max() < 0.2
-    assert not moved[0].any()
-    if pace >= 1:
-        np.testing.assert_allclose(moved[-1], [*slide, twist], atol=1e-9)
-        assert depth[-1] == pytest.approx(0.32)
+    moved, depth = scene.trajectory(101, gesture(motion, slide, twist))
+    assert moved.shape == (101, 3) and depth.shape == (101,)
+    touching = depth > 0
+    assert 0.75 < touching.mean() < 0.85 and not touching[:10].any() and not touching[-10:].any()
+    assert depth.max() == pytest.approx(0.8) and (depth[31:80] == depth.max()).all()
+    assert (np.diff(depth[touching][:20]) >= 0).all() and np.abs(np.diff(depth[touching])).max() < 0.15
+    assert not moved[:40].any()
+    np.testing.assert_allclose(moved[-1], [*slide, twist], atol=1e-9)
     assert (np.diff(moved @ np.sign([1.5, -0.5, 0.2])) >= -1e-12).all()  # never backwards
 
 
+def test_a_clip_shows_a_part_of_a_gesture():
+    whole, depth = scene.trajectory(101, gesture("slide", (1, 0)))
+    part, shallow = scene.trajectory(11, gesture("slide", (1, 0), shown=0.1, middle=0.55))
+    np.testing.assert_allclose(part, whole[50:61], atol=1e-9)
+    np.testing.assert_allclose(shallow, depth[50:61], atol=1e-9)
+
+
+def test_a_regrasp_leaves_the_object_and_comes_back_elsewhere():
+    for frames in (4, 40):
+        moved, depth = scene.trajectory(frames, gesture("hold", shown=0.5, lift=0.5))
+        off = np.flatnonzero(depth <= 0)
+        assert len(off) >= 1 and depth[0] > 0 and depth[-1] > 0
+        assert not moved[0].any()
+        np.testing.assert_allclose(moved[-1], [1.0, 0, 0.1])
+
+
+def test_gestures_differ_in_length_and_some_frames_are_without_contact():
+    depths = np.stack([recordings(SCENES, number)["digit"].depth for number in range(400)])
+    assert 0.03 < (depths <= 0).mean() < 0.2
+    assert ((depths > 0).sum(1) > 0).mean() > 0.97
+    lengths = [scene.draw_touch(SCENES, number, SPLITS).gesture.shown for number in range(400)]
+    assert min(lengths) < 0.4 and max(lengths) > 1.1
+
+
 def test_a_still_is_the_deepest_press():
-    moved, depth = scene.trajectory(1, Gesture(0.8, "slide", np.ones(2), 0.0, 1.0))
+    moved, depth = scene.trajectory(1, gesture("slide", (1, 1)))
     assert not moved.any() and depth.tolist() == [0.8]
 
 
@@ -169,11 +198,14 @@ def test_a_sensor_of_fields_has_no_camera_that_mirrors_or_crops():
 
 def test_directions_are_those_of_the_picture():
     recording = recordings(SCENES, 0)["digit"]
+    assert (
+        scene.directions(recording._replace(gesture=gesture("slide", (2, 0)), depth=-np.ones(10)))["label.motion"]
+        == "hold"
+    )
 
     def seen(motion, slide=(0.0, 0.0), twist=0.0, mirror=(1, 1), rotation=0.0):
         unit = recording.unit._replace(mirror=np.asarray(mirror, np.float32), rotation=np.float32(rotation))
-        gesture = Gesture(0.5, motion, np.asarray(slide), twist, 1.0)
-        return scene.directions(recording._replace(unit=unit, gesture=gesture))
+        return scene.directions(recording._replace(unit=unit, gesture=gesture(motion, slide, twist), depth=np.ones(10)))
 
     assert seen("hold") == {"label.motion": "hold", "label.twist": "none", "label.slide": "none"}
     assert seen("slide", (2, 0.3)) == {"label.motion": "slide", "label.twist": "none", "label.slide": "right"}

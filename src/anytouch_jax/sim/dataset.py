@@ -34,8 +34,7 @@ from anytouch_jax.sim.world import captions, objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches in a part
-VERSION = 3  # a change of the simulator that changes the data of a seed raises it
-NEWER = {"tac3d": 4}  # sensors whose data changed alone
+VERSION = 5  # a change of the simulator that changes the data of a seed raises it
 Row = dict[str, Any]
 
 
@@ -71,7 +70,7 @@ def simulate(
 
 def version(sensors: Sequence[str]) -> int:
     """Return the version of the data that a seed gives for these sensors."""
-    return max(NEWER.get(name, VERSION) for name in sensors)
+    return VERSION
 
 
 def _simulate(
@@ -181,16 +180,17 @@ def _write_recording(
         path = folder / f"{t:03d}{'.npy' if kind == 'field' else '.jpg'}"
         field = folder / f"{t:03d}.npy" if scenes.fields or kind == "field" else None
         if kind != "field":
-            _write_image(out / path, take.image[t])
+            _write_image(out / path, take.image[t], int(recording.unit.quality))
         if field is not None:
             _write_array(out / field, take.field[t])
         rows.append(
             common
             | {"path": path.as_posix(), "frame_index": t, "field_path": field and field.as_posix()}
             | {f"label.{name}": float(np.float32(values[t])) for name, values in take.labels.items()}
+            | ({} if recording.depth[t] > 0 else {"touch": None})  # no place is touched in this frame
         )
     if background is not None:
-        _write_image(out / background, take.background)
+        _write_image(out / background, take.background, int(recording.unit.quality))
         lock = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
         rows.append(common | lock | {"split": "background", "touch": None, "text": None, "image_path": None})
     return rows
@@ -241,8 +241,8 @@ def _write_manifest(parts: list[Path], target: Path) -> None:
     manifests.write(manifest, target)
 
 
-def _write_image(path: Path, image: np.ndarray) -> None:
-    good, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+def _write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
+    good, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not good:
         raise RuntimeError(f"OpenCV could not encode {path}")
     _write_bytes(path, data.tobytes())

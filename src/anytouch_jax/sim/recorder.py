@@ -26,7 +26,8 @@ from anytouch_jax.sim.world.objects import Object
 
 SPACING = 0.1  # mm between pixels of a height map
 RELIEF = 400  # pixels of a height map: 40 mm hold any rotated field and its motion
-GRID = 96  # pixels of the solve grid on the field's short side
+GRID = 96  # pixels of the solve grid on the field's short side, at most
+LEAST = 64  # with fidelity fast the grid has half the image's pixels, or as many as these
 
 
 class ClipInput(NamedTuple):
@@ -34,7 +35,7 @@ class ClipInput(NamedTuple):
 
     `relief` (RELIEF, RELIEF) mm is the object's height map with SPACING mm between pixels, and `place` (2,) mm the
     touched place on it. `start`, `motion`, `depth` and `tilt` are as in `scene.Recording`. `modulus` is the object's
-    in kPa, `friction` that on the gel, `unit` the sensor unit, `seed` u32 that of the image noise.
+    in kPa, `friction` that on the gel, `unit` the sensor unit, `drift` its light's, `seed` u32 the image noise's.
     """
 
     relief: Any
@@ -46,6 +47,7 @@ class ClipInput(NamedTuple):
     modulus: Any
     friction: Any
     unit: Any
+    drift: Any
     seed: Any
 
 
@@ -60,9 +62,9 @@ class ClipOutput(NamedTuple):
     labels: dict[str, Any]
 
 
-def solve_grid(sensor: Sensor) -> tuple[tuple[int, int], float]:
+def solve_grid(sensor: Sensor, size: int = 0, fidelity: Fidelity = "exact") -> tuple[tuple[int, int], float]:
     """Return (rows, columns) of the solve grid over a sensor's field, and its pitch in mm. Its pixels are square."""
-    pitch = min(sensor.field) / GRID
+    pitch = min(sensor.field) / (min(max(LEAST, size // 2), GRID) if fidelity == "fast" and size else GRID)
     rows, columns = (4 * round(side / pitch / 4) for side in sensor.field)
     return (rows, columns), pitch
 
@@ -87,45 +89,44 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
 
 
 def gel_motion(clip: ClipInput) -> Array:
-    """Return the motion (T, 3) mm, mm, rad of the object between frames, in the gel's frame. It starts with 0."""
-    steps = jnp.diff(clip.motion, axis=0, prepend=clip.motion[:1])
+    """Return the motion (T, 3) mm, mm, rad of the object between frames in the gel's frame, first since the touch."""
+    steps = jnp.diff(clip.motion, axis=0, prepend=jnp.zeros((1, 3)))
     return jnp.stack([*rotated(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
 
 
 def simulate_clip(
-    clip: ClipInput, *, sensor: Sensor, fidelity: Fidelity, size: int, fields: tuple[str, ...] = (), slides: bool = True
+    clip: ClipInput, *, sensor: Sensor, fidelity: Fidelity, size: int, fields: tuple[str, ...] = ()
 ) -> ClipOutput:
     """Simulate one clip by `sensor`: contact of every frame, shear with its history, images and labels.
 
-    `size` is the short side of the image in pixels, 0 for the sensor's resolution. `slides` False omits shear.
+    `size` is the short side of the image in pixels, 0 for the sensor's resolution.
     """
-    (rows, columns), pitch = solve_grid(sensor)
+    (rows, columns), pitch = solve_grid(sensor, size, fidelity)
     y, x = jnp.meshgrid(*((jnp.arange(n) - (n - 1) / 2) * pitch for n in (rows, columns)), indexing="ij")
     gel = unit_gel(sensor, clip.unit)
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
     relief = surfaces(clip, x, y)
     contact = jax.vmap(press)(relief, clip.depth)
-    squeezed = (
-        jax.vmap(lambda p: mechanics.sideways(p, gel, pitch))(contact.pressure) if sensor.kind == "field" else None
-    )
-    sheared = _sheared(clip, contact, squeezed, gel, pitch, fidelity) if slides else _unsheared(contact)
+    squeezed = jax.vmap(lambda p: mechanics.sideways(p, gel, pitch, fidelity=fidelity))(contact.pressure)
+    sheared = _sheared(clip, contact, squeezed, gel, pitch, fidelity)
+    sheared = sheared._replace(displacement=sheared.displacement + squeezed)
     labels = _labels(clip, contact, sheared, pitch) | {"depth": _depth(clip, relief)}
     if fidelity == "fast":
         del labels["converged"]  # a few iterations do not converge
     keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
-    if squeezed is not None:
+    if sensor.kind == "field":
         measure = partial(
             optics.measure_field, pitch=pitch, points=sensor.resolution[0], noise=clip.unit.noise, gel=gel
         )
         measured = jax.vmap(lambda *maps: measure(*maps[:-1], key=maps[-1]))(
-            contact.displacement, sheared.displacement + squeezed, contact.pressure, sheared.traction, keys[1:]
+            contact.displacement, sheared.displacement, contact.pressure, sheared.traction, keys[1:]
         )
         return ClipOutput(None, None, measured, labels)
     shape = optics.picture_size(sensor, size)
     draw = partial(optics.render, pitch=pitch, sensor=sensor, unit=clip.unit, resolution=shape)
     behind = optics.backdrop(sensor, clip.unit, shape)
-    image = jax.vmap(lambda u, t, key: draw(u, t, key=key, behind=behind))(
-        contact.displacement, sheared.displacement, keys[1:]
+    image = jax.vmap(lambda u, t, key, drift: draw(u, t, key=key, behind=behind, drift=drift))(
+        contact.displacement, sheared.displacement, keys[1:], clip.drift
     )
     background = optics.background(sensor, clip.unit, keys[0], resolution=shape)
     mapped = _fields(fields, contact, sheared, partial(optics.onto_picture, pitch=pitch, sensor=sensor, unit=clip.unit,
@@ -134,11 +135,11 @@ def simulate_clip(
 
 
 def _sheared(
-    clip: ClipInput, contact: PressResult, squeezed: Array | None, gel: Gel, pitch: float, fidelity: Fidelity
+    clip: ClipInput, contact: PressResult, squeezed: Array, gel: Gel, pitch: float, fidelity: Fidelity
 ) -> shear.Shear:
     """Return the tangential state of every frame, computed from the previous one."""
 
-    def step(state: shear.Shear, frame: tuple[PressResult, Array, Array | None]) -> tuple[shear.Shear, shear.Shear]:
+    def step(state: shear.Shear, frame: tuple[PressResult, Array, Array]) -> tuple[shear.Shear, shear.Shear]:
         state = shear.shear_step(
             state,
             frame[0],
@@ -154,14 +155,8 @@ def _sheared(
         return state, state
 
     start = shear.at_rest((contact.pressure.shape[1], contact.pressure.shape[2]), contact.pressure.dtype)
-    change = None if squeezed is None else jnp.diff(squeezed, axis=0, prepend=jnp.zeros_like(squeezed[:1]))
+    change = jnp.diff(squeezed, axis=0, prepend=jnp.zeros_like(squeezed[:1]))
     return jax.lax.scan(step, start, (contact, gel_motion(clip), change))[1]
-
-
-def _unsheared(contact: PressResult) -> shear.Shear:
-    frames, rows, columns = contact.pressure.shape
-    still = shear.at_rest((rows, columns), contact.pressure.dtype)
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape)), still)
 
 
 def _labels(clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
@@ -211,7 +206,7 @@ class Recorder:
         # Pixels of a recording: an image is at most twice as long as wide, and a sensor's at most 480 pixels high.
         pixels = 2 * scenes.frames * (scenes.size or 480) ** 2
         self._at_once = max(1, min(batch, MAX_PIXELS // pixels))
-        self._relief = lru_cache(64)(lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING))
+        self._relief = lru_cache(512)(lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING))
         self._programs: dict[str, Any] = {}
 
     def record(self, recordings: Sequence[Recording]) -> list[ClipOutput]:
@@ -240,7 +235,6 @@ class Recorder:
                 fidelity=scenes.fidelity,
                 size=scenes.size,
                 fields=scenes.fields,
-                slides=scenes.frames > 1 or SENSORS[name].kind == "field",
             )
             self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]
@@ -258,5 +252,6 @@ class Recorder:
             modulus=np.float32(thing.material.modulus),
             friction=np.float32(thing.material.friction),
             unit=recording.unit,
+            drift=recording.drift,
             seed=np.uint32(recording.seed),
         )

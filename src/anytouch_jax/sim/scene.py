@@ -1,7 +1,7 @@
 """Touch scenes: objects, places, motions and sensor units, drawn from a seed by numpy.
 
-A touch is a place on an object. A recording is one sensor's clip of it: press, hold, slide or twist, release. One
-gesture fills a clip of any length. Ten frames at the sensors' 30 Hz are a third of a second.
+A touch is a place on an object. A recording is one sensor's clip of it: a part of press, hold, slide or twist, release,
+with pauses and regrasps.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from anytouch_jax.config.parsing import BELOW_1, COUNT, NOT_NEGATIVE, SHARE, chosen, in_range
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.sensing.sensors import SENSORS
-from anytouch_jax.sim.sensing.units import THINNEST, Unit, draw_unit
+from anytouch_jax.sim.sensing.units import THINNEST, Unit, draw_drift, draw_unit
 from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray
@@ -97,21 +97,29 @@ class Touch(NamedTuple):
 
 
 class Gesture(NamedTuple):
-    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad, and `pace`, 1 as usual."""
+    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad.
+
+    `phases` (7,) are the shares of lift, press, pause, move, pause, release and lift. A clip shows `shown` of the
+    gesture around `middle`. At `lift` the sensor is off for a moment and comes back moved by `regrasp` (3,).
+    """
 
     depth: float
     motion: Motion
     slide: Array
     twist: float
-    pace: float
+    phases: Array
+    shown: float
+    middle: float
+    lift: float
+    regrasp: Array
 
 
 class Recording(NamedTuple):
     """One sensor's clip of a touch, by one sensor unit.
 
     `start` (3,) mm, mm, rad is the touched place in the gel's frame and the object's turn. `motion` (T, 3) mm, mm, rad
-    moves it from there, about the middle of the gel. `depth` (T,) is in mm and `tilt` (2,) in rise per mm. `seed` is
-    that of the image noise.
+    moves it from there, about the middle of the gel. `depth` (T,) is in mm, negative without contact. `tilt` (2,) is in
+    rise per mm. `drift` (T, 3, 3) is that of the light, `seed` that of the image noise.
     """
 
     touch: Touch
@@ -122,6 +130,7 @@ class Recording(NamedTuple):
     depth: Array
     tilt: Array
     gesture: Gesture
+    drift: Array
     has_photo: bool
     has_text: bool
     seed: int
@@ -166,8 +175,14 @@ def _draw_gesture(scenes: Scenes, rng: np.random.Generator, like: Gesture | None
     angle, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.4, 2.5)
     turn = rng.choice([-1, 1]) * rng.uniform(math.radians(4), math.radians(20))
     slide = np.array([math.cos(angle), math.sin(angle)]) * length * (motion == "slide")
-    pace = 1.0 if like is None else float(rng.uniform(0.6, 1.5))
-    return Gesture(depth, motion, slide, float(turn) * (motion == "twist"), pace)
+    phases = rng.uniform([0, 0.1, 0, 0.25, 0, 0.08, 0], [0.15, 0.35, 0.15, 0.5, 0.2, 0.2, 0.1])
+    phases = phases / phases.sum()
+    first, last = phases[:2].sum() * 0.8, 1 - phases[5:].sum()
+    shown, middle = math.exp(rng.uniform(math.log(0.35), math.log(1.2))), float(rng.uniform(first, last))
+    lift = float(rng.uniform(first, last)) if rng.uniform() < 0.12 else -1.0
+    regrasp = rng.normal(0, 1, 3) * np.array([0.8, 0.8, math.radians(8)])
+    twist = float(turn) * (motion == "twist")
+    return Gesture(depth, motion, slide, twist, phases, shown, middle, lift, regrasp)
 
 
 def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
@@ -188,8 +203,8 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     motion, depth = trajectory(scenes.frames, gesture)
     start = np.array([*offset, yaw])
     has_photo, has_text = (bool(rng.random() < share) for share in (scenes.vision, scenes.text))
-    seed = int(rng.integers(2**31))
-    return Recording(touch, sensor, unit, start, motion, depth, tilt, gesture, has_photo, has_text, seed)
+    seed, drift = int(rng.integers(2**31)), draw_drift(scenes.frames, rng)
+    return Recording(touch, sensor, unit, start, motion, depth, tilt, gesture, drift, has_photo, has_text, seed)
 
 
 def shared_unit(scenes: Scenes, sensor: str) -> Unit:
@@ -200,36 +215,50 @@ def shared_unit(scenes: Scenes, sensor: str) -> Unit:
 
 
 def trajectory(frames: int, gesture: Gesture) -> tuple[Array, Array]:
-    """Return motion (T, 3) and depth (T,) of a gesture: press for a third, move, release in the last fifth.
-
-    Both are smooth. A still (T = 1) is the deepest press.
-    """
+    """Return motion (T, 3) since the touch, and depth (T,), negative without contact. A still is the deepest press."""
     if frames == 1:
         return np.zeros((1, 3)), np.array([gesture.depth])
-    t = np.linspace(0, 1, frames)
-    t = np.clip(t * gesture.pace, 0, 1)
-    smooth = lambda x: np.clip(x, 0, 1) ** 2 * (3 - 2 * np.clip(x, 0, 1))  # noqa: E731
-    depth = gesture.depth * (0.1 + 0.9 * smooth(t / 0.35)) * (1 - 0.6 * smooth((t - 0.8) / 0.2))
-    moved = smooth((t - 0.35) / 0.5)[:, None]
-    return moved * np.array([*gesture.slide, gesture.twist]), depth
+    t = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
+    ends = np.cumsum(gesture.phases)
+
+    def smooth(phase: int) -> Array:
+        x = np.clip((t - ends[phase - 1]) / gesture.phases[phase], 0, 1)
+        return x**2 * (3 - 2 * x)
+
+    depth = gesture.depth * (0.05 + 0.95 * smooth(1)) * (1 - 0.95 * smooth(5))
+    off = (t < ends[0]) | (t > ends[5])
+    motion = smooth(3)[:, None] * np.array([*gesture.slide, gesture.twist])
+    if gesture.lift >= 0:
+        off |= np.abs(t - gesture.lift) <= max(0.04, gesture.shown / (frames - 1) / 2)
+        motion = motion + (t > gesture.lift)[:, None] * gesture.regrasp
+    return motion, np.where(off, -1.0, depth)
+
+
+MOVES = (0.1, math.radians(1))  # mm and rad that the gel must be moved to be labelled so
 
 
 def directions(recording: Recording) -> dict[str, str]:
-    """Return labels of the motion as the image shows it.
+    """Return labels of the motion in contact as the image shows it.
 
     They are `label.motion` (hold, slide, twist), `label.twist` (clockwise, counterclockwise, none) and `label.slide`
     (right, down, left, up, none), the nearest of four directions.
     """
-    unit, gesture = recording.unit, recording.gesture
-    turn = gesture.twist * float(unit.mirror[0] * unit.mirror[1])
-    moves = len(recording.depth) > 1  # a still shows no motion
-    twist = "none" if gesture.motion != "twist" or not moves else "clockwise" if turn > 0 else "counterclockwise"
+    unit, touching = recording.unit, recording.depth > 0
+    steps = np.diff(trajectory(len(touching), recording.gesture._replace(lift=-1.0))[0], axis=0)
+    *slid, turn = steps[touching[1:] & touching[:-1]].sum(0)
+    turn *= float(unit.mirror[0] * unit.mirror[1])
+    motion = "hold"
+    if recording.gesture.motion == "twist" and abs(turn) > MOVES[1]:
+        motion = "twist"
+    elif recording.gesture.motion == "slide" and math.hypot(*slid) > MOVES[0]:
+        motion = "slide"
+    twist = "none" if motion != "twist" else "clockwise" if turn > 0 else "counterclockwise"
     slide = "none"
-    if gesture.motion == "slide" and moves:
+    if motion == "slide":
         c, s = math.cos(float(unit.rotation)), math.sin(float(unit.rotation))
-        x, y = np.array([[c, -s], [s, c]]) @ gesture.slide * np.asarray(unit.mirror)
+        x, y = np.array([[c, -s], [s, c]]) @ np.asarray(slid) * np.asarray(unit.mirror)
         slide = ("right", "down", "left", "up")[round(math.atan2(y, x) / (math.pi / 2)) % 4]
-    return {"label.motion": gesture.motion if moves else "hold", "label.twist": twist, "label.slide": slide}
+    return {"label.motion": motion, "label.twist": twist, "label.slide": slide}
 
 
 def photo_rng(scenes: Scenes, recording: Recording) -> np.random.Generator:

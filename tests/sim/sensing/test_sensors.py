@@ -15,6 +15,7 @@ from anytouch_jax.sim.sensing import calibration, sensors, shading, units
 from anytouch_jax.sim.sensing.sensors import SENSORS, Light, Lights
 
 LIT = [name for name, sensor in SENSORS.items() if isinstance(sensor.look, Lights)]
+CAMERAS = [name for name, sensor in SENSORS.items() if sensor.kind == "image"]
 DIGIT = SENSORS["digit"]
 
 
@@ -38,21 +39,47 @@ def test_an_unknown_sensor_and_one_without_pictures_are_named():
         sensors.look(SENSORS["tac3d"])
 
 
-@pytest.mark.parametrize("name", LIT)
-def test_a_look_made_of_lights_is_neither_black_nor_burnt_and_has_colours(name):
-    seen = sensors.look(SENSORS[name])
-    assert seen.base.dtype == np.float32 and seen.base.shape[2] == 3
-    assert seen.base.min() >= 0.0 and seen.base.max() <= 1.0
-    assert 0.2 < seen.base.mean() < 0.7
-    assert (seen.base == 1).mean() < 0.01
-    assert seen.base.reshape(-1, 3).std(0).min() > 0.02, "every channel varies over the image"
+@pytest.mark.parametrize("name", CAMERAS)
+def test_an_untouched_gel_is_neither_black_nor_burnt_and_has_colours(name):
+    for base in sensors.bases(SENSORS[name]):
+        height, width = SENSORS[name].field
+        assert base.dtype == np.float32 and base.shape[2] == 3
+        assert base.shape[0] / base.shape[1] == pytest.approx(height / width, rel=0.05)
+        assert base.min() >= 0.0 and base.max() <= 1.0
+        assert 0.2 < base.mean() < 0.7
+        assert (base == 1).mean() < 0.01
+        assert base.reshape(-1, 3).std(0).min() > 0.01, "every channel varies over the image"
 
 
 def test_no_two_families_look_alike():
-    small = [sensors.look(SENSORS[n]).base[::30, ::30][:4, :3] for n in LIT]
+    small = [sensors.bases(SENSORS[n])[0, ::8, ::8][:4, :4] for n in CAMERAS]
     for i in range(len(small)):
         for j in range(i):
-            assert np.abs(small[i] - small[j]).mean() > 0.05, (LIT[i], LIT[j])
+            assert np.abs(small[i] - small[j]).mean() > 0.03, (CAMERAS[i], CAMERAS[j])
+
+
+def test_a_digit_shades_as_in_real_pictures():
+    """Real DIGITs show the flank that faces up orange, the one that faces down blue, the right one green."""
+    model = sensors.look(DIGIT).photometry
+    middle = jnp.zeros(1)
+
+    def colour(nx, ny):
+        tilts = jnp.full((1, 1), nx), jnp.full((1, 1), ny)
+        return np.array([shading.colour_change(model.normal[..., c], *tilts, middle, middle)[0, 0] for c in range(3)])
+
+    up, down, right, left = colour(0, 0.5), colour(0, -0.5), colour(-0.5, 0), colour(0.5, 0)
+    assert up[0] > 0.1 > up[1] > 0 > up[2] and up[0] > up[2] + 0.2
+    assert down[2] > down[0] + 0.15 and right[1] > left[1] + 0.1
+    assert not colour(0, 0).any()
+
+
+def test_a_9dtact_darkens_where_it_is_pressed():
+    halo = sensors.look(SENSORS["9dtact"]).photometry.halo
+    assert (halo[2, 0] < -0.2).all() and not halo[:2].any()
+
+
+def test_a_sensor_without_a_camera_has_a_black_gel():
+    assert not sensors.bases(SENSORS["tac3d"]).any()
 
 
 @pytest.mark.parametrize("name", LIT)
@@ -112,7 +139,8 @@ def test_a_unit_follows_from_the_seed_alone():
     first, again, other = (units.draw_unit(DIGIT, np.random.default_rng(s)) for s in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     differs = [name for name, a, b in zip(first._fields, first, other, strict=True) if not np.array_equal(a, b)]
-    assert set(differs) >= {"tint", "gain", "uneven", "thickness", "modulus", "zoom", "rotation", "offset", "noise"}
+    assert set(differs) >= {"tint", "gain", "uneven", "thickness", "modulus", "zoom", "rotation", "offset", "noise",
+                            "base", "focus", "specks", "grain", "lights", "quality", "marker_pitch"}  # fmt: skip
     streams = [np.random.default_rng(5) for _ in SENSORS]
     for sensor, stream in zip(SENSORS.values(), streams, strict=True):
         units.draw_unit(sensor, stream)
@@ -131,6 +159,14 @@ def test_units_stay_inside_the_field_and_carry_markers_by_share():
     assert abs(np.mean([u.marked for u in drawn]) - 0.5) < 0.1
     assert not any(units.draw_unit(DIGIT, rng).marked for _ in range(20)), "a DIGIT has no markers"
     assert all(a.dtype == np.float32 for a in drawn[0])
+    assert np.std([u.base.mean() for u in drawn]) > 0.005, "units are untouched gels of several real ones"
+
+
+def test_the_light_drifts_little_from_frame_to_frame_and_more_from_the_background():
+    drawn = np.stack([units.draw_drift(10, np.random.default_rng(seed)) for seed in range(300)])
+    assert drawn.shape == (300, 10, 3, 3) and drawn.dtype == np.float32
+    since, steps = np.median(np.abs(drawn[:, 0])), np.median(np.abs(np.diff(drawn, axis=1)))
+    assert 0.005 < since < 0.02 and 0.001 < steps < 0.4 * since
 
 
 def test_the_mounting_and_its_inverse():

@@ -205,20 +205,24 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
     return Solution(factor * end.x, excess, complementarity(factor * end.x, excess), end.iterations)
 
 
-def sideways(pressure: Array, gel: Gel, pitch: Any) -> Array:
+def sideways(pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact") -> Array:
     """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W) kPa alone.
 
     A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more under a wide block.
-    A compressible one is also drawn toward the load. Friction reduces the motion (`shear_step`). Raises UserError for a
-    gel without a thickness.
+    A compressible one is also drawn toward the load. Friction reduces the motion (`shear_step`). With "fast" it is
+    computed on the coarsest grid. Raises UserError for a gel without a thickness.
     """
     if is_infinite(gel.thickness):
         raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
-    plan, pitch = Plan(*pressure.shape), jnp.asarray(pitch, pressure.dtype)
+    shape, pitch = (*pressure.shape, 2), jnp.asarray(pitch, pressure.dtype)
+    for _ in grids(pressure.shape)[1:] if fidelity == "fast" else ():
+        pressure, pitch = halved(pressure), 2 * pitch
+    plan = Plan(*pressure.shape)
     spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype), 1, jnp)
     potential = plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)  # mm
     y, x = jnp.gradient(potential)
-    return jnp.stack([x, y], -1)
+    motion = jnp.stack([x, y], -1)
+    return motion if motion.shape == shape else jax.image.resize(motion, shape, "cubic")
 
 
 def halved(field: Array) -> Array:

@@ -8,6 +8,7 @@ dent, background, markers, noise.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,11 +24,13 @@ from anytouch_jax.sim.sensing.units import Unit, rotated
 
 Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope
-SPREAD = 0.25  # mm that markers move down a slope of one: incompressible gel yields sideways
 
 
 class PictureView(NamedTuple):
-    """Places of the image's columns and rows: `x` (W,), `y` (H,) mm from the field's middle, and `u`, `v` in -1..1."""
+    """Places of the image's columns and rows: `x` (W,), `y` (H,) mm from the field's middle, and `u`, `v` in -1..1.
+
+    `u` and `v` are the places that the unit's lights see.
+    """
 
     x: Array
     y: Array
@@ -52,7 +55,8 @@ def picture_view(sensor: Sensor, unit: Unit, resolution: tuple[int, int]) -> Pic
     scale = min(sensor.field[0] / height, sensor.field[1] / width)
     x = unit.window[0] + unit.mirror[0] * unit.zoom * scale * (jnp.arange(width) + 0.5 - width / 2)
     y = unit.window[1] + unit.mirror[1] * unit.zoom * scale * (jnp.arange(height) + 0.5 - height / 2)
-    return PictureView(x, y, 2 * x / sensor.field[1], 2 * y / sensor.field[0])
+    du, dv, su, sv = unit.lights
+    return PictureView(x, y, du + su * 2 * x / sensor.field[1], dv + sv * 2 * y / sensor.field[0])
 
 
 def backdrop(sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = None) -> Array:
@@ -60,14 +64,26 @@ def backdrop(sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = No
 
     Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
     """
-    base, place = look(sensor).base, picture_view(sensor, unit, resolution or picture_size(sensor))
-    rows = interpolation.spline((place.v + 1) / 2 * base.shape[0] - 0.5, base.shape[0])[0]
-    columns = interpolation.spline((place.u + 1) / 2 * base.shape[1] - 0.5, base.shape[1])[0]
-    image = jnp.einsum("ih,chw,jw->cij", rows, jnp.asarray(base.transpose(2, 0, 1)), columns)
-    u, v = place.u[None, None, :], place.v[None, :, None]
-    tilt = [weight[:, None, None] for weight in unit.uneven]
-    uneven = 1 + u * (tilt[0] + u * tilt[2] + v * tilt[3]) + v * (tilt[1] + v * tilt[4])
-    return image * uneven * unit.tint[:, None, None]
+    resolution = resolution or picture_size(sensor)
+    place, shape = picture_view(sensor, unit, resolution), unit.base.shape
+    rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
+    columns = interpolation.spline((place.u + 1) / 2 * shape[1] - 0.5, shape[1])[0]
+    image = jnp.einsum("ih,hwc,jw->cij", rows, unit.base, columns)
+    bits = jax.random.bits(jax.random.key(unit.grain[1].astype(jnp.uint32)), resolution, jnp.uint32)
+    grain = unit.grain[0] / 255 * _noise(bits)
+    u0, v0, radius, *absorbed, _ = jnp.split(unit.specks, 7, 1)  # dirt and wear
+    across = jnp.exp(-0.5 * ((place.x[None] - u0 * sensor.field[1] / 2) / radius) ** 2)
+    along = jnp.exp(-0.5 * ((place.y[None] - v0 * sensor.field[0] / 2) / radius) ** 2)
+    left = 1 - jnp.einsum("ki,kc,kj->cij", along, jnp.concatenate(absorbed, 1), across)
+    light = jax.vmap(partial(_light, place=place, sensor=sensor))(unit.uneven.T, unit.tint)
+    return image * left * light + grain[None]
+
+
+def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Array:
+    """Return the light (H, W) of one colour, relative to the nominal one. It falls on dents as on the untouched gel."""
+    u, v = place.u[None, :], place.v[:, None]
+    relative = 1 + u * (uneven[0] + u * uneven[2] + v * uneven[3]) + v * (uneven[1] + v * uneven[4])
+    return tint * relative * (1 - sensor.vignette * (u**2 + v**2) / 2)
 
 
 def render(
@@ -81,38 +97,41 @@ def render(
     resolution: tuple[int, int] | None = None,
     shadow: bool = True,
     behind: Array | None = None,
+    drift: Array | None = None,
 ) -> Array:
     """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
     The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
     mm (x, y) moves the markers. `key` draws the noise, and None omits it. `resolution` is (height, width), by default
     square pixels with a short side of 224. `sensor`, `resolution` and `shadow` are static under jit. `behind` is the
-    `backdrop` of the same unit and resolution. Raises UserError for a sensor without a camera.
+    `backdrop` of the same unit and resolution. `drift` (3, 3) changes the light (`units.draw_drift`). Raises UserError
+    for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
     model, place = look(sensor), picture_view(sensor, unit, resolution)
     photometry = model.photometry if shadow else model.plain
     matrices = _resample(displacement.shape, pitch, place)
     nx, ny = shading.tilt(*_slopes(displacement, matrices, pitch, sensor, unit), photometry.steepest)
-    halo = None
-    if (shadow and np.any(np.asarray(photometry.halo))) or sensor.markers is not None:
-        halo = _halo(displacement, matrices, pitch, sensor)
     glow: tuple[Array, ...] | None = None
-    if shadow and halo is not None:
+    if shadow and np.any(np.asarray(photometry.halo)):
+        halo = _halo(displacement, matrices, pitch, sensor)
         lit = (*rotated(halo[0], halo[1], unit.light_angle), halo[2])
         glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
     ink = None
-    if sensor.markers is not None and halo is not None:
-        ink = unit.marked * _ink(tangential, halo, matrices, place, sensor.markers, sensor, unit)
+    if sensor.markers is not None:
+        ink = unit.marked * _ink(tangential, matrices, place, sensor.markers, sensor, unit)
     bits = None if key is None else jax.random.bits(key, resolution, jnp.uint32)
 
     def channel(c: dict[str, Array]) -> Array:
         change = shading.colour_change(c["normal"], nx, ny, place.u, place.v)
         if glow is not None:
             change = change + shading.halo_change(c["halo"], glow, place.u, place.v)
-        image = c["behind"] + c["gain"] * change
+        light = _light(c["uneven"], c["tint"], place, sensor)
+        image = c["behind"] + c["gain"] * change * light
         if ink is not None:
-            image = image + ink * (c["ink"] - image)
+            image = image + ink * (c["ink"] * light - image)
+        if drift is not None:
+            image = image * (1 + c["drift"][0] + c["drift"][1] * place.u[None, :] + c["drift"][2] * place.v[:, None])
         noise = 0.0 if bits is None else unit.noise * _noise(bits >> c["shift"])
         return jnp.round(jnp.clip(255 * image + noise, 0, 255)).astype(jnp.uint8)
 
@@ -120,19 +139,24 @@ def render(
         behind = backdrop(sensor, unit, resolution)
     # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU backend cannot fuse the
     # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
-    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind))
+    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift))
     return planes.transpose(1, 2, 0)
 
 
-def _channels(photometry: shading.Photometry, sensor: Sensor, unit: Unit, behind: Array) -> dict[str, Array]:
+def _channels(
+    photometry: shading.Photometry, sensor: Sensor, unit: Unit, behind: Array, drift: Array | None
+) -> dict[str, Array]:
     """Return the inputs that differ between colour channels, each with a leading axis of three."""
     ink = sensor.markers.ink if sensor.markers else (0.0, 0.0, 0.0)
     return {
         "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0),
         "halo": jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0),
         "behind": behind,
-        "gain": unit.gain * unit.tint,
-        "ink": jnp.asarray(ink) * unit.tint,
+        "gain": unit.gain,
+        "tint": unit.tint,
+        "uneven": unit.uneven.T,
+        "ink": jnp.asarray(ink),
+        "drift": jnp.zeros((3, 3)) if drift is None else drift.T,
         "shift": jnp.array([0, 10, 20], jnp.uint32),
     }
 
@@ -165,9 +189,9 @@ def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrice
 def _slopes(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor, unit: Unit) -> tuple[Array, Array]:
     """Return slopes (H, W) along x and y at the pixels, smoothed by the skin and rotated with the unit's lights."""
     ay, dy, ax, dx = matrices
-    if sensor.skin:
-        by, bx = (interpolation.blur(n, sensor.skin / pitch) for n in displacement.shape)
-        displacement = by @ displacement @ bx.T
+    blur = jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05)
+    by, bx = (interpolation.blur(n, blur) for n in displacement.shape)
+    displacement = by @ displacement @ bx.T
     return rotated(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit.light_angle)
 
 
@@ -181,18 +205,17 @@ def _halo(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor) -
 
 
 def _ink(
-    tangential: Array | None, halo: tuple[Array, ...], matrices: Matrices, place: PictureView, ink: Markers,
-    sensor: Sensor, unit: Unit,
-) -> Array:  # fmt: skip
+    tangential: Array | None, matrices: Matrices, place: PictureView, ink: Markers, sensor: Sensor, unit: Unit
+) -> Array:
     """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the pixels."""
     ay, _, ax, _ = matrices
-    x = place.x[None, :] + SPREAD * halo[0]
-    y = place.y[:, None] + SPREAD * halo[1]
+    x, y = (jnp.broadcast_to(a, (len(place.y), len(place.x))) for a in (place.x[None, :], place.y[:, None]))
     if tangential is not None:
         x = x - ay @ tangential[..., 0] @ ax.T
         y = y - ay @ tangential[..., 1] @ ax.T
-    soft = 1.5 * jnp.abs(place.x[1] - place.x[0])
+    soft = 1.5 * jnp.abs(place.x[1] - place.x[0]) + 2 * unit.focus
     half = float(np.hypot(*sensor.field)) / 2
+    x, y = x / unit.marker_pitch, y / unit.marker_pitch
     return ink_coverage(ink, x, y, unit.marker_phase, unit.marker_size, soft, half)
 
 

@@ -1,17 +1,18 @@
 """Simulated sensors, one frozen record each. A new sensor is a new entry of `SENSORS`.
 
-GelSight and GelSight Mini look like the units whose real frames are in the package `taxim`. The other cameras are a few
-lights each, set by eye after published images of their family. Sizes, gels and moduli are round numbers near published
+GelSight, GelSight Mini, DIGIT and 9DTact look like real units: `looks.npz` has their untouched gels, and the colours of
+dents are fitted to real presses (package `taxim`) or to Taxim's tables (DIGIT). `experiments/benchmarks/looks.py` makes
+the file. GelSlim and DuraGel are a few lights each, set by eye. Sizes, gels and moduli are round numbers near published
 ones. Tac3D measures a field and has no image.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from importlib.resources import files
 from typing import Any, Literal, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -64,11 +65,12 @@ class Sensor:
     field: tuple[float, float]  # mm (height, width)
     resolution: tuple[int, int]  # pixels (height, width), or points for kind "field"
     gel: Gel
-    look: str | Lights | None  # name of a real calibration, or lights; None for kind "field"
+    look: str | Lights | None  # name of real units in `looks.npz`, or lights; None for kind "field"
     markers: Markers | None = None
     kind: Literal["image", "field"] = "image"
     skin: float = 0.0  # mm, smallest detail that the coating passes
-    vignette: float = 0.0  # loss of light from the middle to the corners
+    contrast: float = 1.0  # of dents in most units over that of the calibrated one
+    vignette: float = 0.0  # loss of light from the middle to the corners, of dents too
     halo: float = 1.0  # mm, width of the soft shadow
     # Standard deviation of a pixel (0 to 255), or of a field's displacement in mm. 0.01 mm is a third of a pixel of
     # Tac3D's camera with 640 columns.
@@ -76,12 +78,13 @@ class Sensor:
 
 
 class Look(NamedTuple):
-    """The untouched image `base` f32 (h, w, 3) in 0..1 of the whole field, and photometric models with and without the
-    soft shadow."""
+    """Photometric models with and without the soft shadow."""
 
-    base: Array
     photometry: shading.Photometry
     plain: shading.Photometry
+
+
+DARKER = (-0.36, -0.36, -0.34)  # change of a 9DTact's image for each mm of depth
 
 
 SENSORS: dict[str, Sensor] = {
@@ -90,8 +93,8 @@ SENSORS: dict[str, Sensor] = {
         Sensor("gelsight", (14.16, 18.88), (480, 640), Gel(modulus=150.0, poisson=0.48, thickness=4.0), "gelsight",
                Markers(pitch=1.6, radius=0.22, share=0.4), halo=calibration.INDENTERS["gelsight"].halo),
         Sensor("gelsight_mini", (14.16, 18.88), (480, 640), Gel(modulus=180.0, poisson=0.48, thickness=4.25),
-               "gelsight_mini", Markers(pitch=1.9, radius=0.36, share=0.5, ink=(0.13, 0.15, 0.16)),
-               halo=calibration.INDENTERS["gelsight_mini"].halo),
+               "gelsight_mini", Markers(pitch=1.85, radius=0.36, share=0.5, ink=(0.10, 0.15, 0.14)),
+               contrast=0.75, halo=calibration.INDENTERS["gelsight_mini"].halo, noise=0.6),
         Sensor("gelslim", (15.0, 20.0), (320, 427), Gel(modulus=220.0, poisson=0.48, thickness=2.0),
                Lights((0.20, 0.32, 0.38), (
                    Light((-0.70, 0.35), (0.08, 0.48, 0.24), reach=0.6, height=0.3, contrast=2.6),
@@ -101,15 +104,10 @@ SENSORS: dict[str, Sensor] = {
                )),
                Markers(pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12),
                vignette=0.35, halo=0.8, noise=1.5),
-        Sensor("digit", (19.0, 14.25), (320, 240), Gel(modulus=120.0, poisson=0.48, thickness=2.5),
-               Lights((0.16, 0.24, 0.24), (
-                   Light((-1.10, -0.20), (0.66, 0.10, 0.20), reach=0.7, height=0.5, contrast=1.5),
-                   Light((1.00, -0.10), (0.02, 0.34, 0.06), reach=0.75, height=0.5, contrast=1.4),
-                   Light((0.0, 1.10), (0.02, 0.12, 0.40), reach=1.1, height=0.4, contrast=2.6, flat=0.25),
-                   Light((0.10, -0.70), (0.36, 0.18, 0.02), reach=0.6, height=0.5, contrast=1.8, flat=0.4),
-                   Light((0.10, -1.20), (0.02, 0.08, 0.20), reach=0.5, height=0.5, contrast=0.5, flat=0.8),
-               )),
-               vignette=0.25, skin=0.12, noise=2.0),
+        Sensor("digit", (19.0, 14.25), (320, 240), Gel(modulus=120.0, poisson=0.48, thickness=2.5), "digit",
+               contrast=1.4, skin=0.1, noise=0.8),
+        Sensor("9dtact", (18.0, 24.0), (480, 640), Gel(modulus=120.0, poisson=0.48, thickness=3.0), "9dtact",
+               skin=0.15, halo=0.35, noise=0.6),
         Sensor("duragel", (14.0, 18.7), (480, 640), Gel(modulus=350.0, poisson=0.48, thickness=3.0),
                Lights((0.20, 0.17, 0.24), (
                    Light((-1.05, 0.0), (0.40, 0.12, 0.30), reach=1.0, height=0.5, contrast=1.8),
@@ -130,25 +128,45 @@ def find_sensor(name: str) -> Sensor:
     return SENSORS[name]
 
 
+def _stored() -> dict[str, Array]:
+    with (files("anytouch_jax.sim.sensing") / "looks.npz").open("rb") as file, np.load(file) as pack:
+        return {name: np.asarray(pack[name]) for name in pack.files}
+
+
+@lru_cache(maxsize=16)
+def bases(sensor: Sensor) -> Array:
+    """Return untouched images (units, h, w, 3) f32 in 0..1 of the whole field. They are black for a field sensor."""
+    if isinstance(sensor.look, str):
+        return _stored()[f"{sensor.look}.bases"].astype(np.float32) / 255
+    height, width = (round(30 * side / min(sensor.field)) for side in sensor.field)
+    if sensor.look is None:
+        return np.zeros((1, height, width, 3), np.float32)
+    u, v = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    flat = np.zeros_like(u).ravel()
+    base = np.asarray(sensor.look.ambient) + shade(sensor.look, flat, flat, u.ravel(), v.ravel(), flat_only=True)
+    return np.clip(base, 0, 1).reshape(1, height, width, 3).astype(np.float32)
+
+
 @lru_cache(maxsize=16)
 def look(sensor: Sensor) -> Look:
-    """Return the look of a camera sensor. The first use fits real data, which takes a few seconds.
+    """Return the photometry of a camera sensor. The first use may fit real data, which takes a few seconds.
 
     Raises UserError for a field sensor, or if the package with the real frames is missing.
     """
     if sensor.kind != "image" or sensor.look is None:
         raise UserError(f"{sensor.name} has no camera: use optics.measure_field")
-    height, width = (round(120 * side / min(sensor.field)) for side in sensor.field)
-    if isinstance(sensor.look, str):
-        frame = calibration.read_background(sensor.look).astype(np.float32) / 255
-        base = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
-        return Look(base, *calibration.fit_photometry(sensor.look))
-    lights, u, v = sensor.look, *np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
-    flat = np.zeros_like(u).ravel()
-    base = np.asarray(lights.ambient) + shade(lights, flat, flat, u.ravel(), v.ravel(), flat_only=True)
-    base = base.reshape(height, width, 3) * (1 - sensor.vignette * (u**2 + v**2) / 2)[..., None]
-    plain = shading.fit_shading(lambda *place: shade(lights, *place))
-    return Look(np.clip(base, 0, 1).astype(np.float32), plain._replace(halo=_soft_shadow(lights)), plain)
+    if sensor.look in calibration.INDENTERS:
+        return Look(*calibration.fit_photometry(sensor.look))
+    if isinstance(sensor.look, Lights):
+        plain, halo = shading.fit_shading(partial(shade, sensor.look)), _soft_shadow(sensor.look)
+        return Look(plain._replace(halo=halo), plain)
+    plain, halo, widest = shading.assemble(np.zeros((120, 3)), 0.95), np.zeros((3, 3, 3), np.float32), np.full(3, 9.0)
+    if sensor.look == "9dtact":  # black paint comes nearer under clear gel, and light is lost on its way
+        halo[2, 0], widest[2] = DARKER, 1.2
+    else:
+        pack = _stored()
+        plain = plain._replace(normal=pack["digit.normal"], steepest=float(pack["digit.steepest"]))
+    return Look(plain._replace(halo=halo, widest=widest.astype(np.float32)), plain)
 
 
 def _soft_shadow(lights: Lights) -> Array:

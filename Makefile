@@ -26,7 +26,7 @@ WORKERS    ?= 2
 DEMO       ?= runs/demo
 DEMO_STEPS ?= 200
 DEMO_STEPS1 ?= 400
-PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets pouring translation
+PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets
 
 train-stage1: RUN ?= runs/stage1
 train-stage2 probe export-onnx: RUN ?= runs/stage2
@@ -131,14 +131,14 @@ export-onnx: $(ONNX)/.made
 export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]
 	$(PY) -m experiments.onnx_export.run --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
 
-experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 JOBS=1 MINUTES=75 CHUNK=2/5 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
-	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(JOBS), --jobs $(JOBS))$(if $(MINUTES), --minutes $(MINUTES))$(if $(CHUNK), --chunk $(CHUNK))$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
+experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
+	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
 notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..." RUN= DATA=]
 	@mkdir -p runs/notebooks
 	@for page in $(PAGES); do echo $$page; \
-	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/$$(case $$page in pouring|translation) echo $$page/study;; *) echo tables/$$page;; esac).py && \
-	  TABLE=1 OUT=$(CURDIR)/experiments/results PYTHONPATH=$(CURDIR) $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
+	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/tables/$$page.py && \
+	  PYTHONPATH=$(CURDIR) $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
 	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
 
 clean: ## remove .venv, builds and caches; runs stay

@@ -32,17 +32,17 @@ def test_a_baseline_trains_and_embeds(data, tmp_path, compiled_once, name, stage
     lines = read_metrics(tmp_path / "r")
     assert all(np.isfinite(line["loss"]) and not line["skipped"] for line in lines) and len(lines) == 2
     assert all(np.isfinite(array).all() for key, array in arrays_of(result).items())
-    told = set().union(*lines)
-    assert ("match" in told) == (stage == 2 and config.model.match_head != "none")
-    assert ("next_frame" in told) == (stage == 1 and name not in ("t3", "static_only", "no_dynamic"))
+    reported = set().union(*lines)
+    assert ("match" in reported) == (stage == 2 and config.model.match_head != "none")
+    assert ("next_frame" in reported) == (stage == 1 and name not in ("t3", "static_only", "no_dynamic"))
     if stage == 2:
         # (Every touch of this world was felt by both sensors, so that withholding those texts leaves none.)
-        assert ("touch_to_text" in told) == (name not in ("unitouch", "no_text", "no_text_aligned"))
-        assert ("touch_to_vision" in told) == (name != "no_vision")
+        assert ("touch_to_text" in reported) == (name not in ("unitouch", "no_text", "no_text_aligned"))
+        assert ("touch_to_vision" in reported) == (name != "no_vision")
     encoder = load_encoder(tmp_path / "r")
     with pytest.warns(UserWarning, match="was not in training"):
         z = [encoder.encode_touch(STILLS, sensor) for sensor in ("digit", "duragel", "universal")]
     assert all(one.shape == (2, 12) and np.isfinite(one).all() for one in z)
-    np.testing.assert_array_equal(z[1], z[2])  # duragel has a row of its own, which nothing has trained
+    np.testing.assert_array_equal(z[1], z[2])  # the row of duragel is untrained
     told_apart = bool(np.abs(z[0] - z[1]).max() > 0)
     assert told_apart == (name != "tlv_link")  # without tokens all sensors are one

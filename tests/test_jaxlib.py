@@ -18,5 +18,5 @@ def test_a_sum_is_that_of_its_parts_whatever_the_number_of_rows() -> None:
         return scale * jnp.sum(place * (x - place * scale[..., None]), -1)
 
     parts = np.concatenate([summed(x[i : i + 25], scale[i : i + 25]) for i in range(0, 100, 25)])
-    told = f"jaxlib {jaxlib.__version__} sums wrongly; install one that pyproject.toml allows"
-    np.testing.assert_allclose(summed(x, scale), parts, rtol=1e-4, atol=1e-4, err_msg=told)
+    reported = f"jaxlib {jaxlib.__version__} sums wrongly; install one that pyproject.toml allows"
+    np.testing.assert_allclose(summed(x, scale), parts, rtol=1e-4, atol=1e-4, err_msg=reported)

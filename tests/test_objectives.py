@@ -64,7 +64,7 @@ def test_hidden_patches_and_the_future_frame_have_exactly_no_influence():
     (_, (pred, hidden)), grad = reconstruct(PARAMS1, CLIP4)
     grad, hidden = np.asarray(grad), np.asarray(hidden)
     assert pred.shape == (4, 16, 4, 147) and hidden.sum(axis=1).tolist() == [12] * 4
-    assert len({tuple(row) for row in hidden.tolist()}) == 4  # a mask of its own for every sample
+    assert len({tuple(row) for row in hidden.tolist()}) == 4  # another mask for every sample
     assert not grad[:, 3].any()
     cells = grad[:, :3].reshape(4, 3, 4, 7, 4, 7, 3).transpose(0, 2, 4, 1, 3, 5, 6).reshape(4, 16, -1)
     assert not cells[hidden].any() and (np.abs(cells[~hidden]).max(axis=-1) > 0).all()
@@ -338,11 +338,11 @@ def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
 
 def drawn(monkeypatch, config, progress, rows=64):
     """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each (rows,)."""
-    seen = {}
+    received = {}
 
     def spy(params, batch, noise, *, net, config, decoder_sensor, match_noise):
-        seen["rows"] = (batch.align.sensor, *batch.match[1::2])
-        seen["own"] = decoder_sensor
+        received["rows"] = (batch.align.sensor, *batch.match[1::2])
+        received["own"] = decoder_sensor
         return jnp.zeros(()), {}
 
     monkeypatch.setattr(objectives, "stage2_terms", spy)
@@ -351,8 +351,8 @@ def drawn(monkeypatch, config, progress, rows=64):
     text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), np.zeros(0, np.int32)
     batch = Stage2Batch(AlignBatch(one, sensor, *empty, *text), MatchBatch(*(one, sensor) * 3))
     objectives.stage2_loss({}, batch, jax.random.key(3), jnp.float32(progress), net=NET2, config=config)
-    np.testing.assert_array_equal(seen["own"], sensor)  # the decoder is told the sensor's own tokens
-    return [np.asarray(x) for x in seen["rows"]]
+    np.testing.assert_array_equal(received["own"], sensor)  # the decoder gets the sensor's own tokens
+    return [np.asarray(x) for x in received["rows"]]
 
 
 def test_the_draw_of_universal_tokens(monkeypatch):
@@ -427,12 +427,12 @@ def steps(stage, devices, count, batch=None):
 
 @pytest.mark.parametrize("stage", [1, 2])
 def test_the_loss_falls_on_a_fixed_batch(stage):
-    _, found = steps(stage, 1, 40)
-    losses = [row["loss"] for row in found]
+    _, result = steps(stage, 1, 40)
+    losses = [row["loss"] for row in result]
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5]), losses
-    assert not any(row["skipped"] for row in found)
+    assert not any(row["skipped"] for row in result)
     if stage == 2:
-        assert found[-1]["match"] < found[0]["match"] and found[-1]["align"] < found[0]["align"]
+        assert result[-1]["match"] < result[0]["match"] and result[-1]["align"] < result[0]["align"]
 
 
 @pytest.mark.slow
@@ -469,8 +469,8 @@ def test_the_loss_of_preset_tiny_falls_on_a_fixed_batch(stage):
 @pytest.mark.parametrize("devices", [2, 4])
 @pytest.mark.parametrize("stage", [1, 2])
 def test_devices_share_the_batch_and_change_nothing(stage, devices):
-    (one, wanted), (many, found) = steps(stage, 1, 2), steps(stage, devices, 2)
-    for a, b in zip(found, wanted, strict=True):
+    (one, wanted), (many, result) = steps(stage, 1, 2), steps(stage, devices, 2)
+    for a, b in zip(result, wanted, strict=True):
         np.testing.assert_allclose(a["loss"], b["loss"], rtol=1e-5)
         np.testing.assert_allclose(a["grad_norm"], b["grad_norm"], rtol=1e-4)
     params = [flatten(merge(state.trainable, state.frozen)) for state in (many, one)]

@@ -40,10 +40,10 @@ def changed(config, model=None, **objective):
 
 @pytest.mark.parametrize("head", ["mlp", "cosine"])
 def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeypatch, head):
-    seen = []
+    received = []
 
     def spy(params, batch, noise, **options):
-        seen.append(batch)
+        received.append(batch)
         return jnp.zeros(()), {}
 
     monkeypatch.setattr(objectives, "stage2_terms", spy)
@@ -55,12 +55,12 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
         match = match._replace(negative=pixels(4, 1), negative_sensor=SENSOR[:4])
     args = {}, Stage2Batch(align, match), jax.random.key(0), jnp.float32(0.5)
     objectives.stage2_loss(*args, net=build(config.model), config=config)
-    ((shown, told),) = seen
+    ((shown, reported),) = received
     pairs = [(shown.image, align.image, CLIP), (shown.clip, align.clip, IMAGENET)]
-    pairs += [(told[i], match[i], IMAGENET) for i in ((0, 2, 4) if head == "mlp" else (0, 2))]
-    for found, given, (mean, std) in pairs:
-        assert found.dtype == jnp.float32
-        np.testing.assert_allclose(found, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
+    pairs += [(reported[i], match[i], IMAGENET) for i in ((0, 2, 4) if head == "mlp" else (0, 2))]
+    for result, given, (mean, std) in pairs:
+        assert result.dtype == jnp.float32
+        np.testing.assert_allclose(result, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
 
 
 # Stage 2 ------------------------------------------------------------------------------------------------------------
@@ -94,13 +94,13 @@ def test_groups_are_halves_that_do_not_know_of_each_other(what):
         batch = Stage2Batch(batch, None) if what == "align" else Stage2Batch(None, batch)
         return objectives.stage2_terms(params, batch, None, net=net, config=changed(config, groups=groups))
 
-    total, found = terms(batch, 2)
+    total, result = terms(batch, 2)
     halves = [terms(half(batch, i), 1) for i in (0, 1)]
     names = ["align", "touch_to_vision", "text_to_touch", "vision_to_text"] if what == "align" else ["match"]
     for name in names:
-        np.testing.assert_allclose(found[name], np.mean([half[name] for _, half in halves]), rtol=1e-5)
+        np.testing.assert_allclose(result[name], np.mean([half[name] for _, half in halves]), rtol=1e-5)
     np.testing.assert_allclose(total, np.mean([value for value, _ in halves]), rtol=1e-5)
-    assert abs(float(terms(batch, 1)[1][what]) / float(found[what]) - 1) > 0.05
+    assert abs(float(terms(batch, 1)[1][what]) / float(result[what]) - 1) > 0.05
 
 
 @pytest.mark.parametrize("head", ["mlp", "linear"])
@@ -146,11 +146,11 @@ def test_accumulation_of_the_real_loss_equals_the_large_batch(frames):
     batch = floats(4, frames), jnp.asarray(SENSOR[:4]), jnp.asarray(RNG.random((4, 16)), jnp.float32)
     tx = optax.sgd(0.1)  # Adam makes a whole step of the sign of a gradient that is only noise
     state = init_state(net.init(jax.random.key(0)), config)._replace(opt_state=tx.init(None))
-    (whole, found), (parts, others) = (
+    (whole, result), (parts, others) = (
         jax.jit(make_step(loss, tx, total_steps=8, accumulate=count))(state, batch, jax.random.key(0))
         for count in (1, 2)
     )
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), parts.trainable, whole.trainable)
     for name in ("loss", "grad_norm", "update_norm"):
-        assert float(others[name]) == pytest.approx(float(found[name]), rel=1e-5)
-    assert float(found["update_norm"]) > 1e-3
+        assert float(others[name]) == pytest.approx(float(result[name]), rel=1e-5)
+    assert float(result["update_norm"]) > 1e-3

@@ -76,9 +76,9 @@ def communicated(text: str, devices: int) -> tuple[dict[str, float], dict[str, i
 
     def visit(name: str, times: int) -> None:
         for line in bodies.get(name, ()):
-            found = _OPERATION.search(line)
-            if found:
-                kind, size = found["kind"], _bytes(found["type"], found["kind"], "-start(" in line)
+            result = _OPERATION.search(line)
+            if result:
+                kind, size = result["kind"], _bytes(result["type"], result["kind"], "-start(" in line)
                 sent[kind] += times * _on_the_wire(kind, size, _group(line, devices))
                 counts[kind] += times
                 continue  # what it applies is an addition
@@ -262,14 +262,14 @@ class Start:
 
 def first_steps(preset: str, steps: Sequence[tuple[str, str, str]] = STEPS, batch: int | None = None) -> list[Start]:
     """Two fresh processes for each of `steps`: one fills a new cache, the next reads it."""
-    found = []
+    result = []
     for step in steps:
         with tempfile.TemporaryDirectory() as folder:
             for cached in (False, True):
-                found.append(
+                result.append(
                     Start(**ask(answer_start, json.dumps([*step, preset, batch, cached, folder, time.time()])))
                 )
-    return found
+    return result
 
 
 def answer_start(question: str) -> None:
@@ -287,12 +287,12 @@ def answer_start(question: str) -> None:
     sys.stdout.write(json.dumps(asdict(start)) + "\n")
 
 
-def start_table(found: Sequence[Start]) -> str:
+def start_table(result: Sequence[Start]) -> str:
     """A line a process."""
     heads = ("workload", "recipe", "preset", "batch", "cache", "imports s", "trace s", "compile s", "sum s")
     rows = [
         [s.workload, s.recipe, s.preset, str(s.samples), "filled" if s.cached else "empty"]
         + [f"{x:.2f}" for x in (s.imports, s.trace, s.compile, s.total)]
-        for s in found
+        for s in result
     ]
     return markdown_table(heads, rows) + "\n"

@@ -77,11 +77,11 @@ def main() -> None:
     works = [work for what in options.what for work in workloads(what, options.preset, options.batch)]
     for work in works:
         try:
-            found = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, log=log)
+            result = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, log=log)
         except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
-            found = [speed.SpeedRow(work.name, "none", work.samples, note=str(error).splitlines()[0])]
-        rows += found
-        print(speed.speed_table(found), flush=True)
+            result = [speed.SpeedRow(work.name, "none", work.samples, note=str(error).splitlines()[0])]
+        rows += result
+        print(speed.speed_table(result), flush=True)
         save()
     for work in works:
         if work.trains and options.batches:

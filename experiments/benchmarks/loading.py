@@ -1,4 +1,4 @@
-"""Benchmarks of the loader: plain decoding, batches by threads, and the opening of a manifest of millions of rows.
+"""Benchmarks of the loader: plain decoding, augmentations, threads, and opening a manifest of millions of rows.
 
 Variants run in turns, so that a busy machine slows all of them alike; the figures are medians over the rounds.
 """
@@ -14,8 +14,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,15 +26,10 @@ from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown_table
-from experiments.benchmarks.speed import interleaved
 
 SIZES = ((320, 240), (640, 480))
-PLAIN, PLAIN_LINEAR, NO_JITTER, ALL = (
-    "decode + resize",
-    "decode + linear resize",
-    "no colour jitter",
-    "all augmentations",
-)
+PLAIN, PLAIN_LINEAR = "decode + resize", "decode + linear resize"
+NO_JITTER, ALL, ONE_THREAD = "no colour jitter", "all augmentations", "all augmentations, one thread"
 _OFF = {"flip": 0.0, "jitter": (0.0, 0.0, 0.0, 0.0)}
 _JITTER = {"brightness": 0, "contrast": 1, "saturation": 2, "hue": 3}
 _FRAMES = 200  # frames of a video in the large manifest
@@ -159,8 +152,8 @@ def _speeds(path: Path, size: tuple[int, int], rounds: int, threads: int, pixels
         PLAIN_LINEAR: lambda: _plain(files, pixels, threads, cv2.INTER_LINEAR),
     }
     for name, changes in _augmentations().items():
-        config = _config(len(files), threads, pixels, changes)
-        variants[name] = _Pass(Loader(manifest, config))
+        variants[name] = _Pass(Loader(manifest, _config(len(files), threads, pixels, changes)))
+    variants[ONE_THREAD] = _Pass(Loader(manifest, _config(len(files), 1, pixels, {})))
     seconds: dict[str, list[np.ndarray]] = {name: [] for name in variants}
     for turn in range(rounds + 1):
         for name, run in variants.items():
@@ -169,12 +162,12 @@ def _speeds(path: Path, size: tuple[int, int], rounds: int, threads: int, pixels
             if turn:  # the first one warms up
                 seconds[name].append(np.array([time.perf_counter(), time.process_time()]) - start)
     plain = np.array(seconds[PLAIN])
-    found = []
+    rows = []
     for name, taken in seconds.items():
         wall, cpu = np.median(plain / np.array(taken), axis=0).tolist()
         rate = len(files) / float(np.median(taken, axis=0)[0])
-        found.append(LoaderSpeed(size, name, rate, wall, cpu, threads, pixels))
-    return found
+        rows.append(LoaderSpeed(size, name, rate, wall, cpu, 1 if name == ONE_THREAD else threads, pixels))
+    return rows
 
 
 def _augmentations() -> dict[str, dict[str, object]]:
@@ -212,9 +205,9 @@ def _plain(files: Sequence[Path], pixels: int, threads: int, interpolation: int 
         picture = cv2.imdecode(np.frombuffer(files[at].read_bytes(), np.uint8), cv2.IMREAD_COLOR)
         if picture is None:
             raise UserError(f"{files[at]} is not a picture")
-        how = cv2.INTER_AREA if min(picture.shape[:2]) > pixels else cv2.INTER_LINEAR
+        usual = cv2.INTER_AREA if min(picture.shape[:2]) > pixels else cv2.INTER_LINEAR
         cv2.resize(
-            picture, (pixels, pixels), dst=out[at], interpolation=how if interpolation is None else interpolation
+            picture, (pixels, pixels), dst=out[at], interpolation=usual if interpolation is None else interpolation
         )
 
     with ThreadPoolExecutor(threads) as pool:
@@ -301,111 +294,5 @@ def open_here(path: str, stage: int, threads: int) -> None:
     for _ in loader.stream(0, 1):
         times.append(time.perf_counter())
     read, prepare, batch = np.diff(times).round(3).tolist()
-    found = Opened(len(manifest), stage, read, prepare, batch, round(read_mb), round(memory()))
-    sys.stdout.write(json.dumps(asdict(found)) + "\n")
-
-
-# Batches by threads --------------------------------------------------------------------------------------------------
-
-_SIDE = (320, 240)  # pixels of the made-up frames: width, height, those of a DIGIT
-_FEED_FRAMES = 12  # of a recording
-_BATCHES = 2  # of a measurement
-
-
-@dataclass(frozen=True)
-class Feed:
-    """A way to load: seconds a batch, frames a second, and ratio of time and difference of bytes to one thread."""
-
-    kind: str
-    threads: int
-    samples: int
-    seconds: float
-    seconds_iqr: float
-    frames_per_second: float
-    ratio: float
-    difference: int
-
-
-def measure_feeds(name: str, batch: int, *, rounds: int = 5) -> list[Feed]:
-    """A row for each number of threads, stills and clips. Raises UserError where the folder cannot be written."""
-    threads = sorted({1, 2, max(2, os.cpu_count() or 1)})
-    with TemporaryDirectory() as folder:
-        manifest = manifests.read([str(_recordings(Path(folder), max(4, batch // 4)))])
-        return [row for kind in ("clip", "still") for row in _feeds(manifest, name, kind, batch, rounds, threads)]
-
-
-def _recordings(folder: Path, recordings: int) -> Path:
-    """A manifest of recordings of smooth noise, as PNG files."""
-    rng, lines = np.random.default_rng(0), ["path,sensor,sequence,frame_index,split"]
-    try:
-        for sequence in range(recordings):
-            for frame in range(_FEED_FRAMES):
-                small = rng.integers(0, 256, (12, 16, 3), np.uint8)
-                name = f"{sequence:03d}_{frame:02d}.png"
-                if not cv2.imwrite(str(folder / name), cv2.resize(small, _SIDE, interpolation=cv2.INTER_CUBIC)):
-                    raise OSError(28, "the disk does not take it")
-                lines.append(f"{name},digit,{sequence},{frame},train")
-        (folder / "manifest.csv").write_text("\n".join(lines) + "\n")
-    except OSError as error:
-        raise UserError(f"cannot write frames to {folder}: {error.strerror}") from None
-    return folder / "manifest.csv"
-
-
-def _feeds(manifest: Any, name: str, kind: str, batch: int, rounds: int, threads: Sequence[int]) -> list[Feed]:
-    base = preset(name)
-
-    def config(count: int) -> Config:
-        share = 1.0 if kind == "clip" else 0.0
-        return replace(base, data=replace(base.data, threads=count, batch_size=batch, order="random", clip_share=share))
-
-    loaders = [Loader(manifest, config(count)) for count in threads]
-    first = [next(iter(_batches(loader, 1))) for loader in loaders]
-    times = interleaved([lambda loader=loader: _batches(loader, _BATCHES) for loader in loaders], rounds)  # type: ignore[misc]
-    base_times = times[0][:, 0]
-    rows = []
-    for count, seconds, one in zip(threads, (t[:, 0] / _BATCHES for t in times), first, strict=True):
-        low, middle, high = np.percentile(seconds, [25, 50, 75])
-        frames = one.clip.shape[0] * one.clip.shape[1]
-        rows.append(
-            Feed(
-                kind=kind,
-                threads=count,
-                samples=batch,
-                seconds=float(middle),
-                seconds_iqr=float(high - low),
-                frames_per_second=float(frames / middle),
-                ratio=float(np.median(seconds * _BATCHES / base_times)),
-                difference=int(np.max(np.abs(one.clip.astype(int) - first[0].clip.astype(int)))),
-            )
-        )
-    return rows
-
-
-def _batches(loader: Loader, count: int) -> list[Any]:
-    return [batch for _, batch, _ in loader.stream(0, count)]
-
-
-def feed_table(rows: Sequence[Feed]) -> str:
-    """A line a way to load."""
-    heads = (
-        "batches of",
-        "threads",
-        "batch",
-        "time / one thread",
-        "ms a batch (IQR)",
-        "frames/s",
-        "largest difference",
-    )
-    cells = [
-        [
-            f"{row.kind}s",
-            str(row.threads),
-            str(row.samples),
-            f"{row.ratio:.2f}",
-            f"{1e3 * row.seconds:.1f} ({1e3 * row.seconds_iqr:.1f})",
-            f"{row.frames_per_second:.0f}",
-            str(row.difference),
-        ]
-        for row in rows
-    ]
-    return markdown_table(heads, cells) + "\n"
+    opened = Opened(len(manifest), stage, read, prepare, batch, round(read_mb), round(memory()))
+    sys.stdout.write(json.dumps(asdict(opened)) + "\n")

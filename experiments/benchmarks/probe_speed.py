@@ -1,21 +1,12 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
+"""Benchmark of a linear probe on 100,000 features.
 
-# %% [markdown]
-# # How long does a probe on 100,000 features take?
-#
-# Multinomial logistic regression with five penalties to choose from (on 20,000 rows), then the fit on all rows with
-# the one chosen: d = 384, 20 classes, spreads of the directions from 1 to 100, as a network has. Beside it, with
-# SKLEARN=1, scikit-learn's fit for that one penalty: its time, and the loss of both.
-#
-# `python -m experiments.benchmarks.probe_speed`; `ROWS=10000` is a trial of a second.
+Multinomial logistic regression with five penalties (chosen on 20,000 rows), then the fit on all rows: 384 features, 20
+classes, and spreads of the directions from 1 to 100, as a network has. With `SKLEARN=1` scikit-learn's fit for the
+chosen penalty follows: its time, and the loss of both.
 
-# %%
+`python -m experiments.benchmarks.probe_speed`; `ROWS=10000` is a trial of a second.
+"""
+
 from __future__ import annotations
 
 import os
@@ -31,32 +22,31 @@ from experiments.tables import env
 ROWS, OTHERS = env.number("ROWS", 100_000), 10_000
 WIDTH, CLASSES = 384, 20
 
-rng = np.random.default_rng(0)
-mixing = np.linalg.qr(rng.normal(size=(WIDTH, WIDTH)))[0] * np.geomspace(1, 100, WIDTH)
-labels = rng.integers(CLASSES, size=ROWS + 2 * OTHERS)
-hidden = rng.normal(size=(len(labels), WIDTH)) + 0.12 * rng.normal(size=(CLASSES, WIDTH))[labels]
-features = (hidden @ mixing).astype(np.float32)
-train = slice(ROWS)
-split = np.repeat(["train", "val", "test"], [ROWS, OTHERS, OTHERS])
 
-# %%
-start, spent = time.perf_counter(), time.process_time()
-result = probe_features(features, labels, np.arange(len(labels)), split, seeds=0)
-accuracy, penalty = result.accuracy, result.penalty
-wall, spent = time.perf_counter() - start, time.process_time() - spent
-assert penalty is not None
-print(f"{ROWS} features of {WIDTH}, {CLASSES} classes, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}:")
-print(
-    f"{wall:.1f} s ({spent:.1f} s of processor) with the choice of the penalty ({penalty:g}), accuracy {accuracy:.3f}"
-)
-
-# %%
-if env.switch("SKLEARN"):
-    x = (features[train] - features[train].mean(0)) / features[train].std(0)
-    ours = next(logistic.path(x, labels[train], CLASSES, [penalty])).loss
+def main() -> None:
+    rng = np.random.default_rng(0)
+    mixing = np.linalg.qr(rng.normal(size=(WIDTH, WIDTH)))[0] * np.geomspace(1, 100, WIDTH)
+    labels = rng.integers(CLASSES, size=ROWS + 2 * OTHERS)
+    hidden = rng.normal(size=(len(labels), WIDTH)) + 0.12 * rng.normal(size=(CLASSES, WIDTH))[labels]
+    features = (hidden @ mixing).astype(np.float32)
+    split = np.repeat(["train", "val", "test"], [ROWS, OTHERS, OTHERS])
     start, spent = time.perf_counter(), time.process_time()
-    model = LogisticRegression(C=1 / (penalty * ROWS), tol=1e-4, max_iter=1000).fit(x, labels[train])
+    result = probe_features(features, labels, np.arange(len(labels)), split, seeds=0)
     wall, spent = time.perf_counter() - start, time.process_time() - spent
-    right = model.predict_log_proba(x)[np.arange(ROWS), labels[train]]
-    theirs = -right.mean(dtype=np.float64) + penalty / 2 * np.sum(model.coef_.astype(np.float64) ** 2)
-    print(f"scikit-learn, that penalty alone: {wall:.1f} s ({spent:.1f} s); loss {theirs:.6f}, ours {ours:.6f}")
+    penalty = result.penalty
+    assert penalty is not None
+    print(f"{ROWS} features of {WIDTH}, {CLASSES} classes, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}:")
+    print(f"{wall:.1f} s ({spent:.1f} s of processor), penalty {penalty:g}, accuracy {result.accuracy:.3f}")
+    if env.switch("SKLEARN"):
+        x = (features[:ROWS] - features[:ROWS].mean(0)) / features[:ROWS].std(0)
+        ours = next(logistic.path(x, labels[:ROWS], CLASSES, [penalty])).loss
+        start, spent = time.perf_counter(), time.process_time()
+        model = LogisticRegression(C=1 / (penalty * ROWS), tol=1e-4, max_iter=1000).fit(x, labels[:ROWS])
+        wall, spent = time.perf_counter() - start, time.process_time() - spent
+        right = model.predict_log_proba(x)[np.arange(ROWS), labels[:ROWS]]
+        theirs = -right.mean(dtype=np.float64) + penalty / 2 * np.sum(model.coef_.astype(np.float64) ** 2)
+        print(f"scikit-learn, that penalty alone: {wall:.1f} s ({spent:.1f} s); loss {theirs:.6f}, ours {ours:.6f}")
+
+
+if __name__ == "__main__":
+    main()

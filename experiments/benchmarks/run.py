@@ -37,7 +37,7 @@ class Bench:
     preset: PresetName = "tiny"
     """Sizes of the network."""
     batch: int | None = None
-    """Samples a step (default: 16, 16, 8, 4 by preset; 64 for the loader; 4 a device for memory)."""
+    """Samples a step (default: 16, 16, 8, 4 by preset; 4 a device for memory)."""
     out: Path = Path("runs/bench")
     """Folder of speed.md (speed_WHAT_PRESET.md for a part, or another preset), its numbers and figures/."""
     rounds: int = 9
@@ -108,7 +108,6 @@ TABLES: tuple[tuple[Any, Callable[[Any], str]], ...] = (
     (compilation.Layout, compilation.layout_table),
     (simulator.FidelityRow, simulator.fidelity_table),
     (simulator.Recorded, simulator.recording_table),
-    (loading.Feed, loading.feed_table),
     (loading.LoaderSpeed, loading.loader_table),
     (loading.Opened, loading.opened_table),
 )
@@ -193,9 +192,6 @@ def _simulator(options: Bench, _: str) -> Iterator[Section]:
 
 
 def _loader(options: Bench, _: str) -> Iterator[Section]:
-    log("loader: frames a second by threads")
-    feeds = loading.measure_feeds(options.preset, options.samples or 64, rounds=options.turns)
-    yield f"Loader, preset {options.preset}", feeds
     toy: dict[str, Any] = {"sizes": ((64, 48),), "pictures": 4, "rounds": 1, "pixels": 28, "rows": 2000}
     with tempfile.TemporaryDirectory() as folder:
         rows = loading.measure_loading(folder, log=log, **(toy if options.quick else {}))

@@ -136,7 +136,7 @@ def speed_against_error(
     setting = PressSetting() if setting is None else setting
     right = _references(setting, scenes.values(), reference)
     solved = [_solvers(setting, variant, scenes) for variant in variants]
-    found = [(pressed(), sheared()) for pressed, sheared in solved]  # compiles
+    result = [(pressed(), sheared()) for pressed, sheared in solved]  # compiles
     times = np.zeros((rounds, len(variants), 2))
     for turn in range(rounds):
         for number, pair in enumerate(solved):
@@ -146,7 +146,7 @@ def speed_against_error(
                 times[turn, number, kind] = time.perf_counter() - start
     milliseconds = np.median(times, 0) * 1e3 / len(scenes)
     return [
-        _row(variant, setting, milliseconds[number], list(scenes), *found[number], right)
+        _row(variant, setting, milliseconds[number], list(scenes), *result[number], right)
         for number, variant in enumerate(variants)
     ]
 
@@ -166,7 +166,7 @@ def _heights(setting: PressSetting, surface: Surface, grid: int) -> Fields:
 
 
 def _references(setting: PressSetting, surfaces: Iterable[Surface], grid: int) -> list[Solution]:
-    pitch, gel, friction, found = setting.size / grid, setting.gel, setting.friction, []
+    pitch, gel, friction, result = setting.size / grid, setting.gel, setting.friction, []
 
     def solve(heights: Array) -> tuple[PressResult, Shear]:
         contact = press(heights, setting.depth, gel, pitch, tolerance=1e-6, iterations=1000)
@@ -180,8 +180,8 @@ def _references(setting: PressSetting, surfaces: Iterable[Surface], grid: int) -
             if not (bool(contact.converged) and bool(slid.converged)):
                 raise UserError("the reference did not converge: take a coarser one, or a smoother scene")
             fields = np.asarray(contact.displacement), np.asarray(slid.displacement)
-            found.append(Solution(*fields, float(contact.force), float(slid.slip_fraction)))
-    return found
+            result.append(Solution(*fields, float(contact.force), float(slid.slip_fraction)))
+    return result
 
 
 def _solvers(
@@ -264,10 +264,10 @@ def pareto_points(rows: Sequence[FidelityRow]) -> dict[str, tuple[float, float]]
     return points
 
 
-def _picture_error(found: Fields, right: Fields, bare: Fields) -> float:
+def _picture_error(result: Fields, right: Fields, bare: Fields) -> float:
     """Mean absolute difference over the pixels that the touch changes by more than `LEVELS`; 0 where there are none."""
     changed = abs(right - bare).max(-1) > LEVELS
-    return float(abs(found - right)[changed].mean()) if changed.any() else 0.0
+    return float(abs(result - right)[changed].mean()) if changed.any() else 0.0
 
 
 def _resized(values: Any, shape: tuple[int, ...]) -> Fields:

@@ -319,7 +319,7 @@ _HEADS = (
 
 NOTES = """A time is a median over rounds in which all rows of a table, and the matrix products of the peak, take turns;
 the ratio is to the first row of the same round, IQR its interquartile range. GFLOP/s counts useful operations only: the
-matrix products of the formula in `workloads.py`, not what is computed twice or for empty slots. "Of its peak" is
+matrix products of the float32 program, not what is computed twice or for empty slots. "Of its peak" is
 the share of a large square product of the variant's own type in the same rounds. Errors are relative, L2 over all
 elements, against the same parameters and batch in float64. MiB: arguments, results and temporaries of the compiled
 program. Compile times are cold."""

@@ -5,9 +5,10 @@ Imports nothing but jax, flax, optax, numpy and what of ours stands on them: a b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -17,9 +18,9 @@ from jax.sharding import Mesh
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
-from anytouch_jax.config import Config, ModelConfig, Recipe, Stack, preset
+from anytouch_jax.config import Config, ModelConfig, Recipe, preset
 from anytouch_jax.nn.functional import build
-from anytouch_jax.ops import losses, masking
+from anytouch_jax.ops import losses
 from anytouch_jax.train.mesh import gathering
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step
@@ -48,18 +49,10 @@ class Workload:
         """Whether a call is a training step (or an embedding)."""
         return not self.name.startswith("embed")
 
-    @property
+    @cached_property
     def operations(self) -> float:
-        """Useful operations of a call; by the formulas below."""
-        config, samples = self.config, self.samples
-        if not self.trains:
-            return embedding_flops(config.model, samples, self.frames)
-        if config.stage == 1:
-            return stage1_flops(config, samples, self.frames)
-        if self.name.endswith("match"):
-            return match_flops(config, samples, self.frames)
-        length = config.model.text.length if config.model.text else 0
-        return align_flops(config, samples, self.frames, _share(samples, VISION), _share(samples, TEXT), length)
+        """Operations of the matrix products of a call in float32, without recomputation and without empty slots."""
+        return _useful(self)
 
     def resized(self, samples: int) -> Workload:
         """The same with another number of samples."""
@@ -228,104 +221,41 @@ def normalised(batch: Any) -> Any:
 
 
 # Useful operations ----------------------------------------------------------------------------------------------------
-#
-# These are the matrix products that the paper's sums need. A product of (m, k) and (k, n) is 2 m k n operations, and
-# twice as many again in the backward pass, or once for an input without gradient (pixels). Norms, softmax, activations,
-# masks and the optimiser are left out, since a matmul peak does not measure them. So are recomputation (remat), empty
-# slots and hidden patches: a variant that does more work for the same result is not faster.
-
-_TRAINED, _FIRST = 3, 2  # forward and backward, with or without a gradient of the input
 
 
-def _dense(rows: int, inputs: int, outputs: int) -> float:
-    return 2.0 * rows * inputs * outputs
+def products(jaxpr: Any) -> float:
+    """Return the operations of the matrix products and convolutions of a jaxpr; a loop's body counts for each turn."""
+    total = 0.0
+    for eqn in jaxpr.eqns:
+        name, params = eqn.primitive.name, eqn.params
+        if name == "dot_general":
+            (contracted, _), _ = params["dimension_numbers"]
+            total += 2 * eqn.outvars[0].aval.size * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
+        elif name == "conv_general_dilated":
+            kernel = eqn.invars[1].aval
+            total += 2 * eqn.outvars[0].aval.size * kernel.size / kernel.shape[params["dimension_numbers"].rhs_spec[0]]
+        inner = [getattr(one, "jaxpr", one) for one in jax.tree.leaves(list(params.values()), is_leaf=_is_jaxpr)]
+        total += params.get("length", 1) * sum(products(one) for one in inner if _is_jaxpr(one))
+    return total
 
 
-def _block(stack: Stack, sequences: int, length: int, read: int) -> float:
-    """Forward operations of a block over `sequences` of `length` tokens of which `read` are wanted: keys and values of
-    all; queries, scores and sums, MLP of these."""
-    rows = sequences * read
-    attention = 2 * _dense(rows, stack.width, stack.width) + 2 * _dense(rows, length, stack.width)
-    keys = 2 * _dense(sequences * length, stack.width, stack.width)
-    return keys + attention + 2 * _dense(rows, stack.width, stack.mlp)
+def _is_jaxpr(value: Any) -> bool:
+    return hasattr(value, "eqns")
 
 
-def _blocks(stack: Stack, sequences: int, length: int, read: int | None = None) -> float:
-    """Forward operations of a stack; of the last block `read` tokens of each sequence are wanted, or all."""
-    last = _block(stack, sequences, length, length if read is None else read)
-    return (stack.depth - 1) * _block(stack, sequences, length, length) + last
-
-
-def _special(model: ModelConfig) -> int:
-    return 1 + model.sensor_tokens
-
-
-def _patches(model: ModelConfig, width: int, rows: int, frames: int = 1) -> float:
-    return _dense(rows * frames, model.patch**2 * 3, width)
-
-
-def encoder_flops(
-    model: ModelConfig, batch: int, frames: int, patches: int, *, train: bool = True, read: int | None = None
-) -> float:
-    """The touch encoder over `patches` positions of `batch` touches, projection apart; 1 frame is a still."""
-    kernels = 1 if frames == 1 else model.frames
-    blocks = _blocks(model.touch, batch, _special(model) + patches, read)
-    first = _patches(model, model.touch.width, batch * patches, kernels)
-    return first * (_FIRST if train else 1) + blocks * (_TRAINED if train else 1)
-
-
-def stage1_flops(config: Config, batch: int, frames: int) -> float:
-    """A stage-1 step over `batch` touches of `frames` (1, 3 or 4): forward and backward."""
-    model, objective = config.model, config.objective
-    frames = frames if objective.next_frame else min(frames, model.frames)
-    kept = int(model.patches * objective.keep_ratio)
-    seen = batch * (_special(model) + kept)
-    decoder = _dense(seen, model.touch.width, model.embed) + _dense(seen, model.embed, model.decoder.width)
-    decoder += _blocks(model.decoder, batch, _special(model) + model.patches)
-    decoder += _dense(batch * model.patches, model.decoder.width, frames * model.patch**2 * 3)
-    return encoder_flops(model, batch, frames, kept) + _TRAINED * decoder
-
-
-def embedding_flops(model: ModelConfig, batch: int, frames: int, *, train: bool = False) -> float:
-    """Touch embeddings of whole frames: forward only, or with the backward pass."""
-    last = _dense(batch, model.touch.width, model.embed) * (_TRAINED if train else 1)
-    return encoder_flops(model, batch, frames, model.patches, train=train, read=1) + last
-
-
-def image_flops(model: ModelConfig, images: int) -> float:
-    """The image tower over so many images, forward and backward, trained whole."""
-    if model.image is None or not images:
-        return 0.0
-    rest = _blocks(model.image, images, 1 + model.patches) + _dense(images, model.image.width, model.embed)
-    return _FIRST * _patches(model, model.image.width, images * model.patches) + _TRAINED * rest
-
-
-def text_flops(model: ModelConfig, texts: int, length: int) -> float:
-    """The text tower over so many texts of `length` tokens, forward and backward, trained whole."""
-    if model.text is None or not texts:
-        return 0.0
-    stack = model.text.stack
-    return _TRAINED * (_blocks(stack, texts, length) + _dense(texts, stack.width, model.embed))
-
-
-def align_flops(config: Config, batch: int, frames: int, images: int, texts: int, length: int) -> float:
-    """A stage-2 alignment step with so many images and texts present, reconstruction where the recipe keeps it."""
-    model = config.model
-    logits = sum(_dense(batch, model.embed, batch) for there in (images, texts, images and texts) if there)
-    total = embedding_flops(model, batch, min(frames, model.frames), train=True) + 2 * _TRAINED * logits
-    total += image_flops(model, images) + text_flops(model, texts, length)
-    return total + (stage1_flops(config, batch, frames) if config.reconstructs else 0.0)
-
-
-def match_flops(config: Config, batch: int, frames: int) -> float:
-    """A stage-2 matching step over `batch` triples: three embeddings each, and the head on two products; or two
-    embeddings of the patches that are kept, and their cosines."""
-    model = config.model
-    if model.match_head == "cosine":
-        kept = masking.kept(model.patches, config.objective.match_keep)
-        last = _dense(2 * batch, model.touch.width, model.embed) + 2 * _dense(batch, model.embed, batch)
-        return encoder_flops(model, 2 * batch, frames, kept, train=True, read=1) + _TRAINED * last
-    head = _dense(2 * batch, model.embed, 1)
-    if model.match_head == "mlp":
-        head += _dense(2 * batch, model.embed, model.embed)
-    return embedding_flops(model, 3 * batch, frames, train=True) + _TRAINED * head
+def _useful(work: Workload) -> float:
+    model = replace(work.config.model, dtype="float32", attention="xla", remat=False)
+    config = replace(work.config, model=model)
+    net, params, batch = build(model), build(model).abstract(), normalised(make_batch(replace(work, dense=False)))
+    noise = np.zeros((work.samples, model.patches), np.float32)
+    if not work.trains:
+        run: Callable[..., Any] = lambda p: net.encode_touch(p, batch.clip, batch.sensor)  # noqa: E731
+    else:
+        one, two = objectives.stage1_terms, objectives.stage2_terms
+        terms: Callable[..., Any] = (
+            (lambda p: one(p, batch.clip, batch.sensor, noise, net=net, config=config)[0])
+            if config.stage == 1
+            else (lambda p: two(p, batch, noise, net=net, config=config)[0])
+        )
+        run = jax.grad(terms)
+    return products(jax.make_jaxpr(run)(params).jaxpr)

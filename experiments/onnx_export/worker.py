@@ -61,9 +61,9 @@ def main(folder: Path) -> int:
     worst = 0.0
     for count in counts:
         given = (cases[f"touches{count}"], cases[f"sensor{count}"])
-        (found,) = session.run(["features"], dict(zip(names, given, strict=True)))
+        (result,) = session.run(["features"], dict(zip(names, given, strict=True)))
         live = cases[f"features{count}"]
-        worst = max(worst, float(np.abs(found - live).max() / np.abs(live).max()))
+        worst = max(worst, float(np.abs(result - live).max() / np.abs(live).max()))
     print(f"inputs {names}; at most {worst:.1e} of the largest feature from the live model ({counts} touches)")
     return int(not worst <= TOLERANCE)
 

@@ -65,7 +65,7 @@ class Task:
 class Setup(NamedTuple):
     """What differs from run to run, f32 scalars (or stacked).
 
-    `radius`, `height` mm of the cylinder and `empty` g of its own mass; `bead` mm across; `bulk` g / mm^3; `repose`
+    `radius`, `height` mm of the cylinder and `empty` g of its mass; `bead` mm across; `bulk` g / mm^3; `repose`
     rad, the angle of repose; `tilt` rad at the start; `mount` rad from the tilt's axis to the gel's normal;
     `grip_height` mm of the fingers; `grip` N, which falls by the share `relax` within `relax_time` s; `share` of the
     load on the gel's finger; `friction` on the gel; `jolt` N of the arm's step; `place` (2,) mm, `yaw` rad, `lean`

@@ -134,7 +134,7 @@ def features(
     where = np.argwhere(wanted)
     ahead = 1 if stills else FRAMES
     width = encoder.config.model.embed * (2 if pooling == "both" else 1)
-    found = np.zeros((*wanted.shape, width), np.float32)
+    result = np.zeros((*wanted.shape, width), np.float32)
     frames = trials.frames
 
     def encode(part: Array) -> Array:
@@ -142,8 +142,8 @@ def features(
         return encoder.encode_touch(clips, sensor, pooling=pooling)
 
     if len(where):
-        found[tuple(where.T)] = run_in_batches(encode, where, batch)
-    return found
+        result[tuple(where.T)] = run_in_batches(encode, where, batch)
+    return result
 
 
 def subtracted(encoder: Encoder, frames: Array, first: Array) -> Array:
@@ -347,8 +347,8 @@ def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills
         features(encoder, trials, stills=stills, pooling=pooling, sensor=sensor, sides=side, learned=learned)
         for side in (None, sides)
     ]
-    found = [moments(trials, input_table(z), learned) for z in views]
-    x, actions, runs = (np.concatenate(both) for both in zip(*found, strict=True))
+    result = [moments(trials, input_table(z), learned) for z in views]
+    x, actions, runs = (np.concatenate(both) for both in zip(*result, strict=True))
     head, loss = imitate(x, actions, runs, learning)
     return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=learning.votes, loss=loss)
 

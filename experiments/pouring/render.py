@@ -59,13 +59,13 @@ def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
     depths = jnp.geomspace(0.05, 2.0, 8)
     tried = press(z, depths).force
     wanted = setup.grip * jnp.asarray(LEVELS)
-    found = press(z, jnp.exp(jnp.interp(jnp.log(wanted), jnp.log(tried), jnp.log(depths))))
-    middle = jax.tree.map(lambda x: x[1], found)
+    result = press(z, jnp.exp(jnp.interp(jnp.log(wanted), jnp.log(tried), jnp.log(depths))))
+    middle = jax.tree.map(lambda x: x[1], result)
     area = mechanics.area(middle.pressure, PITCH)
     moves = unit_moves(middle, gel)
     shape = optics.picture_size(SENSOR, side)
     behind = optics.backdrop(SENSOR, setup.unit, shape)
-    return Grasp(found.displacement, found.force, moves, jnp.sqrt(area / jnp.pi), behind), middle
+    return Grasp(result.displacement, result.force, moves, jnp.sqrt(area / jnp.pi), behind), middle
 
 
 def unit_moves(contact: PressResult, gel: Gel) -> Array:

@@ -137,9 +137,9 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
     print(markdown_table(("trial", "poured, g", "error, g"), cells))
     results = {"touch": tried} | {k: trials.run(task, setups, keys, rival) for k, rival in rivals.items()}
     for name, one in results.items():
-        found = trials.error(one.poured, task.target)
-        interval = "" if found.low is None else f" (95 %: {found.low:.1f} to {found.high:.1f})"
-        print(f"{name}: mean error {found.mean:.1f} g{interval}")
+        result = trials.error(one.poured, task.target)
+        interval = "" if result.low is None else f" (95 %: {result.low:.1f} to {result.high:.1f})"
+        print(f"{name}: mean error {result.mean:.1f} g{interval}")
     trials.write_film(out / "pour.gif", tried, task)
     poured = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
     return _write(out, learned, about | {"poured": poured})

@@ -1,32 +1,18 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
+"""The pouring study: 60 g of beads by touch alone, in the form of the paper's Table 4.
 
-# %% [markdown]
-# # Pouring by touch alone
-#
-# A cylinder with 100 g of beads is held by two fingers, one of them a GelSight Mini. Three actions (pour, wait,
-# retract) tilt it by 0.25 degrees five times a second. Pour out 60 g, then retract, with nothing but tactile frames.
-# The paper did it with a robot; here cylinder, beads, gel and camera are simulated, and bead size, friction, grip,
-# stiffness, first pose and sensor differ from run to run. A run begins with the grip on the standing cylinder: nothing
-# else shows how soft the gel and how firm the grip is. Then it is lifted, and the actions begin. An expert that sees
-# the scales demonstrates; a small MLP over features of four segments (the last two, the first of the lifted cylinder
-# and that of the standing one) imitates it, the encoder frozen or fine-tuned.
-#
-# `make pouring` takes the encoders of Tables 2 to 4, one of each a seed, from `make experiments` (`STUDY=runs/matrix`),
-# and trains those that are not there. `RUNS="anytouch=runs/stage2 static=runs/static t3=runs/t3"` takes encoders of
-# yours. Names: `none` (no tactile pre-training: the image tower of a stage-2 run or of CLIP; without a path an
-# untrained encoder), `t3`, `static` (without a path the run of `anytouch`, shown single frames only), `anytouch`.
-# `name=a,b,c` gives seeds 0, 1, 2 an encoder of their own. A row without a run is left out, aloud. What is finished is
-# not done again. QUICK=1 is a trial of minutes; TABLE=1 only rewrites the table. SEEDS, TRIALS, DEMOS (a thousand of
-# 84 pixels take 9 GB at the most), TUNE (steps of fine-tuning), MODES, NAME (of the page) and OUT in
-# the environment change the size and the place.
+Two fingers hold a cylinder with 100 g of beads, one of them a GelSight Mini. Three actions (pour, wait, retract) tilt
+it, five times a second. Cylinder, beads, gel and camera are simulated, and differ from run to run. An expert that sees
+the scales demonstrates. A small MLP imitates it, over features of four segments: the last two, the first of the lifted
+cylinder, and that of the standing one. The encoder is frozen or fine-tuned.
 
-# %%
+`make pouring` takes the encoders of `make experiments`, one a seed, and trains the missing ones (`STUDY=`).
+`RUNS="anytouch=path static=path t3=a,b,c"` takes encoders of yours: a path, or one a seed. `none` without a path is an
+untrained encoder, `static` the run of `anytouch` on single frames. A row without a run is left out. Finished rows are
+not run again. `QUICK=1` is a trial of minutes, and `TABLE=1` only makes the page from its records. `SEEDS=`, `TRIALS=`,
+`DEMOS=` (a thousand of 84 pixels take 9 GB), `TUNE=` (steps of fine-tuning), `MODES=`, `NAME=` (of the page) and `OUT=`
+change size and place.
+"""
+
 from __future__ import annotations
 
 import json
@@ -50,10 +36,8 @@ from experiments.pouring import table
 from experiments.pouring import trials as pouring
 from experiments.pouring.physics import VERSION, Task
 from experiments.records import read_records, write_record
-from experiments.tables import env, page, plan
+from experiments.tables import env, plan
 from experiments.tables.work import Work
-
-enable_compilation_cache()
 
 QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
 RUNS, STUDY = env.runs(), env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
@@ -66,17 +50,7 @@ NAME = env.path("NAME", "pouring-quick" if QUICK else "pouring").name
 RESULTS, PAGE = OUT / f"{NAME}.jsonl", OUT / f"{NAME}.md"
 TASK = Task()
 
-if unknown := set(RUNS) - set(table.PAPER):
-    raise UserError(f"RUNS names {', '.join(table.PAPER)}, not {', '.join(sorted(unknown))}")
 
-# %% [markdown]
-# ## The rows
-#
-# Every row of a seed learns from the same demonstrations and is tried on the same runs, so that rows can be compared
-# run by run.
-
-
-# %%
 @cache
 def of_the_tables(seed: int) -> dict[str, Path]:
     """The runs of Tables 2 to 4 by the names of the rows; the image tower of AnyTouch's is the one untouched."""
@@ -111,8 +85,7 @@ def source_of(name: str, seed: int, encoder: Encoder) -> str:
     return f"{'untrained' if path is None else Path(path).name} (weights {encoder.fingerprint}{shown})"
 
 
-LEARNING = asdict(pouring_policy.Learning(tune_steps=TUNE))
-del LEARNING["seed"]
+LEARNING = {name: value for name, value in asdict(pouring_policy.Learning(tune_steps=TUNE)).items() if name != "seed"}
 SETTINGS = {"trials": TRIALS, "demonstrations": DEMOS, "version": VERSION, "policy": pouring_policy.VERSION}
 SETTINGS |= {name: value for name, value in LEARNING.items() if not name.startswith("tune")}
 
@@ -181,19 +154,8 @@ def do_seed(seed: int) -> None:
             write(name, mode, trials, source, since, loss=round(policy.loss, 4))
 
 
-if not TABLE:
-    for seed in SEEDS:
-        do_seed(seed)
-
-# %% [markdown]
-# ## One demonstration, seen
-#
-# Frames of the gel while the cylinder empties, and their change from the standing cylinder: the lifted weight draws the
-# markers along, and they come back as it leaves.
-
-# %%
-figures = OUT / "figures"
-if not TABLE or not (figures / "pouring.gif").exists():
+def draw_demonstration(figures: Path) -> None:
+    """Draw frames of the gel while the cylinder empties, and their change from the standing cylinder; write a film."""
     one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
     last = int(one.steps[0]) - 1
     moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
@@ -208,24 +170,30 @@ if not TABLE or not (figures / "pouring.gif").exists():
     )
     pouring.write_film(figures / "pouring.gif", one, TASK)
 
-# %% [markdown]
-# ## The table
 
-# %%
-rows = table.read_rows(RESULTS)
-runs = {run for row in rows for run in row.runs}
-seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
-fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
-picture = f"{NAME}.png"
-table.draw(figures / picture, rows)
-settings = max((row.settings for row in rows), key=len)
-used = json.loads(settings)
-other = "" if used["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
-text = f"""# Pouring by touch alone (simulated), {used["demonstrations"]} demonstrations
+def main() -> None:
+    if unknown := set(RUNS) - set(table.PAPER):
+        raise UserError(f"RUNS names {', '.join(table.PAPER)}, not {', '.join(sorted(unknown))}")
+    enable_compilation_cache()
+    for seed in () if TABLE else SEEDS:
+        do_seed(seed)
+    figures = OUT / "figures"
+    if not TABLE or not (figures / "pouring.gif").exists():
+        draw_demonstration(figures)
+    rows = table.read_rows(RESULTS)
+    runs = {run for row in rows for run in row.runs}
+    seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
+    fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
+    picture = f"{NAME}.png"
+    table.draw(figures / picture, rows)
+    settings = max((row.settings for row in rows), key=len)
+    used = json.loads(settings)
+    other = "" if used["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
+    text = f"""# Pouring by touch alone (simulated), {used["demonstrations"]} demonstrations
 
 {len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
-    "; fewer: " + ", ".join(fewer) if fewer else ""
-}); mean
+        "; fewer: " + ", ".join(fewer) if fewer else ""
+    }); mean
 |poured - {TASK.target:g} g| with its 95 % interval over seeds (Student's t; the runs of a seed share one policy).
 The paper's numbers are of a robot: only the order can be
 compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
@@ -240,7 +208,9 @@ flow and the load, {VERSION} now):
 
 Made by `SEEDS={",".join(seeds)} make pouring`, from `{NAME}.jsonl`.{other}
 """
-atomic_write(PAGE, text)
-print(text)
-for name in (picture, "pouring_frames.png"):
-    page.show(figures / name)
+    atomic_write(PAGE, text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -197,8 +197,8 @@ def run(
     frames: list[Array] = []
     steps, waited = np.zeros(count, np.int64), np.zeros(count, np.int64)
     while not np.asarray(state.done).all():
-        seen = np.asarray(look(state, setups, grasps, task=task, side=side)) if drawn else None
-        choices = np.asarray(controller.act(seen if controller.looks else None, state), np.int32)
+        shown = np.asarray(look(state, setups, grasps, task=task, side=side)) if drawn else None
+        choices = np.asarray(controller.act(shown if controller.looks else None, state), np.int32)
         if len(history) < START:
             choices = np.full_like(choices, WAIT)
         actions = choices
@@ -208,8 +208,8 @@ def run(
             actions = np.where((choices == RETRACT) & (waited <= late), POUR, choices)
         history.append((choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate))))
         steps += ~np.asarray(state.done)
-        if seen is not None and film:
-            frames.append(seen[:film].copy())
+        if shown is not None and film:
+            frames.append(shown[:film].copy())
         state = _advance(state, actions, setups, task=task)
     choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*history, strict=True))
     out = np.asarray(physics.poured(state, task))

@@ -1,34 +1,16 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
+"""Probes of what captions name, on objects never touched: hardness, roughness and material.
 
-# %% [markdown]
-# # Can what captions name be told of an object never touched?
-#
-# Captions name hardness, roughness and material. After both stages these three are told hardly better than by an
-# untrained encoder, while the form of the indenter, which no caption names, is told far better. Is it the training that
-# is short, or can the simulated touches not tell it? So here the same encoder is trained with the labels themselves,
-# which is more than any caption can say, on the scenes of `make experiments`: contact frames of four sensors, turned
-# over by chance, one linear head a label. What it tells of its own frames is what could be learned by heart; what it
-# tells of the test split, whose pairs of primitive and texture training never had, is what carries over. A small
-# convolutional network is trained in the same way: what it tells and the encoder does not is there in the touches.
-#
-# Then the sensor that is left out, in six touches of each object: linear probes of contact frames, shallow and deep
-# ones, read hardness, roughness, material and indenter from the frozen features of AnyTouch of Tables 2 to 4, of the
-# encoder trained with the labels, of an untrained one, and of the convolutional network, and from pixels less the
-# untouched gel.
-#
-# `python -m experiments.tables.caption_probes` takes some twenty minutes a seed on one core once `make experiments` has
-# trained the encoders. `STUDY=` is the folder of scenes and encoders, made if they are missing. `STEPS=` and `SEEDS=`
-# change the size, and `QUICK=1` is a trial. `TABLE=1` only rewrites the page `named.md` from `named.jsonl`. What is
-# finished is not done again. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small convolutions
-# (`--model.patch-encoder convolutional`): `named_convolutional.md`.
+Are touches too poor to show these labels, or is training too short? The encoder of Tables 2 to 4 is trained with the
+labels themselves, more than any caption says, on contact frames of four sensors, flipped at random, one linear head a
+label. The test split has pairs of primitive and texture that training never had. A small convolutional network is
+trained alike. Then the sensor left out: linear probes of contact frames on the frozen features of each.
 
-# %%
+`python -m experiments.tables.caption_probes` takes 20 minutes a seed on one core, with the encoders of
+`make experiments` (`STUDY=`). `STEPS=`, `SEEDS=` and `QUICK=1` change the size. `TABLE=1` makes the page from its
+records. Finished seeds are not run again. `CONVOLUTIONS=1` has encoders whose patches are read by small convolutions,
+and its own page.
+"""
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -79,13 +61,8 @@ LEFT_OUT = plan.Scenes("left_out", (plan.UNSEEN,), 6 * SIZE.objects, "fine", 0, 
 BATCH, RATE, WARMUP = 64, 1e-3, 100
 SETTINGS = {"size": SIZE.name, "steps": STEPS, "batch": BATCH, "rate": RATE, "simulator": VERSION}
 SETTINGS |= {"touches": LEFT_OUT.touches}
-enable_compilation_cache()
-
-# %% [markdown]
-# ## The touches
 
 
-# %%
 def frames(file: Path, splits: tuple[str, ...], encoder: Encoder) -> dict[str, np.ndarray]:
     """Contact frames of a manifest: images u8 (n, h, w, 3) as the encoder gets them, sensor rows, splits, labels."""
     table = manifests.read([file])
@@ -111,11 +88,6 @@ def touches(work: Work, encoder: Encoder) -> dict[str, np.ndarray]:
     return {name: np.concatenate([one[name] for one in several]) for name in several[0]}
 
 
-# %% [markdown]
-# ## Training with the labels
-
-
-# %%
 def training(seed: int) -> plan.Training:
     """AnyTouch of Tables 2 to 4, or the same with convolutions inside its patches."""
     last = plan.training(SIZE, "anytouch", seed)
@@ -227,11 +199,6 @@ def batched(data: dict[str, np.ndarray], rows: np.ndarray) -> list[tuple[np.ndar
     return [(data["image"][part], data["sensor"][part]) for part in parts]
 
 
-# %% [markdown]
-# ## The sensor left out
-
-
-# %%
 def probes(features: dict[str, np.ndarray], table: manifests.Manifest, rows: np.ndarray) -> dict[str, Any]:
     """What linear probes of contact frames get right of each object never seen, by label."""
     split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
@@ -239,7 +206,6 @@ def probes(features: dict[str, np.ndarray], table: manifests.Manifest, rows: np.
     return probed(features, labels, groups, split)
 
 
-# %%
 def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Work, table: Any) -> dict[str, Any]:
     """What AnyTouch, the encoder trained with the labels, an untrained one and pixels tell."""
     last = training(seed)
@@ -296,20 +262,13 @@ def one_seed(seed: int) -> dict[str, Any]:
     return found
 
 
-runs = [one_seed(seed) for seed in SEEDS]
-
-# %% [markdown]
-# ## The table
-
-
-# %%
 def percent(values: list[float]) -> str:
     low, high = seed_interval(values)
     interval = "" if low is None or high is None else f" ({100 * low:.1f} to {100 * high:.1f})"
     return f"{100 * np.mean(values):.1f} %{interval}"
 
 
-def row(label: str) -> tuple[str, ...]:
+def row(runs: list[dict[str, Any]], label: str) -> tuple[str, ...]:
     ways = [(run["scores"][label], run[CONVOLUTIONAL]["scores"][label]) for run in runs]
     known = [percent([own["commonest"] for own, _ in ways])]
     known += [percent([way[number][part] for way in ways]) for number in (0, 1) for part in ("train", "test")]
@@ -322,24 +281,27 @@ def joined(run: dict[str, Any], label: str) -> dict[str, Any]:
     return one | {"right": one["right"] | {CONVOLUTIONAL: other["right"][CONVOLUTIONAL]}}
 
 
-head = ("label", "commonest answer of train", "its own frames", "objects never touched")
-head += ("convolutional: its own frames", "convolutional: objects never touched")
-told = markdown_table(head, [row(label) for label in LABELS])
-probed_runs = [{label: joined(run, label) for label in LABELS} for run in runs]
-columns = (*NAMES, CONVOLUTIONAL, "pixels", "commonest")
-left_out = probe_table(probed_runs, columns, ("untrained", "pixels"), NAMED, UNNAMED)
-seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
-made = f"SEEDS={','.join(map(str, SEEDS))} python -m experiments.tables.caption_probes"
-made = f"CONVOLUTIONS=1 {made}" if CONVOLUTIONS else made
-inside = ", with small convolutions inside its patches" if CONVOLUTIONS else ""
-text = f"""# What captions name, of objects never touched
+def main() -> None:
+    enable_compilation_cache()
+    runs = [one_seed(seed) for seed in SEEDS]
+    head = ("label", "commonest answer of train", "its own frames", "objects never touched")
+    head += ("convolutional: its own frames", "convolutional: objects never touched")
+    accuracies = markdown_table(head, [row(runs, label) for label in LABELS])
+    probed_runs = [{label: joined(run, label) for label in LABELS} for run in runs]
+    columns = (*NAMES, CONVOLUTIONAL, "pixels", "commonest")
+    left_out = probe_table(probed_runs, columns, ("untrained", "pixels"), NAMED, UNNAMED)
+    seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
+    made = f"SEEDS={','.join(map(str, SEEDS))} python -m experiments.tables.caption_probes"
+    made = f"CONVOLUTIONS=1 {made}" if CONVOLUTIONS else made
+    inside = ", with small convolutions inside its patches" if CONVOLUTIONS else ""
+    text = f"""# What captions name, of objects never touched
 
 The encoder of Tables 2 to 4{inside}, trained with the labels themselves ({runs[0]["settings"]["steps"]} steps of
 {BATCH} contact frames of four sensors), {seeds}; mean with its 95 % interval over seeds. The test split has pairs of
 primitive and texture that training never had. Captions name hardness, roughness and material; they do not name the
 indenter. Beside it a convolutional network with group norms, trained in the same way.
 
-{told}
+{accuracies}
 
 ## {plan.UNSEEN}, left out of training: linear probes of contact frames (mean and spread over seeds)
 
@@ -350,5 +312,9 @@ sensor. AnyTouch is that of Tables 2 to 4{inside}, of the same seeds; captions n
 
 Made by `{made}` ({runs[0]["machine"]}), from `{NAME}.jsonl`.
 """
-atomic_write(OUT / f"{NAME}.md", text)
-print(text)
+    atomic_write(OUT / f"{NAME}.md", text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,11 +1,3 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
-
 # %% [markdown]
 # # Does the encoder feel motion?
 #
@@ -29,7 +21,6 @@ from experiments.tables.questions import VIEWS, dynamic
 from experiments.tables.results import spread
 
 runs = page.runs("dynamics")
-print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
 
 # %% [markdown]
 # ## Picture
@@ -43,24 +34,17 @@ path = page.picture(runs)
 # %%
 for name in ("anytouch", "static_only", "no_flips"):
     for number, task in enumerate(("slip", "force", "twist", "slide")):
-        found = {view: spread(runs, "dynamics", name, dynamic(view)[number]) for view in VIEWS}
-        if all(found.values()):
-            lost = {view: found["clips"][0] - one[0] for view, one in found.items() if view != "clips"}
+        result = {view: spread(runs, "dynamics", name, dynamic(view)[number]) for view in VIEWS}
+        if all(result.values()):
+            lost = {view: result["clips"][0] - one[0] for view, one in result.items() if view != "clips"}
             print(
-                f"{name:18} {task:6} clips {found['clips'][0]:.1f}", {view: round(one, 1) for view, one in lost.items()}
+                f"{name:18} {task:6} clips {result['clips'][0]:.1f}",
+                {view: round(one, 1) for view, one in lost.items()},
             )
-
-# %% [markdown]
-# ## A checkpoint of yours
-#
-# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
-# scored as above, in minutes on a CPU, and compared with our rows.
-
-# %%
-mine = page.yours("dynamics", runs)
 
 # %% [markdown]
 # ## Finding
 
 # %%
 text = page.finding("dynamics", runs)
+mine = page.yours("dynamics", runs)

@@ -32,10 +32,10 @@ def numbers(name: str, usual: str) -> list[int]:
 
 def names(name: str, usual: str, known: Collection[str]) -> list[str]:
     """Names with commas between, each of them `known`. Raises UserError."""
-    found = (os.environ.get(name) or usual).split(",")
-    if wrong := [word for word in found if word not in known]:
-        raise UserError(f"{name}={','.join(found)}: there is no {wrong[0]!r}; choose among {', '.join(known)}")
-    return found
+    result = (os.environ.get(name) or usual).split(",")
+    if wrong := [word for word in result if word not in known]:
+        raise UserError(f"{name}={','.join(result)}: there is no {wrong[0]!r}; choose among {', '.join(known)}")
+    return result
 
 
 def path(name: str, usual: str | Path) -> Path:
@@ -49,10 +49,10 @@ def runs() -> dict[str, list[str]]:
     words = os.environ.get("RUNS", "").split()
     if wrong := [word for word in words if "=" not in word]:
         raise UserError(f"RUNS: name=path for every run, not {wrong[0]!r}")
-    found = {name: paths.split(",") for name, paths in (word.split("=", 1) for word in words)}
-    if lost := [path for paths in found.values() for path in paths if not Path(path).exists()]:
+    result = {name: paths.split(",") for name, paths in (word.split("=", 1) for word in words)}
+    if lost := [path for paths in result.values() for path in paths if not Path(path).exists()]:
         raise UserError(f"RUNS: there is no run {lost[0]}")
-    return found
+    return result
 
 
 def _whole(name: str, word: str, least: int) -> int:

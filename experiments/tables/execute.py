@@ -1,7 +1,7 @@
-"""Running the plan: what is finished is not done again, what does not fit in the time is left for the next call.
+"""Execution of the plan: runs that are missing are made, and each leaves a record.
 
-Several processes may run it in one folder at once: what one has claimed the others leave to it, and they wait only when
-there is nothing else to do.
+Several processes may work in one folder. Each leaves to the others what they have claimed, and waits only when there is
+nothing else to do.
 """
 
 from __future__ import annotations
@@ -14,39 +14,37 @@ from typing import Any, NamedTuple, Protocol
 
 from anytouch_jax.errors import UserError
 from experiments.records import read_records, write_record
-from experiments.tables import budget, plan
+from experiments.tables import plan
 from experiments.tables.plan import Leaf, Scenes, Size, Training
 from experiments.tables.results import differences, simulated
 
-Log = Callable[[str], None]
-PAUSE = 5.0  # s until what others work on is looked at again
+PAUSE = 5.0  # s between two looks at what others work on
 
 
 class Work(Protocol):
-    """What a run is made of (`work.Work`; tests give another). Each of the first two leaves its result on disk."""
+    """What a run is made of (`work.Work`). Data sets and trainings leave their results on disk."""
 
     def ready(self, leaf: Leaf) -> set[str]:
-        """Names of the data sets and keys of the trainings that are finished."""
+        """Return names of the finished data sets and keys of the finished trainings."""
 
     def claim(self, name: str) -> AbstractContextManager[bool]:
-        """Keep other processes from `name` meanwhile; False where one of them works on it."""
+        """Keep other processes from `name`; False where one of them works on it."""
 
     def make(self, one: Scenes, size: Size) -> None:
-        """Make a data set, or finish it."""
+        """Make a data set."""
 
     def train(self, one: Training) -> None:
         """Train a stage, or finish it."""
 
     def score(self, leaf: Leaf) -> dict[str, Any]:
-        """The record of a run whose model is there."""
+        """Return the record of a run whose model is trained."""
 
 
 class Outcome(NamedTuple):
-    """Keys of the runs: finished in this call, found finished, left for want of time, and {key: what went wrong}."""
+    """Keys of the runs made in this call and of those made before it, and {key: error} of those that failed."""
 
     made: list[str]
-    found: list[str]
-    left: list[str]
+    kept: list[str]
     failed: dict[str, str]
 
 
@@ -56,10 +54,7 @@ def is_done(leaf: Leaf, out: Path) -> bool:
 
 
 def check_results(leaves: Sequence[Leaf], out: Path) -> None:
-    """Raise UserError where `out` holds results of one of these questions of another simulator or of other settings.
-
-    They would stand in one table, and a part of what is there would be written over.
-    """
+    """Raise UserError where `out` has results of these questions by another simulator or other settings."""
     if not leaves:
         return
     size, questions = leaves[0].size, {leaf.question for leaf in leaves}
@@ -84,74 +79,48 @@ def execute(
     work: Work,
     out: Path,
     *,
-    minutes: float | None = None,
-    log: Log = print,
-    clock: Callable[[], float] = time.monotonic,
+    log: Callable[[str], None] = print,
     pause: Callable[[float], None] = time.sleep,
 ) -> Outcome:
-    """Do the runs in order, a record each; stop before one that would not fit in `minutes`.
-
-    How long things take is estimated by `budget`, corrected by what they took in this call. A run that fails is logged
-    and left out; the others go on. Raises UserError when not even the first run fits.
-    """
-    start, planned, waited = clock(), 0.0, 0.0
-    result = Outcome([], [], [], {})
-    waiting, announced = list(leaves), set[str]()
+    """Make the missing runs in order, a record each. A run that fails is logged, and the others go on."""
+    result, waiting = Outcome([], [], {}), list(leaves)
     while waiting:
         later: list[Leaf] = []  # another process works on these, or on what they need
         for leaf in waiting:
             if is_done(leaf, out):
-                result.found.append(leaf.key)
+                result.kept.append(leaf.key)
                 continue
-            expected, spent = budget.cost(leaf, work.ready(leaf)), clock() - start
-            seconds = expected * (max(1.0, (spent - waited) / planned) if planned else 1.0)
-            if minutes is not None and spent + seconds > 60 * minutes:
-                if not (result.made or result.failed or announced):
-                    raise UserError(
-                        f"{leaf.key} takes about {expected / 60:.0f} minutes with what it needs, and MINUTES is "
-                        f"{minutes:g}; give more"
-                    )
-                rest = [one.key for one in leaves if one.key not in result.failed and not is_done(one, out)]
-                log(f"{spent / 60:.0f} of {minutes:g} minutes are spent: {len(rest)} runs are left for the next call")
-                return result._replace(left=rest)
-
-            def begin(leaf: Leaf = leaf, seconds: float = seconds) -> None:
-                if leaf.key not in announced:
-                    log(f"{leaf.key}: about {seconds / 60:.1f} min")
-                    announced.add(leaf.key)
-
             with work.claim(leaf.key) as mine:
                 try:
-                    done = mine and (is_done(leaf, out) or _one(leaf, work, out, begin))
+                    done = mine and (is_done(leaf, out) or _make(leaf, work, out, log))
                 except (UserError, RuntimeError, MemoryError) as error:  # XLA's are RuntimeErrors
                     what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
                     log(f"{leaf.key} failed: {what}")
                     result.failed[leaf.key] = what
-                    done = None
-            planned += expected - (0.0 if done else budget.cost(leaf, work.ready(leaf)))
+                    continue
             if done:
                 result.made.append(leaf.key)
-            elif done is not None:
+            else:
                 later.append(leaf)
         if len(later) == len(waiting):
-            since = clock()
             pause(PAUSE)
-            waited += clock() - since
         waiting = later
     return result
 
 
-def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
-    """Make what a run still needs, then the run; False where another process is about to make a part of it.
+def missing(leaf: Leaf, ready: set[str]) -> tuple[list[Scenes], list[Training]]:
+    """Return the data sets and trainings that a run needs and that are not `ready`, in order."""
+    sets = [one for one in plan.scenes(leaf.size) if one.name not in ready]
+    return sets, [one for one in leaf.trainings if one.key not in ready]
 
-    `begin` is called before there is something to do.
-    """
-    for one in budget.missing(leaf, work.ready(leaf))[0]:
+
+def _make(leaf: Leaf, work: Work, out: Path, log: Callable[[str], None]) -> bool:
+    """Make what a run needs, then the run; False where another process is about to make a part of it."""
+    for one in missing(leaf, work.ready(leaf))[0]:
         with work.claim(one.name) as mine:
             if mine and one.name not in work.ready(leaf):
-                begin()
                 work.make(one, leaf.size)
-    sets, trainings = budget.missing(leaf, work.ready(leaf))
+    sets, trainings = missing(leaf, work.ready(leaf))
     if sets:
         return False
     for training in trainings:
@@ -159,9 +128,8 @@ def _one(leaf: Leaf, work: Work, out: Path, begin: Callable[[], None]) -> bool:
             if not mine:
                 return False
             if training.key not in work.ready(leaf):
-                begin()
                 work.train(training)
-    begin()
+    log(leaf.key)
     about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
     about |= {"identity": leaf.identity, "simulator": plan.simulator(), "scoring": plan.scoring(leaf.question)}
     write_record(out, leaf.key, about | work.score(leaf))

@@ -1,36 +1,27 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
+"""Longer clips: what they cost and what they show.
 
-# %% [markdown]
-# # What does a longer look cost, and what does it see?
-#
-# A clip longer than three frames is embedded as several segments of three, whose features are averaged, summed or
-# concatenated (paper, appendix "Discussion on frame number"). Here the same moments are seen with one frame (a still),
-# three, five and seven: slip, force, the sign of a twist and the direction of a slide by linear probes of frozen
-# features (honest protocol, objects never touched in training), beside the time that a clip takes.
-#
-#     make long-clips RUN=runs/stage2 DATA=data/scenes/manifest.parquet
-#
-# `OUT=` is the folder of the page, its picture and `long_clips.jsonl`, which has a line for each length. `ROWS=` is the
-# largest number of moments of a task. A length that was measured with the same encoder and data is not measured again.
-# `QUICK=1` is a trial of a minute or two. `TABLE=1` makes the page from `long_clips.jsonl` alone.
+A clip of more than three frames is embedded as segments of three, whose features are averaged, summed or concatenated
+(App. "Discussion on frame number"). The same moments are embedded with one, three, five and seven frames. Linear probes
+of frozen features (honest protocol, objects never touched in training) read slip, force, the sign of a twist and the
+direction of a slide.
 
-# %%
+    make long-clips RUN=runs/stage2 DATA=data/scenes/manifest.parquet
+
+`OUT=` is the folder of the page and of `long_clips.jsonl`, a line a length. `ROWS=` bounds the moments of a task. A
+length that was measured with the same encoder and data is not measured again. `QUICK=1` is a trial of a minute or two.
+`TABLE=1` makes the page from its records alone.
+"""
+
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
@@ -39,8 +30,9 @@ from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
+from experiments.benchmarks.speed import interleaved
 from experiments.records import read_records, write_record
-from experiments.tables import env, page
+from experiments.tables import env
 
 RUN, DATA = env.path("RUN", "runs/stage2"), env.path("DATA", "data/scenes/manifest.parquet")
 QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
@@ -51,34 +43,37 @@ LOOKS = [(1, "mean"), (3, "mean"), *((frames, join) for frames in (5, 7) for joi
 LONGEST = max(frames for frames, _ in LOOKS)
 TASKS = ("slip", "force", "twist", "slide")
 
-if not TABLE:
+RESULTS = OUT / f"{NAME}.jsonl"
+SETTINGS: dict[str, Any] = {"version": 2, "rows": ROWS, "rounds": ROUNDS, "batch": BATCH}
+
+
+class Moments(NamedTuple):
+    """The same moments for every length: `rows` of `table` that end a clip of the longest, and by task."""
+
+    encoder: Encoder
+    table: Manifest
+    tasks: dict[str, tasks.TaskRows]
+    rows: np.ndarray
+
+
+def moments() -> Moments:
+    """Return the moments of each task by the sensors in the encoder's table."""
     encoder, table = load_encoder(RUN), manifests.read(DATA)
-
-# %% [markdown]
-# ## The same moments for every length
-#
-# A task's moments that end a clip of the longest length, by the sensors in the encoder's table.
-
-
-# %%
-def moments(name: str) -> tasks.TaskRows:
-    found = tasks.select(table, tasks.find_task(name), LONGEST)
-    kept = np.flatnonzero(np.isin(found.sensors, encoder.config.model.sensors))
-    if len(kept) > ROWS:
-        kept = np.sort(np.random.default_rng(0).choice(kept, ROWS, replace=False))
-    return found.take(kept)
+    chosen = {}
+    for name in TASKS:
+        ends = tasks.select(table, tasks.find_task(name), LONGEST)
+        kept = np.flatnonzero(np.isin(ends.sensors, encoder.config.model.sensors))
+        if len(kept) > ROWS:
+            kept = np.sort(np.random.default_rng(0).choice(kept, ROWS, replace=False))
+        chosen[name] = ends.take(kept)
+    return Moments(encoder, table, chosen, np.unique(np.concatenate([one.rows[:, 0] for one in chosen.values()])))
 
 
-if not TABLE:
-    chosen = {name: moments(name) for name in TASKS}
-    rows = np.unique(np.concatenate([one.rows[:, 0] for one in chosen.values()]))
-
-
-def scores(values: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Accuracy, or R2 of force, with its interval over test objects, of each task."""
+def scores(of: Moments, values: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Return the accuracy, or R2 of force, with its interval over test objects, of each task."""
     result: dict[str, dict[str, Any]] = {}
-    for name, one in chosen.items():
-        given = (values[np.searchsorted(rows, one.rows[:, 0])], one.labels, one.groups, one.split)
+    for name, one in of.tasks.items():
+        given = (values[np.searchsorted(of.rows, one.rows[:, 0])], one.labels, one.groups, one.split)
         if name == "force":
             fit = array_probes.probe_features(*given, measured=True)
             result[name] = {"mean": fit.r2, "low": fit.low, "high": fit.high, "test": fit.n_test, "chance": 0.0}
@@ -89,88 +84,64 @@ def scores(values: np.ndarray) -> dict[str, dict[str, Any]]:
     return result
 
 
-# %% [markdown]
-# ## Time
-#
-# All lengths in turns in one process; the median of each, and its ratio to three frames.
-
-
-# %%
 def milliseconds(encoder: Encoder) -> list[float]:
-    """Median time of a clip in a batch, for each look."""
+    """Return the median time of a clip in a batch for each length, all in turns."""
     side = encoder.config.model.image_size
     clips = np.random.default_rng(0).integers(0, 256, (BATCH, LONGEST, side, side, 3), np.uint8)
     sensor = np.zeros(BATCH, np.int32)
-    spent: list[list[float]] = [[] for _ in LOOKS]
-    for turn in range(ROUNDS + 1):
-        for k, (frames, join) in enumerate(LOOKS):
-            start = time.perf_counter()
-            encoder.encode_touch(clips[:, :frames], sensor, pooling="both", join=join)  # type: ignore[arg-type]
-            if turn:  # the first one compiles
-                spent[k].append(1e3 * (time.perf_counter() - start) / BATCH)
-    return [float(np.median(one)) for one in spent]
+    calls = [partial(encoder.encode_touch, clips[:, :n], sensor, pooling="both", join=join) for n, join in LOOKS]
+    return [float(np.median(spent)) * 1e3 / BATCH for spent in interleaved(calls, ROUNDS)]
 
 
-# %% [markdown]
-# ## Look by look
-
-# %%
-RESULTS = OUT / f"{NAME}.jsonl"
-SETTINGS: dict[str, Any] = {"version": 2, "rows": ROWS, "rounds": ROUNDS, "batch": BATCH}
-if not TABLE:
-    SETTINGS |= {"encoder": encoder.fingerprint, "manifest": table.content_hash}
-
-
-def make(key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return the record of a length, measured first unless it was measured with these settings."""
-    record = read_records(RESULTS).get(key)
-    if TABLE and record is None:
-        raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
-    if record is None or not (TABLE or record["settings"] == SETTINGS):
-        record = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": SETTINGS} | measure()
-        write_record(RESULTS, key, record)
-    return record
-
-
-def seen(frames: int, join: Any) -> dict[str, Any]:
-    read, values = embed_rows(encoder, table, rows, frames, "both", join, log=silent)
-    if len(read) < len(rows):
-        raise SystemExit(f"{len(rows) - len(read)} rows cannot be read; `anytouch verify` says what is wrong with them")
-    found = scores(values)
+def probed(of: Moments, frames: int, join: Any) -> dict[str, Any]:
+    """Return the scores of a length."""
+    read, values = embed_rows(of.encoder, of.table, of.rows, frames, "both", join, log=silent)
+    if len(read) < len(of.rows):
+        raise UserError(f"{len(of.rows) - len(read)} rows cannot be read; check them with `anytouch data verify`")
+    found = scores(of, values)
     print({name: round(one["mean"], 3) for name, one in found.items()}, frames, join, flush=True)
     return {"tasks": found}
 
 
-time_taken = make("time", lambda: {"ms": milliseconds(encoder)})
-cost = time_taken["ms"]
-record: list[dict[str, Any]] = []
-for (frames, join), ms in zip(LOOKS, cost, strict=True):
-    about = {"frames": frames, "join": join if frames > 3 else "-", "ms": ms, "ratio": ms / cost[1]}
-    record.append(about | make(f"{frames}-{join}", partial(seen, frames, join)))
+def record_of(key: str, of: Moments | None, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the record of a length, measured first unless it was measured with these settings."""
+    record = read_records(RESULTS).get(key)
+    if of is None:
+        if record is None:
+            raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
+        return record
+    settings = SETTINGS | {"encoder": of.encoder.fingerprint, "manifest": of.table.content_hash}
+    if record is None or record["settings"] != settings:
+        record = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": settings} | measure()
+        write_record(RESULTS, key, record)
+    return record
 
-# %% [markdown]
-# ## Table and picture
 
-
-# %%
 def cell(name: str, one: dict[str, Any]) -> str:
     scale, digits = (1, 2) if name == "force" else (100, 1)
     interval = "" if one["low"] is None else f" ({scale * one['low']:.{digits}f} to {scale * one['high']:.{digits}f})"
     return f"{scale * one['mean']:.{digits}f}{interval}"
 
 
-head = ("frames", "joined by", "ms a clip", "time / 3 frames", "slip %", "force R2", "twist %", "slide %")
-body = [
-    (str(one["frames"]), one["join"], f"{one['ms']:.2f}", f"{one['ratio']:.2f}",
-     *(cell(name, one["tasks"][name]) for name in TASKS))
-    for one in record
-]  # fmt: skip
-chance = (
-    cell(name, record[0]["tasks"][name] | {"mean": record[0]["tasks"][name]["chance"], "low": None}) for name in TASKS
-)
-body.append(("*the commonest answer*", "-", "-", "-", *chance))
-tested = ", ".join(f"{name} {one['test']}" for name, one in record[0]["tasks"].items())
-text = f"""# Longer clips: what they see beside what they cost
+def main() -> None:
+    of = None if TABLE else moments()
+    time_taken = record_of("time", of, lambda: {"ms": milliseconds(of.encoder)})
+    cost = time_taken["ms"]
+    rows: list[dict[str, Any]] = []
+    for (frames, join), ms in zip(LOOKS, cost, strict=True):
+        about = {"frames": frames, "join": join if frames > 3 else "-", "ms": ms, "ratio": ms / cost[1]}
+        rows.append(about | record_of(f"{frames}-{join}", of, partial(probed, of, frames, join)))
+    head = ("frames", "joined by", "ms a clip", "time / 3 frames", "slip %", "force R2", "twist %", "slide %")
+    body = [
+        (str(one["frames"]), one["join"], f"{one['ms']:.2f}", f"{one['ratio']:.2f}",
+         *(cell(name, one["tasks"][name]) for name in TASKS))
+        for one in rows
+    ]  # fmt: skip
+    first = rows[0]["tasks"]
+    chance = (cell(name, first[name] | {"mean": first[name]["chance"], "low": None}) for name in TASKS)
+    body.append(("*the commonest answer*", "-", "-", "-", *chance))
+    tested = ", ".join(f"{name} {one['test']}" for name, one in first.items())
+    text = f"""# Longer clips: what they cost and what they show
 
 Made by `make long-clips` from the run `{time_taken["run"]}`. {time_taken["machine"]}
 Linear probes of frozen features, one fit, on objects never touched in training, 95 % over them; moments: {tested}.
@@ -181,11 +152,14 @@ Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
 
 ![Slip against time](figures/{NAME}.png)
 """
-atomic_write(OUT / f"{NAME}.md", text)
-points = {
-    f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"]) for one in record
-}
-picture = OUT / "figures" / f"{NAME}.png"
-plots.pareto(picture, points, x="ms a clip", y="share of slips told wrongly")
-print(text)
-page.show(picture)
+    atomic_write(OUT / f"{NAME}.md", text)
+    points = {
+        f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"])
+        for one in rows
+    }
+    plots.pareto(OUT / "figures" / f"{NAME}.png", points, x="ms a clip", y="share of slips classified wrongly")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

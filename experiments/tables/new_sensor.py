@@ -1,11 +1,3 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
-
 # %% [markdown]
 # # A new sensor in minutes
 #
@@ -25,7 +17,6 @@ from experiments.tables import page, scores
 from experiments.tables.results import Column, spread
 
 runs = page.runs("new_sensor")
-print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
 
 # %% [markdown]
 # ## Picture
@@ -41,20 +32,12 @@ path = page.picture(runs)
 # %%
 for name, view in (("left_out", scores.NOTHING), ("seen", "seen")):
     for task in scores.STATIC:
-        found = spread(runs, "new_sensor", name, Column(task, view, task))
-        print(f"{name:9} {task:10} {'not run' if found is None else f'{found[0]:.1f} %'}")
-
-# %% [markdown]
-# ## A checkpoint of yours
-#
-# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
-# scored as above, in minutes on a CPU, and compared with our rows.
-
-# %%
-mine = page.yours("new_sensor", runs)
+        result = spread(runs, "new_sensor", name, Column(task, view, task))
+        print(f"{name:9} {task:10} {'not run' if result is None else f'{result[0]:.1f} %'}")
 
 # %% [markdown]
 # ## Finding
 
 # %%
 text = page.finding("new_sensor", runs)
+mine = page.yours("new_sensor", runs)

@@ -1,9 +1,8 @@
-"""What the notebooks share: where the results are, how a picture and a text are shown, in Jupyter or in a terminal, and
-the scores of a checkpoint of one's own.
+"""Notebooks of the tables: their results, pictures and texts, and the scores of a checkpoint of yours.
 
-`RESULTS=` and `FIGURES=` in the environment say where results are read and pictures are written, `RUN=` which run is
-scored beside them, and `DATA=` on what: a folder of simulated data sets as the matrix makes them, or, for real touch, a
-manifest.
+`RESULTS=` and `FIGURES=` in the environment name where results are read and pictures are written. `RUN=` names a run
+folder or weights file to score, and `DATA=` the data to score it on: a folder of simulated data sets as the matrix
+makes them, or a manifest of real touch.
 """
 
 from __future__ import annotations
@@ -16,27 +15,28 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown_table
-from experiments.tables import budget, pictures, plan, report, scores
+from experiments.tables import pictures, plan, report, scores
 from experiments.tables.results import Run, differences, read
 from experiments.tables.work import Work
 
 ROOT = Path(__file__).resolve().parents[2]
 DEFAULT = ROOT / "experiments" / "results" / "matrix.jsonl"
-# The run whose row a checkpoint stands beside, and the size whose rows and refits it is scored with.
-BESIDE = {"q1": "+".join(plan.SENSORS), "q2": "matched", "new_sensor": "left_out"}
+# The run whose row a checkpoint is compared with, and the size whose rows and refits it is scored with.
+COMPARED = {"q1": "+".join(plan.SENSORS), "q2": "matched", "new_sensor": "left_out"}
 SIZE = plan.FULL
 
 
 def runs(question: str) -> list[Run]:
     """Return the runs of a question. Without any, print how to make them."""
     results = Path(os.environ.get("RESULTS") or DEFAULT)
-    found = [run for run in read(results) if run.question == question]
-    if not found:
+    result = [run for run in read(results) if run.question == question]
+    if not result:
         text(f"**{results} holds no result of `{question}`: `make experiments ONLY={question}` makes them.**")
-    if wrong := differences([run.about for run in found]):
-        text(f"**The results of `{question}` in {results} differ in what they must share ({wrong}): none is shown.**")
+    if wrong := differences([run.about for run in result]):
+        text(f"**The results of `{question}` in {results} cannot be compared ({wrong}): none is shown.**")
         return []
-    return found
+    print(len(result), "runs,", len({run.seed for run in result}), "seeds")
+    return result
 
 
 def show(path: Path) -> None:
@@ -79,34 +79,35 @@ class Given(Work):
 def yours(question: str, several: list[Run]) -> list[dict[str, object]]:
     """Score the run `RUN` on the question as the matrix does, show it next to our rows, and return its rows.
 
-    Without RUN it says how. Simulated data sets that are not in DATA (default: runs/matrix) are made there. Raises
-    UserError for a run, or a manifest of real touch, that is not there.
+    Scoring takes minutes on a CPU. Simulated data sets that are missing in DATA (default: runs/matrix) are made there.
+    Raises UserError for a missing run or manifest of real touch.
     """
     data = os.environ.get("DATA", "")
     if not os.environ.get("RUN"):
-        text("`RUN=folder DATA=folder` in the environment scores a checkpoint of yours here, beside the table.")
+        text("`RUN=folder DATA=folder` in the environment scores a checkpoint of yours on this question.")
         return []
     run = Path(os.environ["RUN"])
     if not run.exists():
-        raise UserError(f"there is no run {run}; name with RUN= the folder of a training or a weights file")
+        raise UserError(f"there is no run {run}; RUN= is a run folder or a weights file")
     folder, real = Path(data or ROOT / "runs" / "matrix"), ROOT.parent / "shared" / "real_touch" / "manifest.csv"
     if question == plan.REAL:
         folder, real = Path(tempfile.mkdtemp(prefix="anytouch-")), Path(data or real)
         if not real.exists():
-            raise UserError(f"there is no {real}; name the manifest of real touch with DATA=")
-    work, name = Given(run, folder, real), BESIDE.get(question, "anytouch")
+            raise UserError(f"there is no {real}; DATA= is the manifest of real touch")
+    work, name = Given(run, folder, real), COMPARED.get(question, "anytouch")
     leaf = plan.Leaf(question, name, 0, plan.training(SIZE, "anytouch", 0), SIZE)
     for one in plan.scenes(SIZE) if question != plan.REAL else ():
         if not work.made(one, SIZE):
-            text(f"{folder / one.name} is made, about {budget.of_scenes(one, SIZE) / 60:.0f} minutes.")
+            text(f"{folder / one.name} is simulated first, which takes minutes.")
             work.make(one, SIZE)
-    found = scores.score(leaf, work)["rows"]
-    text(f"{run}, beside the mean over seeds of `{name}` in the results; other data make other numbers:")
-    text(markdown_table(("view", "task", "metric", "protocol", "yours", "95 %", "ours"), _beside(found, several, name)))
-    return list(found)
+    result = scores.score(leaf, work)["rows"]
+    text(f"{run}, and the mean over seeds of `{name}` in the results. Other data give other numbers:")
+    head = ("view", "task", "metric", "protocol", "yours", "95 %", "ours")
+    text(markdown_table(head, _compared(result, several, name)))
+    return list(result)
 
 
-def _beside(found: list[dict[str, object]], several: list[Run], name: str) -> list[tuple[str, ...]]:
+def _compared(result: list[dict[str, object]], several: list[Run], name: str) -> list[tuple[str, ...]]:
     """A line for each row: its value and interval, and the mean of the rows of `name` that measure the same."""
     keys = ("view", "task", "metric", "protocol")
     ours: dict[tuple[object, ...], list[float]] = {}
@@ -114,7 +115,7 @@ def _beside(found: list[dict[str, object]], several: list[Run], name: str) -> li
         if row["mean"] is not None:
             ours.setdefault(tuple(row[key] for key in keys), []).append(row["mean"])
     lines = []
-    for row in found:
+    for row in result:
         low, high, same = row.get("low"), row.get("high"), ours.get(tuple(row[key] for key in keys))
         between = "-" if low is None or high is None else f"{low:.3f} to {high:.3f}"
         mean = "-" if row["mean"] is None else f"{row['mean']:.3f}"

@@ -25,7 +25,7 @@ COLOURED = 12  # touches that get a colour and their lines; the others are grey
 
 def draw_all(runs: Sequence[Run], folder: Path) -> list[Path]:
     """Every picture for which there is a run; a file is named after its question."""
-    found = []
+    result = []
     for name, draw in (
         ("q1", q1),
         ("q2", q2),
@@ -37,8 +37,8 @@ def draw_all(runs: Sequence[Run], folder: Path) -> list[Path]:
     ):
         if any(run.question == name for run in runs):
             path = draw(runs, folder / f"{name}.png")
-            found += [path] if path is not None else []
-    return found
+            result += [path] if path is not None else []
+    return result
 
 
 def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | None:
@@ -132,9 +132,9 @@ def ablations(runs: Sequence[Run], path: Path) -> Path:
         for place, name in enumerate(names):
             for shift, colour, one in ((-0.15, "C0", column), (0.15, "C1", questions.FORM[number])):
                 whole = values(runs, "ablations", "anytouch", one)
-                found = change(values(runs, "ablations", name, one), whole, None)
-                if found.mean is not None:
-                    _dot(axis, place + shift, (found.mean, found.low, found.high), colour)
+                result = change(values(runs, "ablations", name, one), whole, None)
+                if result.mean is not None:
+                    _dot(axis, place + shift, (result.mean, result.low, result.high), colour)
             theirs = paper.TABLE6[name][number] - paper.TABLE6["anytouch"][number]  # type: ignore[operator]
             axis.scatter(theirs, place, s=22, marker="D", color="#bbbbbb", zorder=1)
         axis.axvline(0, color="#222222", linewidth=0.7)
@@ -152,9 +152,9 @@ def dynamics(runs: Sequence[Run], path: Path) -> Path:
     for i, axis in enumerate(axes):
         for place, view in enumerate(views):
             for shift, name in ((-0.2, "anytouch"), (0.2, "static_only")):
-                found = spread(runs, "dynamics", name, questions.dynamic(view)[i])
-                if found is not None:
-                    _bar(axis, place + shift, found, 0.38, "C0" if name == "anytouch" else "#bbbbbb")
+                result = spread(runs, "dynamics", name, questions.dynamic(view)[i])
+                if result is not None:
+                    _bar(axis, place + shift, result, 0.38, "C0" if name == "anytouch" else "#bbbbbb")
         axis.set_title(questions.dynamic("clips")[i].title, fontsize=9)
         axis.set_xticks(range(len(views)), views, rotation=30, fontsize=8)
         axis.axhline(0, color="#222222", linewidth=0.6)
@@ -197,10 +197,10 @@ def real_touch(runs: Sequence[Run], path: Path) -> Path:
         for number, run in enumerate(several):
             for row in run.about["rows"]:
                 if row["task"] == task and row["view"] in views:
-                    found = tuple(None if row[key] is None else 100 * row[key] for key in ("mean", "low", "high"))
+                    result = tuple(None if row[key] is None else 100 * row[key] for key in ("mean", "low", "high"))
                     shift = 0.18 * (number - (len(several) - 1) / 2)
                     ours = row["view"] == real.OURS
-                    _dot(axis, views.index(row["view"]) + shift, found, "C0" if ours else "#7a94b0")  # type: ignore[arg-type]
+                    _dot(axis, views.index(row["view"]) + shift, result, "C0" if ours else "#7a94b0")  # type: ignore[arg-type]
         axis.set_title(task, fontsize=8)
         axis.set(ylim=(len(views) - 0.5, -0.5), xlabel="accuracy, %")
         axis.set_yticks(range(len(views)), views if axis is axes[0] else [], fontsize=8)
@@ -221,16 +221,16 @@ def _lines(names: Sequence[str], columns: Sequence[Column]) -> tuple[Any, list[A
     return figure, axes
 
 
-def _dot(axis: Any, place: float, found: tuple[float, float | None, float | None] | None, colour: str) -> None:
-    if found is not None:
-        mean, low, high = found
+def _dot(axis: Any, place: float, result: tuple[float, float | None, float | None] | None, colour: str) -> None:
+    if result is not None:
+        mean, low, high = result
         axis.scatter(mean, place, s=26, color=colour, zorder=3)
         if low is not None and high is not None:
             axis.plot([low, high], [place, place], color=colour, linewidth=1.4, zorder=2)
 
 
-def _bar(axis: Any, place: float, found: tuple[float, float | None, float | None], width: float, colour: str) -> None:
-    mean, low, high = found
+def _bar(axis: Any, place: float, result: tuple[float, float | None, float | None], width: float, colour: str) -> None:
+    mean, low, high = result
     axis.bar(place, mean, width, color=colour)
     if low is not None and high is not None:
         axis.plot([place, place], [low, high], color="#222222", linewidth=1.2)
@@ -238,13 +238,13 @@ def _bar(axis: Any, place: float, found: tuple[float, float | None, float | None
 
 def _line(
     axis: Any,
-    found: Sequence[tuple[float, float | None, float | None] | None],
+    result: Sequence[tuple[float, float | None, float | None] | None],
     label: str,
     colour: str,
     *,
     bars: bool = True,
 ) -> None:
-    there = [(i, one) for i, one in enumerate(found) if one is not None]
+    there = [(i, one) for i, one in enumerate(result) if one is not None]
     axis.plot([i for i, _ in there], [one[0] for _, one in there], "o-", color=colour, label=label, markersize=4)
     for i, (_, low, high) in there if bars else ():
         if low is not None and high is not None:

@@ -244,17 +244,17 @@ def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests
 
 def leaves(size: Size, *, real: bool = True) -> list[Leaf]:
     """Every run of the matrix, in order: all questions with one seed, then with the next; last `real` data."""
-    found: list[Leaf] = []
+    result: list[Leaf] = []
     for number, seed in enumerate(size.seeds):
         for question, name, model, tower in _of_seed(size, seed, first=number == 0):
-            found.append(Leaf(question, name, seed, model, size, tower))
+            result.append(Leaf(question, name, seed, model, size, tower))
     if real:
         # A sensor of the pack is in none of these tables, and one frame in ten has no picture of the untouched gel.
         real_data = {"background": "keep", "on_bad_sample": "skip"}
         for seed in size.seeds:
             model = training(size, "anytouch", seed, extra=(REAL,), data=real_data)
-            found.append(Leaf("real", "anytouch", seed, model, size))
-    return found
+            result.append(Leaf("real", "anytouch", seed, model, size))
+    return result
 
 
 def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, Training | None, bool]]:

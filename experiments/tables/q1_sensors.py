@@ -1,11 +1,3 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
-
 # %% [markdown]
 # # Q1: what does each sensor's data add?
 #
@@ -31,7 +23,6 @@ from experiments.tables.questions import FOUR
 from experiments.tables.results import change, values
 
 runs = page.runs("q1")
-print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
 
 # %% [markdown]
 # ## Picture
@@ -45,7 +36,7 @@ path = page.picture(runs)
 # %% [markdown]
 # ## Each step by itself
 #
-# What a sensor adds to the two columns of the unseen sensor, beside what it added in the paper (percentage points).
+# What a sensor adds to the two columns of the unseen sensor, and what it added in the paper (percentage points).
 
 # %%
 names = list(TABLE1)
@@ -57,18 +48,10 @@ for before, after in pairwise(names[1:]):
     )
 
 # %% [markdown]
-# ## A checkpoint of yours
-#
-# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
-# scored as above, in minutes on a CPU, and compared with our rows.
-
-# %%
-mine = page.yours("q1", runs)
-
-# %% [markdown]
 # ## Finding
 #
 # The table, and of every row whether its sign agrees with the paper's.
 
 # %%
 text = page.finding("q1", runs)
+mine = page.yours("q1", runs)

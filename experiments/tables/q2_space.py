@@ -1,11 +1,3 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
-
 # %% [markdown]
 # # Q2: what does the space of touches look like?
 #
@@ -13,7 +5,7 @@
 # alignment and cross-sensor matching added one by one. By eye: without touch, samples lie by sensor; masked modelling
 # draws each sensor together; alignment begins to blend them; **matching mixes them, and they lie by touch**.
 #
-# A t-SNE shows what one wants to see, so numbers stand beside it here: is the same touch by another sensor found
+# A t-SNE shows what one wants to see, so numbers are given too: is the same touch by another sensor found
 # among 50 (top-1, top-5), silhouettes by sensor and by object, alignment and uniformity (Wang & Isola, 2020).
 #
 #     make experiments ONLY=q2
@@ -26,7 +18,6 @@ from experiments.tables.questions import SPACE
 from experiments.tables.results import Column, spread
 
 runs = page.runs("q2")
-print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
 
 # %% [markdown]
 # ## Picture
@@ -45,21 +36,13 @@ path = page.picture(runs)
 # %%
 for view in ("class token", "patches"):
     for name in ("untrained", "masked", "aligned", "matched"):
-        found = [spread(runs, "q2", name, Column(one.title, view, *one[2:])) for one in SPACE[:4]]
-        cells = (f"{one.title} {value[0]:.{one.digits}f}" for one, value in zip(SPACE, found, strict=False) if value)
+        result = [spread(runs, "q2", name, Column(one.title, view, *one[2:])) for one in SPACE[:4]]
+        cells = (f"{one.title} {value[0]:.{one.digits}f}" for one, value in zip(SPACE, result, strict=False) if value)
         print(f"{view:12} {name:10}", ", ".join(cells))
-
-# %% [markdown]
-# ## A checkpoint of yours
-#
-# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
-# scored as above, in minutes on a CPU, and compared with our rows.
-
-# %%
-mine = page.yours("q2", runs)
 
 # %% [markdown]
 # ## Finding
 
 # %%
 text = page.finding("q2", runs)
+mine = page.yours("q2", runs)

@@ -1,11 +1,3 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
-
 # %% [markdown]
 # # Q3: is the unified representation better at static and dynamic perception?
 #
@@ -26,7 +18,6 @@ from experiments.tables.results import change, values
 from experiments.tables.tables import title
 
 runs = page.runs("q3")
-print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
 
 # %% [markdown]
 # ## Picture
@@ -44,19 +35,10 @@ path = page.picture(runs)
 for name in ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only"):
     moving = [one for one in dynamic("clips") if one.metric == "accuracy"]
     for what, columns in (("static", SIX), ("dynamic", moving)):
-        found = [change(values(runs, "q3", "anytouch", c), values(runs, "q3", name, c), None).mean for c in columns]
-        found = [one for one in found if one is not None]
-        if found:
-            print(f"{title(name):40} {what:8} {sum(found) / len(found):+.1f}")
-
-# %% [markdown]
-# ## A checkpoint of yours
-#
-# `RUN=` names a run, `DATA=` the folder of the data sets (default: runs/matrix, made where they are not there): it is
-# scored as above, in minutes on a CPU, and compared with our rows.
-
-# %%
-mine = page.yours("q3", runs)
+        result = [change(values(runs, "q3", "anytouch", c), values(runs, "q3", name, c), None).mean for c in columns]
+        result = [one for one in result if one is not None]
+        if result:
+            print(f"{title(name):40} {what:8} {sum(result) / len(result):+.1f}")
 
 # %% [markdown]
 # Raw pixels and the untrained encoder are no rivals of the paper. They say how much a number means: a task that
@@ -66,6 +48,7 @@ mine = page.yours("q3", runs)
 
 # %%
 text = page.finding("q3", runs)
+mine = page.yours("q3", runs)
 
 # %% [markdown]
 # ## The control: the same restricted data

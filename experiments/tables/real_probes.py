@@ -1,11 +1,3 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
-
 # %% [markdown]
 # # What do both stages know of real touch?
 #
@@ -14,7 +6,7 @@
 # is it, does it slip (objects left out), and which object is it on the other finger (another camera, gel and dots).
 #
 # **What a probe may not be given credit for.** Set-up (dots, tint) and object are partly confounded in the pack, and
-# raw pixels see it; so raw pixels and an untrained encoder stand beside every number, and only a difference whose
+# raw pixels see it; so every number is compared with raw pixels and an untrained encoder, and only a difference whose
 # interval over test groups is above zero, in every seed, counts. Objects with a photograph or caption and those
 # without stand apart: the first may have been named in pre-training.
 #
@@ -27,7 +19,6 @@ from experiments.tables import page
 from experiments.tables.real import OURS, PIXELS, UNTRAINED
 
 runs = page.runs("real")
-print(len(runs), "runs,", len({run.seed for run in runs}), "seeds")
 
 # %% [markdown]
 # ## Picture
@@ -50,16 +41,8 @@ for task in dict.fromkeys(row["task"] for run in runs for row in run.about["rows
                     print(f"{task:36} less {rival:9} seed {run.seed} {mean:+6.1f} ({low:+.1f} to {high:+.1f})")
 
 # %% [markdown]
-# ## A checkpoint of yours
-#
-# `RUN=` names a run, `DATA=` the manifest of real touch: it is
-# scored as above, in minutes on a CPU, and compared with our rows.
-
-# %%
-mine = page.yours("real", runs)
-
-# %% [markdown]
 # ## Finding
 
 # %%
 text = page.finding("real", runs)
+mine = page.yours("real", runs)

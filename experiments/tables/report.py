@@ -22,52 +22,52 @@ test objects). Accuracies are in %, by a linear probe of frozen features on obje
 `honest`: the penalty is chosen without the test set.
 
 An interval over seeds is one of trainings for these test objects, which are the same for every seed: it does not say
-how other objects would come out (the records hold no numbers by object, so these cannot be drawn anew here).
+how other objects would come out (the records hold no numbers by object, so these cannot be drawn again here).
 
 A sign is that of the difference of two rows, seed by seed. It *agrees* when the interval leaves zero out on the paper's
 side, is *undecided* when zero lies within, and is not claimed below {CLAIM} seeds. The data are simulated, the network
 is preset tiny made smaller still, trained from scratch for minutes, and cross-sensor matching is contrast with all
 other touches of the batch instead of the paper's pairs (`Size` in `tables/plan.py` says why): compared is the direction
-of an effect, never the paper's absolute numbers, which stand beside ours as printed there. Columns: *seen* is a data
+of an effect, never the paper's absolute numbers, which are printed next to ours. Columns: *seen* is a data
 set trained on (as TAG); *seen sensor, other data* one never trained on (as Feel), whose objects are held out from the
 probe (their kinds may have been met in pre-training); *unseen sensor* a sensor never trained on (as OF 1.0 and OF 2.0).
 Recipes of one stage are trained for that stage's steps alone, AnyTouch for both. *No tactile pre-training* is the image
 tower of our AnyTouch: it never saw a touch, but was trained here towards touch, photographs and text; the paper's CLIP
 never met touch. Statements on dynamic tasks and on the grasp test the paper's claim, not a number of its."""
 _TITLE = "# The paper's questions, answered"
-CAUSES = "causes.md"  # beside the page, written by hand: why a sign does not agree
+CAUSES = "causes.md"  # next to the page, written by hand: why a sign does not agree
 
 
 def parts(runs: Sequence[Run]) -> dict[str, Part]:
     """The sections, by question. Without runs, or where they differ in what they must share, there is no table."""
-    found, kept = {}, comparable(runs)
+    result, kept = {}, comparable(runs)
     for name, make in questions.OF.items():
         wrong = differences([run.about for run in runs if run.question == name])
-        found[name] = make(kept)
+        result[name] = make(kept)
         if not any(run.question == name for run in runs):
-            found[name] = found[name]._replace(text="**Not run.**")
+            result[name] = result[name]._replace(text="**Not run.**")
         if wrong:
             text = f"**No table: these runs differ in what they must share ({wrong}).** Make them again in one folder."
-            found[name] = Part(found[name].title, text, ())
-    return found
+            result[name] = Part(result[name].title, text, ())
+    return result
 
 
 def text(runs: Sequence[Run], figures: Sequence[Path] = ()) -> str:
     """The whole page."""
-    found = parts(runs)
+    result = parts(runs)
     by_name = {path.stem: path for path in figures}
     lines = [
         _TITLE,
         _INTRO,
-        tally({p.title: p.statements for p in found.values() if p.statements}),
-        by_chance([one for part in found.values() for one in part.statements]),
+        tally({p.title: p.statements for p in result.values() if p.statements}),
+        by_chance([one for part in result.values() for one in part.statements]),
     ]
     sizes = sorted({size_of(run, runs) for run in runs})
     if sizes not in ([], ["full"]):
         lines.append(f"**Sizes in these results: {', '.join(sizes)}. Numbers of toy sizes mean nothing.**")
     if unlike := recipes(runs):
         lines.append(f"The questions are of different recipes: {unlike}. A table never mixes them.")
-    for name, part in found.items():
+    for name, part in result.items():
         lines += [f"## {part.title}", part.text]
         if name in by_name:
             lines.append(f"![{part.title}](figures/{by_name[name].name})")

@@ -1,4 +1,4 @@
-"""The tables of the paper from the JSON files of the runs, the paper's numbers beside ours, and whether signs agree."""
+"""Tables of the paper from the records of the runs: the paper's numbers next to ours, and whether signs agree."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Statement(NamedTuple):
 
 def judge(runs: Sequence[Run], question: str, columns: Sequence[Column], pairs: Sequence[Pair]) -> list[Statement]:
     """The statements of a table."""
-    found = []
+    result = []
     for pair in pairs:
         sides = [
             (mine := values(runs, question, pair.first, one), _opponent(runs, question, pair.second, one, mine),
@@ -84,27 +84,27 @@ def judge(runs: Sequence[Run], question: str, columns: Sequence[Column], pairs: 
             row = by_column[over[0]]
         else:
             row = together([sides[i] for i in whole], sum(np.sign(pair.expected[i] or 0) for i in whole) or None)
-        found.append(Statement(pair.label, row, by_column, over))
-    return found
+        result.append(Statement(pair.label, row, by_column, over))
+    return result
 
 
 def _opponent(runs: Sequence[Run], question: str, name: str, column: Column, first: Seeds) -> Seeds:
     """The values of the second of a pair; what is not trained is one number, the same for every seed of the first."""
-    found = values(runs, question, name, column)
-    return dict.fromkeys(first, next(iter(found.values()))) if found and name in UNSEEDED else found
+    result = values(runs, question, name, column)
+    return dict.fromkeys(first, next(iter(result.values()))) if result and name in UNSEEDED else result
 
 
 def against(table: Table, first: str | None, second: str | None) -> list[Pair]:
     """Pairs of every other model of a table with `first` (or `second`) held: the paper's differences are expected."""
-    found = []
+    result = []
     for name in table.names:
         one, two = first or name, second or name
         if one == two:
             continue
         ours, theirs = (table.paper.get(model, (None,) * len(table.columns)) for model in (one, two))
         expected = [None if a is None or b is None else float(a - b) for a, b in zip(ours, theirs, strict=True)]
-        found.append(Pair(f"{title(one)} against {title(two)}", one, two, expected))
-    return found
+        result.append(Pair(f"{title(one)} against {title(two)}", one, two, expected))
+    return result
 
 
 def title(name: str) -> str:
@@ -115,7 +115,7 @@ def title(name: str) -> str:
 def block(runs: Sequence[Run], table: Table, statements: Sequence[Statement]) -> str:
     """Return the table, that of the published protocol, and the statements, as Markdown."""
     parts = [_ours(runs, table)]
-    parts += [said] if (said := published(runs, table)) else []
+    parts += [logged] if (logged := published(runs, table)) else []
     if statements:
         parts.append("\n".join(map(sentence, statements)))
     return "\n\n".join(parts)
@@ -144,19 +144,21 @@ def commonest(runs: Sequence[Run], question: str, column: Column) -> float | Non
     """What one answer for all gives on the test rows of a column of accuracies, as printed; 0 for R2."""
     if column.metric == "r2":
         return 0.0
-    found = [row["chance"] for run in runs if run.question == question and (row := run.row(column)) and "chance" in row]
-    return column.factor * float(np.mean(found)) if found and column.metric == "accuracy" else None
+    result = [
+        row["chance"] for run in runs if run.question == question and (row := run.row(column)) and "chance" in row
+    ]
+    return column.factor * float(np.mean(result)) if result and column.metric == "accuracy" else None
 
 
 def published(runs: Sequence[Run], table: Table) -> str:
     """Means under the published protocol; nothing where no run has it."""
     lines = []
     for name in table.names:
-        found = [values(runs, table.question, name, column, "published") for column in table.columns]
-        if any(found):
-            pairs = zip(found, table.columns, strict=True)
+        result = [values(runs, table.question, name, column, "published") for column in table.columns]
+        if any(result):
+            pairs = zip(result, table.columns, strict=True)
             cells = [f"{np.mean(list(one.values())):.{column.digits}f}" if one else "-" for one, column in pairs]
-            lines.append((title(name), str(max(map(len, found))), *cells))
+            lines.append((title(name), str(max(map(len, result))), *cells))
     if not lines:
         return ""
     head = ("published protocol (chosen on test)", "seeds", *(column.title for column in table.columns))
@@ -165,10 +167,10 @@ def published(runs: Sequence[Run], table: Table) -> str:
 
 def cell(runs: Sequence[Run], question: str, name: str, column: Column) -> str:
     """Mean and interval of a cell."""
-    found = spread(runs, question, name, column)
-    if found is None:
+    result = spread(runs, question, name, column)
+    if result is None:
         return "-"
-    mean, low, high = found
+    mean, low, high = result
     between = "" if low is None or high is None else f" ({low:.{column.digits}f} to {high:.{column.digits}f})"
     return f"{mean:.{column.digits}f}{between}"
 

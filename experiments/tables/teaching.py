@@ -1,34 +1,23 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
+"""Simulated scenes as teachers: retrieval and probes on objects never touched in training.
 
-# %% [markdown]
-# # Do simulated scenes teach a representation of touch?
-#
-# On objects never touched in training (whole pairs of primitive and texture are held out):
-#
-# 1. **Retrieval.** The same touch by another sensor and another unit, among 50 touches that resemble it most in
-#    position, depth and force, after each sensor's mean feature was subtracted. Stage 2 against stage 1 alone, an
-#    untrained encoder (shown touches less the untouched gel, as the trained ones, and as the camera gives them),
-#    background-differenced pixels, and the vector (contact area, centroid, force). For fine data (one motion for all
-#    sensors) and coarse data (by hand); one encoder a seed learns from both.
-# 2. **A sensor left out.** GelSlim is not in the sensor table of the trained encoders: its touches get the universal
-#    tokens. Linear probes on its features, for labels that captions name (hardness, roughness, material) and for one
-#    that they do not (indenter).
-#
-# `python -m experiments.tables.teaching` does all of it, run by run, in an hour or more a seed: what is finished is
-# not done again. `TOUCHES=500 STEPS2=1000` is less than half the work, and less is learned;
-# `TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are where runs
-# and results go: the page `teaching.md` and `teaching.jsonl`, a line for each grade and seed, from which `TABLE=1`
-# makes the page again. `CONVOLUTIONS=1` is all of it with encoders whose patches are read by small
-# convolutions (`--model.patch-encoder convolutional`), which find more in as many steps and take longer for them:
-# `teaching_convolutional.md`.
+1. Retrieval: the same touch by another sensor and unit, among 50 that resemble it most in position, depth and force.
+   Compared are stage 2, stage 1, untrained encoders, background-differenced pixels, and contact area, centroid, force.
+2. A sensor left out: linear probes of GelSlim, whose touches get the universal tokens, for labels that captions name
+   (hardness, roughness, material) and one that they do not (indenter).
 
-# %%
+`python -m experiments.tables.teaching` takes an hour or more a seed. Finished runs are not made again.
+`TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are folders of
+runs and results. `TABLE=1` makes the page from its records. `CONVOLUTIONS=1` has encoders whose patches are read by
+small convolutions, and its own page.
+
+Six touches of each object by the sensor left out: with two a probe cannot distinguish encoders. `MORE=` touches a grade
+are trained on alone. The paper's data are contact frames, so only frames with six tenths of the strongest contact of
+their recording are drawn. Matching departs from the paper, whose head compares a pair with *one* other on CLIP's
+weights: from scratch that stays at chance. Cosines against all other touches of the batch compare 126 pairs at once
+(`match_head=cosine`), all of one sensor (`negatives=same_sensor`), so that the sensor is no clue. 600 steps of stage 1
+leave the plateau sooner than 150.
+"""
+
 from __future__ import annotations
 
 from dataclasses import asdict, replace
@@ -37,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.cli.app import main
+from anytouch_jax.cli import app
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
@@ -70,34 +59,11 @@ NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)
 
 def anytouch(*words: Any) -> None:
     """Run a subcommand; a run or a data set that is finished answers at once."""
-    status = main([str(word) for word in words])
+    status = app.main([str(word) for word in words])
     if status:
         raise SystemExit(status)
 
 
-# %% [markdown]
-# ## Data and runs
-#
-# One data set a grade, and one by the sensor that is left out, with six touches of each of the same objects (at two
-# touches an object a probe cannot distinguish encoders). Places differ from grade to grade; objects, and which of
-# them are held out, do not. `MORE=` touches a grade, of the same objects at other places, are trained on alone, so that
-# what is scored stays the same whatever their number. Both stages for every seed, on all grades together as on
-# TacQuad's two parts, at preset tiny with smaller towers and pictures: less work a step, and more is learned in a
-# minute.
-#
-# **Contact frames.** The paper's data are contact frames. A simulated recording begins before anything shows, and pairs
-# of such a frame with one of full contact teach little: with them contrast learned more slowly. So
-# `anytouch data contact` marks the frames that have six tenths of the strongest contact of their recording, and only
-# these are drawn.
-#
-# Matching departs from the paper here. Its head tells a pair from *one* other pair, on an encoder that already knows
-# pictures (CLIP); the same loss on an encoder from scratch stays at chance for as long as a CPU can wait. Cosines
-# against all other touches of the batch (`match_head=cosine`) tell 126 pairs apart at once; all touches to be found in
-# a batch are of one sensor (`negatives=same_sensor`), as in the galleries, so that the sensor tells none of them apart.
-# It begins on a plateau, since stage 1 leaves the class token nearly equal for all touches; in a trial of one seed it
-# left it sooner, and came further, after 600 steps of stage 1 than after 150.
-
-# %%
 SMALL = ["--preset", "tiny", "--model.image-size", 84]
 SMALL += ["--model.patch-encoder", "convolutional"] if CONVOLUTIONS else []
 SUBTRACT = ["--data.background", "subtract"]  # the contact alone: units differ more than touches do
@@ -124,9 +90,9 @@ def scenes(grade: str) -> list[Path]:
         f"{LEFT_OUT}-{grade}": ((LEFT_OUT,), 6 * OBJECTS, 6 * OBJECTS * turn),
     }
     for name, (sensors, touches, first) in sets.items():
-        folder, how = WORK / name, ["--objects", OBJECTS, "--grade", grade, "--size", 128]
+        folder, size = WORK / name, ["--objects", OBJECTS, "--grade", grade, "--size", 128]
         if touches:
-            words = ["--sensors", *sensors, "--touches", touches, "--first", first, *how]
+            words = ["--sensors", *sensors, "--touches", touches, "--first", first, *size]
             anytouch("data", "simulate", "--out", folder, *words)
         if touches and sensors == SENSORS:
             marked.append(folder / "manifest_contact.parquet")
@@ -162,14 +128,6 @@ def features(encoders: dict[str, Encoder], seed: int, table: Any, rows: np.ndarr
     return {name: embed_rows(e, table, rows, pooling=pooling, log=silent)[1] for name, e in every}
 
 
-# %% [markdown]
-# ## Retrieval and probes on objects never seen
-#
-# Of every set of features what is kept is how many queries, or touches, of each object it got right: the share, and its
-# interval over objects, need no more.
-
-
-# %%
 def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any]:
     table = manifests.read(WORK / f"scenes-{grade}" / "manifest.parquet")
     rows = deepest_rows(table, table.rows_of("test"))
@@ -193,10 +151,6 @@ def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any
     return {"data": table.content_hash} | probed(found, labels, groups, split)
 
 
-# %% [markdown]
-# ## Grade by grade, seed by seed
-
-# %%
 SETTINGS = {"touches": TOUCHES, "more": MORE, "objects": OBJECTS, "steps": [STEPS1, STEPS2], "grades": GRADES}
 SETTINGS |= {"simulator": VERSION}
 RESULTS = OUT / f"{NAME}.jsonl"
@@ -226,11 +180,6 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
     return found
 
 
-# %% [markdown]
-# ## Tables
-
-
-# %%
 NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
 RIVALS = ("untrained", "pixels")  # of the probes
 
@@ -251,28 +200,32 @@ def retrieval_table(found: list[dict[str, Any]]) -> str:
     )
 
 
-# %%
-files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
-first = files[GRADES[0]][0]
-if any(one["settings"] != first["settings"] for found in files.values() for one in found):
-    raise UserError(f"{RESULTS} has records made by different settings. Run this page without TABLE=1.")
-size = " ".join(f"{name.upper()}={first['settings'][name]}" for name in ("touches", "more", "objects"))
-size += " STEPS1={} STEPS2={}".format(*first["settings"]["steps"])
-size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
-tower = first["config"]["model"]["touch"]
-network = f"preset tiny with a touch tower of {tower['width']} x {tower['depth']}"
-network += f" at {first['config']['model']['image_size']} pixels"
-network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
-lines = [
-    "# Simulated scenes as teachers",
-    "",
-    f"Made by `{size} python -m experiments.tables.teaching`, {network}.",
-    "",
-]
-for grade, found in files.items():
-    lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
-    lines += [retrieval_table(found), ""]
-    lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
-    lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
-atomic_write(OUT / f"{NAME}.md", "\n".join(lines))
-print("\n".join(lines))
+def main() -> None:
+    files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
+    first = files[GRADES[0]][0]
+    if any(one["settings"] != first["settings"] for found in files.values() for one in found):
+        raise UserError(f"{RESULTS} has records made by different settings. Run this page without TABLE=1.")
+    size = " ".join(f"{name.upper()}={first['settings'][name]}" for name in ("touches", "more", "objects"))
+    size += " STEPS1={} STEPS2={}".format(*first["settings"]["steps"])
+    size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
+    touch = first["config"]["model"]["touch"]
+    network = f"preset tiny with a touch tower of {touch['width']} x {touch['depth']}"
+    network += f" at {first['config']['model']['image_size']} pixels"
+    network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
+    lines = [
+        "# Simulated scenes as teachers",
+        "",
+        f"Made by `{size} python -m experiments.tables.teaching`, {network}.",
+        "",
+    ]
+    for grade, found in files.items():
+        lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
+        lines += [retrieval_table(found), ""]
+        lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
+        lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
+    atomic_write(OUT / f"{NAME}.md", "\n".join(lines))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

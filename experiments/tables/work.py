@@ -40,7 +40,7 @@ DONE, BEGUN = "done.json", "begun.json"
 
 
 class Work:
-    """`execute.Work` in the folder `folder`; `real` is the manifest of real touch, or None where there is none."""
+    """`execute.Work` in the folder `folder`; `real` is the manifest of real touch, or None without it."""
 
     def __init__(self, folder: Path, *, real: Path | None = None, log: Log = print) -> None:
         self.folder, self.real, self.log = folder, real, log
@@ -94,7 +94,7 @@ class Work:
         start, run, of = time.perf_counter(), self.run_of(one), self._contents(one)
         before = noted(run / BEGUN) or noted(run / DONE)
         if before.get("of", of) != of:
-            self.log(f"  {run.name} was trained on other data: it is begun anew")
+            self.log(f"  {run.name} was trained on other data: it starts again")
             shutil.rmtree(run)
             before = {}
         about = {"of": of, "parts": before.get("parts", 0) + 1, "seconds": before.get("seconds", 0.0)}
@@ -135,9 +135,9 @@ class Work:
 
     def score(self, leaf: Leaf) -> dict[str, Any]:
         start = time.perf_counter()
-        found = scores.score(leaf, self)
+        outcome = scores.score(leaf, self)
         self._forget()
-        trained, data = [], {name: content_hash(self.manifest(name)) for name in found.pop("data")}
+        trained, data = [], {name: content_hash(self.manifest(name)) for name in outcome.pop("data")}
         for one in leaf.trainings:
             about = noted(self.run_of(one) / DONE)
             data |= about.pop("of")  # what it learned from, whatever is there now
@@ -154,7 +154,7 @@ class Work:
             "source": source_hash(),
             "machine": machine.describe().sentence(),
             "seconds": round(time.perf_counter() - start, 1),
-        } | found
+        } | outcome
 
     def _finish(self, folder: Path, about: dict[str, Any]) -> None:
         atomic_write(folder / DONE, json.dumps(about) + "\n")
@@ -172,11 +172,11 @@ def check_objects(size: Size) -> None:
     What is held out of `own` must not be met in training on `aligned`. Data sets of one seed draw from one catalogue,
     in which a name is one object; which of them are held out hangs on how many there are.
     """
-    seen: dict[tuple[int, str], tuple[str, str]] = {}
+    known: dict[tuple[int, str], tuple[str, str]] = {}
     for one in plan.scenes(size):
         things, splits = objects_and_splits(_simulated(one, size))
         for thing, split in zip(things, splits, strict=True):
-            name, before = seen.setdefault((one.seed, thing.name), (one.name, split))
+            name, before = known.setdefault((one.seed, thing.name), (one.name, split))
             if before != split:
                 least = min(other.touches for other in plan.scenes(size) if other.seed == one.seed)
                 raise UserError(

@@ -8,9 +8,8 @@ What is predicted is the difference from the mean target of the training pairs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, from_json, to_json
+from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part, build
 from anytouch_jax.objectives import normalise_touch
@@ -39,7 +39,6 @@ from experiments.translation.networks import (
 GENERATOR = "generator.safetensors"
 
 Params = dict[str, Any]
-_BATCH = 64
 _GREY = (0, 128, 255)  # least, middle and most of a touch less its gel (`data.transforms.subtract_background`)
 
 
@@ -169,21 +168,11 @@ class Generator:
                 f"images must be uint8 RGB of {side} x {side} pixels, not {images.dtype} {images.shape}; "
                 "data.transforms.touch_evaluation resizes them"
             )
-        return in_batches(_program(nameless(self.design)), self.params, images)
+        return run_in_batches(partial(_program(nameless(self.design)), self.params), images)
 
     def from_features(self, x: np.ndarray) -> np.ndarray:
         """The prediction f32 in the normalised units of the error, from what `features` gave."""
-        return in_batches(_heads(nameless(self.design)), self.params, x)
-
-
-def in_batches(run: Callable[[Any, Any], Any], params: Any, images: np.ndarray) -> np.ndarray:
-    """`run(params, part)` of images part by part, the last part filled up: one shape, one compilation."""
-    found = []
-    for first in range(0, len(images), _BATCH):
-        part = images[first : first + _BATCH]
-        full = np.concatenate([part, np.repeat(part[-1:], min(_BATCH, len(images)) - len(part), axis=0)])
-        found.append(np.asarray(run(params, full))[: len(part)])
-    return np.concatenate(found)
+        return run_in_batches(partial(_heads(nameless(self.design)), self.params), x)
 
 
 def nameless(design: Design) -> Design:

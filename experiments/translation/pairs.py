@@ -76,27 +76,27 @@ def _frames(manifest: Manifest, sensor: str, split: str) -> dict[tuple[int, int]
     graded = "grade" in manifest.table.column_names
     grade = manifest.column("grade").to_pylist() if graded else ["fine"] * len(manifest)
     frame = np.asarray(manifest.column("frame_index"))
-    found: dict[tuple[int, int], int] = {}
+    result: dict[tuple[int, int], int] = {}
     splits = manifest.column("split").to_pylist()
     for row in (row for row, name in enumerate(splits) if name == split):
         if names[row] != sensor or touch[row] < 0 or grade[row] not in (None, "fine"):
             continue
         key = (int(touch[row]), int(frame[row]))
-        if key in found:
+        if key in result:
             raise UserError(
                 f"{manifest.where(row)}: {sensor} felt frame {key[1]} of touch {manifest.value(row, 'touch')!r} twice "
-                f"(row {manifest.number[found[key]]}); keep one unit of it"
+                f"(row {manifest.number[result[key]]}); keep one unit of it"
             )
-        found[key] = row
-    return found
+        result[key] = row
+    return result
 
 
 def _objects(manifest: Manifest, rows: np.ndarray) -> set[str]:
-    found = {manifest.value(int(row), "object") for row in rows}
-    if None in found:
+    result = {manifest.value(int(row), "object") for row in rows}
+    if None in result:
         row = next(int(row) for row in rows if manifest.value(int(row), "object") is None)
         raise UserError(f"{manifest.where(row)} has no object; test pairs must be of objects never seen")
-    return found
+    return result
 
 
 def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:

@@ -1,36 +1,18 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-# ---
+"""The translation study: one sensor's touch as another feels it (App. "Cross-sensor generation", Table 7).
 
-# %% [markdown]
-# # One sensor's touch as another would feel it
-#
-# The paper's appendix "Cross-sensor generation": images of a DuraGel painted from those of a GelSight Mini, and the
-# 20 x 20 field of a Tac3D (displacement and force) regressed from a GelSight Mini or a DIGIT, on fine-aligned pairs.
-# How well it goes is a measure of the encoder. Here the pairs are simulated: one device of each sensor, mounted
-# straight, one motion for all of them frame by frame; a quarter of the objects, by whole pairs of primitive and
-# texture, is only ever tested on. Training stops where the error on the objects of a third split is smallest.
-#
-#     make translation
-#
-# trains the encoders, too: AnyTouch and T3-style as in Tables 2 to 4, AnyTouch's stage 1 by itself, its stage 2 with a
-# layer decay (`--optim.layer-decay 0.1`: the lower layers stay nearly as stage 1 left them), and the weights half-way
-# from stage 1 to stage 2 (`anytouch convert --between`); one of each a seed, on the scenes of `make experiments`
-# (`STUDY=runs/matrix`; made where they are not there) less all objects of the pairs.
-# `RUNS="anytouch=runs/stage2 t3=runs/t3"` takes encoders of yours: name=run folder or weights file, name=a,b,c
-# for one a seed. `STEPS1=3000` gives stage 1, T3-style's too, so many steps, and its table a separate page
-# (`translation_3000.md`). Each is compared with two plain references trained on the same pairs: copying the mean
-# training target, and a U-Net (images) or an MLP on pixels (fields) from scratch. `QUICK=1` is a trial of minutes.
-#
-# A run is one line of `experiments/results/translation.jsonl`. What is finished is not done again. The table is made
-# from this file alone, and `TABLE=1` does nothing else. `WORK=` and `OUT=` in the environment are where data and
-# results go; `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` (frozen, fine or both with a comma) change the size.
+Images of a DuraGel are painted from those of a GelSight Mini. The 20 x 20 field of a Tac3D is regressed from a GelSight
+Mini or a DIGIT. The pairs are simulated: one device of each sensor and one motion for all, frame by frame. A quarter of
+the objects, by whole pairs of primitive and texture, is tested on. Training stops where the error on a third split is
+smallest. Each translation is compared with copying the mean target, and with a network on pixels from scratch.
 
-# %%
+`make translation` trains the encoders too, one of each a seed, on the scenes of `make experiments` without the objects
+of the pairs (`encoders.py`). In the environment: `RUNS="anytouch=runs/stage2 t3=a,b,c"` takes encoders of yours (a
+path, or one a seed). `REMAINING="coarse.parquet ..."` writes `coarse_remaining.parquet` next to each and stops: train
+encoders of yours on that. `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
+and `OUT=` are folders of the scenes, the pairs and the results. `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` change the
+size, `QUICK=1` is a trial of minutes, and `TABLE=1` only makes the page from `translation.jsonl`.
+"""
+
 from __future__ import annotations
 
 import os
@@ -53,7 +35,7 @@ from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.records import read_records, write_record
-from experiments.tables import env, page, plan
+from experiments.tables import env, plan
 from experiments.tables.work import Work
 from experiments.translation import encoders as own_encoders
 from experiments.translation import page as translated
@@ -71,58 +53,34 @@ NAME = "_".join(["translation", *(["quick"] if QUICK else []), *map(str, LONGER.
 WORK, OUT = env.path("WORK", "runs/translation"), env.path("OUT", "experiments/results")
 RUNS, STUDY = env.runs(), env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 TOUCHES, STEPS = env.number("TOUCHES", 24 if QUICK else 400), env.number("STEPS", 40 if QUICK else 600)
-if RUNS and LONGER:
-    raise UserError("STEPS1 is for the encoders that this page trains; leave it out with RUNS, whose encoders are done")
 SEEDS = env.numbers("SEEDS", "0" if QUICK else "0,1,2")
 TUNE = env.names("TUNE", "frozen", ("frozen", "fine"))
 RESULTS = OUT / f"{NAME}.jsonl"
-enable_compilation_cache()
 
-# %% [markdown]
-# ## The pairs
-#
-# 60 objects (24 in a trial), several touches of each. The names of the objects say texture, material and primitive.
-
-# %%
-scenes = Scenes(
+# Names of objects say texture, material and primitive.
+SCENES = Scenes(
     touches=TOUCHES, objects=24 if QUICK else 60, sensors=("gelsight_mini", "digit", "duragel", "tac3d"),
     seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
 )  # fmt: skip
-PAIRS = WORK / f"pairs-{TOUCHES}-{version(scenes.sensors)}"
-
-# %% [markdown]
-# ## What the encoders may be trained on
-#
-# The paper takes the coarse data of the same objects out of pre-training. `encoders.py` does so by name: it
-# keeps the rows whose object is in no split of the pairs. For encoders of your own `REMAINING="coarse.parquet ..."
-# make translation` writes `coarse_remaining.parquet` next to each and stops. Train them on that.
+PAIRS = WORK / f"pairs-{TOUCHES}-{version(SCENES.sensors)}"
 
 
-# %%
 def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
     """How many objects of the pairs the encoder was trained on in its last stage, if its manifests are still there."""
     files = [Path(path) for path in encoder.config.data.manifests]
     if not files or not all(file.is_file() for file in files):
         return "unknown"
-    seen = manifests.read(files)
-    trained = {seen.value(int(row), "object") for row in seen.rows_of("train")}
+    learned = manifests.read(files)
+    trained = {learned.value(int(row), "object") for row in learned.rows_of("train")}
     return str(len(trained & set(table.column("object").to_pylist()) - {None}))
 
 
-# %% [markdown]
-# ## One run
-#
-# A frozen encoder (or one trained along, `TUNE=fine`), a fresh ViT decoder or MLP, and for images a critic: the same
-# encoder with an MLP. Error: mean squared error of normalised pixels, or of each channel of the field in deviations.
-
-
-# %%
-def seen_by(encoder: Encoder) -> tuple[int, bool]:
+def view_of(encoder: Encoder) -> tuple[int, bool]:
     """Return the picture size of an encoder, and whether it subtracts the background."""
     return encoder.config.model.image_size, encoder.subtracts
 
 
-def mark(encoder: Encoder | None) -> str:
+def source_of(encoder: Encoder | None) -> str:
     """Return the source of an encoder and the fingerprint of its weights."""
     if encoder is None:
         return PIXELS
@@ -130,10 +88,11 @@ def mark(encoder: Encoder | None) -> str:
 
 
 def settings(
-    task: tuple[str, str], name: str, encoder: Encoder | None, seen: tuple[int, bool], tune: str, seed: int, data: str
+    task: tuple[str, str], name: str, encoder: Encoder | None, view: tuple[int, bool], tune: str, seed: int, data: str
 ) -> dict[str, Any]:
     return {
-        "from": task[0], "to": task[1], "name": name, "encoder": mark(encoder), "size": seen[0], "subtracts": seen[1],
+        "from": task[0], "to": task[1], "name": name, "encoder": source_of(encoder),
+        "size": view[0], "subtracts": view[1],
         "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
         "pairs": data, "version": training.VERSION, "simulator": version(task), **LONGER,
     }  # fmt: skip
@@ -179,50 +138,39 @@ def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
     if RUNS:
         loaded = {path: load_encoder(path) for paths in RUNS.values() for path in paths}
         return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
-    found: dict[str, dict[int, Encoder]] = {}
-    for seed in SEEDS:
-        for name, one in own_encoders.encoders(Work(STUDY), SIZE, seed, table).items():
-            found.setdefault(name, {})[seed] = one
-    return found
+    by_seed = {seed: own_encoders.encoders(Work(STUDY), SIZE, seed, table) for seed in SEEDS}
+    return {name: {seed: by_seed[seed][name] for seed in SEEDS} for name in by_seed[SEEDS[0]]}
 
 
-# %% [markdown]
-# ## What an encoder knows besides pictures
-#
-# What a stage learns of pictures it may lose of what touches have in common. So the page also has how often
-# the encoder finds the same touch by another sensor, among 50 on objects never seen (the test split of `fine`).
-
-
-# %%
-def all_runs() -> None:
-    """Every run that is not there yet, task by task: frames are read once a task."""
-    simulate(scenes, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
+def make_all() -> None:
+    """Make every missing run, task by task: frames are read once a task."""
+    simulate(SCENES, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
     table = manifests.read(PAIRS / "manifest.parquet")
     if os.environ.get("REMAINING"):
         for word in os.environ["REMAINING"].split():
             own_encoders.write_remaining(Path(word), table)
         raise SystemExit(0)
     known = encoders(table)
+    plain = view_of(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
     if not (RUNS or QUICK):  # a trial has too few touches for galleries of 50
         fine = manifests.read(Work(STUDY).manifest("fine"))
         for name, seed in product(known, SEEDS):
             one = known[name][seed]
-            score_retrieval(RESULTS, name, seed, one, mark(one), fine)
+            score_retrieval(RESULTS, name, seed, one, source_of(one), fine)
     content = {task: of_sensors(table, task) for task in TASKS}
-    plain = seen_by(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
     wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in own_encoders.NOT_TUNED]
     plans = [*wanted, (PIXELS, "scratch")]
     every = {}
     for (task, seed), (name, tune) in product(product(TASKS, SEEDS), plans):
         encoder = known[name][seed] if name in known else None
-        about = settings(task, name, encoder, seen_by(encoder) if encoder else plain, tune, seed, content[task])
+        about = settings(task, name, encoder, view_of(encoder) if encoder else plain, tune, seed, content[task])
         stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
         every[stem] = (about, encoder)
     others = [record["settings"] for key, record in runs_of(RESULTS).items() if key not in every]
     one_table([*(about for about, _ in every.values()), *others], RESULTS)
     before = read_records(RESULTS).get("overlap", {})  # of encoders that have rows already
-    met = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
-    write_record(RESULTS, "overlap", before | {name: " to ".join(found) for name, found in met.items()})
+    shared = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
+    write_record(RESULTS, "overlap", before | {name: " to ".join(several) for name, several in shared.items()})
     for source, target in TASKS:
         mine = [(*one, key) for key, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
         done = runs_of(RESULTS)
@@ -237,15 +185,18 @@ def all_runs() -> None:
             one_run(about, encoder, (*data, shown), key)
 
 
-if not TABLE:
-    all_runs()
+def main() -> None:
+    if RUNS and LONGER:
+        raise UserError(
+            "STEPS1 is for encoders that this study trains; leave it out with RUNS, whose encoders are trained"
+        )
+    if not TABLE:
+        enable_compilation_cache()
+        make_all()
+    text = translated.page(RESULTS)
+    atomic_write(OUT / f"{NAME}.md", text)
+    print(text)
 
-# %% [markdown]
-# ## The table, from the records of the runs
 
-# %%
-text = translated.page(RESULTS)
-atomic_write(OUT / f"{NAME}.md", text)
-print(text)
-for picture in translated.pictures(RESULTS):
-    page.show(picture)
+if __name__ == "__main__":
+    main()

@@ -17,6 +17,7 @@ import numpy as np
 import optax
 from jax import Array
 
+from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.objectives import normalise_touch
@@ -27,7 +28,6 @@ from experiments.translation.generator import (
     Generator,
     Params,
     features,
-    in_batches,
     judged,
     nameless,
     predict,
@@ -146,8 +146,8 @@ class _Pairs(NamedTuple):
         """The mean error on val; None without it."""
         if self.val is None:
             return None
-        source, target, seen = self.val
-        guess = now.normalised(source) if seen is None else now.from_features(seen)
+        source, target, read = self.val
+        guess = now.normalised(source) if read is None else now.from_features(read)
         return float(_errors(now, guess, target).mean())
 
 
@@ -156,10 +156,11 @@ def _pairs(design: Design, params: Params, images: np.ndarray, targets: np.ndarr
     mean, scale = units(design, params["fixed"])
     if design.encoder is None or design.fit.tune != "frozen":
         return _Pairs(images, targets, None, mean, scale, None if val is None else (*val, None))
-    sees = partial(in_batches, _features(nameless(design)), params["encoder"])
-    judges = partial(in_batches, _judged(nameless(design)), (params["encoder"], params["fixed"].get("gel")))
-    real = judges(targets) if design.has_critic else None
-    return _Pairs(sees(images), targets, real, mean, scale, None if val is None else (*val, sees(val[0])))
+    read = partial(_features(nameless(design)), params["encoder"])
+    judge = partial(_judged(nameless(design)), (params["encoder"], params["fixed"].get("gel")))
+    real = run_in_batches(judge, targets) if design.has_critic else None
+    known = None if val is None else (*val, run_in_batches(read, val[0]))
+    return _Pairs(run_in_batches(read, images), targets, real, mean, scale, known)
 
 
 def _finite(step: int, metrics: dict[str, Any], error: float | None) -> dict[str, float]:
@@ -179,9 +180,9 @@ def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: 
     if encoder is not None:
         params["encoder"] = encoder.params
     every = max(1, len(images) // _SAMPLE)
-    seen = in_batches(_features(nameless(design)), params.get("encoder"), images[::every][:_SAMPLE])
-    mean, scale = _moments(seen)
-    fixed = {"mean": mean, "scale": scale} if encoder is None else {"mean": mean, "whiten": whitening(seen)}
+    read = run_in_batches(partial(_features(nameless(design)), params.get("encoder")), images[::every][:_SAMPLE])
+    mean, scale = _moments(read)
+    fixed = {"mean": mean, "scale": scale} if encoder is None else {"mean": mean, "whiten": whitening(read)}
     if design.shape.field:
         fixed["unit_mean"], fixed["unit_scale"] = _moments(targets)
     if design.has_critic and design.subtracts:
@@ -202,7 +203,7 @@ def whitening(tokens: np.ndarray) -> np.ndarray:
     than `_FAINT` of the largest (ZCA).
 
     An encoder's channels go together: ten of a hundred directions hold nearly all of their variance, and what a picture
-    needs beside them is learned late or never where each channel is divided by its own deviation.
+    needs in addition is learned late or never where each channel is divided by its own deviation.
     """
     flat = tokens.reshape(-1, tokens.shape[-1]).astype(np.float64)
     variance, axes = np.linalg.eigh(np.cov(flat, rowvar=False))
@@ -234,7 +235,7 @@ def _features(design: Design) -> Any:
 
 @lru_cache(maxsize=8)
 def _judged(design: Design) -> Any:
-    return jax.jit(lambda seen, images: judged(design, seen[0], normalise_touch(images), seen[1]))
+    return jax.jit(lambda read, images: judged(design, read[0], normalise_touch(images), read[1]))
 
 
 # One step -----------------------------------------------------------------------------------------------------------
@@ -283,13 +284,13 @@ def _step(design: Design) -> Any:
         error = jnp.mean((out - batch.y) ** 2)
         if not design.has_critic:
             return error, (error, out, jnp.zeros(()))
-        seen = judge_features(critic, still, out)
-        fooled = jnp.mean(jax.nn.softplus(-design.critic.apply(critic["head"], seen)))
-        return error + weight * fooled, (error, out, seen)
+        read = judge_features(critic, still, out)
+        fooled = jnp.mean(jax.nn.softplus(-design.critic.apply(critic["head"], read)))
+        return error + weight * fooled, (error, out, read)
 
-    def critic_loss(critic: Params, still: Params, batch: Batch, out: Array, seen: Array, weight: Array) -> Array:
+    def critic_loss(critic: Params, still: Params, batch: Batch, out: Array, read: Array, weight: Array) -> Array:
         real = batch.real if frozen else judge_features(critic, still, batch.y)
-        fake = seen if frozen else judge_features(critic, still, out)
+        fake = read if frozen else judge_features(critic, still, out)
         logit = lambda x: design.critic.apply(critic["head"], x)  # noqa: E731
         slope = jax.grad(lambda x: jnp.sum(logit(x)))(real)
         penalty = jnp.mean(jnp.sum(slope**2, axis=-1))
@@ -298,13 +299,13 @@ def _step(design: Design) -> Any:
 
     def step(state: State, still: Params, batch: Batch, rates: Rates) -> tuple[State, dict[str, Array]]:
         rate, weight, penalty = rates
-        grads, (error, out, seen) = jax.grad(made_loss, has_aux=True)(state.made, state.critic, still, batch, weight)
+        grads, (error, out, read) = jax.grad(made_loss, has_aux=True)(state.made, state.critic, still, batch, weight)
         made, made_moments = _updated(rate, grads, state.made_moments, state.made)
         metrics = {"error": error}
         critic, critic_moments = state.critic, state.critic_moments
         if design.has_critic:
-            out, seen = jax.lax.stop_gradient((out, seen))
-            metrics["critic"], grads = jax.value_and_grad(critic_loss)(critic, still, batch, out, seen, penalty)
+            out, read = jax.lax.stop_gradient((out, read))
+            metrics["critic"], grads = jax.value_and_grad(critic_loss)(critic, still, batch, out, read, penalty)
             critic, critic_moments = _updated(rate, grads, critic_moments, critic)
         return State(made, critic, made_moments, critic_moments), metrics
 
@@ -316,8 +317,8 @@ def _updated(rate: Array, grads: Params, moments: Any, params: Params) -> tuple[
 
     def moved(part: str) -> Params:
         own = 0.1 * rate if part == "encoder" else rate
-        found: Params = jax.tree.map(lambda p, u: p - own * u, params[part], updates[part])
-        return found
+        result: Params = jax.tree.map(lambda p, u: p - own * u, params[part], updates[part])
+        return result
 
     return {part: moved(part) for part in params}, moments
 
@@ -338,9 +339,9 @@ def mean_errors(generator: Generator, targets: np.ndarray) -> np.ndarray:
 
 def _errors(generator: Generator, guess: np.ndarray, targets: np.ndarray) -> np.ndarray:
     mean, scale = units(generator.design, generator.params["fixed"])
-    found = []
+    result = []
     for first in range(0, len(targets), _CHUNK):
         part = slice(first, first + _CHUNK)
         away = guess[part] - (targets[part].astype(np.float64) - mean) / scale
-        found.append((away**2).mean(axis=tuple(range(1, away.ndim))))
-    return np.concatenate(found)
+        result.append((away**2).mean(axis=tuple(range(1, away.ndim))))
+    return np.concatenate(result)

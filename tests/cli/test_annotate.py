@@ -102,7 +102,7 @@ def test_an_estimate_needs_no_key(anytouch, mistake, touches, monkeypatch):
     assert "OPENAI_API_KEY" in mistake(*words)
 
 
-def test_failures_are_told_counted_and_the_rest_is_kept(anytouch, touches, tmp_path):
+def test_failures_are_reported_counted_and_the_rest_is_kept(anytouch, touches, tmp_path):
     (tmp_path / "see1.png").write_bytes(b"no picture")
     with serve() as server:
         done = anytouch("data", "annotate", touches, "--url", server.url, "--yes", "--out", tmp_path / "c.csv")

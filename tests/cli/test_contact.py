@@ -15,7 +15,7 @@ def contacts(path):
     return manifests.read(path).column("label.contact").to_pylist()
 
 
-def test_every_frame_is_marked_beside_the_manifest(anytouch, pressed):
+def test_every_frame_is_marked_next_to_the_manifest(anytouch, pressed):
     done = anytouch("data", "contact", pressed)
     assert done.status == 0
     target = pressed.with_name("touch_contact.parquet")
@@ -46,7 +46,7 @@ def test_a_threshold_moves_the_border_in_marks_check_and_picture(anytouch, press
     assert "'gelsight'" in anytouch("data", "contact", pressed, "--threshold", "gelsight", "5").err
 
 
-def test_check_writes_nothing_unless_it_is_told_where(anytouch, pressed, tmp_path):
+def test_check_writes_nothing_without_out(anytouch, pressed, tmp_path):
     done = anytouch("data", "contact", pressed, "--check")
     assert done.status == 0 and "precision 1.000, recall 1.000" in done.out
     assert sorted(path.name for path in tmp_path.glob("*.parquet")) == ["touch.parquet"]
@@ -97,7 +97,7 @@ def test_known_contact_may_be_true_or_false_and_nothing_else(anytouch, mistake, 
     assert "row 4 of" in named and "'yes'" in named
 
 
-def test_marks_that_are_kept_are_told_of_and_cannot_be_moved(anytouch, mistake, pressed, monkeypatch):
+def test_marks_that_are_kept_are_reported_and_cannot_be_moved(anytouch, mistake, pressed, monkeypatch):
     anytouch("data", "contact", pressed)
     marked = pressed.with_name("touch_contact.parquet")
     monkeypatch.setattr(

@@ -20,7 +20,7 @@ def slides(tmp_path):
     return tmp_path / "my data"
 
 
-def test_a_manifest_is_written_and_the_counts_stand_beside_the_papers(anytouch, slides, tmp_path):
+def test_a_manifest_is_written_and_the_counts_are_compared_with_the_papers(anytouch, slides, tmp_path):
     done = anytouch("data", "index", "ycb_slide", slides, "--out", tmp_path / "slides.csv", "--val", "0", "--test", "0")
     assert (done.status, done.err) == (0, "")
     assert f"{tmp_path / 'slides.csv'}: 20 rows of 5 sequences (train 20)" in done.out

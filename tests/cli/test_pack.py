@@ -27,7 +27,7 @@ def test_a_pack_reads_like_the_files(anytouch, pressed, tmp_path):
     subprocess.run(["sha256sum", "-c", "--quiet", "SHA256SUMS"], cwd=tmp_path / "shards", check=True)
 
 
-def test_the_folder_lies_beside_and_a_finished_pack_is_left_alone(anytouch, pressed, tmp_path):
+def test_the_folder_lies_next_to_the_manifest_and_a_finished_pack_is_left_alone(anytouch, pressed, tmp_path):
     assert anytouch("data", "pack", pressed).status == 0
     shard = tmp_path / "touch_packed" / "touch" / "00000.zip"
     before = shard.stat().st_mtime_ns

@@ -14,16 +14,16 @@ def touches(tmp_path_factory):
     return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 6, "val": 6, "test": 10}, each=2)
 
 
-def test_retrieval_of_a_run_beside_its_controls(touches, tiny_run, tmp_path, capsys):
+def test_retrieval_of_a_run_and_its_controls(touches, tiny_run, tmp_path, capsys):
     out = tmp_path / "deep" / "found.json"
     words = ["--model", str(tiny_run), "--data", str(touches), "--gallery", "6", "--out", str(out)]
     assert main(["retrieve", *words]) == 0
     table = capsys.readouterr().out
     for name in (str(tiny_run), "random encoder", "pixels minus background", "area, centroid, force"):
         assert f"| {name} | all | all |" in table
-    found = json.loads(out.read_text())
-    assert found["split"] == "test" and len(found["data"]) == 64
-    pooled = {one["name"]: one for one in found["results"] if one["query_sensor"] == "all" and not one["centred"]}
+    result = json.loads(out.read_text())
+    assert result["split"] == "test" and len(result["data"]) == 64
+    pooled = {one["name"]: one for one in result["results"] if one["query_sensor"] == "all" and not one["centred"]}
     assert len(pooled) == 4
     for one in pooled.values():
         assert one["gallery"] == 6 and one["queries"] == 60 and one["chance1"] == pytest.approx(1 / 6)

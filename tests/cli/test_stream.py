@@ -99,7 +99,7 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
     rng = np.random.default_rng(0)
     upright = [cv2.resize(rng.integers(0, 256, (4, 3, 3), np.uint8), (24, 32)) for _ in range(3)]
     lying = [cv2.rotate(one[:, ::-1], cv2.ROTATE_90_COUNTERCLOCKWISE) for one in upright]
-    found = {}
+    result = {}
     for name, frames in (("upright", upright), ("lying", lying)):
         (tmp_path / name).mkdir()
         for number, frame in enumerate(frames):
@@ -116,9 +116,9 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
             done = anytouch(command, "--model", tiny_run, "--data", tmp_path / form, "--out", out, *turn)
             assert done.status == 0, done
             with np.load(out) as file:
-                found[form] = file["features"]
-    np.testing.assert_array_equal(found["lying"], found["upright"])
-    np.testing.assert_allclose(found["lying.avi"], found["upright.avi"], atol=1e-2 * np.abs(found["upright"]).max())
+                result[form] = file["features"]
+    np.testing.assert_array_equal(result["lying"], result["upright"])
+    np.testing.assert_allclose(result["lying.avi"], result["upright.avi"], atol=1e-2 * np.abs(result["upright"]).max())
 
 
 @pytest.mark.parametrize("out", ["f.npz", "-"])

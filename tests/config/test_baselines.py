@@ -134,24 +134,24 @@ def test_train_takes_a_baseline_before_the_users_own_overrides() -> None:
 
 
 def test_train_refuses_a_baseline_that_does_not_fit(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    def told(*args: str) -> str:
+    def reported(*args: str) -> str:
         assert app.main(["train", *TRAIN, *args]) == 2
         return capsys.readouterr().err
 
-    assert "no baseline is called 'moco'" in told("--baseline", "moco")
-    assert "no_pretraining is not trained" in told("--baseline", "no_pretraining")
-    assert "t3 has no stage 2" in told("--baseline", "t3", "--stage", "2")
+    assert "no baseline is called 'moco'" in reported("--baseline", "moco")
+    assert "no_pretraining is not trained" in reported("--baseline", "no_pretraining")
+    assert "t3 has no stage 2" in reported("--baseline", "t3", "--stage", "2")
     init = ("--stage", "2", "--init", str(tmp_path))
-    assert "--objective.match-keep has no effect in stage 1" in told("--objective.match-keep", "0.5")
+    assert "--objective.match-keep has no effect in stage 1" in reported("--objective.match-keep", "0.5")
     for option, value in (("match-head", "cosine"), ("lora-rank", "4"), ("temperature", "0.2")):
-        assert f"--model.{option} has no effect in stage 1" in told(f"--model.{option}", value)
-    assert "--data.negatives has no effect in stage 1" in told("--data.negatives", "same_sensor")
+        assert f"--model.{option} has no effect in stage 1" in reported(f"--model.{option}", value)
+    assert "--data.negatives has no effect in stage 1" in reported("--data.negatives", "same_sensor")
     clip = ("--stage", "2", "--towers", "pretrained", "--clip-weights", str(tmp_path), "--model.temperature")
-    assert "--model.temperature has no effect with --clip-weights" in told(*clip, "0.2")
-    assert "there is no manifest" in told(*clip, "0.07")
+    assert "--model.temperature has no effect with --clip-weights" in reported(*clip, "0.2")
+    assert "there is no manifest" in reported(*clip, "0.07")
     masked = ("--objective.mask-ratio", "0.5", *init)
-    assert "--objective.mask-ratio has no effect in stage 2 of the paper recipe" in told(*masked)
+    assert "--objective.mask-ratio has no effect in stage 2 of the paper recipe" in reported(*masked)
     for kept in (("--recipe", "release", *masked), ("--baseline", "t3")):
-        assert "there is no manifest" in told(*kept)
-    assert "no_stage1 has no stage 1" in told("--baseline", "no_stage1", *init)
-    assert "there is no manifest" in told("--baseline", "no_matching", *init)
+        assert "there is no manifest" in reported(*kept)
+    assert "no_stage1 has no stage 1" in reported("--baseline", "no_stage1", *init)
+    assert "there is no manifest" in reported("--baseline", "no_matching", *init)

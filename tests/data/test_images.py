@@ -198,8 +198,8 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     for name in ("background.jpg", "Photo.png"):
         assert cv2.imwrite(str(tmp_path / name), np.zeros((4, 4, 3), np.uint8))
     np.save(tmp_path / "000.npy", np.zeros((20, 20, 6), np.float32))
-    frames, beside = images.list_images(tmp_path)
-    assert len(frames) == 3 and {name: file.name for name, file in beside.items()} == {
+    frames, other = images.list_images(tmp_path)
+    assert len(frames) == 3 and {name: file.name for name, file in other.items()} == {
         "background": "background.jpg", "photo": "Photo.png"
     }  # fmt: skip
     order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_sort_key)

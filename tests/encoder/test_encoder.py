@@ -77,11 +77,11 @@ def test_what_cannot_be_embedded_is_one_sentence(encoder):
             encoder.encode_touch(CLIPS[:, 0], np.asarray(ids))
 
 
-def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
-    said = []
-    assert encoder.sensor_row("digit", said.append) == 1 and said == []
-    assert encoder.sensor_row("my_sensor", said.append) == 9
-    assert len(said) == 1 and "'my_sensor'" in said[0] and "universal tokens" in said[0]
+def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_logged(encoder):
+    lines = []
+    assert encoder.sensor_row("digit", lines.append) == 1 and lines == []
+    assert encoder.sensor_row("my_sensor", lines.append) == 9
+    assert len(lines) == 1 and "'my_sensor'" in lines[0] and "universal tokens" in lines[0]
     still = CLIPS[:, 0]
     with pytest.warns(UserWarning, match="'my_sensor'"):  # from Python it is said as a warning
         served = encoder.encode_touch(still, "my_sensor")
@@ -94,18 +94,18 @@ def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_said(encoder):
     )
 
 
-def test_a_sensor_of_the_table_that_training_never_saw_is_told_of(encoder, tmp_path):
+def test_a_sensor_of_the_table_that_training_never_used_is_reported(encoder, tmp_path):
     assert encoder.trained_sensors == ("digit", "gelsight_mini") and encoder.universal_drawn
-    said = []
-    assert [encoder.sensor_row(name, said.append) for name in ("digit", "universal", "tacto")] == [1, 9, 7]
-    (line,) = said
+    lines = []
+    assert [encoder.sensor_row(name, lines.append) for name in ("digit", "universal", "tacto")] == [1, 9, 7]
+    (line,) = lines
     assert "'tacto' was not in training, which had digit, gelsight_mini: using the universal tokens" in line
     with pytest.warns(UserWarning, match="'tacto'"):
         np.testing.assert_array_equal(encoder.encode_touch(CLIPS[:, 0], "tacto"), encoder.encode_touch(CLIPS[:, 0]))
     # without universal tokens the mean of the others serves, also where the universal ones are asked for
-    own, said = replace(encoder, universal_drawn=False), []
-    assert [own.sensor_row(name, said.append) for name in ("digit", "tacto", "universal", "mine")] == [1, 7, 9, 9]
-    assert len(said) == 3 and all("using the mean of the trained sensors' tokens" in line for line in said)
+    own, lines = replace(encoder, universal_drawn=False), []
+    assert [own.sensor_row(name, lines.append) for name in ("digit", "tacto", "universal", "mine")] == [1, 7, 9, 9]
+    assert len(lines) == 3 and all("using the mean of the trained sensors' tokens" in line for line in lines)
     about = {safetensors.MODEL_KEY: to_json(encoder.config.model), safetensors.SEEN_KEY: "digit"}
     params = build(encoder.config.model).init(jax.random.key(0))
     safetensors.write_safetensors(tmp_path / "w.safetensors", convert.to_release(params, encoder.config.model), about)
@@ -128,7 +128,7 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
 
 
 def test_an_encoder_of_a_weights_file(tmp_path):
-    """Our metadata stores the head counts; a file without it needs a config.json beside it."""
+    """Our metadata stores the head counts; a file without it needs a config.json next to it."""
     wide = replace(touch_model().touch, width=64, heads=1)
     model = touch_model(touch=wide, decoder=replace(touch_model().decoder, width=32, heads=1))
     for heads, about in ((1, False), (4, True)):
@@ -142,11 +142,11 @@ def test_an_encoder_of_a_weights_file(tmp_path):
             with pytest.raises(UserError, match=r"1\.safetensors.*heads of .*touch \(width 64\)"):
                 load_encoder(path)
             write_heads(tmp_path, here)
-        found = load_encoder(path)
-        np.testing.assert_array_equal(found.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
-        assert found.config.model.touch == here.touch
+        result = load_encoder(path)
+        np.testing.assert_array_equal(result.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
+        assert result.config.model.touch == here.touch
         wanted = Encoder(made.config, {"touch": params["touch"]}, "").encode_touch(CLIPS[:, 0], "digit")
-        np.testing.assert_allclose(found.encode_touch(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
+        np.testing.assert_allclose(result.encode_touch(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
 
 
 def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_tokens(tmp_path):
@@ -166,16 +166,16 @@ def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_
     for row in range(10):
         np.testing.assert_array_equal(tokens[row], stored[row if row < 5 else 9])
     np.testing.assert_array_equal(untold.params["touch"]["sensor_tokens"], stored)
-    said: list[str] = []
-    assert encoder.sensor_row("9dtact", said.append) == 5 and "was not in training" in said[0]
-    # through `convert` the numbers of the file stay, and what they are of is told
+    lines: list[str] = []
+    assert encoder.sensor_row("9dtact", lines.append) == 5 and "was not in training" in lines[0]
+    # through `convert` the numbers of the file stay, and what they are of is reported
     words = ["--model", str(tmp_path / "authors.safetensors"), "--out", str(tmp_path / "again.safetensors")]
     assert main(["export", "--to", "release", *words]) == 0
     again = load.read_weights(tmp_path / "again.safetensors")
     np.testing.assert_array_equal(again["sensor_token"], stored)
-    found = load_encoder(tmp_path / "again.safetensors")
-    assert found.trained_sensors == encoder.trained_sensors
-    np.testing.assert_array_equal(found.params["touch"]["sensor_tokens"], tokens)
+    result = load_encoder(tmp_path / "again.safetensors")
+    assert result.trained_sensors == encoder.trained_sensors
+    np.testing.assert_array_equal(result.params["touch"]["sensor_tokens"], tokens)
 
 
 def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
@@ -213,10 +213,10 @@ def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):
 
 
 def test_a_manifest_gives_what_its_pictures_give(encoder, world):
-    manifest, said = manifests.read(world), []
-    rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, log=said.append)
+    manifest, lines = manifests.read(world), []
+    rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, log=lines.append)
     order = np.argsort(rows)
-    assert rows[order].tolist() == [0, 5, 9] and said == []
+    assert rows[order].tolist() == [0, 5, 9] and lines == []
     for row, value in zip(rows, values, strict=True):
         image = touch_evaluation([decode(manifest.file(int(row)))], 28)
         wanted = encoder.encode_touch(image[None], manifest.value(int(row), "sensor"))
@@ -226,12 +226,14 @@ def test_a_manifest_gives_what_its_pictures_give(encoder, world):
 def test_every_touch_may_have_a_sensor_of_its_own(encoder):
     side, names = encoder.config.model.image_size, encoder.config.model.sensors
     frames = np.random.default_rng(0).integers(0, 256, (3, side, side, 3), np.uint8)
-    told = ["gelsight_mini", "digit", "gelsight_mini"]
-    found = encoder.encode_touch(frames, told)
-    np.testing.assert_array_equal(found, encoder.encode_touch(frames, np.array([names.index(name) for name in told])))
-    np.testing.assert_array_equal(found, encoder.encode_touch(frames, np.array(told)))
+    reported = ["gelsight_mini", "digit", "gelsight_mini"]
+    result = encoder.encode_touch(frames, reported)
+    np.testing.assert_array_equal(
+        result, encoder.encode_touch(frames, np.array([names.index(name) for name in reported]))
+    )
+    np.testing.assert_array_equal(result, encoder.encode_touch(frames, np.array(reported)))
     with pytest.raises(UserError, match="one integer for each of the 3 touches"):
-        encoder.encode_touch(frames, told[:2])
+        encoder.encode_touch(frames, reported[:2])
 
 
 def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
@@ -246,13 +248,13 @@ def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
         embed_rows(encoder, manifest, np.asarray([], np.int64))
 
 
-def test_an_unknown_sensor_of_a_manifest_is_said_once(encoder, world):
+def test_an_unknown_sensor_of_a_manifest_is_logged_once(encoder, world):
     known = replace(encoder.config.model, sensors=("gelsight", "digit", "universal"))
     params = {"touch": encoder.params["touch"] | {"sensor_tokens": encoder.params["touch"]["sensor_tokens"][[0, 1, 9]]}}
-    small, said = Encoder(replace(encoder.config, model=known), params, "small"), []
+    small, lines = Encoder(replace(encoder.config, model=known), params, "small"), []
     manifest = manifests.read(world)
-    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, log=said.append)
-    assert len(said) == 1 and "'gelsight_mini'" in said[0]
+    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, log=lines.append)
+    assert len(lines) == 1 and "'gelsight_mini'" in lines[0]
     image = touch_evaluation([decode(world.parent / "b0.png")], 28)[None]
     np.testing.assert_allclose(values[0], encoder.encode_touch(image)[0], atol=1e-5)
 
@@ -311,9 +313,9 @@ def test_a_run_of_cudnn_can_be_used_where_there_is_none(encoder, monkeypatch, ti
     stored = replace(encoder.config, model=replace(encoder.config.model, attention="cudnn"))
     real = checkpoint.load_params
     monkeypatch.setattr(checkpoint, "load_params", lambda *a: (real(*a)[0], to_json(stored), real(*a)[2]))
-    found = load_encoder(tiny_run)
-    assert found.config.model.attention == "auto"
-    np.testing.assert_array_equal(found.encode_touch(CLIPS[:, 0], "digit"), encoder.encode_touch(CLIPS[:, 0], "digit"))
+    result = load_encoder(tiny_run)
+    assert result.config.model.attention == "auto"
+    np.testing.assert_array_equal(result.encode_touch(CLIPS[:, 0], "digit"), encoder.encode_touch(CLIPS[:, 0], "digit"))
 
 
 def test_a_run_that_keeps_an_average_is_used_by_it(tmp_path):

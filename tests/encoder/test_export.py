@@ -51,9 +51,9 @@ def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, en
     run = load(path)
     for count in (1, 2, 5):
         live = encoder.encode_touch(CLIPS[:count], ROWS[:count])
-        found = run(CLIPS[:count], ROWS[:count])
-        assert found.shape == (count, 12) and found.dtype == np.float32
-        np.testing.assert_allclose(found, live, atol=1e-5)
+        result = run(CLIPS[:count], ROWS[:count])
+        assert result.shape == (count, 12) and result.dtype == np.float32
+        np.testing.assert_allclose(result, live, atol=1e-5)
     np.testing.assert_allclose(run(CLIPS, "digit"), encoder.encode_touch(CLIPS, "digit"), atol=1e-5)
     np.testing.assert_allclose(run(CLIPS), encoder.encode_touch(CLIPS), atol=1e-5)  # the universal tokens
     assert np.abs(run(CLIPS) - run(CLIPS, "digit")).max() > 1e-4
@@ -93,10 +93,10 @@ def test_long_clips_other_poolings_and_bfloat16(tmp_path):
     encoder = random_encoder(Config(touch_model(dtype="bfloat16")), seed=1)
     long = np.concatenate([CLIPS, CLIPS[:, :1]], axis=1)
     about = export(encoder, tmp_path / "m.bin", frames=4, platforms=("cpu",), pooling="both", join="concat")
-    found = load(tmp_path / "m.bin")(long, ROWS)
-    assert found.shape == (5, 48) and about["features"] == 48 and found.dtype == np.float32
+    result = load(tmp_path / "m.bin")(long, ROWS)
+    assert result.shape == (5, 48) and about["features"] == 48 and result.dtype == np.float32
     live = encoder.encode_touch(long, ROWS, pooling="both", join="concat")
-    np.testing.assert_allclose(found, live, atol=0.05 * np.abs(live).max())
+    np.testing.assert_allclose(result, live, atol=0.05 * np.abs(live).max())
 
 
 @pytest.mark.parametrize("attention", ["cudnn", "mapped"])

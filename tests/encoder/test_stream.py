@@ -115,42 +115,42 @@ def features_of(encoder, frames, numbers):
 def test_every_frame_of_a_video_in_order(encoder, video, frames, stride, clips):
     source, live = open_source(video)
     assert not live
-    found = list(stream(encoder, source, live=live, sensor=DIGIT, frames=frames, stride=stride))
-    assert [one.number for one in found] == [clip[-1] for clip in clips]
+    outcome = list(stream(encoder, source, live=live, sensor=DIGIT, frames=frames, stride=stride))
+    assert [one.number for one in outcome] == [clip[-1] for clip in clips]
     wanted = features_of(encoder, list(frames_from_video(video)), clips)
-    np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
-    times = [one.at for one in found]
-    assert times == sorted(times) and all(min(one.seconds) >= 0 for one in found)
-    assert all(one.age >= sum(one.seconds[2:]) for one in found)  # copy and encoder lie between frame and features
+    np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
+    times = [one.at for one in outcome]
+    assert times == sorted(times) and all(min(one.seconds) >= 0 for one in outcome)
+    assert all(one.age >= sum(one.seconds[2:]) for one in outcome)  # copy and encoder lie between frame and features
     assert not source.isOpened()
 
 
 def test_a_slow_reader_of_a_video_loses_nothing(encoder, video):
     """The mailbox has one slot: the reader waits with its next clip while nobody takes."""
     source, _ = open_source(video)
-    seen = []
+    received = []
     retrieve = source.retrieve
 
     class Counted:
         grab, release, get = source.grab, source.release, source.get
 
         def retrieve(self):
-            seen.append(len(seen))
+            received.append(len(received))
             return retrieve()
 
     embedded = stream(encoder, Counted(), live=False, sensor=DIGIT)
     first = next(embedded)
-    assert len(seen) <= 3  # one embedded, one in the slot, one that waits for the slot
+    assert len(received) <= 3  # one embedded, one in the slot, one that waits for the slot
     assert [first.number, *(one.number for one in embedded)] == list(range(8))
 
 
 def test_pooling_and_join_are_those_of_embed(encoder, video):
     source, live = open_source(video)
-    found = list(stream(encoder, source, live=live, sensor=DIGIT, frames=6, pooling="both", join="concat"))
+    outcome = list(stream(encoder, source, live=live, sensor=DIGIT, frames=6, pooling="both", join="concat"))
     small = touch_evaluation(list(frames_from_video(video)), 28)
     wanted = encoder.encode_touch(np.stack([small[:6], small[1:7], small[2:]]), "digit", pooling="both", join="concat")
     assert wanted.shape == (3, 48)
-    np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
+    np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
 
 
 # Cameras ------------------------------------------------------------------------------------------------------------
@@ -159,17 +159,17 @@ def test_pooling_and_join_are_those_of_embed(encoder, video):
 def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
     camera = Camera(ready=3)
     embedded = stream(encoder, camera, live=True, sensor=DIGIT, frames=3, log=lambda sentence: None)
-    found = [next(embedded)]
-    assert found[0].number == 2
+    outcome = [next(embedded)]
+    assert outcome[0].number == 2
     camera.show(5)  # nobody takes meanwhile, and the camera is read all the same
     assert camera.seen == list(range(8))
-    found.append(next(embedded))
+    outcome.append(next(embedded))
     camera.show(1)
-    found.append(next(embedded))
-    assert [one.number for one in found] == [2, 7, 8]
+    outcome.append(next(embedded))
+    assert [one.number for one in outcome] == [2, 7, 8]
     frames = [camera.frame(i)[..., ::-1] for i in range(9)]
     wanted = features_of(encoder, frames, [(0, 1, 2), (5, 6, 7), (6, 7, 8)])  # consecutive, whatever was dropped
-    np.testing.assert_allclose([one.values for one in found], wanted, atol=1e-5)
+    np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
     camera.end()
     with pytest.raises(CameraError, match="after 9 frames"):
         next(embedded)
@@ -265,11 +265,11 @@ def test_a_grey_camera_is_read_as_grey_files_are(encoder):
 @pytest.mark.parametrize("kind", ["frozen", "black", "ok"])
 def test_a_frozen_and_a_black_picture_are_reported_once(encoder, kind):
     logged = []
-    found = []
+    outcome = []
     result = collect(
-        stream(encoder, FaultyCamera(kind, frames=60), live=True, sensor=DIGIT, log=logged.append), found.append
+        stream(encoder, FaultyCamera(kind, frames=60), live=True, sensor=DIGIT, log=logged.append), outcome.append
     )
-    pictures = [one.picture for one in found]
+    pictures = [one.picture for one in outcome]
     assert pictures[0] == "ok" and pictures[-1] == kind and result.missed == 0
     assert sum(f"is {kind} at frame" in line for line in logged) == (kind != "ok")
     counts = {"frozen": result.frozen, "black": result.black}
@@ -290,8 +290,8 @@ def test_a_camera_that_does_not_answer_is_not_waited_for(encoder, monkeypatch):
 def test_times_of_a_video_are_those_of_its_frames(encoder, tmp_path):
     stamps = [0, 30, 60, 500, 510, 1500]
     source, live = open_source(write_uneven_video(tmp_path / "uneven.mkv", stamps))
-    found = list(stream(encoder, source, live=live, sensor=DIGIT))
-    np.testing.assert_allclose([one.time for one in found], np.array(stamps) / 1000, atol=1e-6)
+    outcome = list(stream(encoder, source, live=live, sensor=DIGIT))
+    np.testing.assert_allclose([one.time for one in outcome], np.array(stamps) / 1000, atol=1e-6)
 
 
 def test_a_frame_of_a_video_that_cannot_be_decoded(encoder):

@@ -46,12 +46,12 @@ def test_the_guesses_without_a_model(frames):
             guess = target[sample, ~hidden[sample], :shown].mean(axis=0)
             errors.append(((target[sample, patch, :shown] - guess) ** 2).mean())
     guess = plain_reconstruction(target, hidden, 3)
-    found = reconstruction_loss(guess, target, hidden, next_frame=frames == 4)[1]
-    assert float(found["reconstruction"]) == pytest.approx(np.mean(errors), rel=1e-5)
-    assert set(found) == ({"reconstruction", "next_frame"} if frames == 4 else {"reconstruction"})
+    result = reconstruction_loss(guess, target, hidden, next_frame=frames == 4)[1]
+    assert float(result["reconstruction"]) == pytest.approx(np.mean(errors), rel=1e-5)
+    assert set(result) == ({"reconstruction", "next_frame"} if frames == 4 else {"reconstruction"})
     if frames == 4:
         copy = ((target[:, :, 3] - target[:, :, 2]) ** 2).mean()
-        assert float(found["next_frame"]) == pytest.approx(copy, rel=1e-5)
+        assert float(result["next_frame"]) == pytest.approx(copy, rel=1e-5)
 
 
 @pytest.mark.parametrize("background", ["keep", "subtract"])
@@ -63,8 +63,8 @@ def test_scores_are_means_over_clips(tmp_path, background):
     ends = manifest.clips(4, "test")[:, -1]
     net = build(config.model)
     params = net.init(jax.random.key(0))
-    found = pixel_scores(params, manifest, ends, net=net, config=config)
-    sums = dict.fromkeys(found, 0.0)
+    result = pixel_scores(params, manifest, ends, net=net, config=config)
+    sums = dict.fromkeys(result, 0.0)
     for start, (ids, batch) in zip((0, 2, 4), evaluation(manifest, ends, config, "clip", frames=4), strict=True):
         noise = jax.random.uniform(jax.random.key(start), (2, config.model.patches))
         for i in range(len(ids)):
@@ -82,8 +82,8 @@ def test_scores_are_means_over_clips(tmp_path, background):
             for name in sums:
                 kind, _, term = name.rpartition(" ")
                 sums[name] += float(errors[f"{kind} " if kind else ""][term]) / 5
-    assert found == pytest.approx(sums, rel=1e-4)
-    assert ("untouched reconstruction" in found) == (background == "subtract") and "plain next_frame" in found
+    assert result == pytest.approx(sums, rel=1e-4)
+    assert ("untouched reconstruction" in result) == (background == "subtract") and "plain next_frame" in result
 
 
 def test_what_cannot_be_scored_is_refused(tmp_path):
@@ -130,9 +130,9 @@ def test_a_clip_is_shown_with_its_mask_reconstruction_and_next_frame():
     for sample in range(2):
         original, masked, filled = grid[sample, :3], grid[sample, 3:6], grid[sample, 6:9]
         np.testing.assert_array_equal(original, CLIP[sample, :3])
-        seen = ~hidden[sample]
+        visible = ~hidden[sample]
         for panel in (masked, filled):
-            np.testing.assert_array_equal(panel[:, seen], CLIP[sample, :3][:, seen])
+            np.testing.assert_array_equal(panel[:, visible], CLIP[sample, :3][:, visible])
         assert (masked[:, hidden[sample]] == 128).all()
         assert (filled[:, hidden[sample]] != CLIP[sample, :3][:, hidden[sample]]).mean() > 0.9
         np.testing.assert_array_equal(grid[sample, 9], CLIP[sample, 3])

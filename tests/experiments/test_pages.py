@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
+import ast
 import shutil
 from pathlib import Path
 
 import pytest
 import synthetic
 from places import EXPERIMENTS
+from scripts import visit
 
 from anytouch_jax.errors import UserError
 from experiments.records import read_records, write_record
@@ -41,9 +42,7 @@ def render(tmp_path, monkeypatch, capsys):
         for picture in (RESULTS / "figures").glob(f"{name}*"):
             (tmp_path / "figures" / picture.name).touch()  # a page lists the pictures that are there
         (tmp_path / "figures" / "pouring.gif").touch()
-        for key, value in ({"TABLE": "1", "OUT": str(tmp_path)} | settings).items():
-            monkeypatch.setenv(key, value)
-        runpy.run_path(str(EXPERIMENTS / script))
+        visit(monkeypatch, script, **({"TABLE": 1, "OUT": tmp_path} | settings))
         return (tmp_path / f"{name}.md").read_text()
 
     return run
@@ -58,6 +57,19 @@ def test_the_page_of_the_matrix_is_what_its_records_give():
     figures = [RESULTS / "figures" / f"{name}.png" for name in report.parts([])]
     again = report.whole(read(RESULTS / "matrix.jsonl"), [path for path in figures if path.exists()], RESULTS)
     assert (RESULTS / "README.md").read_text() == again, "render it again: make experiments RENDER=1"
+
+
+def test_a_study_starts_only_as_a_script():
+    """Modules define; notebooks, with their cells, and a guard for scripts alone do something."""
+    for path in EXPERIMENTS.rglob("*.py"):
+        text = path.read_text()
+        for node in ast.parse(text).body if "# %%" not in text else ():
+            line = ast.unparse(node)
+            harmless = isinstance(node, ast.Import | ast.ImportFrom | ast.FunctionDef | ast.ClassDef | ast.Assign)
+            harmless |= isinstance(node, ast.AnnAssign | ast.AugAssign) or isinstance(
+                getattr(node, "value", 0), ast.Constant
+            )
+            assert harmless or line.startswith(("if __name__ ==", "sys.path.insert(")), (path, line)
 
 
 def test_every_file_of_results_has_a_page():

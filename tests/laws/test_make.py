@@ -88,17 +88,6 @@ def test_what_targets_take_by_default_is_in_the_repository() -> None:
     assert folder.is_relative_to(ROOT) and list(folder.glob("A_*.npz"))
 
 
-def test_quick_and_whole_test_run() -> None:
-    assert "not slow" in make("-n", "test").stdout
-    assert "not slow" not in make("-n", "test-all").stdout
-
-
-def test_every_target_makes_the_environment_first() -> None:
-    text = (ROOT / "Makefile").read_text()
-    for target in set(TARGETS) - {"help", "clean", "bench-gpu"}:  # which runs where nothing may be installed
-        assert re.search(rf"^{target}: \$\(STAMP\)( \$\(scenes\))? ## \S", text, re.MULTILINE), target
-
-
 def test_plain_make_lists_every_target() -> None:
     done = make()
     assert done.returncode == 0

@@ -60,8 +60,8 @@ def test_a_target_of_the_readme_is_there_and_heeds_its_variables(line: str) -> N
 
 def test_the_notebooks_named_are_those_that_are_made() -> None:
     pages = re.search(r"^PAGES +\?= (.*)$", MAKEFILE, re.MULTILINE).group(1).split()
-    told = re.search(r"make notebooks +# the pages (.*)$", TEXT, re.MULTILINE).group(1)
-    assert told.split(", ") == pages
+    reported = re.search(r"make notebooks +# the pages (.*)$", TEXT, re.MULTILINE).group(1)
+    assert reported.split(", ") == pages
 
 
 def test_the_pinned_jax_is_the_one_named_for_a_gpu() -> None:
@@ -105,7 +105,7 @@ def test_links_lead_somewhere(name: str) -> None:
         file, _, heading = target.partition("#")
         if file.startswith("http"):
             continue
-        found = (ROOT / name).parent / file if file else ROOT / name
-        assert found.is_file(), target
-        titles = re.findall(r"^#+ (.*)$", found.read_text(), re.MULTILINE) if heading else []
+        result = (ROOT / name).parent / file if file else ROOT / name
+        assert result.is_file(), target
+        titles = re.findall(r"^#+ (.*)$", result.read_text(), re.MULTILINE) if heading else []
         assert not heading or heading in [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]

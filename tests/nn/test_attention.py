@@ -112,10 +112,10 @@ def test_auto_maps_on_one_cpu_and_nowhere_else(monkeypatch):
     ],
 )
 def test_cudnn_does_what_it_can_and_xla_the_rest(monkeypatch, dtype, length, masked, asked):
-    told = []
+    reported = []
     monkeypatch.setattr(
-        jax.nn, "dot_product_attention", lambda q, *_, implementation, **__: told.append(implementation) or q
+        jax.nn, "dot_product_attention", lambda q, *_, implementation, **__: reported.append(implementation) or q
     )
     q = jnp.zeros((1, length, 2, 4), dtype)
     attention(q, q, q, implementation="cudnn", mask=jnp.ones((1, length), bool) if masked else None)
-    assert told == [asked]
+    assert reported == [asked]

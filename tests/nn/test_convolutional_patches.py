@@ -105,7 +105,7 @@ def test_an_image_tower_has_no_projection_to_give():
         inflate(PARAMS, {"patch": {"kernel": np.zeros((147, 16))}})
 
 
-def test_weights_of_another_patch_encoder_are_told_with_the_option_that_lacks():
+def test_weights_of_another_patch_encoder_name_the_option_that_lacks():
     config = tiny_config(1, patch_encoder="convolutional")
     with pytest.raises(UserError, match=r"add --model.patch-encoder shared"):
         compatible.check_form(Path("run"), replace(config.model, patch_encoder="shared"), config)

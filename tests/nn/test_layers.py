@@ -140,14 +140,14 @@ def test_rematerialised_stacks_give_the_same_gradient_from_work_done_again(metho
         "encode_image": (clip[:, 0],),
         "encode_text": (ids.reshape(2, 8), jnp.ones((2, 8), bool)),
     }[method]
-    params, found = build(full_model()).init(jax.random.key(1)), []
+    params, result = build(full_model()).init(jax.random.key(1)), []
     for remat in (False, True):
         net = build(full_model(remat=remat))
         first = lambda params, net=net: getattr(net, method)(params, *args)  # noqa: E731
         slope = jax.grad(lambda params, first=first: jnp.mean(first(params) ** 2))
         again = re.findall(r"\b(?:remat2?|checkpoint)\[", str(jax.make_jaxpr(slope)(params)))
-        found.append((jax.jit(slope)(params), len(again)))
-    (plain, few), (remat, many) = found
+        result.append((jax.jit(slope)(params), len(again)))
+    (plain, few), (remat, many) = result
     assert many - few >= 2 * (2 if method == "reconstruct" else 1)  # of each stack, of encoder and decoder
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), remat, plain)
     assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(plain)) > 0.01

@@ -38,8 +38,8 @@ def rounded(x):
 def test_a_product_and_its_gradients_are_those_of_the_rounded_operands(shape):
     x, kernel, g = draw(shape)
     a, b, c = (rounded(part) for part in (x, kernel, g))
-    found = jax.jit(both, static_argnums=3)(x, kernel, g, "bfloat16")
-    for ours, wanted in zip(found, (a @ b, c @ b.T, a.T @ c), strict=True):
+    result = jax.jit(both, static_argnums=3)(x, kernel, g, "bfloat16")
+    for ours, wanted in zip(result, (a @ b, c @ b.T, a.T @ c), strict=True):
         assert ours.dtype == jnp.float32
         np.testing.assert_allclose(ours, wanted, rtol=1e-5, atol=1e-5)
 

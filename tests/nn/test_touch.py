@@ -52,9 +52,9 @@ def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
     model = touch_model(touch=Stack(8, 5, 2, 16))
     net, clip = build(model), clips(1)
     params = net.init(jax.random.key(0))
-    found = np.asarray(net.bind(params).touch.states(clip, SENSOR, 3))
-    assert found.shape == (2, 1 + 5 + 16, 3 * 8)
-    for depth, part in ((0, found[..., :8]), (2, found[..., 8:16]), (5, found[..., 16:])):  # 2.5 is rounded to even
+    result = np.asarray(net.bind(params).touch.states(clip, SENSOR, 3))
+    assert result.shape == (2, 1 + 5 + 16, 3 * 8)
+    for depth, part in ((0, result[..., :8]), (2, result[..., 8:16]), (5, result[..., 16:])):  # 2.5 is rounded to even
         early = replace(model, touch=replace(model.touch, depth=max(depth, 1)))
         cut = jax.tree.map(lambda x: x, params)
         cut["touch"]["blocks"] = jax.tree.map(lambda x, depth=depth: x[: max(depth, 1)], params["touch"]["blocks"])
@@ -65,7 +65,7 @@ def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
     np.testing.assert_allclose(last, net.bind(params).touch.hidden(clip, SENSOR), atol=1e-6)
     every = net.bind(params).touch.states(clip, SENSOR, 6)
     assert every.shape[-1] == 6 * 8
-    np.testing.assert_allclose(every[..., :8], found[..., :8], atol=1e-6)
+    np.testing.assert_allclose(every[..., :8], result[..., :8], atol=1e-6)
 
 
 def test_hidden_patches_have_exactly_no_influence():

@@ -71,11 +71,11 @@ def test_bfloat16_is_widened_before_it_is_computed_with(name):
     def run(*inputs):
         return jax.value_and_grad(weighed, argnums=tuple(range(len(inputs))), has_aux=True)(*inputs)
 
-    (_, found), grads = run(*halves)
+    (_, result), grads = run(*halves)
     with jax.enable_x64(True):
         (_, exact), wanted = run(*(np.asarray(x, np.float64) for x in halves))
-    assert found.dtype == jnp.float32 and exact.dtype == np.float64
-    np.testing.assert_allclose(found, exact, rtol=2e-5, atol=1e-5)
+    assert result.dtype == jnp.float32 and exact.dtype == np.float64
+    np.testing.assert_allclose(result, exact, rtol=2e-5, atol=1e-5)
     for grad, right in zip(grads, wanted, strict=True):
         assert grad.dtype == jnp.bfloat16 and np.isfinite(np.asarray(grad, np.float32)).all()
         # Rounded to 8 bits where a use of the input ends, and nowhere before.

@@ -17,7 +17,7 @@ from tests.parity.golden_files import GRADIENT, OUTPUT, Case, Row, read_cases
 from tests.parity.run import main
 
 HERE = Path(__file__).parent / "golden"
-ALL = SHARED / "golden"  # the whole set, where it lies beside the checkout
+ALL = SHARED / "golden"  # the whole set, where it lies next to the checkout
 WHOLE = [case.name for case in read_cases(ALL)] if ALL.is_dir() else []
 SAVED = sorted(ALL.glob("*.pth"))
 CASES = {case.name: case for case in read_cases(HERE)}
@@ -84,7 +84,7 @@ def test_a_case_of_the_whole_set_is_within_tolerance(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", SAVED, ids=lambda path: path.name)
-def test_the_authors_checkpoints_give_the_parameters_beside_them(path, tmp_path):
+def test_the_authors_checkpoints_give_the_recorded_parameters(path, tmp_path):
     stage = path.name.split("_")[0]
     for file in (path, ALL / f"{stage}_params.npz", ALL / f"{stage}_params.json"):
         shutil.copy(file, tmp_path)
@@ -95,9 +95,9 @@ def test_the_authors_checkpoints_give_the_parameters_beside_them(path, tmp_path)
 def test_a_wrong_number_is_reported(tmp_path):
     name = "pos_embed_32_4_cls"
     folder = copied(tmp_path, "I_pos_embed", **{name: lambda x: x + 2e-5 * (np.arange(x.size).reshape(x.shape) == 77)})
-    found = bad(folder)
-    assert set(found) == {name}
-    assert found[name].error == pytest.approx(2e-5, rel=0.05) and found[name].tolerance == pytest.approx(OUTPUT)
+    result = bad(folder)
+    assert set(result) == {name}
+    assert result[name].error == pytest.approx(2e-5, rel=0.05) and result[name].tolerance == pytest.approx(OUTPUT)
 
 
 def test_a_nan_is_reported(tmp_path):
@@ -157,13 +157,13 @@ def test_checkpoints_that_do_not_fit_their_parameters_are_failed_cases(tmp_path,
     for dropped, wrong in (("head", []), ("touch_decoder_blocks.1", None)):
         fewer = {name: array for name, array in stored.items() if dropped not in name}
         monkeypatch.setattr(weights.load, "read_weights", lambda path, fewer=fewer: fewer)
-        found = [row for row in cases.run(folder) if not row.good]
-        assert {row.case for row in found} == ({"stage1_tiny.pth"} if wrong is None else set())
+        result = [row for row in cases.run(folder) if not row.good]
+        assert {row.case for row in result} == ({"stage1_tiny.pth"} if wrong is None else set())
     whole = (folder / "stage1_params.npz").read_bytes()
     (folder / "stage1_params.npz").write_bytes(whole[: len(whole) // 2])  # truncated
-    found = [row for row in cases.run(folder) if not row.good]
-    assert {row.case for row in found} == {"stage1_params", "stage1_tiny.pth"}
-    assert all("cannot read the golden arrays" in row.note for row in found)
+    result = [row for row in cases.run(folder) if not row.good]
+    assert {row.case for row in result} == {"stage1_params", "stage1_tiny.pth"}
+    assert all("cannot read the golden arrays" in row.note for row in result)
 
 
 def test_a_folder_without_cases_is_one_sentence(tmp_path):
@@ -183,7 +183,7 @@ def test_tolerances_are_the_larger_of_relative_and_five_times_the_noise():
     a, b, c = case.rows
     assert a.good and a.error == pytest.approx(1e-4) and a.tolerance == pytest.approx(1.5e-4)
     assert not b.good and b.tolerance == pytest.approx(GRADIENT)
-    assert not c.good  # a recorded zero is compared in absolute terms, and not with a tolerance of its own size
+    assert not c.good  # a recorded zero is compared in absolute terms, and not with a tolerance of its size
     assert not Row("c", "d", float("nan"), 1.0).good
 
 

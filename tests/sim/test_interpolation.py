@@ -59,7 +59,7 @@ def test_sample_gives_the_pixels_back():
     raster = np.random.default_rng(0).standard_normal((20, 31)).astype(np.float32)
     x, y = np.meshgrid((np.arange(31) - 15) * 0.13, (np.arange(20) - 9.5) * 0.13)
     np.testing.assert_allclose(SAMPLE(raster, 0.13, x.astype(np.float32), y.astype(np.float32)), raster, atol=2e-4)
-    # Moved by whole pixels: the rest of the raster, and its lowest border where there is none.
+    # Moved by whole pixels: the rest of the raster, and its lowest border outside.
     moved = SAMPLE(raster, 0.13, (x + 3 * 0.13).astype(np.float32), (y - 2 * 0.13).astype(np.float32))
     np.testing.assert_allclose(moved[2:, :-3], raster[:-2, 3:], atol=2e-4)
     border = min(raster[0].min(), raster[-1].min(), raster[:, 0].min(), raster[:, -1].min())

@@ -38,7 +38,7 @@ def arrays(count: int, seed: int = 0, size: int = 28) -> tuple[np.ndarray, np.nd
 
 
 def make_pairs(folder: Path, touches: dict[str, int], frames: int = 2) -> Path:
-    """A manifest of `touches` {split: number}, each of an object of its own, felt by three cameras and a Tac3D."""
+    """A manifest of `touches` {split: number}, each of another object, felt by three cameras and a Tac3D."""
     rng = np.random.default_rng(5)
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []

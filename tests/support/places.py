@@ -4,5 +4,5 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENTS = ROOT / "experiments"
-SHARED = ROOT.parent / "shared"  # data beside the checkout; tests that need it are skipped without it
+SHARED = ROOT.parent / "shared"  # data next to the checkout; tests that need it are skipped without it
 SUPPORT = ROOT / "tests" / "support"

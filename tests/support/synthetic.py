@@ -52,15 +52,15 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
         "restricted": SIX, "grasp": GRASP,
         "dynamics": (*(one for view in VIEWS for one in dynamic(view)), *STATIC),
     }.get(leaf.question, ())  # fmt: skip
-    found = [(one.view, one.task, one.metric) for one in columns]
+    result = [(one.view, one.task, one.metric) for one in columns]
     if leaf.question == "q3" and leaf.name in scores.READ:
         tasks = (*scores.STATIC, scores.FORM)
-        found += [(f"read: {way}", task, "accuracy") for way in scores.WAYS for task in tasks]
+        result += [(f"read: {way}", task, "accuracy") for way in scores.WAYS for task in tasks]
     if leaf.question == "new_sensor":
         views = ["seen"] if leaf.name == "seen" else [scores.NOTHING]
         for count in scores.FRAMES if leaf.name != "seen" else ():
             views += [f"universal, {count} labelled", f"fitted, {count} labelled"]
-        found = [(view, task, "accuracy") for view in views for task in scores.STATIC]
+        result = [(view, task, "accuracy") for view in views for task in scores.STATIC]
     if leaf.question == "real":
         views = [
             real.OURS,
@@ -69,8 +69,8 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
             f"{real.OURS} - {real.PIXELS}",
             f"{real.OURS} - {real.UNTRAINED}",
         ]
-        found = [(view, task, "accuracy") for task in ("object", "slip, objects left out") for view in views]
-    return found
+        result = [(view, task, "accuracy") for task in ("object", "slip, objects left out") for view in views]
+    return result
 
 
 def _rows(leaf: plan.Leaf, view: str, task: str, metric: str, mean: Mean) -> list[dict[str, Any]]:

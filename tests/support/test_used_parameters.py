@@ -15,9 +15,9 @@ X = np.ones(3, np.float32)
 
 
 def used(loss, **params):
-    found = used_parameters(loss, params)
-    assert all(type(value) is bool for value in jax.tree.leaves(found))
-    return {name for name, value in found.items() if value}
+    result = used_parameters(loss, params)
+    assert all(type(value) is bool for value in jax.tree.leaves(result))
+    return {name for name, value in result.items() if value}
 
 
 def test_dead_code_and_metrics_do_not_count():
@@ -128,22 +128,22 @@ def test_a_primitive_that_is_not_known_uses_everything():
 
 @pytest.mark.parametrize("transform", [jax.jit, jax.checkpoint, lambda f: f])
 def test_it_can_be_asked_while_tracing(transform):
-    seen = []
+    received = []
 
     @transform
     def outer(params, x):
-        seen.append(used_parameters(lambda p, y: jnp.sum(p["a"] * y), params, x))
+        received.append(used_parameters(lambda p, y: jnp.sum(p["a"] * y), params, x))
         return x
 
     outer({"a": X, "b": X}, X)
-    assert seen[0] == {"a": True, "b": False}
+    assert received[0] == {"a": True, "b": False}
 
 
 def test_a_nested_tree_keeps_its_form():
-    found = used_parameters(
+    result = used_parameters(
         lambda p, key: p["x"]["y"] * jax.random.normal(key), {"x": {"y": 1.0, "z": 2.0}}, jax.random.key(0)
     )
-    assert found == {"x": {"y": True, "z": False}}
+    assert result == {"x": {"y": True, "z": False}}
 
 
 def test_a_scan_is_read_in_the_words_of_either_jax():

@@ -1,4 +1,4 @@
-"""A world on disk where several sensors feel the same places: each touch has a texture of its own, a place, a force."""
+"""A world on disk where several sensors feel the same places: each touch has its texture, place and force."""
 
 from __future__ import annotations
 

@@ -71,11 +71,11 @@ def start(run_dir: Path, count: int = 2, *, devices: int = 1, hit: int = -1, at:
 def finish(processes, timeout: float = 600):
     """(exit status, error stream) of each, in order."""
     try:
-        said = [process.communicate(timeout=timeout)[1] for process in processes]
+        lines = [process.communicate(timeout=timeout)[1] for process in processes]
     finally:
         for process in processes:
             process.kill()
-    return [(process.returncode, text) for process, text in zip(processes, said, strict=True)]
+    return [(process.returncode, text) for process, text in zip(processes, lines, strict=True)]
 
 
 def main(run_dir: str, hit: int, at: int, number: int, run: dict) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from places import SHARED
 
-# The golden vectors lie beside the checkout, where they are present; every other test makes its own files.
+# The golden vectors lie next to the checkout, where they are present; every other test makes its own files.
 GOLDEN = SHARED / "golden"
 collect_ignore = [] if GOLDEN.is_dir() else ["test_golden_weights.py"]
 

@@ -50,13 +50,13 @@ class Rival:
     def batch(self) -> dict[str, torch.Tensor]:
         """The batch as the model takes it, from uint8."""
         images = {"image": "image"}
-        found = {
+        result = {
             name: floats(x, images.get(name, "touch")) if x.dtype == torch.uint8 and x.ndim > 3 else x
             for name, x in self.raw.items()
         }
         if self.work["kind"] == "align":
-            found["both_image"], found["both_text"] = self.both
-        return found
+            result["both_image"], result["both_text"] = self.both
+        return result
 
     def value(self, batch: dict[str, torch.Tensor], noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(loss, output); an embedding has no loss."""
@@ -89,8 +89,8 @@ class Rival:
             loss, output = self.function(variant)(self.batch(), self.noise)
         if self.trains:
             loss.backward()
-        found = {f"grad/{k}": p.grad for k, p in self.model.named_parameters() if p.grad is not None}
-        save_file({k: v.detach().float().contiguous() for k, v in (found | {"output": output}).items()}, out)
+        result = {f"grad/{k}": p.grad for k, p in self.model.named_parameters() if p.grad is not None}
+        save_file({k: v.detach().float().contiguous() for k, v in (result | {"output": output}).items()}, out)
         self.model.zero_grad(set_to_none=True)
         return {"loss": float(loss.detach())}
 

@@ -322,7 +322,7 @@ def test_splits_references_and_nothing_to_compare(tmp_path):
         c.contact_quality(_manifest(tmp_path, **{"label.force": ["x"]}), _scores([1]))
 
 
-def test_pressed_frames_with_known_force_are_told_from_free_ones(tmp_path):
+def test_pressed_frames_with_known_force_are_distinguished_from_free_ones(tmp_path):
     y, x = np.mgrid[:60, :80]
     force = np.array([0.0] * 6 + [1.0, 2.0, 4.0, 8.0])
     rng = np.random.default_rng(0)

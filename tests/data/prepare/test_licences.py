@@ -39,7 +39,7 @@ def test_commercial_rows_are_those_that_certainly_are(make):
     assert kept.manifest.where(3) == loose.where(6)
     report = verify(loose)
     assert finding_rows(report) == {"licence_conflict": [3]} and "'CC-BY-NC-4.0'" in report.findings[0].examples[0]
-    found = licences(loose)
-    assert sum(entry.rows for entry in found) == 8 and found[0] == ("MIT", YES, ("d0", "d1"), 2)
+    result = licences(loose)
+    assert sum(entry.rows for entry in result) == 8 and result[0] == ("MIT", YES, ("d0", "d1"), 2)
     with pytest.raises(UserError, match=r"2 may not, 2 do not say"):
         commercial_only(select_rows(loose, np.array([2, 3, 5, 7])))

@@ -259,7 +259,7 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
     with pytest.raises(PackError, match=words) as error:
         pack(loose, tmp_path / "out")
     assert "\n" not in str(error.value)
-    assert not list((tmp_path / "out").rglob("*.zip")) or harm in ("empty", "folder")  # told before the packing
+    assert not list((tmp_path / "out").rglob("*.zip")) or harm in ("empty", "folder")  # reported before the packing
     assert {file.name for file in (tmp_path / "out").rglob("*.part")} | {
         f.name for f in (tmp_path / "out").rglob(".*")
     } <= {".lock"}

@@ -16,19 +16,14 @@ def estimate(frames):
     return estimate_untouched_gel([scale_picture(frame) for frame in frames])
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.75, 0.95])
+@pytest.mark.parametrize(("number", "share"), list(enumerate([0.1, 0.5, 0.75, 0.95])))
 @pytest.mark.parametrize("look", LOOKS)
-def test_films_that_are_pressed_for_any_share_of_the_time_are_decided_and_not_inverted(look, share):
-    accuracy = []
-    for shape in SHAPES:
-        frames, contact = press_film(look, share, shape)
-        gel, _ = estimate(frames)
-        if gel is not None:
-            assert gel.has_dots == (look == "dotted")
-            predicted = np.array([gel.score(frame) for frame in frames]) > THRESHOLDS[SENSORS[look]]
-            accuracy.append(float((predicted == contact).mean()))
-    assert len(accuracy) >= 0.8 * len(SHAPES)
-    assert np.mean(accuracy) >= 0.95 and min(accuracy) > 0.9
+def test_films_that_are_pressed_for_any_share_of_the_time_are_decided_and_not_inverted(look, number, share):
+    frames, contact = press_film(look, share, SHAPES[(number + LOOKS.index(look)) % len(SHAPES)])
+    gel, _ = estimate(frames)
+    assert gel is not None and gel.has_dots == (look == "dotted")
+    predicted = np.array([gel.score(frame) for frame in frames]) > THRESHOLDS[SENSORS[look]]
+    assert (predicted == contact).mean() >= 0.95
 
 
 @pytest.mark.parametrize("look", LOOKS)

@@ -1,4 +1,4 @@
-"""Recordings of one's own: what counts as a recording, as its frames, and as what lies beside it."""
+"""Recordings of a user: what counts as a recording, as its frames, and as other files."""
 
 from __future__ import annotations
 

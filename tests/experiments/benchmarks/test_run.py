@@ -77,12 +77,9 @@ def test_what_was_measured_outlives_what_fails_later(tiny, tmp_path, capsys, mon
 def test_loader_and_simulator(tmp_path):
     assert run("loader", "simulator", "--quick", "--out", tmp_path) == 0
     numbers = numbers_of(tmp_path, "loader_simulator_tiny")["results"]
-    loads = numbers["Loader, preset tiny"]
-    assert {(row["kind"], row["threads"]) for row in loads} >= {("clip", 1), ("still", 1), ("clip", 2)}
-    assert all(row["difference"] == 0 and row["frames_per_second"] > 0 for row in loads)
-    beside = numbers["Loader compared with plain decoding, and a large manifest"]
-    assert {row["variant"] for row in beside if "variant" in row} >= {"decode + resize", "all augmentations"}
-    assert [row["stage"] for row in beside if "stage" in row] == [1, 2]
+    rows = numbers["Loader compared with plain decoding, and a large manifest"]
+    assert {row["variant"] for row in rows if "variant" in row} >= {"decode + resize", "all augmentations"}
+    assert [row["stage"] for row in rows if "stage" in row] == [1, 2]
     assert {row["fidelity"] for row in numbers["Simulator"]} == {"exact", "fast"}
     whole = numbers["Simulator, whole recordings of two frames at 32 pixels, default fidelity"]
     assert [row["sensor"] for row in whole] == ["digit", "all, two at a time"]

@@ -42,7 +42,7 @@ def test_the_reference_itself_has_no_error(rows):
     assert max(same.image.values()) < 0.05  # a rounded grey level here and there
 
 
-def test_errors_are_told(rows):
+def test_errors_are_reported(rows):
     same, coarse, hasty, quick = rows
     assert coarse.converged == 2 and hasty.converged < 2
     assert max(hasty.rms.values()) > max(coarse.rms.values()) > 5 * max(same.rms.values())
@@ -54,9 +54,9 @@ def test_errors_are_told(rows):
 def test_only_what_a_touch_changes_is_scored():
     bare, right = np.zeros((4, 4, 3)), np.zeros((4, 4, 3))
     right[0, 0] = 30, 0, 0
-    found = right.copy()
-    found[0, 0, 0], found[3, 3] = 24, 9
-    assert simulator._picture_error(found, right, bare) == 2 and simulator._picture_error(found, bare, bare) == 0
+    result = right.copy()
+    result[0, 0, 0], result[3, 3] = 24, 9
+    assert simulator._picture_error(result, right, bare) == 2 and simulator._picture_error(result, bare, bare) == 0
 
 
 def test_shear_moves_the_markers_of_the_picture():

@@ -36,8 +36,8 @@ def play(setup: physics.Setup, actions: jax.Array, seed: int, task: Task = TASK)
 
 def actions_of(*parts: tuple[int, int], length: int = 300) -> jax.Array:
     """(action, times) one after the other, then waiting."""
-    found = np.concatenate([np.full(times, action) for action, times in parts])
-    return jnp.asarray(np.concatenate([found, np.full(length - len(found), WAIT)]), jnp.int32)
+    result = np.concatenate([np.full(times, action) for action, times in parts])
+    return jnp.asarray(np.concatenate([result, np.full(length - len(result), WAIT)]), jnp.int32)
 
 
 still = jax.jit(partial(physics.load, task=TASK, shocks=False))
@@ -199,28 +199,28 @@ def test_a_task_that_cannot_be_done_is_refused(changes, words):
 @pytest.mark.parametrize("mass", [100.0, 40.0, 0.0])
 def test_an_upright_cylinder_weighs_m_g(mass):
     setup = setup_of(0, share=1.0)  # all of it on the gel
-    found = still(at(setup, mass=mass), setup)
+    result = still(at(setup, mass=mass), setup)
     weight = (mass + float(setup.empty)) * 1e-3 * GRAVITY
-    np.testing.assert_allclose(np.asarray(found.shear), [0, weight], rtol=1e-5, atol=1e-6)
-    assert float(found.twist) == pytest.approx(0, abs=1e-4)
-    assert float(found.normal) == pytest.approx(float(setup.grip), rel=0.1)
+    np.testing.assert_allclose(np.asarray(result.shear), [0, weight], rtol=1e-5, atol=1e-6)
+    assert float(result.twist) == pytest.approx(0, abs=1e-4)
+    assert float(result.normal) == pytest.approx(float(setup.grip), rel=0.1)
 
 
 def test_a_standing_cylinder_loads_nothing_but_the_grip():
     setup = setup_of(0)
-    found = still(at(setup, tilt=0.7)._replace(steps=jnp.asarray(physics.STAND - 1)), setup)
-    assert np.asarray(found.shear).tolist() == [0, 0] and float(found.twist) == 0
-    assert 0.9 * float(setup.grip) < float(found.normal) <= float(setup.grip)
+    result = still(at(setup, tilt=0.7)._replace(steps=jnp.asarray(physics.STAND - 1)), setup)
+    assert np.asarray(result.shear).tolist() == [0, 0] and float(result.twist) == 0
+    assert 0.9 * float(setup.grip) < float(result.normal) <= float(setup.grip)
 
 
 def test_the_weight_is_there_at_every_tilt():
     """Both fingers and the grip's axis together bear m g, whatever the share and the tilt."""
     for tilt in (0.0, 0.4, 0.9, 1.4):
         setup = setup_of(1, share=1.0, mount=0.0)
-        found = still(at(setup, tilt=tilt, slope=0.3), setup)  # the gel faces the axis of the tilt: no couple
+        result = still(at(setup, tilt=tilt, slope=0.3), setup)  # the gel faces the axis of the tilt: no couple
         weight = (100 + float(setup.empty)) * 1e-3 * GRAVITY
-        assert float(jnp.hypot(*found.shear)) == pytest.approx(weight, rel=1e-5)
-        assert float(jnp.arctan2(*found.shear)) == pytest.approx(tilt, abs=1e-5)
+        assert float(jnp.hypot(*result.shear)) == pytest.approx(weight, rel=1e-5)
+        assert float(jnp.arctan2(*result.shear)) == pytest.approx(tilt, abs=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -228,7 +228,7 @@ def test_two_fingers_balance_gravity_and_its_moment(seed):
     """Forces and moments by vectors: a finger stands at +R n, with the gel, and one at -R n; both bear f k and f e."""
     setup = setup_of(seed, share=0.5, relax=0.0)
     tilt, slope, mass = 0.8, 0.4, 70.0
-    found = still(at(setup, tilt=tilt, mass=mass, slope=slope), setup)
+    result = still(at(setup, tilt=tilt, mass=mass, slope=slope), setup)
     d, k = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
     t, m = np.cross(k, d), float(setup.mount)
     n, radius, total = math.cos(m) * t + math.sin(m) * d, float(setup.radius), mass + float(setup.empty)
@@ -238,10 +238,10 @@ def test_two_fingers_balance_gravity_and_its_moment(seed):
     arm = middle / total - float(setup.grip_height) * k
     gravity = total * 1e-3 * GRAVITY * (math.sin(tilt) * d - math.cos(tilt) * k)
     moment = np.cross(arm, gravity)
-    on_gel = float(found.shear[0]) * e - float(found.shear[1]) * k + (float(found.normal) - float(setup.grip)) * n
+    on_gel = float(result.shear[0]) * e - float(result.shear[1]) * k + (float(result.normal) - float(setup.grip)) * n
     on_other = gravity - on_gel
     np.testing.assert_allclose(on_gel @ n, gravity @ n / 2, atol=1e-4)
-    held = np.cross(radius * n, on_gel) + np.cross(-radius * n, on_other) + 2 * float(found.twist) * n
+    held = np.cross(radius * n, on_gel) + np.cross(-radius * n, on_other) + 2 * float(result.twist) * n
     np.testing.assert_allclose(held @ n, moment @ n, rtol=1e-4)
     np.testing.assert_allclose(held @ e, moment @ e, rtol=1e-3)
     assert abs(moment @ n) > 1 and abs(moment @ e) > 1  # N mm
@@ -279,12 +279,12 @@ def test_the_heap_lies_where_a_fine_sum_says():
 def test_the_load_is_continuous(seed):
     setup = setup_of(seed)
     states = play(setup, actions_of((POUR, 150), (WAIT, 20), (RETRACT, 30)), seed)
-    found = jax.vmap(lambda s: still(s, setup))(states)
+    result = jax.vmap(lambda s: still(s, setup))(states)
     weight = (TASK.beads + float(setup.empty)) * 1e-3 * GRAVITY
     states = jax.tree.map(lambda x: x[physics.STAND :], states)  # once it is lifted
-    found = jax.tree.map(lambda x: x[physics.STAND :], found)
+    result = jax.tree.map(lambda x: x[physics.STAND :], result)
     out = np.abs(np.diff(np.asarray(states.mass))) / 1000 * GRAVITY
-    for part, scale in ((found.shear, 1.0), (found.twist[:, None], 30.0), (found.normal[:, None], 1.0)):
+    for part, scale in ((result.shear, 1.0), (result.twist[:, None], 30.0), (result.normal[:, None], 1.0)):
         jump = np.abs(np.diff(np.asarray(part), axis=0)).max(1)
         assert (jump <= scale * (0.02 * weight + 2 * out) + 0.01).all()  # a quarter of a degree, and what flowed
 

@@ -47,7 +47,7 @@ def encoder():
 
 
 def changed(manifest, folder, **columns):
-    """The manifest with other columns, beside the same pictures."""
+    """The manifest with other columns, next to the same pictures."""
     table = manifests.read(manifest)
     cells = {name: table.column(name).to_pylist() for name in table.table.column_names}
     for name, change in columns.items():
@@ -58,27 +58,27 @@ def changed(manifest, folder, **columns):
 
 
 def test_what_is_written_is_read(shown, manifest):
-    found = recordings.read(manifest, SIDE)
-    assert found.sensor == "gelsight_mini" and found.test.tolist() == [False, False, False, True]
-    np.testing.assert_array_equal(found.trials.steps, shown.steps)
+    result = recordings.read(manifest, SIDE)
+    assert result.sensor == "gelsight_mini" and result.test.tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(result.trials.steps, shown.steps)
     taken = shown.taken
     for name in ("actions", "choices", "frames"):
-        np.testing.assert_array_equal(getattr(found.trials, name)[taken], getattr(shown, name)[taken])
-    assert np.isnan(found.trials.mass).all()  # no policy is told the scales
+        np.testing.assert_array_equal(getattr(result.trials, name)[taken], getattr(shown, name)[taken])
+    assert np.isnan(result.trials.mass).all()  # no policy gets the mass
     assert pq.read_table(manifest)["label.mass"].to_pylist()[0] == pytest.approx(float(shown.mass[0, 0]))
 
 
 def test_runs_of_the_test_come_last_and_parts_are_no_copies(shown, manifest):
     first = int(shown.steps[0])  # the first run is the test's, not the last
     path = changed(manifest, "turned", split=lambda x: ["test"] * first + ["train"] * (len(x) - first))
-    found = recordings.read(path, SIDE)
-    assert found.test.tolist() == [False, False, False, True]
-    np.testing.assert_array_equal(found.trials.steps, [*shown.steps[1:], shown.steps[0]])
-    learned, unseen = found.part(False), found.part(True)
+    result = recordings.read(path, SIDE)
+    assert result.test.tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(result.trials.steps, [*shown.steps[1:], shown.steps[0]])
+    learned, unseen = result.part(False), result.part(True)
     assert len(learned.steps) == COUNT - 1 and unseen.steps.tolist() == [first]
     np.testing.assert_array_equal(unseen.frames[:first, 0], shown.frames[:first, 0])
     for part in (learned, unseen):
-        assert np.shares_memory(part.frames, found.trials.frames)
+        assert np.shares_memory(part.frames, result.trials.frames)
 
 
 def test_what_is_unused_teaches_nobody_and_an_empty_choice_is_the_action(shown, manifest):
@@ -86,41 +86,43 @@ def test_what_is_unused_teaches_nobody_and_an_empty_choice_is_the_action(shown, 
     path = changed(manifest, "part", **{
         "split": lambda x: ["unused"] * first + x[first:], "label.choice": lambda x: [None] * len(x),
     })  # fmt: skip
-    found = recordings.read(path, SIDE)
-    assert len(found.trials.steps) == COUNT - 1
-    np.testing.assert_array_equal(found.trials.choices, found.trials.actions)
+    result = recordings.read(path, SIDE)
+    assert len(result.trials.steps) == COUNT - 1
+    np.testing.assert_array_equal(result.trials.choices, result.trials.actions)
 
 
 def test_recordings_teach_what_the_demonstrations_teach(shown, manifest, encoder):
-    found = recordings.read(manifest, SIDE)
-    direct = pouring_policy.learn_frozen(encoder, found._replace(trials=shown).part(False), FAST, stills=False)
-    read = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=False)
+    result = recordings.read(manifest, SIDE)
+    direct = pouring_policy.learn_frozen(encoder, result._replace(trials=shown).part(False), FAST, stills=False)
+    read = pouring_policy.learn_frozen(encoder, result.part(False), FAST, stills=False)
     for a, b in zip(direct.head.layers, read.head.layers, strict=True):
         np.testing.assert_array_equal(a[0], b[0])
 
 
 @pytest.mark.parametrize("stills", [False, True])
 def test_a_policy_on_disk_acts_as_the_one_that_learned(shown, manifest, encoder, tmp_path, stills):
-    found = recordings.read(manifest, SIDE)
-    policy = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=stills, sensor=found.sensor)
-    policy = pouring_policy.fine_tune(policy, found.part(False), FAST)
+    result = recordings.read(manifest, SIDE)
+    policy = pouring_policy.learn_frozen(encoder, result.part(False), FAST, stills=stills, sensor=result.sensor)
+    policy = pouring_policy.fine_tune(policy, result.part(False), FAST)
     recordings.save_policy(tmp_path, policy)
     again = recordings.load_policy(tmp_path)
-    said = []
+    lines = []
     for one in (policy, again):
         one.begin(COUNT)
-        said.append(np.stack([one.act(frames) for frames in shown.frames]))
-    np.testing.assert_array_equal(*said)
+        lines.append(np.stack([one.act(frames) for frames in shown.frames]))
+    np.testing.assert_array_equal(*lines)
     assert again.stills == stills and again.sensor == "gelsight_mini" and again.encoder.subtracts
-    assert again.encoder.trained_sensors is None  # as before: nobody told
+    assert again.encoder.trained_sensors is None  # as before: unknown
 
 
 def test_a_policy_on_disk_knows_the_sensors_of_its_encoder(shown, encoder, tmp_path):
-    seen = ("digit", "gelsight_mini")
-    touch = serve_unseen(encoder.params["touch"], encoder.config.model, seen, universal_drawn=True)  # as it is loaded
-    encoder = replace(encoder, trained_sensors=seen, params={"touch": touch})
+    received = ("digit", "gelsight_mini")
+    touch = serve_unseen(
+        encoder.params["touch"], encoder.config.model, received, universal_drawn=True
+    )  # as it is loaded
+    encoder = replace(encoder, trained_sensors=received, params={"touch": touch})
     recordings.save_policy(tmp_path, pouring_policy.learn_frozen(encoder, shown, FAST, stills=True))
-    assert recordings.load_policy(tmp_path).encoder.trained_sensors == seen
+    assert recordings.load_policy(tmp_path).encoder.trained_sensors == received
 
 
 def test_a_policy_on_disk_knows_how_its_features_are_pooled_and_its_votes(shown, encoder, tmp_path):
@@ -130,9 +132,9 @@ def test_a_policy_on_disk_knows_how_its_features_are_pooled_and_its_votes(shown,
     assert (again.pooling, again.votes) == ("both", 5)
     with np.load(tmp_path / "policy.npz") as file:
         arrays = dict(file)
-    told = json.loads(str(arrays["about"]))
-    del told["pooling"], told["votes"]  # as written before policies could choose
-    np.savez(tmp_path / "policy.npz", **(arrays | {"about": np.asarray(json.dumps(told))}))
+    reported = json.loads(str(arrays["about"]))
+    del reported["pooling"], reported["votes"]  # as written before policies could choose
+    np.savez(tmp_path / "policy.npz", **(arrays | {"about": np.asarray(json.dumps(reported))}))
     again = recordings.load_policy(tmp_path)
     assert (again.pooling, again.votes) == ("class", 1)
 
@@ -152,21 +154,21 @@ def test_agreement_with_the_hand(shown):
     choices = np.full((20, 2), POUR)
     choices[12:] = RETRACT
     trials = pouring.Trials(np.zeros(2), np.array([20, 16]), choices, choices, *[np.zeros((20, 2))] * 3, None)
-    said = np.full((20, 2), POUR)
-    said[14:] = RETRACT  # two moments late in both runs, four fifths of a second at 5 a second... of 15 and of 11
-    found = recordings.compare(said, trials, 5.0)
-    assert found.share == pytest.approx((13 / 15 + 9 / 11) / 2)
-    assert found.balanced == pytest.approx((1 + 8 / 12) / 2)  # WAIT was never chosen
-    assert found.turn == pytest.approx(0.4)
+    lines = np.full((20, 2), POUR)
+    lines[14:] = RETRACT  # two moments late in both runs, four fifths of a second at 5 a second... of 15 and of 11
+    result = recordings.compare(lines, trials, 5.0)
+    assert result.share == pytest.approx((13 / 15 + 9 / 11) / 2)
+    assert result.balanced == pytest.approx((1 + 8 / 12) / 2)  # WAIT was never chosen
+    assert result.turn == pytest.approx(0.4)
     never = recordings.compare(np.full((20, 2), WAIT), trials, 5.0)
     assert never.share == 0 and never.turn == pytest.approx(((20 - 12) + (16 - 12)) / 2 / 5)
 
 
 def test_policies_are_compared_on_the_test_runs(manifest, encoder):
-    found = recordings.read(manifest, SIDE)
-    policy = pouring_policy.learn_frozen(encoder, found.part(False), FAST, stills=False)
-    touch = recordings.agreement(policy, found.part(True), 5.0)
-    blind = recordings.agreement_blind(found.part(False), found.part(True), FAST, 5.0)
+    result = recordings.read(manifest, SIDE)
+    policy = pouring_policy.learn_frozen(encoder, result.part(False), FAST, stills=False)
+    touch = recordings.agreement(policy, result.part(True), 5.0)
+    blind = recordings.agreement_blind(result.part(False), result.part(True), FAST, 5.0)
     assert 0 <= touch.share <= 1 and 0 <= blind.share <= 1
 
 

@@ -25,7 +25,7 @@ FAST = Learning(steps=600, width=32, tune_steps=2, tune_runs=2)
 
 
 @pytest.fixture(scope="module")
-def told() -> pouring.Trials:
+def reported() -> pouring.Trials:
     """Demonstrations without frames: the flow alone."""
     return pouring_policy.demonstrate(TASK, 0, 20, side=None, late=0, chunk=20)
 
@@ -47,37 +47,37 @@ def encoder():
     return random_encoder(tiny_config())
 
 
-def test_the_expert_pours_the_target(told):
-    wrong = np.abs(told.poured - TASK.target)
+def test_the_expert_pours_the_target(reported):
+    wrong = np.abs(reported.poured - TASK.target)
     assert wrong.mean() < 1.5 and wrong.max() < 6
-    assert set(np.unique(told.actions[told.taken])) == {POUR, WAIT, RETRACT}
-    for run in range(len(told.poured)):
-        mine = told.actions[: told.steps[run], run]
+    assert set(np.unique(reported.actions[reported.taken])) == {POUR, WAIT, RETRACT}
+    for run in range(len(reported.poured)):
+        mine = reported.actions[: reported.steps[run], run]
         assert (mine[:5] == WAIT).all() and (mine[-12:] == RETRACT).all()
-        assert (np.diff(told.mass[: told.steps[run], run]) <= 0).all()
-    assert told.steps.std() > 5
+        assert (np.diff(reported.mass[: reported.steps[run], run]) <= 0).all()
+    assert reported.steps.std() > 5
 
 
-def test_the_same_seed_is_the_same_run_in_any_company(told):
+def test_the_same_seed_is_the_same_run_in_any_company(reported):
     lock = pouring_policy.demonstrate(TASK, 0, 3, side=None, late=0, chunk=3)
-    np.testing.assert_array_equal(lock.poured, told.poured[:3])
+    np.testing.assert_array_equal(lock.poured, reported.poured[:3])
     longest = len(lock.actions)
     taken = lock.taken
-    np.testing.assert_array_equal(lock.actions[taken], told.actions[:longest, :3][taken])
+    np.testing.assert_array_equal(lock.actions[taken], reported.actions[:longest, :3][taken])
     other = pouring_policy.demonstrate(TASK, 1, 3, side=None, late=0, chunk=3)
     assert np.abs(other.tilt[0] - lock.tilt[0]).min() > 1e-3
 
 
-def test_a_late_hand_changes_what_is_done_and_not_what_is_told(told, late):
-    assert (told.choices == told.actions).all()
+def test_a_late_hand_changes_what_is_done_and_not_the_choice(reported, late):
+    assert (reported.choices == reported.actions).all()
     for run in range(20):
         mine = late.choices[: late.steps[run], run], late.actions[: late.steps[run], run]
         first = int((mine[0] == RETRACT).argmax())
         assert (mine[0][first:] == RETRACT).all() and (mine[0][:first] == mine[1][:first]).all()
         over = int((mine[1][first:] == RETRACT).argmax())
         assert (mine[1][first : first + over] == POUR).all() and (mine[1][first + over :] == RETRACT).all()
-        same = min(first, told.steps[run])
-        np.testing.assert_array_equal(late.mass[:same, run], told.mass[:same, run])
+        same = min(first, reported.steps[run])
+        np.testing.assert_array_equal(late.mass[:same, run], reported.mass[:same, run])
     assert late.poured.std() > 5 and late.poured.min() > 59
 
 
@@ -85,20 +85,20 @@ def test_a_late_hand_changes_what_is_done_and_not_what_is_told(told, late):
 def test_a_blind_policy_pours_but_cannot_know():
     blind = bounds.learn_blind(TASK, 0, 20, FAST)
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
-    found = pouring.run(TASK, setups, keys, blind)
-    assert 4 < pouring.error(found.poured, TASK.target).mean < 30
-    assert found.poured.std() > 4  # the runs differ, it does not
+    result = pouring.run(TASK, setups, keys, blind)
+    assert 4 < pouring.error(result.poured, TASK.target).mean < 30
+    assert result.poured.std() > 4  # the runs differ, it does not
 
 
 @pytest.mark.slow
-def test_counting_is_the_best_it_can_be_and_no_more(told):
+def test_counting_is_the_best_it_can_be_and_no_more(reported):
     counter = pouring.best_counter(TASK, *pouring.draw_runs(TASK, 0, 20))
     setups, keys = pouring.draw_runs(TASK, 0, 20)
     errors = {}
     for more in (-24, 0, 24):
-        found = pouring.run(TASK, setups, keys, pouring.Counter(counter.pours + more))
-        errors[more] = pouring.error(found.poured, TASK.target).mean
-        assert ((found.actions == POUR) & found.taken).sum(0).max() == counter.pours + more
+        result = pouring.run(TASK, setups, keys, pouring.Counter(counter.pours + more))
+        errors[more] = pouring.error(result.poured, TASK.target).mean
+        assert ((result.actions == POUR) & result.taken).sum(0).max() == counter.pours + more
     assert 4 < errors[0] < min(errors[-24], errors[24])
 
 
@@ -134,17 +134,17 @@ def test_imitation_learns_a_toy_signal_and_beats_blind(late):
     )
     assert loss < 0.5 * np.log(3)
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
-    seen = pouring.run(TASK, setups, keys, Seer(head))
+    received = pouring.run(TASK, setups, keys, Seer(head))
     blind = pouring.run(TASK, setups, keys, bounds.learn_blind(TASK, 0, 20, FAST))
-    assert pouring.error(seen.poured, TASK.target).mean < 4
-    assert np.mean(np.abs(seen.poured - 60) < np.abs(blind.poured - 60)) > 0.6
+    assert pouring.error(received.poured, TASK.target).mean < 4
+    assert np.mean(np.abs(received.poured - 60) < np.abs(blind.poured - 60)) > 0.6
 
 
 @pytest.mark.slow
 def test_the_loss_is_that_of_demonstrations_held_out_at_their_best():
     rng = np.random.default_rng(0)
     runs = np.repeat(np.arange(10), 12)
-    noise = rng.normal(size=(120, 40)).astype(np.float32)  # each run can be told by heart, and tells nothing of others
+    noise = rng.normal(size=(120, 40)).astype(np.float32)  # each run can be learned by heart, and predicts no other
     choices = rng.integers(0, 3, 120)
     learning = replace(FAST, steps=600, batch=256, components=40, dropout=0.0)
     head, loss = pouring_policy.imitate(noise, choices, runs, learning)
@@ -162,13 +162,13 @@ def test_dropout_leaves_out_its_share_while_a_policy_learns_and_nothing_when_it_
     head = pouring_policy.Head(jnp.zeros(100), jnp.eye(100), ((jnp.eye(100), jnp.zeros(100)),))
     x, key = jnp.ones((400, 100)), jax.random.key(0)
     np.testing.assert_allclose(pouring_policy.forward(head, x, 0.3), 1)  # no key: it acts
-    found = np.asarray(pouring_policy.forward(head, x, 0.3, key))
-    assert (found == 0).mean() == pytest.approx(0.3, abs=0.01)
-    np.testing.assert_allclose(found[found != 0], 1 / 0.7, rtol=1e-6)  # so the mean stays
+    result = np.asarray(pouring_policy.forward(head, x, 0.3, key))
+    assert (result == 0).mean() == pytest.approx(0.3, abs=0.01)
+    np.testing.assert_allclose(result[result != 0], 1 / 0.7, rtol=1e-6)  # so the mean stays
 
 
 @pytest.mark.slow
-def test_dropout_keeps_features_from_being_learned_by_heart_and_told_policies_have_none(late, monkeypatch):
+def test_dropout_keeps_features_from_being_learned_by_heart_and_policies_over_loads_have_none(late, monkeypatch):
     rng = np.random.default_rng(0)
     runs = np.repeat(np.arange(10), 12)
     signal = rng.integers(0, 3, 120)
@@ -188,9 +188,9 @@ def test_dropout_keeps_features_from_being_learned_by_heart_and_told_policies_ha
 def test_the_load_alone_is_enough_to_pour_by():
     head = bounds.learn_loads(TASK, 0, 20, Learning())
     setups, keys = pouring.draw_runs(TASK, pouring_policy.UNSEEN, 20)
-    told = pouring.run(TASK, setups, keys, bounds.Scales(TASK, setups, head))
+    reported = pouring.run(TASK, setups, keys, bounds.Scales(TASK, setups, head))
     blind = pouring.run(TASK, setups, keys, bounds.learn_blind(TASK, 0, 20, Learning()))
-    assert pouring.error(told.poured, TASK.target).mean < 0.75 * pouring.error(blind.poured, TASK.target).mean
+    assert pouring.error(reported.poured, TASK.target).mean < 0.75 * pouring.error(blind.poured, TASK.target).mean
 
 
 def test_inputs_are_changes_from_the_standing_and_the_lifted_cylinder():
@@ -204,8 +204,8 @@ def test_inputs_are_changes_from_the_standing_and_the_lifted_cylinder():
 
 def test_blind_inputs_hold_time_and_own_actions_only():
     actions = np.array([[WAIT], [POUR], [POUR], [RETRACT]])
-    found = bounds.blind_inputs(actions)[:, 0] * 100
-    np.testing.assert_allclose(found, [[0, 0, 0, 0], [1, 0, 1, 0], [2, 1, 1, 0], [3, 2, 1, 0]], atol=1e-4)
+    result = bounds.blind_inputs(actions)[:, 0] * 100
+    np.testing.assert_allclose(result, [[0, 0, 0, 0], [1, 0, 1, 0], [2, 1, 1, 0], [3, 2, 1, 0]], atol=1e-4)
 
 
 def test_the_loss_by_hand():
@@ -240,11 +240,11 @@ def test_touch_sees_in_a_run_what_it_learned_from(shown, encoder):
     """The closed loop feeds the MLP the same inputs as the table of the demonstrations; its last moments vote."""
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5, votes=3), stills=False)
     z = pouring_policy.features(encoder, shown, stills=False, batch=8)
-    said = pouring_policy.log_probabilities(policy.head, pouring_policy.input_table(z).reshape(8, -1)).reshape(4, 2, 3)
+    lines = pouring_policy.log_probabilities(policy.head, pouring_policy.input_table(z).reshape(8, -1)).reshape(4, 2, 3)
     policy.begin(2)
     acted = [policy.act(frames, None) for frames in shown.frames]
     assert (np.stack(acted[:5]) == WAIT).all()
-    voted = np.stack([said[max(0, moment - 2) : moment + 1].mean(0) for moment in range(4)])
+    voted = np.stack([lines[max(0, moment - 2) : moment + 1].mean(0) for moment in range(4)])
     np.testing.assert_array_equal(np.stack(acted[5:]), voted.argmax(-1))
 
 
@@ -254,8 +254,8 @@ def test_a_moment_astray_is_outvoted_and_two_are_not(encoder, monkeypatch):
         ([quiet, quiet, astray, quiet], [POUR] * 4),
         ([quiet, astray, astray], [POUR, POUR, RETRACT]),
     ):
-        said = iter(moments)
-        monkeypatch.setattr(pouring_policy, "log_probabilities", lambda head, x, said=said: next(said))
+        lines = iter(moments)
+        monkeypatch.setattr(pouring_policy, "log_probabilities", lambda head, x, lines=lines: next(lines))
         policy = pouring_policy.Touch(encoder, None, stills=True, votes=3)
         policy.begin(1)
         frames = np.zeros((1, SIDE, SIDE, 3), np.uint8)
@@ -271,11 +271,11 @@ def test_fine_tuning_trains_the_encoder_and_keeps_the_first_policy(shown, encode
     moved = jax.tree.map(lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()), tuned.encoder.params, before)
     assert max(jax.tree.leaves(moved)) > 1e-5
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, encoder.params), before)
-    found = pouring.run(replace(TASK, limit=9), *pouring.draw_runs(TASK, 3, 2), tuned, side=SIDE)
-    assert found.poured.shape == (2,) and found.frames is None
+    result = pouring.run(replace(TASK, limit=9), *pouring.draw_runs(TASK, 3, 2), tuned, side=SIDE)
+    assert result.poured.shape == (2,) and result.frames is None
 
 
-def test_fine_tuning_that_goes_astray_is_told(shown, encoder):
+def test_fine_tuning_that_diverges_is_reported(shown, encoder):
     policy = pouring_policy.learn_frozen(encoder, shown, replace(FAST, steps=5), stills=False)
     with pytest.raises(UserError, match=r"went astray .*lower tune_rate"):
         pouring_policy.fine_tune(policy, shown, replace(FAST, tune_steps=12, tune_rate=1e30))
@@ -291,11 +291,11 @@ def test_fine_tuning_decides_on_what_the_closed_loop_sees(shown, encoder):
     clips = pouring_policy.segments(encoder, shown.frames, where.reshape(-1, 2), 3).reshape(6, 6, 3, SIDE, SIDE, 3)
     params = {"encoder": encoder.params, "head": {"basis": policy.head.basis, "layers": policy.head.layers}}
     row = encoder.sensor_row(policy.sensor)
-    found = pouring_policy.logits_of(params, clips, net=encoder.net, pooling="both", mean=policy.head.mean, sensor=row)
+    result = pouring_policy.logits_of(params, clips, net=encoder.net, pooling="both", mean=policy.head.mean, sensor=row)
     moment = chains.numbers[:, 3:] - pouring_policy.LIFTED
     runs = np.broadcast_to(chains.runs[:, None], moment.shape)
     expected = wanted.reshape(4, 2, 3)[moment, runs]
-    np.testing.assert_allclose(found[chains.inside], expected[chains.inside], atol=1e-4 * np.abs(wanted).max())
+    np.testing.assert_allclose(result[chains.inside], expected[chains.inside], atol=1e-4 * np.abs(wanted).max())
 
 
 def test_every_moment_of_choice_is_as_likely_in_a_chain():
@@ -323,9 +323,9 @@ def test_without_a_look_nothing_is_drawn(monkeypatch):
     assert pouring.run(replace(TASK, limit=4), setups, keys, pouring.Expert(TASK)).frames is None
 
 
-def test_mistakes_are_one_sentence(told, encoder):
+def test_mistakes_are_one_sentence(reported, encoder):
     with pytest.raises(UserError, match="no frames"):
-        pouring_policy.features(encoder, told, stills=True)
+        pouring_policy.features(encoder, reported, stills=True)
     with pytest.raises(UserError, match="not finite"):
         pouring_policy.imitate(np.full((4, 2), np.nan), np.zeros(4, int), np.arange(4), FAST)
     with pytest.raises(UserError, match="tune_steps"):

@@ -56,14 +56,14 @@ def test_mistakes_are_one_sentence(monkeypatch, name, word, sentence):
 
 def test_a_page_that_is_run_as_a_script_ends_with_the_sentence(monkeypatch):
     monkeypatch.setenv("RUN", "nix")
-    found = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-m", "experiments.tables.long_clips"], capture_output=True, text=True, check=False, cwd=ROOT
     )
-    lines = found.stderr.splitlines()
-    assert found.returncode == 1 and len(lines) == 1 and lines[0].startswith("long_clips.py: ") and "nix" in lines[0]
+    lines = result.stderr.splitlines()
+    assert result.returncode == 1 and len(lines) == 1 and lines[0].startswith("long_clips.py: ") and "nix" in lines[0]
 
 
 def test_a_page_that_is_interrupted_says_so():
     words = [sys.executable, "-c", "from experiments.tables import env\nraise KeyboardInterrupt"]
-    found = subprocess.run(words, capture_output=True, text=True, check=False, cwd=ROOT)
-    assert found.returncode != 0 and found.stderr == "-c: interrupted; the same command goes on\n"
+    result = subprocess.run(words, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert result.returncode != 0 and result.stderr == "-c: interrupted; the same command goes on\n"

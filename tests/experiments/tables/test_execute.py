@@ -1,4 +1,4 @@
-"""Running the plan with a trainer that only takes notes: order, sharing, resumption, the budget, failures."""
+"""Running the plan with a trainer that only takes notes: order, sharing, resumption, failures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from experiments.records import read_records, write_record
-from experiments.tables import budget, plan
+from experiments.tables import plan
 from experiments.tables.execute import PAUSE, execute
 from experiments.tables.work import Work
 
@@ -22,12 +22,12 @@ NAME = "matrix.jsonl"
 
 
 class Notes:
-    """A worker that takes, on its own clock, as long as the plan says (times `slow`)."""
+    """A worker that only notes what it is asked for."""
 
-    def __init__(self, slow: float = 1.0, fail: str = "", stop_at: str = "") -> None:
+    def __init__(self, fail: str = "", stop_at: str = "") -> None:
         self.done: set[str] = set()
         self.calls: list[str] = []
-        self.time, self.slow, self.fail, self.stop_at = 0.0, slow, fail, stop_at
+        self.fail, self.stop_at = fail, stop_at
         self.elsewhere: set[str] = set()  # what another process works on
 
     def claim(self, name):
@@ -37,37 +37,31 @@ class Notes:
         return self.done
 
     def make(self, one, size):
-        self._did(one.name, budget.of_scenes(one, size))
+        self._did(one.name)
 
     def train(self, one):
         assert one.init is None or one.init.key in self.done
         if one.key == self.stop_at:
             self.stop_at = ""
             raise KeyboardInterrupt
-        self._did(one.key, budget.of_training(one))
+        self._did(one.key)
 
     def score(self, leaf):
         assert all(one.key in self.done for one in leaf.trainings)
         if leaf.name == self.fail:
             raise UserError("no such column")
-        self.time += self.slow * budget.of_scores(leaf)
         self.calls.append(leaf.key)
         return {"rows": []}
 
-    def _did(self, name, seconds):
+    def _did(self, name):
         assert name not in self.done, "made twice"
         self.calls.append(name)
         self.done.add(name)
-        self.time += self.slow * seconds
-
-    def clock(self):
-        return self.time
 
 
 def run(work, out, **options):
-    said: list[str] = []
-    result = execute(options.pop("leaves", LEAVES), work, out / NAME, log=said.append, clock=work.clock, **options)
-    return result, said
+    lines: list[str] = []
+    return execute(LEAVES, work, out / NAME, log=lines.append, **options), lines
 
 
 def test_each_training_is_made_once_and_every_run_leaves_a_record(tmp_path):
@@ -87,14 +81,14 @@ def test_each_training_is_made_once_and_every_run_leaves_a_record(tmp_path):
 def test_a_finished_run_is_not_repeated_and_one_of_other_settings_is(tmp_path):
     run(Notes(), tmp_path)
     work = Notes()
-    result, said = run(work, tmp_path)
-    assert not result.made and not work.calls and not said and len(result.found) == len(LEAVES)
+    result, lines = run(work, tmp_path)
+    assert not result.made and not work.calls and not lines and len(result.kept) == len(LEAVES)
     write_record(tmp_path / NAME, LEAVES[2].key, {"identity": "of other settings"})
     result, _ = run(Notes(), tmp_path)
     assert result.made == [LEAVES[2].key]
 
 
-def test_a_half_done_run_is_gone_on_with(tmp_path):
+def test_a_half_done_run_is_continued(tmp_path):
     last = LEAVES[1].trainings[-1].key
     work = Notes(stop_at=last)
     with pytest.raises(KeyboardInterrupt):
@@ -102,54 +96,13 @@ def test_a_half_done_run_is_gone_on_with(tmp_path):
     assert [*read_records(tmp_path / NAME)] == [LEAVES[0].key]
     first = list(work.calls)
     result, _ = run(work, tmp_path)
-    assert result.found == [LEAVES[0].key] and result.made == [leaf.key for leaf in LEAVES[1:]]
+    assert result.kept == [LEAVES[0].key] and result.made == [leaf.key for leaf in LEAVES[1:]]
     assert work.calls[len(first)] == last  # nothing that was there is made again
 
 
-def test_it_stops_before_a_run_that_does_not_fit_and_goes_on_later(tmp_path):
-    work, files = Notes(), []
-    for _ in range(20):
-        began = work.time
-        result, said = run(work, tmp_path, minutes=40)
-        assert work.time - began <= 40 * 60
-        files += result.made
-        if not result.left:
-            break
-        assert "left for the next call" in said[-1] and result.left == [leaf.key for leaf in LEAVES][len(files) :]
-    assert files == [leaf.key for leaf in LEAVES]
-
-
-def test_a_slow_machine_is_noticed(tmp_path):
-    quick, _ = run(Notes(), tmp_path / "a", minutes=40)
-    slow, _ = run(Notes(slow=1.5), tmp_path / "b", minutes=40)
-    assert 0 < len(slow.made) < len(quick.made)
-    for minutes in range(25, 61):
-        work = Notes(slow=1.5)
-        run(work, tmp_path / str(minutes), minutes=minutes)
-        assert work.time <= 60 * minutes
-
-
-def test_waiting_for_others_is_no_slow_machine(tmp_path):
-    by_itself, work, leaves = Notes(), Notes(), LEAVES[:2]
-    work.elsewhere = {leaves[1].key}
-
-    def pause(seconds):  # the other process is lost after an hour, with nothing done
-        work.time += 60 * 60
-        work.elsewhere = set()
-
-    run(by_itself, tmp_path / "a", leaves=leaves)
-    result, _ = run(work, tmp_path / "b", leaves=leaves, minutes=by_itself.time / 60 + 61, pause=pause)
-    assert not result.left
-
-
-def test_a_budget_for_nothing_is_a_sentence(tmp_path):
-    with pytest.raises(UserError, match=r"takes about \d+ minutes .* MINUTES is 1; give more"):
-        run(Notes(), tmp_path, minutes=1)
-
-
-def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path):
-    result, said = run(Notes(fail="no_text"), tmp_path)
-    assert list(result.failed.values()) == ["no such column"] and "no_text-0 failed" in "\n".join(said)
+def test_a_run_that_fails_is_logged_and_the_others_go_on(tmp_path):
+    result, lines = run(Notes(fail="no_text"), tmp_path)
+    assert list(result.failed.values()) == ["no such column"] and "no_text-0 failed" in "\n".join(lines)
     assert len(result.made) == len(LEAVES) - 1 and "ablations-no_text-0" not in read_records(tmp_path / NAME)
 
 
@@ -169,7 +122,7 @@ def test_what_another_process_works_on_is_left_to_it(tmp_path):
 
     result, _ = run(work, tmp_path, pause=pause)
     assert 1 < len(need) < len(LEAVES) - 1 and LEAVES[-1] not in need
-    assert result.found == [LEAVES[-1].key] and sorted(result.made) == sorted(leaf.key for leaf in LEAVES[:-1])
+    assert result.kept == [LEAVES[-1].key] and sorted(result.made) == sorted(leaf.key for leaf in LEAVES[:-1])
     assert not {"coarse", training.key, LEAVES[-1].key} & set(work.calls)
     assert {leaf.key for leaf in need} == set(result.made[-len(need) :])  # the others did not wait for it
 

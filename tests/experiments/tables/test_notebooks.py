@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +9,7 @@ from dataclasses import replace
 import pytest
 import synthetic
 from places import ROOT
+from scripts import visit
 
 from anytouch_jax.errors import UserError
 from experiments.tables import page, plan
@@ -20,10 +20,8 @@ PAGES = {
 }  # fmt: skip
 
 
-def visit(name, monkeypatch, results, figures):
-    monkeypatch.setenv("RESULTS", str(results))
-    monkeypatch.setenv("FIGURES", str(figures))
-    return runpy.run_path(str(ROOT / "experiments" / "tables" / f"{name}.py"))
+def show(name, monkeypatch, results, figures):
+    return visit(monkeypatch, f"tables/{name}.py", RESULTS=results, FIGURES=figures)
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +35,15 @@ def made_up(tmp_path_factory):
     "name", ["q2_space", *(pytest.param(one, marks=pytest.mark.slow) for one in PAGES if one != "q2_space")]
 )
 def test_a_page_shows_its_picture_and_its_finding(name, made_up, tmp_path, monkeypatch, capsys):
-    found = visit(name, monkeypatch, made_up, tmp_path)
+    result = show(name, monkeypatch, made_up, tmp_path)
     out = capsys.readouterr().out
-    assert found["path"] == tmp_path / f"{PAGES[name]}.png" and found["path"].stat().st_size > 5000
-    assert (found["text"] in out and "3 seeds" in out) or name == "new_sensor"
+    assert result["path"] == tmp_path / f"{PAGES[name]}.png" and result["path"].stat().st_size > 5000
+    assert (result["text"] in out and "3 seeds" in out) or name == "new_sensor"
     assert len(out.splitlines()) > 12
 
 
 def test_a_page_without_results_says_what_to_do(tmp_path, monkeypatch, capsys):
-    visit("ablations", monkeypatch, tmp_path / "matrix.jsonl", tmp_path)
+    show("ablations", monkeypatch, tmp_path / "matrix.jsonl", tmp_path)
     assert "`make experiments ONLY=ablations` makes them" in capsys.readouterr().out
 
 
@@ -57,12 +55,12 @@ def test_accuracies_alone_are_averaged(tmp_path, monkeypatch, capsys):
         lambda question, name, seed, view, task: 0.9 * (task == "force") * (name == "t3"),
     )
     monkeypatch.setattr("experiments.tables.pictures.draw_all", lambda runs, folder: [])
-    visit("q3_perception", monkeypatch, tmp_path / "matrix.jsonl", tmp_path)
-    found = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("T3-style ")]
-    assert found == [["T3-style", "static", "+0.0"], ["T3-style", "dynamic", "+0.0"]]
+    show("q3_perception", monkeypatch, tmp_path / "matrix.jsonl", tmp_path)
+    result = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("T3-style ")]
+    assert result == [["T3-style", "static", "+0.0"], ["T3-style", "dynamic", "+0.0"]]
 
 
-def test_a_run_of_ones_own_is_asked_for_in_one_line(monkeypatch, capsys, tmp_path):
+def test_a_run_of_yours_is_asked_for_in_one_line(monkeypatch, capsys, tmp_path):
     monkeypatch.delenv("RUN", raising=False)
     assert page.yours("q2", []) == [] and len(capsys.readouterr().out.splitlines()) == 1
     monkeypatch.setenv("RUN", str(tmp_path / "none"))
@@ -71,7 +69,7 @@ def test_a_run_of_ones_own_is_asked_for_in_one_line(monkeypatch, capsys, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, tiny_run, compiled_once):
+def test_a_run_of_yours_is_scored_next_to_ours(tmp_path, monkeypatch, capsys, tiny_run, compiled_once):
     size = replace(plan.QUICK, own=24, fine=24, coarse=24, other=24, objects=24, frames=6)
     monkeypatch.setattr(page, "SIZE", size)
     monkeypatch.setenv("RUN", str(tiny_run))
@@ -79,10 +77,10 @@ def test_a_run_of_ones_own_is_scored_beside_ours(tmp_path, monkeypatch, capsys, 
     synthetic.write(tmp_path / "made.jsonl", plan.leaves(plan.FULL))
     monkeypatch.setattr("experiments.tables.pictures.draw_all", lambda runs, folder: [])
     for name, least in (("q2_space", 6), ("q1_sensors", 8), ("dynamics", 19)):
-        mine = visit(name, monkeypatch, tmp_path / "made.jsonl", tmp_path)["mine"]
+        mine = show(name, monkeypatch, tmp_path / "made.jsonl", tmp_path)["mine"]
         out = capsys.readouterr().out
         assert len(mine) >= least and all(f"| {row['view']} | {row['task']} |" in out for row in mine)
-        assert f"{mine[0]['mean']:.3f}" in out and "| 0.500 |" in out  # theirs beside
+        assert f"{mine[0]['mean']:.3f}" in out and "| 0.500 |" in out  # ours
     assert "is made, about" not in out  # the data sets of the first page serve the others
 
 

@@ -42,8 +42,8 @@ def test_the_four_spaces_have_a_mark_for_every_touch_and_sensor(tmp_path):
 def test_the_four_spaces_are_of_one_seed(tmp_path):
     synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed != 0])
     runs = [run for run in read(tmp_path / "matrix.jsonl") if (run.name, run.seed) != ("masked", 1)]
-    chosen, told = pictures.q2(runs, tmp_path / "a.png"), pictures.q2(runs, tmp_path / "b.png", seed=2)
-    assert chosen.read_bytes() == told.read_bytes()  # masked has no seed 1, so all are of seed 2
+    chosen, reported = pictures.q2(runs, tmp_path / "a.png"), pictures.q2(runs, tmp_path / "b.png", seed=2)
+    assert chosen.read_bytes() == reported.read_bytes()  # masked has no seed 1, so all are of seed 2
     first = pictures.q2(read(tmp_path / "matrix.jsonl"), tmp_path / "first.png")
     assert first.read_bytes() == pictures.q2(read(tmp_path / "matrix.jsonl"), tmp_path / "one.png", seed=1).read_bytes()
     apart = [run for run in runs if (run.name == "masked") == (run.seed == 2)]

@@ -1,15 +1,10 @@
-"""The graph of the matrix: what is shared, what a run's result hangs on, what it costs."""
+"""The graph of the matrix: what is shared, and what a run's result depends on."""
 
 from __future__ import annotations
 
 import dataclasses
-import statistics
 
-import pytest
-from places import EXPERIMENTS
-
-from experiments.records import read_records
-from experiments.tables import budget, plan
+from experiments.tables import plan
 from experiments.tables.paper import TABLE1, TABLE6
 
 LEAVES = plan.leaves(plan.FULL)
@@ -54,7 +49,8 @@ def test_table_1_adds_sensors_without_touches_felt_twice():
     for name in list(TABLE1)[1:]:
         one = BY_NAME["q1", name, 0].model
         assert one.config.data.manifests == tuple(f"own/{sensor}" for sensor in name.split("+"))
-        assert one.config.model.sensors == (*name.split("+"), "universal") and not budget.matches(one)
+        assert one.config.model.sensors == (*name.split("+"), "universal")
+        assert not set(one.config.data.manifests) & set(plan.ALIGNED)
     rivals = [BY_NAME["restricted", name, 0].model.config for name in ("unitouch", "no_matching")]
     assert rivals[0].data.manifests == rivals[1].data.manifests and rivals[0].model.sensors == rivals[1].model.sensors
 
@@ -95,46 +91,3 @@ def test_without_real_data_there_is_no_real_run():
         "real"
     }
     assert plan.REAL in BY_NAME["real", "anytouch", 0].model.config.data.manifests
-
-
-def test_the_matrix_fits_in_its_hours():
-    assert 3 * 3600 < sum(budget.costs(LEAVES)) / 1.35 < 4.1 * 3600
-    assert sum(budget.costs(plan.leaves(plan.QUICK))) < 16 * 60
-    assert max(budget.costs(LEAVES)) < 75 * 60
-
-
-def test_cost_counts_what_is_shared_once():
-    anytouch, text = BY_NAME["ablations", "anytouch", 0], BY_NAME["ablations", "no_text", 0]
-    data = {one.name for one in plan.scenes(plan.FULL)}
-    lock = budget.cost(text, data)
-    after = budget.cost(text, data | {one.key for one in anytouch.trainings})
-    assert lock - after == pytest.approx(budget.of_training(text.trainings[0]))
-    assert budget.cost(text, ()) - lock == pytest.approx(
-        sum(budget.of_scenes(one, plan.FULL) for one in plan.scenes(plan.FULL))
-    )
-    assert budget.costs([anytouch, anytouch])[1] == budget.of_scores(anytouch)
-
-
-def test_rates_are_what_the_committed_runs_took():
-    taken: dict[str, float] = {}
-    for record in read_records(EXPERIMENTS / "results" / "matrix.jsonl").values():
-        taken |= {one["key"]: one["seconds"] for one in record["trained"]}
-    found = {one.key: one for leaf in LEAVES for one in leaf.trainings if one.key in taken}
-    assert found
-    ratios = [taken[key] / budget.of_training(one) for key, one in found.items()]
-    assert 0.5 < statistics.median(ratios) < 2.5  # from one day to another these machines differ by a factor of two
-
-
-@pytest.mark.parametrize("of", [1, 3, 8])
-def test_chunks_are_all_runs_once_and_in_order(of):
-    parts = [budget.chunk(LEAVES, number, of) for number in range(1, of + 1)]
-    assert [leaf for part in parts for leaf in part] == LEAVES
-    whole = sum(budget.costs(LEAVES))
-    for part in parts:
-        assert sum(budget.costs(part)) < whole / of + 30 * 60  # what it makes again
-        assert of < 8 or sum(budget.costs(part)) < 75 * 60
-
-
-def test_a_chunk_that_is_none_is_refused():
-    with pytest.raises(ValueError, match="count from 1"):
-        budget.chunk(LEAVES, 0, 3)

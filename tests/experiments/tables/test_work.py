@@ -29,7 +29,7 @@ def write_data(folder, text):
 
 
 class Trainer:
-    """Stands for `pretrain`: takes ten seconds of a clock of its own, is interrupted when told."""
+    """Stands for `pretrain`: takes ten seconds of its clock, is interrupted on request."""
 
     def __init__(self, patch):
         self.calls, self.time, self.stop = [], 0.0, False
@@ -51,13 +51,13 @@ def trainer(monkeypatch):
 @pytest.fixture
 def work(tmp_path):
     write_data(tmp_path, "one")
-    said = []
-    found = Work(tmp_path, log=said.append)
-    found.said = said
-    return found
+    lines = []
+    result = Work(tmp_path, log=lines.append)
+    result.said = lines
+    return result
 
 
-def test_a_training_on_other_data_is_not_finished_and_is_begun_anew(work, trainer):
+def test_a_training_on_other_data_is_not_finished_and_starts_again(work, trainer):
     sets = {"own", "fine", "coarse", "other"}
     assert work.ready(LEAF) == sets
     for one in LEAF.trainings:
@@ -67,7 +67,7 @@ def test_a_training_on_other_data_is_not_finished_and_is_begun_anew(work, traine
     assert work.ready(LEAF) == sets
     work.train(FIRST)
     assert trainer.calls[-1] == (FIRST.key, False)  # nothing is left of the first one
-    assert f"  {FIRST.key} was trained on other data: it is begun anew" in work.said
+    assert f"  {FIRST.key} was trained on other data: it starts again" in work.said
     assert work.ready(LEAF) == sets | {FIRST.key}
 
 
@@ -100,9 +100,9 @@ def test_a_record_names_the_data_that_were_learned_from(work, trainer, monkeypat
         work.train(one)
     learned = work._contents(LEAF.model)
     write_data(work.folder, "two")
-    found = work.score(LEAF)
-    assert {name: found["data"][name] for name in learned} == learned and "own/digit" in found["data"]
-    assert all("of" not in one and one["seconds"] == 10.0 for one in found["trained"])
+    result = work.score(LEAF)
+    assert {name: result["data"][name] for name in learned} == learned and "own/digit" in result["data"]
+    assert all("of" not in one and one["seconds"] == 10.0 for one in result["trained"])
 
 
 def test_adapted_runs_are_made_again_for_other_data_or_weights(tmp_path, monkeypatch):

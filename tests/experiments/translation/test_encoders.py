@@ -67,4 +67,4 @@ def test_nothing_but_the_manifests_differs_from_the_tables_of_the_paper():
                 alike = replace(mine.config.data, manifests=theirs.config.data.manifests)
                 assert alike == theirs.config.data
                 assert (mine.config.model, mine.config.objective) == (theirs.config.model, theirs.config.objective)
-                assert all(found.endswith(encoders.LESS) for found in mine.config.data.manifests)
+                assert all(result.endswith(encoders.LESS) for result in mine.config.data.manifests)

@@ -31,8 +31,8 @@ def plain() -> list[dict[str, Any]]:
 def test_a_pair_is_one_frame_of_one_touch_by_two_sensors():
     rows = plain()
     rows = [rows[i] for i in np.random.default_rng(0).permutation(len(rows))]
-    found = table(rows)
-    split = pairs.find_pairs(found, A, B)
+    result = table(rows)
+    split = pairs.find_pairs(result, A, B)
     for part, name in ((split.train, "train"), (split.test, "test")):
         assert len(part.source) == len(part.target) == 12 == len(set(part.source)) == len(set(part.target))
         for first, second in zip(part.source, part.target, strict=True):
@@ -52,8 +52,8 @@ def test_what_has_no_partner_is_left_out():
     rows += felt(A, "train", 10, touch=None) + felt(B, "train", 10, touch=None)
     rows += felt(A, "train", 11, grade=None) + felt(B, "train", 11, grade=None)  # a real recording has no grade
     rows += felt(A, "train", 12)
-    found = pairs.find_pairs(table(rows), A, B)
-    numbers = [rows[i]["object"] for i in found.train.source]
+    result = pairs.find_pairs(table(rows), A, B)
+    numbers = [rows[i]["object"] for i in result.train.source]
     assert len(numbers) == 12 + 2 + 3
     assert numbers.count("train thing 8") == 2 and numbers.count("train thing 11") == 3
 
@@ -116,18 +116,18 @@ def test_encoders_are_trained_on_other_objects():
 
 
 def test_pixels_and_fields_come_in_the_order_of_the_rows(tmp_path):
-    found = manifests.read(make_pairs(tmp_path, {"train": 5, "test": 2}))
-    split = pairs.find_pairs(found, A, B)
-    x, y = pairs.read_pairs(found, split.train, 14)
+    result = manifests.read(make_pairs(tmp_path, {"train": 5, "test": 2}))
+    split = pairs.find_pairs(result, A, B)
+    x, y = pairs.read_pairs(result, split.train, 14)
     assert x.shape == y.shape == (10, 14, 14, 3) and x.dtype == np.uint8
     for part, images in ((split.train.source, x), (split.train.target, y)):
         for k in (0, 7, 9):
-            image = cv2.imread(str(found.file(int(part[k]))))[..., ::-1]
+            image = cv2.imread(str(result.file(int(part[k]))))[..., ::-1]
             np.testing.assert_array_equal(images[k], cv2.resize(image, (14, 14), interpolation=cv2.INTER_AREA))
-    field_pairs = pairs.find_pairs(found, "digit", "tac3d").test
-    x, y = pairs.read_pairs(found, field_pairs, 14)
+    field_pairs = pairs.find_pairs(result, "digit", "tac3d").test
+    x, y = pairs.read_pairs(result, field_pairs, 14)
     assert y.shape == (4, 20, 20, 6) and y.dtype == np.float32 and len(x) == 4
-    np.testing.assert_array_equal(y[3], np.load(found.file(int(field_pairs.target[3]), "field_path")))
+    np.testing.assert_array_equal(y[3], np.load(result.file(int(field_pairs.target[3]), "field_path")))
 
 
 @pytest.mark.parametrize(
@@ -140,9 +140,9 @@ def test_pixels_and_fields_come_in_the_order_of_the_rows(tmp_path):
     ],
 )
 def test_a_bad_field_is_named(tmp_path, content, says):
-    found = manifests.read(make_pairs(tmp_path, {"train": 2, "test": 1}, frames=1))
-    rows = pairs.find_pairs(found, A, "tac3d").train.target
-    file = found.file(int(rows[1]), "field_path")
+    result = manifests.read(make_pairs(tmp_path, {"train": 2, "test": 1}, frames=1))
+    rows = pairs.find_pairs(result, A, "tac3d").train.target
+    file = result.file(int(rows[1]), "field_path")
     if content is None:
         file.unlink()
     elif isinstance(content, bytes):
@@ -150,7 +150,7 @@ def test_a_bad_field_is_named(tmp_path, content, says):
     else:
         np.save(file, content)
     with pytest.raises(UserError, match=says) as error:
-        pairs.read_fields(found, rows)
+        pairs.read_fields(result, rows)
     assert str(file) in str(error.value) and f"row {rows[1]}" in str(error.value)
     with pytest.raises(UserError, match="has no field_path"):
-        pairs.read_fields(found, pairs.find_pairs(found, A, B).train.target)
+        pairs.read_fields(result, pairs.find_pairs(result, A, B).train.target)

@@ -56,8 +56,8 @@ def test_a_translation_is_trained_scored_and_kept(run, world_of_pairs):
 def test_an_image_becomes_an_image(run, world_of_pairs, script, tmp_path):
     out = tmp_path / "new" / "a.png"
     words = ("--model", run, "--source", "gelsight_mini", "--target", "duragel", "--out", out)
-    said = script(translate, picture(world_of_pairs), *words)
-    assert said.status == 0 and said.out.strip() == str(out)
+    lines = script(translate, picture(world_of_pairs), *words)
+    assert lines.status == 0 and lines.out.strip() == str(out)
     made = cv2.imread(str(out))[..., ::-1]
     given = cv2.imread(str(picture(world_of_pairs)))[..., ::-1]
     np.testing.assert_array_equal(made, load(run / "generators" / "gelsight_mini-duragel")(given[None])[0])
@@ -65,11 +65,11 @@ def test_an_image_becomes_an_image(run, world_of_pairs, script, tmp_path):
 
 def test_several_images_and_fields(run, world_of_pairs, script, tmp_path):
     images = [picture(world_of_pairs, k) for k in range(2)]
-    said = script(translate, *images, "--model", run, "--out", tmp_path)
-    assert said.status == 0
+    lines = script(translate, *images, "--model", run, "--out", tmp_path)
+    assert lines.status == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == [f"{image.stem}_duragel.png" for image in images]
-    said = script(translate, images[0], "--model", run, "--source", "digit", "--target", "tac3d", "--out", tmp_path)
-    assert said.status == 0
+    lines = script(translate, images[0], "--model", run, "--source", "digit", "--target", "tac3d", "--out", tmp_path)
+    assert lines.status == 0
     field = np.load(tmp_path / f"{images[0].stem}_tac3d.npy")
     assert field.shape == (20, 20, 6) and field.dtype == np.float32
 
@@ -77,12 +77,12 @@ def test_several_images_and_fields(run, world_of_pairs, script, tmp_path):
 def test_a_generator_of_its_own_place(run, world_of_pairs, script, tmp_path):
     words = ("--source", "gelsight_mini", "--target", "tac3d")
     home = tmp_path / "mine"
-    said = script(translate, "--fit", "--data", world_of_pairs, "--model", run, *words, "--out", home, *FIT)
-    assert said.status == 0 and "held-out objects" in said.out
-    said = script(translate, picture(world_of_pairs), "--generator", home, *words, "--out", tmp_path / "f.npy")
-    assert said.status == 0 and np.load(tmp_path / "f.npy").shape == (20, 20, 6)
-    said = script(translate, "--fit", "--data", world_of_pairs, "--model", run, *words, "--out", home, *FIT)
-    assert said.status == 2 and "--out" in said.err
+    lines = script(translate, "--fit", "--data", world_of_pairs, "--model", run, *words, "--out", home, *FIT)
+    assert lines.status == 0 and "held-out objects" in lines.out
+    lines = script(translate, picture(world_of_pairs), "--generator", home, *words, "--out", tmp_path / "f.npy")
+    assert lines.status == 0 and np.load(tmp_path / "f.npy").shape == (20, 20, 6)
+    lines = script(translate, "--fit", "--data", world_of_pairs, "--model", run, *words, "--out", home, *FIT)
+    assert lines.status == 2 and "--out" in lines.err
 
 
 def test_mistakes(run, world_of_pairs, script, tmp_path):
@@ -110,6 +110,6 @@ def test_mistakes(run, world_of_pairs, script, tmp_path):
         (("--fit", *data, "--model", run, "--steps", 0, "--out", tmp_path / "new"), "at least 1"),
     ]
     for given, named in cases:
-        said = script(translate, *given)
-        assert said.status == 2 and named in said.err and len(said.err.strip().splitlines()) == 1, given
+        lines = script(translate, *given)
+        assert lines.status == 2 and named in lines.err and len(lines.err.strip().splitlines()) == 1, given
     assert not list(tmp_path.glob("*.npy"))

@@ -74,21 +74,21 @@ def regressed(compiled_once) -> Generator:
 )
 def test_the_error_falls_on_a_fixed_batch(tune, adversarial):
     options = Fit(steps=40, batch=8, learning_rate=5e-3, tune=tune, adversarial=adversarial)
-    found, losses = training.fit(ENCODER, X[:8], Y[:8], **SENSORS, options=options, shape=IMAGE)
+    result, losses = training.fit(ENCODER, X[:8], Y[:8], **SENSORS, options=options, shape=IMAGE)
     first, last = losses[0]["error"], losses[-1]["error"]
     assert last < 0.5 * first and all(np.isfinite(list(line.values())).all() for line in losses)
     assert ("critic" in losses[-1]) == (adversarial > 0) and losses[-1]["step"] == 40
     # better than copying the mean of the very images that it was trained on
-    assert training.errors(found, X[:8], Y[:8]).mean() < 0.7 * training.mean_errors(found, Y[:8]).mean()
+    assert training.errors(result, X[:8], Y[:8]).mean() < 0.7 * training.mean_errors(result, Y[:8]).mean()
 
 
 @pytest.mark.parametrize("shape", [IMAGE, FIELD], ids=["unet", "mlp"])
 def test_the_references_learn_from_pixels_alone(shape):
     targets = FIELDS if shape.field else Y
     options = Fit(steps=40, batch=8, learning_rate=1e-2)
-    found, losses = training.fit(None, X, targets, **SENSORS, options=options, shape=shape)
-    assert set(found.params) == {"head", "fixed"} and "critic" not in losses[-1]
-    assert training.errors(found, X, targets).mean() < 0.6 * training.mean_errors(found, targets).mean()
+    result, losses = training.fit(None, X, targets, **SENSORS, options=options, shape=shape)
+    assert set(result.params) == {"head", "fixed"} and "critic" not in losses[-1]
+    assert training.errors(result, X, targets).mean() < 0.6 * training.mean_errors(result, targets).mean()
 
 
 def test_frozen_encoders_stay_bit_for_bit(made):
@@ -111,10 +111,10 @@ def test_the_state_that_does_best_on_other_objects_is_kept():
     """What is right for the training pairs is wrong for these: the first state is the best, and it is the one kept."""
     options = Fit(steps=40, batch=8, learning_rate=1e-2)
     val = X[:8], FIELDS[:8]
-    found, losses = training.fit(None, X[:8], -FIELDS[:8], **SENSORS, val=val, options=options, shape=FIELD)
-    told = [line["val"] for line in losses]
-    assert told[-1] > 1.02 * min(told) and len(told) == 20
-    np.testing.assert_allclose(training.errors(found, *val).mean(), min(told), rtol=1e-5)
+    result, losses = training.fit(None, X[:8], -FIELDS[:8], **SENSORS, val=val, options=options, shape=FIELD)
+    reported = [line["val"] for line in losses]
+    assert reported[-1] > 1.02 * min(reported) and len(reported) == 20
+    np.testing.assert_allclose(training.errors(result, *val).mean(), min(reported), rtol=1e-5)
     empty = X[:0], FIELDS[:0]
     assert "val" not in training.fit(None, X, FIELDS, **SENSORS, val=empty, options=options, shape=FIELD)[1][-1]
 
@@ -162,13 +162,13 @@ def test_each_network_moves_against_the_other():
     state, still = training.begin(one, params)
     x = np.asarray(features(one, params["encoder"], X[:8]))
     y = np.asarray(normalise_touch(Y[:8]))
-    seen = lambda pixels: judged(one, params["encoder"], pixels, None)  # noqa: E731
-    batch, rates = training.Batch(x, y, np.asarray(seen(y))), training.rates(one, params["fixed"], 1)
+    received = lambda pixels: judged(one, params["encoder"], pixels, None)  # noqa: E731
+    batch, rates = training.Batch(x, y, np.asarray(received(y))), training.rates(one, params["fixed"], 1)
     after, _ = training._step(nameless(one))(state, still, batch, rates)
 
     def looks(made, critic, real=None):
         out = predict(one, made | still, x) if real is None else real
-        return float(one.critic.apply(critic["head"], seen(out)).mean())
+        return float(one.critic.apply(critic["head"], received(out)).mean())
 
     assert looks(after.made, state.critic) > looks(state.made, state.critic)
     gap = lambda critic: looks(None, critic, y) - looks(state.made, critic)  # noqa: E731
@@ -183,15 +183,15 @@ def test_an_encoder_that_knows_touches_less_the_gel_judges_them_so():
     gel = np.random.default_rng(1).integers(60, 200, Y.shape[1:], np.uint8)
     touched = np.where(np.arange(len(Y)) % 3 == 0, 1, 0)[:, None, None, None] * np.uint8(90)
     targets = np.clip(gel.astype(int) - touched, 0, 255).astype(np.uint8)  # a third of the pairs touch every place
-    found, losses = training.fit(less, X, targets, **SENSORS, options=Fit(steps=2, batch=8), shape=IMAGE)
-    assert found.design.has_critic and "critic" in losses[-1]
-    bare = found.params["fixed"]["gel"]
+    result, losses = training.fit(less, X, targets, **SENSORS, options=Fit(steps=2, batch=8), shape=IMAGE)
+    assert result.design.has_critic and "critic" in losses[-1]
+    bare = result.params["fixed"]["gel"]
     np.testing.assert_allclose(bare, np.asarray(normalise_touch(gel)), atol=1e-5)
     images = np.random.default_rng(2).integers(0, 256, Y.shape, np.uint8)
     shown = np.stack(subtract_background(images, gel))
     assert (shown == 0).any() and (shown == 255).any()  # clipped on both sides
-    one, seen = found.design, np.asarray(judged(found.design, less.params, normalise_touch(images), bare))
-    np.testing.assert_allclose(seen, judged(one, less.params, normalise_touch(shown), None), atol=1e-4)
+    one, received = result.design, np.asarray(judged(result.design, less.params, normalise_touch(images), bare))
+    np.testing.assert_allclose(received, judged(one, less.params, normalise_touch(shown), None), atol=1e-4)
     assert "gel" not in training.fit(ENCODER, X, Y, **SENSORS, options=Fit(steps=1), shape=IMAGE)[0].params["fixed"]
 
 
@@ -208,16 +208,16 @@ def test_a_field_that_is_linear_in_the_features_is_found_again():
     images = rng.integers(0, 256, (1600, 28, 28, 3), np.uint8)
     shape = replace(FIELD, field=(2, 2, 3), hidden=64, few=8)
     one = design(shape)
-    seen = np.asarray(features(one, ENCODER.params, images))[:, one.shape.special :, :4].reshape(1600, -1)
-    seen = (seen - seen.mean(0)) / seen.std(0)
-    targets = (seen @ rng.standard_normal((seen.shape[1], 12)) / 8).reshape(-1, 2, 2, 3).astype(np.float32) + 4
+    received = np.asarray(features(one, ENCODER.params, images))[:, one.shape.special :, :4].reshape(1600, -1)
+    received = (received - received.mean(0)) / received.std(0)
+    targets = (received @ rng.standard_normal((received.shape[1], 12)) / 8).reshape(-1, 2, 2, 3).astype(np.float32) + 4
     options = Fit(steps=400, batch=64, learning_rate=1e-2)
-    found, _ = training.fit(
+    result, _ = training.fit(
         ENCODER, images[:1500], targets[:1500], source="digit", target="tac3d", options=options, shape=shape
     )
-    ours = training.errors(found, images[1500:], targets[1500:]).mean()
-    assert ours < 0.1 * training.mean_errors(found, targets[1500:]).mean()
-    away = found(images[1500:]) - targets[1500:]  # in the field's own units
+    ours = training.errors(result, images[1500:], targets[1500:]).mean()
+    assert ours < 0.1 * training.mean_errors(result, targets[1500:]).mean()
+    away = result(images[1500:]) - targets[1500:]  # in the field's own units
     assert np.sqrt((away**2).mean()) < 0.25 * targets.std()
 
 
@@ -227,10 +227,10 @@ def test_the_embedded_patches_and_up_to_four_blocks_of_an_encoder_are_read():
     deep = replace(MODEL, touch=replace(MODEL.touch, depth=9))
     many = replace(ENCODER, config=replace(ENCODER.config, model=deep))
     assert training._design(many, X, Y, "digit", "duragel", Fit(), None).shape.states == STATES
-    seen = np.asarray(features(design(shapes[0]), ENCODER.params, X[:2]))
-    assert seen.shape == (2, IMAGE.special + MODEL.patches, shapes[0].read)
+    received = np.asarray(features(design(shapes[0]), ENCODER.params, X[:2]))
+    assert received.shape == (2, IMAGE.special + MODEL.patches, shapes[0].read)
     last = np.asarray(features(design(), ENCODER.params, X[:2]))
-    np.testing.assert_allclose(seen[..., -last.shape[-1] :], last, atol=1e-6)
+    np.testing.assert_allclose(received[..., -last.shape[-1] :], last, atol=1e-6)
 
 
 def test_tokens_are_whitened_and_faint_directions_stay_faint():
@@ -245,17 +245,17 @@ def test_tokens_are_whitened_and_faint_directions_stay_faint():
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-4 * np.abs(matrix).max())
     assert np.isfinite(training.whitening(np.zeros((4, 3, 6), np.float32))).all()
     params = training.start(design(), ENCODER, X, Y)  # and a translation is given them so
-    seen = np.asarray(features(design(), ENCODER.params, X)).reshape(-1, MODEL.touch.width)
-    given = (seen - params["fixed"]["mean"]) @ params["fixed"]["whiten"]
+    received = np.asarray(features(design(), ENCODER.params, X)).reshape(-1, MODEL.touch.width)
+    given = (received - params["fixed"]["mean"]) @ params["fixed"]["whiten"]
     assert np.abs(np.linalg.eigvalsh(np.cov(given, rowvar=False))[-3:] - 1).max() < 0.1
 
 
 def test_a_target_that_never_changes_is_copied():
     same = np.repeat(Y[:1], len(X), axis=0)
     options = Fit(steps=1, batch=8, learning_rate=1e-9)
-    found = training.fit(ENCODER, X, same, **SENSORS, options=options, shape=IMAGE)[0]
-    assert training.mean_errors(found, same).max() < 1e-9
-    assert np.isfinite(training.errors(found, X, same)).all()
+    result = training.fit(ENCODER, X, same, **SENSORS, options=options, shape=IMAGE)[0]
+    assert training.mean_errors(result, same).max() < 1e-9
+    assert np.isfinite(training.errors(result, X, same)).all()
 
 
 @pytest.mark.parametrize("change", [{"steps": 0}, {"batch": 0}, {"adversarial": -1.0}, {"learning_rate": 0.0}])
@@ -264,7 +264,7 @@ def test_settings_that_make_no_sense(change):
         Fit(**change)
 
 
-def test_a_rate_that_blows_up_is_said():
+def test_a_rate_that_diverges_is_reported():
     options = Fit(steps=20, batch=8, learning_rate=1e30)
     with pytest.raises(UserError, match="not finite at step"):
         training.fit(ENCODER, X, Y, **SENSORS, options=options, shape=IMAGE)
@@ -334,7 +334,7 @@ def test_a_saved_generator_comes_back_bit_for_bit(made, regressed, tmp_path):
         assert load(folder / GENERATOR).design == one.design
 
 
-def test_what_is_no_generator_is_said(tmp_path):
+def test_what_is_no_generator_is_named(tmp_path):
     with pytest.raises(UserError, match=r"there is no generator in .*--fit"):
         load(tmp_path / "none")
     for name in ("digit-duragel", "gelslim-duragel"):

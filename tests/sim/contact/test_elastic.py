@@ -167,9 +167,9 @@ def test_the_tangential_kernels_of_a_layer_are_those_of_its_symbols():
     with jax.enable_x64(True):
         xx, xy, _ = elastic.tangential_spectra(plan, pitch, poisson, thickness, 1.0, jnp.float64)
         forward = plan.forward(jnp.asarray(load))
-        found = [np.asarray(plan.inverse(one)) * pitch for one in (plan.even(forward, xx), plan.odd(forward, xy))]
+        result = [np.asarray(plan.inverse(one)) * pitch for one in (plan.even(forward, xx), plan.odd(forward, xy))]
     symbols = along * cosine**2 + across * sine**2, (along - across) * cosine * sine
-    for one, symbol, tolerance in zip(found, symbols, (0.01, 0.02), strict=True):
+    for one, symbol, tolerance in zip(result, symbols, (0.01, 0.02), strict=True):
         moved = np.fft.ifft2(np.fft.fft2(load, wave.shape) * symbol).real[:n, :n]
         np.testing.assert_allclose(one, moved, atol=tolerance * np.abs(moved).max())
 
@@ -188,8 +188,8 @@ def test_the_sideways_kernel_is_that_of_its_symbol(poisson):
     moved = np.fft.ifft2(np.fft.fft2(load, wave.shape) * symbol).real[:n, :n]
     gel = Gel(modulus=1 - poisson**2, poisson=poisson, thickness=thickness)
     with jax.enable_x64(True):
-        found = np.asarray(sideways(jnp.asarray(load), gel, pitch))[..., 0]
+        result = np.asarray(sideways(jnp.asarray(load), gel, pitch))[..., 0]
     inside = np.s_[1:-1, 1:-1]  # one-sided differences at the rim
-    np.testing.assert_allclose(found[inside], moved[inside], atol=0.02 * np.abs(moved).max())
+    np.testing.assert_allclose(result[inside], moved[inside], atol=0.02 * np.abs(moved).max())
     turned = np.asarray(sideways(jnp.asarray(load.T, jnp.float32), gel, pitch))[..., 1].T
-    np.testing.assert_allclose(turned, found, atol=1e-3 * np.abs(moved).max())  # and float32 is enough
+    np.testing.assert_allclose(turned, result, atol=1e-3 * np.abs(moved).max())  # and float32 is enough

@@ -34,9 +34,9 @@ def fast(surface, depth, pitch):
 
 
 def solved(surface, depth, pitch, modulus_object=INF):
-    found = exact(jnp.asarray(surface, jnp.float32), depth, pitch, modulus_object)
-    assert found.converged
-    return jax.tree.map(np.asarray, found)
+    outcome = exact(jnp.asarray(surface, jnp.float32), depth, pitch, modulus_object)
+    assert outcome.converged
+    return jax.tree.map(np.asarray, outcome)
 
 
 def ball(pitch, radius=8.0, at=(0.0, 0.0)):
@@ -60,16 +60,16 @@ def test_hertz_sphere(depth):
     radius = 8.0
     a = np.sqrt(radius * depth)
     pitch = 3.2 * a / N
-    found = solved(ball(pitch, radius), depth, pitch)
-    assert found.force == pytest.approx(4 / 3 * PLANE * np.sqrt(radius) * depth**1.5 * 1e-3, rel=0.01)
-    assert np.sqrt(mechanics.area(found.pressure, pitch) / np.pi) == pytest.approx(a, rel=0.01)
-    assert found.pressure.max() == pytest.approx(2 * PLANE * np.sqrt(depth / radius) / np.pi, rel=0.01)
-    assert found.displacement.max() == pytest.approx(depth, rel=2e-3)
+    outcome = solved(ball(pitch, radius), depth, pitch)
+    assert outcome.force == pytest.approx(4 / 3 * PLANE * np.sqrt(radius) * depth**1.5 * 1e-3, rel=0.01)
+    assert np.sqrt(mechanics.area(outcome.pressure, pitch) / np.pi) == pytest.approx(a, rel=0.01)
+    assert outcome.pressure.max() == pytest.approx(2 * PLANE * np.sqrt(depth / radius) / np.pi, rel=0.01)
+    assert outcome.displacement.max() == pytest.approx(depth, rel=2e-3)
     x, y = grid(pitch)
     far = np.hypot(x, y) > 1.2 * a
     r = np.hypot(x, y)[far] / a
     outside = depth / np.pi * ((2 - r**2) * np.arcsin(1 / r) + np.sqrt(r**2 - 1))  # Johnson 3.42a
-    np.testing.assert_allclose(found.displacement[far], outside, rtol=0.01)
+    np.testing.assert_allclose(outcome.displacement[far], outside, rtol=0.01)
 
 
 def test_cylinder_on_its_line_load():
@@ -79,8 +79,8 @@ def test_cylinder_on_its_line_load():
     """
     radius, pitch = 4.0, 0.1
     x, _ = grid(pitch)
-    found = solved(-(x**2) / (2 * radius), 0.14, pitch)
-    section = found.pressure[N // 2 - 4 : N // 2 + 4].mean(0)
+    outcome = solved(-(x**2) / (2 * radius), 0.14, pitch)
+    section = outcome.pressure[N // 2 - 4 : N // 2 + 4].mean(0)
     line = section.sum() * pitch
     half_width = 2 * np.sqrt(line * radius / (np.pi * PLANE))
     assert 4 < half_width / pitch < 8
@@ -95,12 +95,12 @@ def test_flat_punch():
     radius, pitch, depth = 2.4, 0.1, 0.2
     x, y = grid(pitch)
     inside = np.hypot(x, y) <= radius
-    found = solved(np.where(inside, 0.0, -INF), depth, pitch)
+    outcome = solved(np.where(inside, 0.0, -INF), depth, pitch)
     a = np.sqrt(inside.sum() * pitch**2 / np.pi)
-    assert found.force == pytest.approx(2 * a * PLANE * depth * 1e-3, rel=0.02)
-    assert found.pressure[N // 2, N // 2] == pytest.approx(PLANE * depth / (np.pi * a), rel=0.02)
-    assert not found.pressure[~inside].any()
-    np.testing.assert_allclose(found.displacement[inside], depth, rtol=1e-4)
+    assert outcome.force == pytest.approx(2 * a * PLANE * depth * 1e-3, rel=0.02)
+    assert outcome.pressure[N // 2, N // 2] == pytest.approx(PLANE * depth / (np.pi * a), rel=0.02)
+    assert not outcome.pressure[~inside].any()
+    np.testing.assert_allclose(outcome.displacement[inside], depth, rtol=1e-4)
 
 
 @pytest.mark.parametrize("shape", ["ball", "rough"])
@@ -110,8 +110,8 @@ def test_force_is_the_slope_of_the_energy(shape):
     surface = ball(pitch) if shape == "ball" else rough(pitch)
     depths, energies = (0.28, 0.3, 0.32), []
     for depth in depths:
-        found = solved(surface, depth, pitch)
-        energies.append(0.5 * np.sum(found.pressure * found.displacement, dtype=np.float64) * pitch**2 * 1e-3)
+        outcome = solved(surface, depth, pitch)
+        energies.append(0.5 * np.sum(outcome.pressure * outcome.displacement, dtype=np.float64) * pitch**2 * 1e-3)
     work = (energies[2] - energies[0]) / (depths[2] - depths[0])
     assert work == pytest.approx(solved(surface, 0.3, pitch).force, rel=2e-3)
 
@@ -119,9 +119,9 @@ def test_force_is_the_slope_of_the_energy(shape):
 @pytest.mark.parametrize("solve", [exact, fast])
 def test_zero_depth_is_exactly_nothing(solve):
     for surface in (ball(0.1), rough(0.1), np.zeros((N, N)), np.full((N, N), -INF)):
-        found = solve(jnp.asarray(surface, jnp.float32), 0.0, 0.1)
-        assert not np.asarray(found.pressure).any() and not np.asarray(found.displacement).any()
-        assert found.force == 0 and found.converged
+        outcome = solve(jnp.asarray(surface, jnp.float32), 0.0, 0.1)
+        assert not np.asarray(outcome.pressure).any() and not np.asarray(outcome.displacement).any()
+        assert outcome.force == 0 and outcome.converged
 
 
 @pytest.mark.parametrize("solve", [exact, fast])
@@ -178,9 +178,9 @@ def square(pitch):
 @pytest.mark.parametrize("depth", [1e-7, 0.02, 1.0, 50.0])
 def test_hard_cases_converge_and_stay_finite(shape, depth):
     surface = jnp.asarray(shape(0.1), jnp.float32)
-    found = exact(surface, depth, 0.1)
-    assert found.converged and found.residual <= 2e-5
-    for result in (found, fast(surface, depth, 0.1)):
+    outcome = exact(surface, depth, 0.1)
+    assert outcome.converged and outcome.residual <= 2e-5
+    for result in (outcome, fast(surface, depth, 0.1)):
         assert all(np.isfinite(np.asarray(field)).all() for field in result)
         assert (np.asarray(result.pressure) >= 0).all()
         highest = max(float(jnp.max(jnp.where(jnp.isfinite(surface), surface, -1))) + depth, 0)  # apex between pixels
@@ -190,26 +190,26 @@ def test_hard_cases_converge_and_stay_finite(shape, depth):
 
 def test_hundreds_of_islands():
     surface = rough(0.1, spread=0.3)
-    found = solved(surface, -1.2 * surface.mean(), 0.1)
-    islands = cv2.connectedComponents((found.pressure > 0).astype(np.uint8), connectivity=4)[0] - 1
+    outcome = solved(surface, -1.2 * surface.mean(), 0.1)
+    islands = cv2.connectedComponents((outcome.pressure > 0).astype(np.uint8), connectivity=4)[0] - 1
     assert islands > 200
-    assert found.iterations < 100
+    assert outcome.iterations < 100
 
 
 def test_says_when_it_did_not_converge():
-    found = press(jnp.asarray(rough(0.1), jnp.float32), 0.1, Gel(), 0.1, iterations=2)
-    assert not found.converged and found.residual > 1e-4 and found.iterations == 2
-    assert np.isfinite(np.asarray(found.displacement)).all()
+    outcome = press(jnp.asarray(rough(0.1), jnp.float32), 0.1, Gel(), 0.1, iterations=2)
+    assert not outcome.converged and outcome.residual > 1e-4 and outcome.iterations == 2
+    assert np.isfinite(np.asarray(outcome.displacement)).all()
 
 
 def test_double_precision_in_double_precision_out():
     with jax.enable_x64(True):
-        found = press(jnp.asarray(ball(0.1)), 0.2, Gel(), 0.1, tolerance=1e-10)
-        assert found.pressure.dtype == found.force.dtype == jnp.float64
-        assert found.converged and found.residual <= 1e-10
+        outcome = press(jnp.asarray(ball(0.1)), 0.2, Gel(), 0.1, tolerance=1e-10)
+        assert outcome.pressure.dtype == outcome.force.dtype == jnp.float64
+        assert outcome.converged and outcome.residual <= 1e-10
     single = exact(jnp.asarray(ball(0.1), jnp.float32), 0.2, 0.1)
     assert single.pressure.dtype == single.displacement.dtype == single.force.dtype == jnp.float32
-    np.testing.assert_allclose(single.displacement, np.asarray(found.displacement), atol=2e-5)
+    np.testing.assert_allclose(single.displacement, np.asarray(outcome.displacement), atol=2e-5)
 
 
 def test_an_elastic_object_shares_the_deformation():
@@ -233,18 +233,18 @@ def test_a_thinner_layer_is_stiffer():
 def test_on_a_bonded_layer_an_elastic_object_moves_as_a_half_space_and_the_gel_as_a_layer():
     pitch, soft, gel = 0.25, PLANE / 3, Gel(thickness=2.0)
     surface = jnp.asarray(ball(pitch), jnp.float32)
-    found = press(surface, 0.6, gel, pitch, modulus_object=soft, tolerance=1e-5)
+    outcome = press(surface, 0.6, gel, pitch, modulus_object=soft, tolerance=1e-5)
     plan = Plan(N, N)
 
     def moves(thickness, modulus):
         spectrum = elastic.normal_spectrum(plan, pitch, gel.poisson, thickness, 1.0, jnp.float32)
-        return np.asarray(plan.inverse(plan.even(plan.forward(found.pressure * (pitch / modulus)), spectrum)))
+        return np.asarray(plan.inverse(plan.even(plan.forward(outcome.pressure * (pitch / modulus)), spectrum)))
 
     layer, object_ = moves(2.0, PLANE), moves(INF, soft)
-    np.testing.assert_allclose(found.displacement, layer, atol=2e-4)
-    touching = np.asarray(found.pressure) > 0
+    np.testing.assert_allclose(outcome.displacement, layer, atol=2e-4)
+    touching = np.asarray(outcome.pressure) > 0
     np.testing.assert_allclose((layer + object_)[touching], (np.asarray(surface) + 0.6)[touching], atol=1e-3)
-    assert abs(found.displacement[N // 2, 2]) < 0.02 * np.max(found.displacement)  # no dent like 1 / r far away
+    assert abs(outcome.displacement[N // 2, 2]) < 0.02 * np.max(outcome.displacement)  # no dent like 1 / r far away
     quick = press(surface, 0.6, gel, pitch, fidelity="fast", modulus_object=soft).displacement
     assert np.sqrt(np.mean((quick - layer) ** 2)) < 0.02 * layer.max()
 

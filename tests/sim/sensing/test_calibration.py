@@ -30,7 +30,7 @@ def test_the_package_carries_the_presses_in_red_green_blue(gelsight):
     assert tuple(calibration.read_background("gelsight_mini").mean((0, 1)).round()) == (83, 99, 113)
 
 
-def test_the_mini_circles_are_drawn_anew_and_agree_with_each_other():
+def test_the_mini_circles_are_drawn_again_and_agree_with_each_other():
     presses = calibration.read_presses("gelsight_mini")
     assert len(presses.radius) == 24
     moved = np.hypot(*(presses.centre - presses.recorded[:, :2]).T)
@@ -85,8 +85,8 @@ def synthetic(centre, size=(120, 160), width=12.0):
 @pytest.mark.parametrize("centre", [(80, 60), (91, 47), (62, 66)])
 def test_the_odd_centre_is_found_from_afar(centre):
     frame, plain = synthetic(centre)
-    found = calibration.odd_centre(frame, plain, np.array([78.0, 58.0]), 30)
-    np.testing.assert_allclose(found, centre, atol=1)
+    result = calibration.odd_centre(frame, plain, np.array([78.0, 58.0]), 30)
+    np.testing.assert_allclose(result, centre, atol=1)
 
 
 def test_the_circle_grows_with_the_dent_and_an_untouched_frame_has_none():

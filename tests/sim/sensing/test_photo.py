@@ -83,16 +83,16 @@ def test_textures_can_be_seen(texture):
         for thing in (draw_object("flat", t, "plastic", 4) for t in ("smooth", texture))
     )
     for seed in range(3):
-        seen = [fineness(photograph(t, (0.0, 0.0), np.random.default_rng(seed), 160)) for t in (plain, structured)]
-        assert seen[1] > 1.6 * seen[0]
+        received = [fineness(photograph(t, (0.0, 0.0), np.random.default_rng(seed), 160)) for t in (plain, structured)]
+        assert received[1] > 1.6 * received[0]
 
 
 @pytest.mark.parametrize("colour", [(0.8, 0.15, 0.1), (0.1, 0.6, 0.15), (0.15, 0.2, 0.8)])
 def test_the_material_gives_its_colour(colour):
     thing = painted(draw_object("flat", "weave", "fabric", 4), *colour)
     for seed in range(4):
-        seen = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 64)[24:40, 24:40].mean((0, 1))
-        assert np.argmax(seen) == np.argmax(colour) and seen.max() > 1.5 * seen.min()
+        received = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 64)[24:40, 24:40].mean((0, 1))
+        assert np.argmax(received) == np.argmax(colour) and received.max() > 1.5 * received.min()
 
 
 def test_gloss_makes_highlights():

@@ -78,11 +78,11 @@ def test_sizes_suit_a_gel():
 @pytest.mark.parametrize("texture", TEXTURES)
 def test_the_slopes_are_those_of_the_height_maps(texture):
     axis = np.arange(300) * 0.04
-    found = []
+    result = []
     for seed in range(3):
         z = height(Shape("flat", texture, 1e3, 1.0, 1.0, seed=seed), *np.meshgrid(axis, axis))
-        found.append(np.sqrt(np.mean(np.square(np.gradient(z, 0.04)).sum(0))))
-    assert np.mean(found) == pytest.approx(objects.TEXTURE_KINDS[texture].slope, rel=0.06)
+        result.append(np.sqrt(np.mean(np.square(np.gradient(z, 0.04)).sum(0))))
+    assert np.mean(result) == pytest.approx(objects.TEXTURE_KINDS[texture].slope, rel=0.06)
 
 
 def test_no_two_objects_feel_alike():
@@ -129,21 +129,23 @@ def test_labels_have_three_classes_each_and_follow_the_object():
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.35])
 @pytest.mark.parametrize("seed", range(5))
 def test_whole_pairs_are_held_out(share, seed):
-    seen, unseen = hold_out(THINGS, share, seed)
-    assert sorted((*seen, *unseen), key=THINGS.index) == list(THINGS)
-    assert list(seen) == sorted(seen, key=THINGS.index) and list(unseen) == sorted(unseen, key=THINGS.index)
-    assert not {t.kind for t in seen} & {t.kind for t in unseen}
-    assert {t.shape.primitive for t in seen} == set(PRIMITIVES) and {t.shape.texture for t in seen} == set(TEXTURES)
+    received, unseen = hold_out(THINGS, share, seed)
+    assert sorted((*received, *unseen), key=THINGS.index) == list(THINGS)
+    assert list(received) == sorted(received, key=THINGS.index) and list(unseen) == sorted(unseen, key=THINGS.index)
+    assert not {t.kind for t in received} & {t.kind for t in unseen}
+    assert {t.shape.primitive for t in received} == set(PRIMITIVES) and {t.shape.texture for t in received} == set(
+        TEXTURES
+    )
     largest = max(Counter(t.kind for t in THINGS).values())
     assert share * 64 <= len(unseen) < share * 64 + largest
-    assert hold_out(THINGS, share, seed) == (seen, unseen)
+    assert hold_out(THINGS, share, seed) == (received, unseen)
 
 
 def test_other_seeds_hold_out_others():
     assert len({hold_out(THINGS, 0.2, seed)[1] for seed in range(6)}) == 6
 
 
-def test_what_cannot_be_held_out_is_said():
+def test_what_cannot_be_held_out_is_reported():
     for share in (0.0, 1.0, -0.1, math.nan):
         with pytest.raises(UserError, match="between 0 and 1"):
             hold_out(THINGS, share, 0)

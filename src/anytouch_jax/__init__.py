@@ -9,42 +9,32 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "config": [
-        "Config",
-        "DataConfig",
-        "LossConfig",
-        "ModelConfig",
-        "OptimConfig",
-        "RunConfig",
-        "from_json",
-        "preset",
-        "to_json",
-    ],
-    "errors": ["UserError"],
-    "batch": ["AlignBatch", "MatchBatch", "Stage2Batch", "TouchBatch"],
-    "nn.functional": ["Net", "build"],
-    "ops.tokens": ["patchify", "unpatchify"],
-    "ops.masking": ["random_mask"],
-    "ops.losses": ["alignment_loss", "info_nce", "matching_loss", "reconstruction_loss"],
-    "objectives": ["stage1_loss", "stage1_terms", "stage2_loss", "stage2_terms", "trained_by"],
-    "train.step": ["TrainState", "init_state", "make_step"],
-    "train.optim": ["optimizer"],
-    "train.loop": ["fit"],
-    "pretrain": ["pretrain"],
-    "evaluate.array_probes": ["leave_groups_out", "probe_features"],
-    "evaluate.heads": ["ProbeHead", "load_head"],
-    "evaluate.probing": ["probe_benchmark", "probe_label", "probe_tasks"],
-    "data.loading.loader": ["Loader"],
-    "data.manifest.manifest": ["Manifest"],
-    "weights.tree": ["interpolate"],
-    "encoder.encoder": ["Encoder", "load_encoder", "random_encoder"],
-    "encoder.preprocess": ["Preprocess"],
+    "config": "Config DataConfig LossConfig ModelConfig OptimConfig RunConfig from_json preset to_json",
+    "errors": "UserError",
+    "batch": "AlignBatch MatchBatch Stage2Batch TouchBatch",
+    "nn.functional": "Net build",
+    "ops.tokens": "patchify unpatchify",
+    "ops.masking": "random_mask",
+    "ops.losses": "alignment_loss info_nce matching_loss reconstruction_loss",
+    "objectives": "stage1_loss stage1_terms stage2_loss stage2_terms trained_by",
+    "train.step": "TrainState init_state make_step",
+    "train.optim": "optimizer",
+    "train.loop": "fit",
+    "pretrain": "pretrain",
+    "evaluate.array_probes": "leave_groups_out probe_features",
+    "evaluate.heads": "ProbeHead load_head",
+    "evaluate.probing": "probe_benchmark probe_label probe_tasks",
+    "data.loading.loader": "Loader",
+    "data.manifest.manifest": "Manifest",
+    "weights.tree": "interpolate",
+    "encoder.encoder": "Encoder load_encoder random_encoder",
+    "encoder.preprocess": "Preprocess",
 }
 _ALIASES = {  # public names that say more outside their module
     "load_exported": ("encoder.export", "load"),
     "read_manifest": ("data.manifest.manifest", "read"),
 }
-_HOME = {name: (module, name) for module, names in _HOMES.items() for name in names} | _ALIASES
+_HOME = {name: (module, name) for module, names in _HOMES.items() for name in names.split()} | _ALIASES
 
 __all__ = sorted(_HOME)
 __version__ = "0.1.0"

@@ -125,14 +125,6 @@ def _part(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
 
 
-def _open_for_lock(path: str | Path) -> IO[bytes]:
-    """Open a file for writing, as a network disk locks no other; for reading if writing is not allowed."""
-    try:
-        return open(path, "ab" if not os.path.exists(path) else "r+b")
-    except OSError:
-        return open(path, "rb")
-
-
 @contextlib.contextmanager
 def lock(path: str | Path) -> Iterator[bool]:
     """Lock a file until the block or the process ends; give whether it was free. The file is created if needed.
@@ -146,7 +138,11 @@ def lock(path: str | Path) -> Iterator[bool]:
         yield True
         return
     free = True
-    with _open_for_lock(path) as file:
+    try:  # for writing, as a network disk locks no other file
+        opened = open(path, "r+b" if os.path.exists(path) else "ab")  # noqa: SIM115
+    except OSError:
+        opened = open(path, "rb")  # noqa: SIM115
+    with opened as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config, ModelConfig
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.ops import losses, masking, sensor_tokens, tokens
 
@@ -38,15 +38,9 @@ def _normalise(pixels: Array, mean: tuple[float, ...], std: tuple[float, ...]) -
 
 
 def stage1_terms(
-    params: Params,
-    clip: Array,
-    sensor: Array,
-    noise: Array,
-    *,
-    net: Net,
-    config: Config,
+    params: Params, clip: Array, sensor: Array, noise: Array, *, net: Net, config: Config,
     decoder_sensor: Array | None = None,
-) -> tuple[Array, Metrics]:
+) -> tuple[Array, Metrics]:  # fmt: skip
     """Return the loss of stage 1 and its terms: masked reconstruction and, for clips, the next frame (Eq. 8).
 
     `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame. `sensor` i32 (B,)
@@ -63,15 +57,9 @@ def stage1_terms(
 
 
 def reconstruct(
-    params: Params,
-    clip: Array,
-    sensor: Array,
-    noise: Array,
-    *,
-    net: Net,
-    config: Config,
+    params: Params, clip: Array, sensor: Array, noise: Array, *, net: Net, config: Config,
     decoder_sensor: Array | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array]:  # fmt: skip
     """Return pixels (B, N, T, P*P*3) of all positions from the visible ones, and `hidden` (B, N).
 
     See `stage1_terms`. The encoder sees the first three frames only, whatever T is.
@@ -184,72 +172,49 @@ def _scatter(packed: Array, row: Array, rows: int) -> tuple[Array, Array]:
 
 
 def stage2_terms(
-    params: Params,
-    batch: Stage2Batch,
-    noise: Array | None,
-    *,
-    net: Net,
-    config: Config,
-    decoder_sensor: Array | None = None,
-    match_noise: Array | None = None,
-) -> tuple[Array, Metrics]:
+    params: Params, batch: Stage2Batch, noise: Array | None, *, net: Net, config: Config,
+    decoder_sensor: Array | None = None, match_noise: Array | None = None,
+) -> tuple[Array, Metrics]:  # fmt: skip
     """Return L_align + lambda L_match (Eq. 9) and every term, unweighted.
 
     Pixels are normalised floats, sensor rows are already drawn. A part of `batch` that is None is not computed. The
     release recipe adds the stage-1 loss of the align batch, if `noise` (B, N) is given. `match_noise` (M, B, N) decides
     which patches the M touches of matching keep; None keeps all.
     """
-    objective = config.objective
-    total = jnp.zeros(())
-    metrics: Metrics = {}
-    aligned, matched = _touches(batch, net.model)
+    (align, match), objective = batch, config.objective
+    total, metrics = jnp.zeros(()), Metrics()
+    aligned = [] if align is None else [(align.clip[:, : net.model.frames], align.sensor)]
+    matched = [] if match is None else [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
+    if match is not None and net.model.match_head != "cosine":  # by cosine the other pairs are the negatives
+        matched.append((match.negative, match.negative_sensor))
     if match_noise is None:
         z_touch = touch_embeddings(params, aligned + matched, net=net)
     else:
         visible = max(1, masking.count_visible(net.model.patches, objective.match_keep))
         ids = jax.vmap(lambda noise: masking.random_mask(noise, visible)[0])(match_noise)
         z_touch = touch_embeddings(params, aligned, net=net) + touch_embeddings(params, matched, net=net, keep_ids=ids)
-    if batch.align is not None:
-        z = align_embeddings(params, batch.align, z_touch.pop(0), net=net)
-        scale = net.scale(params)
-        align, terms = losses.alignment_loss(
+    if align is not None:
+        z, scale = align_embeddings(params, align, z_touch.pop(0), net=net), net.scale(params)
+        loss, terms = losses.alignment_loss(
             *z, scale, config.pair_weights, groups=objective.groups, center=objective.center_embeddings
         )
-        total, metrics = total + align, metrics | terms | {"align": align, "temperature": 1 / scale}
+        total, metrics = total + loss, metrics | terms | {"align": loss, "temperature": 1 / scale}
         if config.recipe == "release" and noise is not None:
-            clip, sensor = batch.align.clip, batch.align.sensor
-            pixels, terms = stage1_terms(
-                params, clip, sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor
+            loss, terms = stage1_terms(
+                params, align.clip, align.sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor
             )
-            total, metrics = total + pixels, metrics | terms
-    if batch.match is not None:
+            total, metrics = total + loss, metrics | terms
+    if match is not None:
         if net.model.match_head == "cosine":
-            first, second = z_touch
-            scale, place = net.scale(params), batch.match.place
-            match, right = losses.contrast_loss(first, second, scale, groups=objective.groups, place=place)
+            (first, second), scale = z_touch, net.scale(params)
+            loss, right = losses.contrast_loss(first, second, scale, groups=objective.groups, place=match.place)
         else:
             z_anchor, *others = z_touch
             positive, negative = (net.match(params, z_anchor, z) for z in others)  # Eq. 5
-            match = losses.matching_loss(positive, negative)
+            loss = losses.matching_loss(positive, negative)
             right = jnp.mean(jnp.concatenate([positive > 0, negative < 0]).astype(jnp.float32))
-        total, metrics = total + objective.match_weight * match, metrics | {"match": match, "match_accuracy": right}
+        total, metrics = total + objective.match_weight * loss, metrics | {"match": loss, "match_accuracy": right}
     return total, metrics
-
-
-Touches = list[tuple[Array, Array]]
-
-
-def _touches(batch: Stage2Batch, model: ModelConfig) -> tuple[Touches, Touches]:
-    """Return the touches to align (without a next frame), and those to match: anchor, positive and negative.
-
-    Matching by cosine has no negative touch: the other pairs of the batch are the negatives.
-    """
-    align, match = batch
-    aligned = [] if align is None else [(align.clip[:, : model.frames], align.sensor)]
-    if match is None:
-        return aligned, []
-    pair = [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
-    return aligned, pair if model.match_head == "cosine" else [*pair, (match.negative, match.negative_sensor)]
 
 
 def stage2_loss(
@@ -257,18 +222,18 @@ def stage2_loss(
 ) -> tuple[Array, Metrics]:
     """Return `stage2_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`; `progress` drives p_u."""
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
-    align, match, noise, own, metrics = batch.align, batch.match, None, None, {}
-    match_noise = None
+    (align, match), patches = batch, net.model.patches
+    metrics, noise, own, match_noise = Metrics(), None, None, None
     if align is not None:
         own = align.sensor
-        noise = jax.random.uniform(key_noise, (len(own), net.model.patches))
+        noise = jax.random.uniform(key_noise, (len(own), patches))
         metrics["p_u"], sensor = _draw_tokens(own, key_align, progress, net, config)
         align = align._replace(clip=normalise_touch(align.clip), sensor=sensor, image=normalise_image(align.image))
     if match is not None:
         metrics["p_u"], match = _draw_match(match, key_match, progress, net, config)
         if config.objective.match_keep < 1:
-            shape = (2 if net.model.match_head == "cosine" else 3, len(match.sensor), net.model.patches)
-            match_noise = jax.random.uniform(key_keep, shape)
+            touches = 2 if net.model.match_head == "cosine" else 3
+            match_noise = jax.random.uniform(key_keep, (touches, len(match.sensor), patches))
     batch = Stage2Batch(align, match)
     loss, terms = stage2_terms(
         params, batch, noise, net=net, config=config, decoder_sensor=own, match_noise=match_noise
@@ -278,9 +243,8 @@ def stage2_loss(
 
 def _draw_tokens(sensor: Array, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, Array]:
     """Return p_u at `progress`, and the sensor rows after one draw a sample (Eq. 7)."""
-    p_u = sensor_tokens.universal_probability(
-        progress, config.objective.universal_start, config.objective.universal_end
-    )
+    objective = config.objective
+    p_u = sensor_tokens.universal_probability(progress, objective.universal_start, objective.universal_end)
     uniform = jax.random.uniform(key, sensor.shape)
     return p_u, sensor_tokens.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
 

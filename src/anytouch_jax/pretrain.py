@@ -35,15 +35,9 @@ SCRATCH_VOCABULARY, TOKENIZER, CHECKPOINTS = 2048, "tokenizer.json", "checkpoint
 
 
 def pretrain(
-    config: Config,
-    run: str | Path,
-    *,
-    init: str | Path | None = None,
-    clip: str | Path | None = None,
-    stop_after: int | None = None,
-    log: Log = print,
-    mesh: Mesh | None = None,
-) -> FitResult:
+    config: Config, run: str | Path, *, init: str | Path | None = None, clip: str | Path | None = None,
+    stop_after: int | None = None, log: Log = print, mesh: Mesh | None = None,
+) -> FitResult:  # fmt: skip
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
     `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1.
@@ -54,25 +48,21 @@ def pretrain(
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     log = log if jax.process_index() == 0 else silent
     resumes = bool(steps(run / CHECKPOINTS))
-    _check_settings(config)
-    _check_start(config, run, init, clip, resumes)
+    _check(config, run, init, clip, resumes)
     manifest = manifests.read(config.data.manifests)
     config, tokenizer = _choose_tokenizer(config, run, manifest, clip, resumes)
     net = build(config.model)
     params = net.init(jax.random.key(config.run.seed))
-    stored: dict[str, Any] = {}
-    sensors: tuple[str, ...] = ()
+    stored, sensors, notes = dict[str, Any](), tuple[str, ...](), list[str]()
     if resumes:  # only the shapes of `params` matter
         with suppress(CheckpointError):  # `fit` reports a damaged checkpoint
             stored = read_metadata(run)
         _check_resume(run, manifest, stored, log, init=init, clip=clip)
     else:
         params, notes, sensors = load_init(params, config, init=init, clip=clip)
-        for note in notes:
-            log(note)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
-    for note in loader.notes:
+    for note in (*notes, *loader.notes):
         log(note)
     config = _with_warmup(config, run, loader)
     trained = {*loader.trained_sensors, *sensors, *stored.get("seen", ())}
@@ -91,58 +81,43 @@ def pretrain(
         if jax.process_index() == 0 and tokenizer is not None and not resumes:
             tokenizer.save(run / TOKENIZER)
         return fit(
-            config,
-            params=params,
-            loss_fn=partial(loss, net=net, config=config),
-            batches=loader.stream,
-            run_dir=run,
-            trained=partial(objectives.trained_by, config=config),
-            stop_after=stop_after,
-            on_report=partial(_draw_reconstructions, run=run, net=net, config=config),
-            metadata=metadata,
-            log=log,
-            mesh=mesh,
-        )
+            config, params=params, loss_fn=partial(loss, net=net, config=config), batches=loader.stream, run_dir=run,
+            trained=partial(objectives.trained_by, config=config), stop_after=stop_after, metadata=metadata,
+            on_report=partial(_draw_reconstructions, run=run, net=net, config=config), log=log, mesh=mesh,
+        )  # fmt: skip
 
 
-def _check_settings(config: Config) -> None:
-    """Raise UserError for settings that this machine or this stage cannot follow."""
-    model = config.model
-    if model.attention == "cudnn" and jax.default_backend() != "gpu":
-        raise UserError("--model.attention cudnn needs a GPU of NVIDIA; leave it out here")
-    if model.attention == "cudnn" and model.dtype != "bfloat16":
-        raise UserError("--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out")
-    if model.dtype == "float64" and not jax.config.read("jax_enable_x64"):
-        raise UserError("--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32")
-    if model.dtype != "float64" and jax.config.read("jax_enable_x64"):
-        raise UserError(
-            "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: unset it, or add "
-            "--model.dtype float64"
-        )
-    if config.stage == 2 and config.optim.accumulate > 1 and (model.image or model.text):
-        raise UserError(
-            "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
-            "whole batch; lower --batch instead"
-        )
-    if model.match_head == "linear" and config.recipe == "paper":
-        raise UserError("--model.match-head linear is the head of the release; add --recipe release, or choose mlp")
-
-
-def _check_start(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> None:
-    """Raise UserError for a folder that the run cannot use, and for weights that are missing or not read."""
-    if config.stage == 1 and init is not None and clip is not None:
-        raise UserError("--init and --clip-weights both give stage 1 its touch encoder; leave one out")
-    if run.is_file():
-        raise UserError(f"{run} is a file, not a folder; choose another --run")
-    earlier = begun_with(run)
-    if earlier is not None and earlier.stage != config.stage:
+def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> None:
+    """Raise UserError for settings that this machine or this stage cannot follow, and for missing weights."""
+    model, has_x64 = config.model, jax.config.read("jax_enable_x64")
+    cudnn, float64 = model.attention == "cudnn", model.dtype == "float64"
+    slots = config.stage == 2 and bool(model.image or model.text)
+    has_tokenizer = model.text is None or (run / TOKENIZER).exists()
+    lacks_clip = config.towers == "pretrained" and clip is None and not (resumes and has_tokenizer)
+    wrong = {
+        "--model.attention cudnn needs a GPU of NVIDIA; leave it out here": cudnn and jax.default_backend() != "gpu",
+        "--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out": cudnn
+        and model.dtype != "bfloat16",
+        "--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32": float64
+        and not has_x64,
+        "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: unset it, or add "
+        "--model.dtype float64": has_x64 and not float64,
+        "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
+        "whole batch; lower --batch instead": slots and config.optim.accumulate > 1,
+        "--model.match-head linear is the head of the release; add --recipe release, or choose mlp": (
+            model.match_head == "linear" and config.recipe == "paper"
+        ),
+        "--init and --clip-weights both give stage 1 its touch encoder; leave one out": (
+            config.stage == 1 and init is not None and clip is not None
+        ),
+        f"{run} is a file, not a folder; choose another --run": run.is_file(),
+        "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in the same "
+        "folder": lacks_clip,
+    }
+    if sentences := [sentence for sentence, is_so in wrong.items() if is_so]:
+        raise UserError(sentences[0])
+    if (earlier := begun_with(run)) is not None and earlier.stage != config.stage:
         raise UserError(f"{run} has a run of stage {earlier.stage}; choose another --run for stage {config.stage}")
-    has_tokenizer = config.model.text is None or (run / TOKENIZER).exists()
-    if config.towers == "pretrained" and clip is None and not (resumes and has_tokenizer):
-        raise UserError(
-            "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in the "
-            "same folder"
-        )
 
 
 def _check_resume(
@@ -167,7 +142,7 @@ def _with_warmup(config: Config, run: Path, loader: Loader) -> Config:
     earlier = begun_with(run)
     if config.optim.warmup is not None or (earlier is not None and earlier.optim.warmup is None):
         return config
-    return replace(config, optim=replace(config.optim, warmup=min(loader.steps_per_epoch, config.warmup)))
+    return config.with_settings({"optim.warmup": min(loader.steps_per_epoch, config.warmup)})
 
 
 def _choose_tokenizer(config: Config, run: Path, manifest: Any, clip: Any, resumes: bool) -> tuple[Config, Any]:
@@ -184,7 +159,7 @@ def _choose_tokenizer(config: Config, run: Path, manifest: Any, clip: Any, resum
     if tokenizer is None or config.towers == "pretrained":
         return config, tokenizer
     text = replace(config.model.text, vocab=max(tokenizer.vocab_size, 2))
-    return replace(config, model=replace(config.model, text=text)), tokenizer
+    return config.with_settings({"model.text": text}), tokenizer
 
 
 def _draw_reconstructions(step: int, params: Params, batch: Any, *, run: Path, net: Net, config: Config) -> None:

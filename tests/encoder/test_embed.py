@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from anytouch_jax.encoder.arrays import spread_lines
 from anytouch_jax.encoder.embed import embed_frames, run_in_batches
 from anytouch_jax.encoder.encoder import load_encoder
-from anytouch_jax.encoder.spread import spread_lines
 from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)

@@ -47,7 +47,7 @@ def encoder(stored):
 
 
 def test_towers_equal_those_of_training(encoder, stored):
-    ids, mask = encoder.parts.tokenizer.encode(TEXTS, 8)
+    ids, mask = encoder.tokenizer.encode(TEXTS, 8)
     images = np.stack([vision_evaluation(photo, 28) for photo in PHOTOS])
     rows = np.arange(3, dtype=np.int32)
     batch = AlignBatch(jnp.zeros((3, 1, 28, 28, 3)), jnp.asarray(rows), normalise_image(images), rows, ids, mask, rows)
@@ -92,10 +92,10 @@ def test_the_matching_head_of_a_run(encoder, stored):
 def test_towers_go_to_the_device_only_when_they_are_called(stored):
     encoder = load_encoder(stored.run)
     encoder.encode_touch(STILLS, "digit")
-    assert not encoder.parts.compiled and set(encoder.params) == {"touch"}
-    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(encoder.parts.params["text"]))
+    assert set(encoder._compiled) == {("class", "mean")} and set(encoder.params) == {"touch"}
+    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(encoder.others["text"]))
     encoder.encode_text(TEXTS)
-    assert set(encoder.parts.compiled) == {"encode_text"}
+    assert set(encoder._compiled) == {("class", "mean"), "encode_text"}
 
 
 def test_absent_towers_and_wrong_types_are_one_sentence(encoder, stored, tiny_run, tmp_path):
@@ -114,11 +114,11 @@ def test_absent_towers_and_wrong_types_are_one_sentence(encoder, stored, tiny_ru
     with pytest.raises(UserError, match="texts"):
         encoder.encode_text([3])
     bare = load_encoder(stored.run)
-    object.__setattr__(bare.parts, "tokenizer_file", None)
+    object.__setattr__(bare, "tokenizer_file", None)
     with pytest.raises(UserError, match=r"no tokenizer\.json"):
         bare.encode_text(TEXTS)
     train_tokenizer([f"word{i} and {'xyz' * i}" for i in range(900)], 3000).save(tmp_path)
     other = load_encoder(stored.run)
-    object.__setattr__(other.parts, "tokenizer_file", tmp_path / "tokenizer.json")
+    object.__setattr__(other, "tokenizer_file", tmp_path / "tokenizer.json")
     with pytest.raises(UserError, match="tokens, the text tower"):
         other.encode_text(TEXTS)

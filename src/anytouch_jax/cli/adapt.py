@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from anytouch_jax.cli.output import check_home, log, refuse_unused
-from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, SEED, in_range
+from anytouch_jax.config.parsing import Count, NotNegative, Seed
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class AdaptOptions:
     data: tuple[Path, ...]  # Manifests with frames of the sensor in split train.
     sensor: str  # Name of the sensor, as in the column sensor of the manifest.
     out: Path  # Run folder to write, for embed, probe and retrieve.
-    frames: int = 100
+    frames: NotNegative[int] = 100
     """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
     labels: str | None = None
     """Label column whose classes the frames are fitted to. Known sensors must have examples of them."""
-    steps: int = 200  # Steps of the fit.
-    seed: int = 0  # Random seed.
+    steps: Count[int] = 200  # Steps of the fit.
+    seed: Seed = 0  # Random seed.
 
 
 def run(options: AdaptOptions) -> int:
@@ -34,7 +34,6 @@ def run(options: AdaptOptions) -> int:
     from anytouch_jax.encoder.adapt import adapt, check_empty, save
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    in_range("--", options, seed=SEED, steps=COUNT, frames=NOT_NEGATIVE)
     if not options.frames:
         refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
     check_empty(options.out)

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from anytouch_jax.cli.output import (
-    check_apart,
-    check_folder,
-    check_new,
-    default_target,
-    log,
-    refuse_unused,
-    write_new,
-)
-from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
+from anytouch_jax.cli import output
+from anytouch_jax.cli.output import log, refuse_unused
+from anytouch_jax.config.parsing import Count, NotNegative
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.data.prepare.captions import CaptionResult, CostEstimate, Endpoint
 
 
@@ -44,14 +36,14 @@ class AnnotateOptions:
     key_variable: str = "OPENAI_API_KEY"  # Environment variable that holds the key.
     yes: bool = False  # Do not ask for confirmation.
     estimate: bool = False  # Print the estimate and stop.
-    price_in: float | None = None  # Price of a million input tokens, for the estimate.
-    price_out: float | None = None  # Price of a million output tokens.
+    price_in: NotNegative[float | None] = None  # Price of a million input tokens, for the estimate.
+    price_out: NotNegative[float | None] = None  # Price of a million output tokens.
     limit: int | None = None  # Number of captions to ask for, to look at a sample first.
     captions: Path | None = None
     """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no model."""
     key: str | None = None  # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
     sheet: Path | None = None  # HTML page of captions with their pictures, to check by eye.
-    sheet_count: int = 40  # Captions on that page.
+    sheet_count: Count[int] = 40  # Captions on that page.
     split: str | None = None  # Only rows of this split.
     family: tuple[tuple[str, Literal["photograph", "object", "phrase"]], ...] = ()
     """Prompt of your dataset, as in: mydata photograph."""
@@ -89,20 +81,25 @@ def run(options: AnnotateOptions) -> int:
         refuse_unused(options, ("sheet_count",), "without --sheet")
     if (options.price_in is None) != (options.price_out is None):
         raise UserError("--price-in needs --price-out, and the reverse: both count in the estimate")
-    in_range("--", options, price_in=NOT_NEGATIVE, price_out=NOT_NEGATIVE, sheet_count=COUNT)
     manifest = manifests.read(options.manifest)
-    target = options.out or default_target(options.manifest, "captions")
+    target = options.out or output.default_target(options.manifest, "captions")
     if not options.estimate:
-        check_new(manifest, target)
-        check_folder(target, read=() if options.captions is None else (options.captions,))
-    check_apart(out=target, sheet=options.sheet)
-    if options.sheet is not None:
-        check_folder(options.sheet, "--sheet", read=manifest.files)
+        output.check_new(manifest, target)
+        output.check_folder(target, read=() if options.captions is None else (options.captions,))
+    output.check_apart(out=target, sheet=options.sheet)
+    output.check_folder(options.sheet, "--sheet", read=manifest.files)
     if options.captions is not None:
-        return _attach(manifest, options.captions, options.key, options.overwrite, target)
+        captioned, notes = manifests.attach_text(
+            manifest, options.captions, key=options.key, overwrite=options.overwrite
+        )
+        for note in notes:
+            log(note)
+        count = int(captioned.present("text").sum())
+        print(f"{output.write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a caption")
+        return 0
     try:
         annotated = annotate(
-            manifest, _endpoint(options), options.answers or default_target(options.manifest, "answers", ""),
+            manifest, _endpoint(options), options.answers or output.default_target(options.manifest, "answers", ""),
             confirm=lambda estimate: _confirm(options, estimate), price_in=options.price_in,
             price_out=options.price_out, threads=options.threads, side=options.side, split=options.split,
             families=dict(options.family), overwrite=options.overwrite, second_image=options.second_image,
@@ -114,30 +111,15 @@ def run(options: AnnotateOptions) -> int:
     if options.sheet is not None:
         sheet = sample_sheet(manifest, annotated.captions, options.sheet, count=options.sheet_count)
         log(f"{sheet}: captions to check")
-    print(f"{write_new(annotated.manifest, target)}: {len(annotated.captions):,} captions")
+    print(f"{output.write_new(annotated.manifest, target)}: {len(annotated.captions):,} captions")
     return 1 if annotated.failures else 0
-
-
-def _attach(manifest: Manifest, captions: Path, key: str | None, overwrite: bool, target: Path) -> int:
-    """Write the manifest with the captions of a table."""
-    from anytouch_jax.data.manifest.manifest import attach_text
-
-    captioned, notes = attach_text(manifest, captions, key=key, overwrite=overwrite)
-    for note in notes:
-        log(note)
-    count = int(captioned.present("text").sum())
-    print(f"{write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a caption")
-    return 0
 
 
 def _endpoint(options: AnnotateOptions) -> Endpoint:
     from anytouch_jax.data.prepare.captions import Endpoint
 
-    return Endpoint(
-        options.url, options.vlm, key_variable=options.key_variable, timeout=options.timeout, tries=options.tries,
-        max_tokens=options.max_tokens, temperature=options.temperature, json_mode=options.json_mode,
-        token_field=options.token_field,
-    )  # fmt: skip
+    _, _, *names = (field.name for field in fields(Endpoint))
+    return Endpoint(options.url, options.vlm, **{name: getattr(options, name) for name in names})
 
 
 def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:

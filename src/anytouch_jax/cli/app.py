@@ -33,7 +33,7 @@ from anytouch_jax.cli import (
     train,
     verify,
 )
-from anytouch_jax.cli.arguments import RENAMED_COMMANDS, parse_options
+from anytouch_jax.cli.arguments import RENAMED, parse_options
 from anytouch_jax.errors import CheckError, UserError
 
 
@@ -110,6 +110,7 @@ def guarded(program: str, run: Callable[[], int]) -> int:
 
     A programming error keeps its traceback.
     """
+    status = 2
     try:
         with warnings.catch_warnings():
             warnings.showwarning = partial(_show_warning, warnings.showwarning)
@@ -123,24 +124,24 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         return status
     except SystemExit as stop:  # the parser's, after --help or a usage error
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-    except CheckError as error:
-        return _report(program, str(error), 1)
     except UserError as error:
-        return _report(program, str(error))
+        sentence, status = str(error), 1 if isinstance(error, CheckError) else 2
     except BrokenPipeError:  # the reader of our output closed it (| head)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
         advice = ". Free some space." if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        return _report(program, f"{error.filename or 'a file'}: {error.strerror or error}{advice}")
+        sentence = f"{error.filename or 'a file'}: {error.strerror or error}{advice}"
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's is a RuntimeError
             raise
         less = "Use a smaller --batch, --size, --gallery or --preset, or --model.remat in training."
-        return _report(program, f"there is not enough memory. {less}")
+        sentence = f"there is not enough memory. {less}"
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    print(f"{program}: {sentence}", file=sys.stderr)
+    return status
 
 
 def _missing_devices() -> UserError | None:
@@ -153,11 +154,6 @@ def _missing_devices() -> UserError | None:
     except Exception:
         return UserError(f"JAX_PLATFORMS is {platforms!r}, which jax cannot use here: unset it, or install jax for it")
     return None
-
-
-def _report(program: str, sentence: str, status: int = 2) -> int:
-    print(f"{program}: {sentence}", file=sys.stderr)
-    return status
 
 
 def _show_warning(default: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any) -> None:
@@ -188,8 +184,8 @@ Every command explains its options and gives an example with --help."""
 
 def _unknown(name: str, group: str) -> str:
     """Return the sentence that answers a command that does not exist."""
-    if name in RENAMED_COMMANDS:
-        return f"anytouch: {name} has a new name: use {RENAMED_COMMANDS[name]}."
+    if name in RENAMED:
+        return f"anytouch: {name} has a new name: use {RENAMED[name]}."
     if group and name.partition(" ")[2].startswith("-"):
         choices = " or ".join(one for one in COMMANDS if one.startswith(f"{group} "))
         return f"anytouch: {group} needs a subcommand: {choices}."

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import is_dataclass
-from typing import Any, get_args, get_origin, get_type_hints
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
+from anytouch_jax.config.parsing import check
 from anytouch_jax.errors import UserError
 
-RENAMED_COMMANDS = {
+# Old names of commands, and of options: each applies to a command without an option of the old name.
+RENAMED = {
     "simulate": "anytouch data simulate",
     "index": "anytouch data index",
     "contact": "anytouch data contact",
@@ -21,9 +23,6 @@ RENAMED_COMMANDS = {
     "translate": "make translation",
     "bench": "make bench",
     "parity": "make parity",
-}
-# Each applies to a command without an option of the old name.
-RENAMED_OPTIONS = {
     "--run": "--model",
     "--input": "--data",
     "--stream": "the command `anytouch stream`",
@@ -41,17 +40,28 @@ RENAMED_OPTIONS = {
 def parse_options(kind: Any, name: str, args: Sequence[str], default: Any = None, *, add_help: bool = True) -> Any:
     """Return the record `kind` of the options in `args`.
 
-    Raises UserError for a renamed or repeated option, and SystemExit after --help and tyro's own errors.
+    Raises UserError for a renamed or repeated option or a number out of its range, and SystemExit after --help and
+    tyro's own errors.
     """
     import tyro
 
     args = [expand_home(arg) for arg in args]
     _refuse_renamed(kind, args)
     _refuse_repeated(kind, args)
-    extra = {} if default is None else {"default": default}
-    return tyro.cli(
-        kind, prog=f"anytouch {name}", args=args, config=[tyro.conf.AvoidSubcommands], add_help=add_help, **extra
+    # The text of an option explains a default that is None or empty.
+    hint = tyro.conf.arg(help_behavior_hint=lambda value: "" if value in ("None", "") else f"(default: {value})")
+    kept = get_type_hints(kind, include_extras=True)
+    marks = {field.name: (hint, *[tyro.conf.DisallowNone] * (field.default is None)) for field in fields(kind)}
+    hints = {name: Annotated[kept[name], *more] for name, more in marks.items()}
+    shown = type(
+        kind.__name__, (kind,), {"__doc__": kind.__doc__, "__module__": kind.__module__, "__annotations__": hints}
     )
+    extra = {} if default is None else {"default": default}
+    options = tyro.cli(
+        shown, prog=f"anytouch {name}", args=args, config=[tyro.conf.AvoidSubcommands], add_help=add_help, **extra
+    )
+    check(options, "--")
+    return options
 
 
 def expand_home(arg: str) -> str:
@@ -65,21 +75,24 @@ def option_of(arg: str) -> str:
     return arg.partition("=")[0].replace("_", "-")
 
 
+def spelled(field: str) -> str:
+    """Return the option of a field: --save-every for save_every."""
+    return f"--{field.replace('_', '-')}"
+
+
 def _refuse_renamed(kind: Any, args: Sequence[str]) -> None:
-    known = {f"--{name.replace('_', '-')}" for name in get_type_hints(kind)}
+    known = set(map(spelled, get_type_hints(kind)))
     for option in map(option_of, args):
-        section = option.partition(".")[0]
-        for old in (option, section):
-            if old in RENAMED_OPTIONS and old not in known:
-                rest = option.removeprefix(old) if RENAMED_OPTIONS[old].startswith("--") else ""
-                raise UserError(f"{option} has a new name: use {RENAMED_OPTIONS[old]}{rest}")
+        for old in (option, option.partition(".")[0]):
+            if old.startswith("--") and old in RENAMED and old not in known:
+                rest = option.removeprefix(old) if RENAMED[old].startswith("--") else ""
+                raise UserError(f"{option} has a new name: use {RENAMED[old]}{rest}")
 
 
 def _refuse_repeated(kind: Any, args: Sequence[str]) -> None:
     """Raise UserError for an option of several values that is repeated: the first values would be lost."""
     options = [option_of(arg) for arg in args]
-    for name in _options_of_several(kind):
-        option = f"--{name.replace('_', '-')}"
+    for option in map(spelled, _options_of_several(kind)):
         if options.count(option) > 1:
             raise UserError(f"{option} is given twice. Write it once, followed by all its values.")
 

@@ -5,19 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from tyro.conf import Positional
 
-from anytouch_jax.cli.output import (
-    check_apart,
-    check_folder,
-    check_new,
-    default_target,
-    log,
-    refuse_unused,
-    write_new,
-)
-from anytouch_jax.config.parsing import Range, in_range
+from anytouch_jax.cli import output
+from anytouch_jax.cli.output import log, refuse_unused
+from anytouch_jax.config.parsing import Range
 
 
 @dataclass(frozen=True)
@@ -43,7 +37,9 @@ class ContactOptions:
     """PNG of kept and dropped frames by rising score. Look at it before you trust a threshold."""
     check: bool = False  # Print precision and recall against a reference column. Writes a manifest only with --out.
     reference: str | None = None  # Column for --check (default: label.force, label.contact or label.contact_score).
-    above: float | None = None  # Value of the reference column above which a frame is in contact.
+    above: Annotated[float | None, Range(-math.inf, math.inf, "a number")] = (
+        None  # Value of the reference column above which a frame is in contact.
+    )
     threads: int = 2  # Threads that read pictures.
 
 
@@ -58,15 +54,14 @@ def run(options: ContactOptions) -> int:
         refuse_unused(options, ("reference", "above"), "without --check")
     elif options.out is None:
         refuse_unused(options, ("drop",), "on --check, which writes a manifest only with --out")
-    in_range("--", options, above=Range(-math.inf, math.inf, "a number"))
     manifest = manifests.read(options.manifest)
-    target = options.out or (None if options.check else default_target(options.manifest, "contact"))
+    target = options.out or (None if options.check else output.default_target(options.manifest, "contact"))
     if target is not None:
-        check_new(manifest, target)
-    check_apart(out=target, picture=options.picture)
+        output.check_new(manifest, target)
+    output.check_apart(out=target, picture=options.picture)
     if options.picture is not None:
         frames = map(manifest.file, range(len(manifest))) if options.picture.exists() else ()
-        check_folder(options.picture, "--picture", read=(*manifest.files, *frames), suffix=".png")
+        output.check_folder(options.picture, "--picture", read=(*manifest.files, *frames), suffix=".png")
     thresholds = dict(options.threshold)
     contact.threshold_of_rows(manifest, thresholds, options.share)  # raises for a mistake, before the work
     if options.check:
@@ -90,5 +85,5 @@ def run(options: ContactOptions) -> int:
         picture = contact.contact_sheet(manifest, scores, options.picture, thresholds=thresholds)
         log(f"{picture}: kept and dropped frames")
     if target is not None:
-        print(f"{write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
+        print(f"{output.write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
     return 0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
+from anytouch_jax.config.parsing import Count
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class FrameOptions:
     rotate: Literal[0, 90, 180, 270] = 0  # Turn the frames clockwise by so many degrees, before anything else.
     flip: Literal["none", "across", "down"] = "none"
     """Mirror the frames after that: across exchanges left and right, down exchanges top and bottom."""
-    frames: int = 1  # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
+    frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
     pooling: Literal["class", "mean", "both"] | None = None
     """Features: the class token, the mean of the patch tokens, or both (default: that of --head, else class)."""
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a long clip are joined.
@@ -51,40 +52,38 @@ class EmbedOptions(FrameOptions):
     data: tuple[Path, ...]  # Manifests (.csv, .parquet), or one folder of frames, picture or video.
     out: Path  # The .npz to write: features (n, d), rows (n,), key/* (n,).
     split: str | None = None  # Only this split of a manifest.
-    batch: int = 64  # Frames at a time.
+    batch: Count[int] = 64  # Frames at a time.
     on_bad_sample: Literal["error", "skip"] = "error"
     """Stop at a row or picture that cannot be read, or skip and count it."""
 
 
 def run(options: EmbedOptions) -> int:
     """Write the features as .npz."""
-    from anytouch_jax.encoder.embed import save_npz
-    from anytouch_jax.encoder.spread import spread_lines
+    from anytouch_jax.encoder.arrays import spread_lines
 
+    data = options.data[0]
     is_manifest = all(path.suffix.lower() in (".csv", ".parquet") for path in options.data)
     if is_manifest:
         per_row = ("sensor", "background", "rotate", "flip")
         refuse_unused(options, per_row, "with a manifest, whose rows name their sensor and background")
+    elif len(options.data) != 1:
+        raise UserError(f"--data takes several manifests, or one folder or video, not {len(options.data)} paths")
+    elif not data.exists():
+        raise UserError(f"there is no manifest, folder or video at {data}")
     else:
-        if len(options.data) != 1:
-            raise UserError(f"--data takes several manifests, or one folder or video, not {len(options.data)} paths")
-        if not options.data[0].exists():
-            raise UserError(f"there is no manifest, folder or video at {options.data[0]}")
         refuse_unused(options, ("split",), "with a folder or a video, which has no splits")
-        if options.data[0].is_file():
+        if data.is_file():
             refuse_unused(options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame")
-    if options.batch < 1:
-        raise UserError(f"--batch must be 1 or more, not {options.batch}")
     check_folder(options.out, read=(options.model, *options.data), suffix=".npz")
     encoder, pooling, head = load_inputs(options)
     if is_manifest:
-        features = _embed_manifest(encoder, options, pooling)
-        about = features_metadata(encoder, options, pooling, options.data)
+        features, about = _embed_manifest(encoder, options, pooling), {}
     else:
-        features = _embed_frames(encoder, options, pooling)
-        about = frames_metadata(encoder, options, pooling, options.data[0])
+        row, preprocess, about = frames_input(encoder, options, data)
+        features = _embed_frames(encoder, options, pooling, row, preprocess)
         log_universal(encoder, options)
-    save_npz(options.out, with_labels(features, head), about)
+    about |= {"pooling": pooling, "input": " ".join(map(str, options.data))}
+    save_features(options.out, encoder, features, head, options, about)
     for line in spread_lines(features.values):
         log(line)
     skipped = f", {features.skipped} skipped" if features.skipped else ""
@@ -109,60 +108,44 @@ def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean"
     return encoder, pooling, head
 
 
-def features_metadata(encoder: Encoder, options: FrameOptions, pooling: str, data: tuple[Path, ...]) -> dict[str, str]:
-    """Return what a features file stores about its features."""
-    return {
-        "encoder": encoder.source,
-        "weights": encoder.fingerprint,
-        "input": " ".join(map(str, data)),
-        "pooling": pooling,
-        "frames": str(options.frames),
-        "join": options.join,
-        "dtype": encoder.config.model.dtype,
-    }
+def save_features(
+    out: Path,
+    encoder: Encoder,
+    features: Features,
+    head: LinearHead | None,
+    options: FrameOptions,
+    about: dict[str, str],
+) -> None:
+    """Write features to `out`, with what a `head` predicts, and metadata."""
+    from anytouch_jax.encoder.embed import save_npz
+
+    if head is not None and len(features.values):
+        label, p = head(features.values)
+        features = replace(features, predictions={"label": label, "p": p.max(1)})
+    about |= {"encoder": encoder.source, "weights": encoder.fingerprint, "dtype": encoder.config.model.dtype}
+    save_npz(out, features, about | {"frames": str(options.frames), "join": options.join})
 
 
-def frames_metadata(encoder: Encoder, options: FrameOptions, pooling: str, data: Path) -> dict[str, str]:
-    """Return `features_metadata` with what was done to the frames of a folder, a video or a camera."""
-    gel = gel_of(encoder, options, data)
-    background = "the first frame" if gel is None else str(gel)
-    return features_metadata(encoder, options, pooling, (data,)) | {
-        "sensor": options.sensor or UNIVERSAL,
-        "background": background if encoder.subtracts else "not subtracted",
-        "rotate": str(options.rotate),
-        "flip": options.flip,
-    }
+def frames_input(encoder: Encoder, options: FrameOptions, data: Path) -> tuple[int, Preprocess, dict[str, str]]:
+    """Return the sensor's row and the preprocessing of the frames of a folder, a video or a camera, and their metadata.
 
-
-def with_labels(features: Features, head: LinearHead | None) -> Features:
-    """Return features with the `label` (n,) that a head predicts and its probability `p` (n,)."""
-    if head is None:
-        return features
-    label, p = head(features.values)
-    return replace(features, predictions={"label": label, "p": p.max(1)})
-
-
-def gel_of(encoder: Encoder, options: FrameOptions, data: Path) -> Path | None:
-    """Return the picture of the untouched gel: that of --background, or that of the folder if the encoder needs it."""
-    from anytouch_jax.data.images import BACKGROUND, list_images
-
-    if options.background is None and encoder.subtracts and data.is_dir():
-        return list_images(data)[1].get(BACKGROUND)
-    return options.background
-
-
-def preprocess_of(encoder: Encoder, options: FrameOptions, data: Path) -> Preprocess:
-    """Return the preprocessing of the frames of a folder, a video or a camera, and log what it subtracts."""
-    from anytouch_jax.data.images import decode
+    The picture of the untouched gel is that of --background, or that of the folder if the encoder needs it. What is
+    subtracted is logged.
+    """
+    from anytouch_jax.data.images import BACKGROUND, decode, list_images
     from anytouch_jax.encoder.preprocess import Preprocess
 
-    gel = gel_of(encoder, options, data)
+    row, gel = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.background
+    if gel is None and encoder.subtracts and data.is_dir():
+        gel = list_images(data)[1].get(BACKGROUND)
+    background = "the first frame" if gel is None else str(gel)
     if gel is not None and not encoder.subtracts:
         log("--background is not used: this encoder was trained on frames without background subtraction")
     if options.background is None and encoder.subtracts:
-        background = "the first frame" if gel is None else str(gel)
         log(f"this encoder needs background-subtracted frames: {background} is the background (see --background)")
-    return Preprocess(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
+    preprocess = Preprocess(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
+    about = {"background": background if encoder.subtracts else "not subtracted", "rotate": str(options.rotate)}
+    return row, preprocess, about | {"sensor": options.sensor or UNIVERSAL, "flip": options.flip}
 
 
 def log_universal(encoder: Encoder, options: FrameOptions) -> None:
@@ -207,14 +190,13 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
     return embedding.Features(values, rows, keys, len(usable) - len(rows))
 
 
-def _embed_frames(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Features:
+def _embed_frames(encoder: Encoder, options: EmbedOptions, pooling: Any, row: int, preprocess: Preprocess) -> Features:
     """Embed every clip of consecutive frames of a folder or a video, keyed by its last frame."""
     import numpy as np
 
     from anytouch_jax.encoder.embed import embed_frames
 
     data, times = options.data[0], list[float]()
-    row, preprocess = encoder.sensor_row(options.sensor or UNIVERSAL, log), preprocess_of(encoder, options, data)
     features = embed_frames(
         encoder, _numbered_frames(data, options.on_bad_sample, times), row, preprocess, length=options.frames,
         pooling=pooling, join=options.join, batch=options.batch,
@@ -233,35 +215,27 @@ def _numbered_frames(
     A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped. The
     time stamps of a video's frames are appended to `times`.
     """
-    from anytouch_jax.data.images import (
-        SUFFIXES,
-        ImageError,
-        decode,
-        frame_numbers,
-        list_images,
-        split_series,
-        timed_frames,
-    )
+    from anytouch_jax.data import images
 
-    if data.suffix.lower() in SUFFIXES and data.is_file():
-        yield 0, data.name, decode(data)
+    if data.suffix.lower() in images.SUFFIXES and data.is_file():
+        yield 0, data.name, images.decode(data)
         return
     if not data.is_dir():
-        for number, (seconds, frame) in enumerate(timed_frames(data)):
+        for number, (seconds, frame) in enumerate(images.timed_frames(data)):
             times.append(seconds)
             yield number, "", frame
         return
-    files, others = list_images(data)
+    files, others = images.list_images(data)
     if others:
         log(f"{', '.join(file.name for file in others.values())}: not a frame, not embedded")
     start = 0  # first frame number of a finger: no clip spans two fingers
-    for names in split_series([file.name for file in files]).values():
-        numbers = [start + number for number in frame_numbers(names)]
+    for names in images.split_series([file.name for file in files]).values():
+        numbers = [start + number for number in images.frame_numbers(names)]
         start = numbers[-1] + 2
         for number, name in zip(numbers, names, strict=True):
             try:
-                yield number, name, decode(data / name)
-            except ImageError:
+                yield number, name, images.decode(data / name)
+            except images.ImageError:
                 if on_bad_sample == "error":
                     raise
                 yield number, name, None

@@ -8,9 +8,11 @@ from typing import Any, Literal
 
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import UNIVERSAL, ModelConfig, to_json
+from anytouch_jax.config.parsing import Share
 from anytouch_jax.errors import UserError
 
-Loaded = tuple[dict[str, Any], ModelConfig, dict[str, str]]  # parameters, their model, metadata
+# What two networks must share to be interpolated.
+_SAME = ("touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "activation", "sensors")
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class ExportOptions:
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     between: Path | None = None
     """Weights: the run or file that MODEL was trained from. Writes an interpolation of the two."""
-    share: float = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
+    share: Share = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
 
 
 def run(options: ExportOptions) -> int:
@@ -46,19 +48,16 @@ def run(options: ExportOptions) -> int:
         refuse_unused(options, ("frames", "platforms", "pooling", "join", "dtype"), f"with --to {options.to}")
         return _export_weights(options)
     refuse_unused(options, ("between", "share"), "with --to jax")
-    from anytouch_jax.encoder import encoder as features
-    from anytouch_jax.encoder import export
-    from anytouch_jax.encoder.export import describes
+    from anytouch_jax.encoder.encoder import load_encoder
+    from anytouch_jax.encoder.export import describes, export
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_folder(options.out, read=(options.model,))
     enable_compilation_cache()
-    encoder = features.load_encoder(options.model).computed_in(options.dtype)
+    encoder = load_encoder(options.model).computed_in(options.dtype)
     refuse_join(options, encoder.config.model.frames)
-    about = export.export(
-        encoder, options.out, frames=options.frames, platforms=options.platforms, pooling=options.pooling,
-        join=options.join,
-    )  # fmt: skip
+    names = ("frames", "platforms", "pooling", "join")
+    about = export(encoder, options.out, **{name: getattr(options, name) for name in names})
     print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(options.platforms)}; {about['input']}")
     print(f"largest difference from the live model: {about['worst_difference']:.1e} of the largest feature")
     print(f"{describes(options.out)}: how to call it")
@@ -66,60 +65,41 @@ def run(options: ExportOptions) -> int:
 
 
 def _export_weights(options: ExportOptions) -> int:
-    from anytouch_jax.weights import convert, safetensors
+    from anytouch_jax.weights import convert, load, safetensors, tree
 
     source, before = options.model, options.between
     if before is None:
         refuse_unused(options, ("share",), "without --between")
-    if not 0 <= options.share <= 1:
-        raise UserError(f"--share must be 0 to 1, not {options.share:g}")
     read = [path for path in (source, before) if path is not None and not path.is_dir()]
     check_folder(options.out, read=read, suffix=".safetensors")
-    params, model, about = _loaded(source)
+    loaded = load.load_model(source, stored_rows=True)
+    params, model, about = loaded.params, loaded.config.model, loaded.export_metadata()
     if before is not None:
-        params = _between(_loaded(before), (params, model, about), options)
+        other = load.load_model(before, stored_rows=True)
+        differ = [name for name in _SAME if getattr(other.config.model, name) != getattr(model, name)]
+        grounds = [one.get(safetensors.BACKGROUND_KEY, "keep") for one in (other.export_metadata(), about)]
+        if differ := differ + ["background"] * (grounds[0] != grounds[1]):
+            raise UserError(
+                f"{before} and {source} have different networks ({', '.join(differ)}). --between takes the run that "
+                "MODEL was trained from."
+            )
+        params = tree.interpolate(other.params, params, options.share)
         about |= {"source": f"{options.share:g} of the way from {before} to {source}"}
-    if options.to == "release":
+    if options.to == "safetensors":
+        safetensors.export_safetensors(options.out, params, about | {safetensors.MODEL_KEY: to_json(model)})
+    else:
         if not {"touch", "decoder"} <= params.keys():
             raise UserError(f"{source} lacks the touch encoder or decoder of the authors' files. Use --to safetensors.")
         params, model = _universal_last(params, model)
-    about |= {safetensors.MODEL_KEY: to_json(model)}
-    if options.to == "safetensors":
-        safetensors.export_safetensors(options.out, params, about)
-    else:
         if "matcher" in params and model.match_head == "mlp":
             log("the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code ignores")
-        if "force" in params:
+        if params.pop("force", None) is not None:
             log("the force heads are left out: the authors' files have none. Use --to safetensors to keep them.")
-            params = {name: tree for name, tree in params.items() if name != "force"}
+        about |= {safetensors.MODEL_KEY: to_json(model), "format": "pt"}
         arrays = convert.to_release(params, model, allow_extra=True)
-        safetensors.write_safetensors(options.out, arrays, about | {"format": "pt"})
+        safetensors.write_safetensors(options.out, arrays, about)
     print(f"{options.out}: written")
     return 0
-
-
-def _loaded(source: Path) -> Loaded:
-    """Return the parameters of a run or a file, their model, and the metadata to store."""
-    from anytouch_jax.weights import load
-
-    loaded = load.load_model(source, stored_rows=True)
-    return loaded.params, loaded.config.model, loaded.export_metadata()
-
-
-def _between(first: Loaded, second: Loaded, options: ExportOptions) -> dict[str, Any]:
-    """Return parameters between `first` and `second`. Raises UserError if their networks differ."""
-    from anytouch_jax.weights import safetensors, tree
-
-    names = ("touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "activation", "sensors")
-    other = [name for name in names if getattr(first[1], name) != getattr(second[1], name)]
-    if first[2].get(safetensors.BACKGROUND_KEY, "keep") != second[2].get(safetensors.BACKGROUND_KEY, "keep"):
-        other.append("background")
-    if other:
-        raise UserError(
-            f"{options.between} and {options.model} have different networks ({', '.join(other)}). --between takes the "
-            "run that MODEL was trained from."
-        )
-    return tree.interpolate(first[0], second[0], options.share)
 
 
 def _universal_last(params: dict[str, Any], model: ModelConfig) -> tuple[dict[str, Any], ModelConfig]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
 
-from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
+from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, from_json
 from anytouch_jax.errors import UserError
 
 _TABLES = (".csv", ".parquet")
@@ -38,19 +39,19 @@ def run(options: InfoOptions) -> int:
 def _lines(path: Path) -> list[str]:
     if not path.exists():
         raise UserError(f"there is no {path}")
+    suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
     if path.is_dir():
         return _folder(path)
-    description = path.with_name(f"{path.name}.json")
     if description.is_file():
         from anytouch_jax.encoder.export import read_checked
 
         read_checked(path)
         return [f"{path}: an exported encoder", description.read_text("utf-8").strip()]
-    if path.suffix.lower() in _TABLES:
+    if suffix in _TABLES:
         return _manifest(path)
-    if path.suffix.lower() == ".npz" and (lines := _features(path) or _head(path)):
+    if suffix == ".npz" and (lines := _arrays(path)):
         return lines
-    if path.suffix.lower() in _WEIGHTS or path.name.endswith(".index.json"):
+    if suffix in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path)
     known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
     raise UserError(f"{path} has no known format. Known are {known}.")
@@ -70,46 +71,41 @@ def _folder(path: Path) -> list[str]:
 
 
 def _run(path: Path) -> list[str]:
-    from anytouch_jax.config import from_json
     from anytouch_jax.weights import checkpoint
-    from anytouch_jax.weights.checkpoint import CheckpointError, checked, resolve
 
     metadata = checkpoint.read_metadata(path)
-    try:
-        checked(resolve(path, None))
-        damage = []
-    except CheckpointError as error:
-        damage = [str(error)]
     config: Config = from_json(metadata["config"])
-    source = metadata.get("source") or {}
+    source, loss = metadata.get("source") or {}, metadata.get("metrics", {}).get("loss")
+    saved, best = checkpoint.steps(path / "checkpoints"), checkpoint.best_of(path / "checkpoints")
     model = [_model(config.model), _sensors(config.model, metadata.get("seen"))]
     if "sensor" in source:
         adapted = f"tokens of {source['sensor']} fitted to {source['frames']} frames"
-        return [f"{path}: the run {source['run']}, with {adapted}", *model, *damage]
-    saved, best = checkpoint.steps(path / "checkpoints"), checkpoint.best_of(path / "checkpoints")
-    checkpoints = f", checkpoints at {', '.join(map(str, saved))}" if saved else ""
-    if best is not None:
-        checkpoints += f" (lowest loss at {best})"
-    starts = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
-    loss = metadata.get("metrics", {}).get("loss")
-    content = f" (content {metadata['data'][:12]})" if metadata.get("data") else ""
-    return [
-        f"{path}: a run of stage {config.stage}, step {metadata['step']} of {config.run.steps}{checkpoints}",
-        f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
-        *model,
-        f"background: {config.data.background}",
-        f"started from {', '.join(starts) or 'random weights'}",
-        f"data: {', '.join(config.data.manifests) or 'unknown'}{content}",
-        *([f"loss {loss:.4g}, the mean since the previous checkpoint"] if loss is not None else []),
-        *damage,
-    ]
+        lines = [f"{path}: the run {source['run']}, with {adapted}", *model]
+    else:
+        checkpoints = f", checkpoints at {', '.join(map(str, saved))}" if saved else ""
+        checkpoints += "" if best is None else f" (lowest loss at {best})"
+        starts = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
+        content = f" (content {metadata['data'][:12]})" if metadata.get("data") else ""
+        lines = [
+            f"{path}: a run of stage {config.stage}, step {metadata['step']} of {config.run.steps}{checkpoints}",
+            f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
+            *model,
+            f"background: {config.data.background}",
+            f"started from {', '.join(starts) or 'random weights'}",
+            f"data: {', '.join(config.data.manifests) or 'unknown'}{content}",
+        ]
+        lines += [] if loss is None else [f"loss {loss:.4g}, the mean since the previous checkpoint"]
+    try:
+        checkpoint.checked(checkpoint.resolve(path, None))
+    except checkpoint.CheckpointError as error:
+        lines.append(str(error))
+    return lines
 
 
 def _model(model: ModelConfig, *, heads_known: bool = True) -> str:
-    touch = model.touch
-    heads = f"{touch.heads} heads" if heads_known else "heads unknown"
+    heads = f"{model.touch.heads} heads" if heads_known else "heads unknown"
     return (
-        f"touch encoder: width {touch.width}, depth {touch.depth}, {heads}, images of {model.image_size} "
+        f"touch encoder: width {model.touch.width}, depth {model.touch.depth}, {heads}, images of {model.image_size} "
         f"pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} features"
     )
 
@@ -128,26 +124,28 @@ def _weights(path: Path) -> list[str]:
     from anytouch_jax.weights.convert import detect_layout
 
     weights, metadata = load.read_weights(path), safetensors.read_file_metadata(path)
-    owners = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
     layout = detect_layout(weights)
-    names = owners.get(layout, f"the authors' ({layout})")
+    names = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}.get(
+        layout, f"the authors' ({layout})"
+    )
     model, unknown = load.form_of_file(path, weights)
     count = sum(array.size for array in weights.values())
-    infinite = [name for name, array in weights.items() if not np.isfinite(array).all()]
-    activation = load.clip_activation(path) if layout in ("clip", "openclip") else model.activation
-    return [
+    lines = [
         f"{path}: {len(weights)} arrays of {count:,} numbers, with {names} names",
         _model(model, heads_known=not unknown.keys() & {"touch", "image"}),
-        *([] if activation else ["The activation is unknown. OpenAI's CLIP wants quick_gelu."]),
-        *([f"Its head counts are unknown ({', '.join(unknown)}): a config.json gives them."] if unknown else []),
-        *([] if layout in ("clip", "openclip") else [_sensors(model, load.trained_sensors(metadata, model))]),
-        *([f"{infinite[0]} is not finite, so that these weights cannot embed anything."] if infinite else []),
     ]
+    if layout not in ("clip", "openclip"):
+        lines.append(_sensors(model, load.trained_sensors(metadata, model)))
+    elif not load.clip_activation(path):
+        lines.append("The activation is unknown. OpenAI's CLIP wants quick_gelu.")
+    if unknown:
+        lines.append(f"Its head counts are unknown ({', '.join(unknown)}): a config.json gives them.")
+    if infinite := next((name for name, array in weights.items() if not np.isfinite(array).all()), ""):
+        lines.append(f"{infinite} is not finite, so that these weights cannot embed anything.")
+    return lines
 
 
 def _manifest(path: Path) -> list[str]:
-    from collections import Counter
-
     from anytouch_jax.data.manifest import manifest as manifests
 
     table = manifests.read(path)
@@ -171,9 +169,9 @@ def _manifest(path: Path) -> list[str]:
     ]
 
 
-def _features(path: Path) -> list[str]:
-    """Return lines about features of `anytouch embed`; [] for another .npz. Raises UserError for a damaged file."""
-    from anytouch_jax.encoder.spread import spread_lines
+def _arrays(path: Path) -> list[str]:
+    """Return lines about features or a head; [] for another .npz. Raises UserError for a damaged file."""
+    from anytouch_jax.encoder.arrays import spread_lines
     from anytouch_jax.files import read_arrays
 
     is_small = path.stat().st_size < _SPREAD_BYTES
@@ -181,32 +179,24 @@ def _features(path: Path) -> list[str]:
         arrays = read_arrays(path, only=lambda name: name.startswith("about/") or (is_small and name == "features"))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}") from None
+    if {"format", "mark", "classes"} <= arrays.keys():
+        from anytouch_jax.evaluate.heads import load_head
+
+        head = load_head(path)
+        return [
+            f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
+            f"for features of {len(head.mean)} with --pooling {head.pooling} --frames {head.frames}, "
+            f"encoder {head.fingerprint}",
+        ]
     if not {"features", "rows"} <= arrays.keys():
         return []
     values, rows = arrays["features"], arrays["rows"]
     if values.ndim != 2 or values.dtype.kind not in "fiu" or rows.shape != values.shape[:1]:
         raise UserError(f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}.")
-    keys = [name.removeprefix("key/") for name in arrays if name.startswith("key/")]
-    metadata = [
-        f"{name.removeprefix('about/')}: {str(arrays[name])[:200]}" for name in arrays if name.startswith("about/")
-    ]
+    keys = ", ".join(name.removeprefix("key/") for name in arrays if name.startswith("key/"))
+    about = {name.removeprefix("about/"): str(arrays[name])[:200] for name in arrays if name.startswith("about/")}
     return [
-        f"{path}: {len(values):,} features of {values.shape[1]}, with {', '.join(keys) or 'row numbers'}",
-        *metadata,
+        f"{path}: {len(values):,} features of {values.shape[1]}, with {keys or 'row numbers'}",
+        *(f"{name}: {text}" for name, text in about.items()),
         *(spread_lines(values) if is_small else []),
-    ]
-
-
-def _head(path: Path) -> list[str]:
-    """Return lines about a head of `anytouch probe label --save`; [] for another .npz."""
-    from anytouch_jax.evaluate.heads import load_head
-    from anytouch_jax.files import read_arrays
-
-    if not {"format", "mark", "classes"} <= read_arrays(path, only=lambda _: False).keys():
-        return []
-    head = load_head(path)
-    options = f"--pooling {head.pooling} --frames {head.frames}"
-    return [
-        f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
-        f"for features of {len(head.mean)} with {options}, encoder {head.fingerprint}",
     ]

@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from anytouch_jax.cli.arguments import spelled
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
     `reason` ends the sentence, as in "has no effect <with a folder>".
     """
     defaults = {field.name: field.default for field in fields(options)}
-    changed = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) != defaults[name]]
+    changed = [spelled(name) for name in names if getattr(options, name) != defaults[name]]
     if changed:
         raise UserError(f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. Remove it.")
 
@@ -61,12 +62,10 @@ def check_new(manifest: Manifest, path: Path) -> Path:
     from anytouch_jax.data.manifest.schema import is_manifest
 
     target = path.expanduser().resolve()
-    if target in manifest.files:
-        raise UserError(f"{target} is the manifest that was read. Name another file with --out.")
     if target.is_file() and not is_manifest(target):
         raise UserError(f"{target} exists and is no manifest. Name another file with --out, or remove it.")
     manifests.check_target(manifest, target)
-    check_folder(target)
+    check_folder(target, read=manifest.files)
     return target
 
 
@@ -79,24 +78,25 @@ def write_new(manifest: Manifest, path: Path) -> Path:
     return target
 
 
-def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path] = (), suffix: str = "") -> None:
-    """Make the folder of a file that will be written after long work; `option` named it.
+def check_folder(
+    path: Path | None, option: str = "--out", *, read: Iterable[str | Path] = (), suffix: str = ""
+) -> None:
+    """Make the folder of a file that will be written after long work, if there is one; `option` named it.
 
     Raises UserError for a folder that cannot be made, for a `path` that is a folder, a device or one of the files
     that are `read`, and for another ending than `suffix`.
     """
+    if path is None:
+        return
     if suffix and path.suffix.lower() != suffix:
         raise UserError(f"{path} must end in {suffix}. Choose another {option}.")
     try:
-        if path.is_dir():
-            raise UserError(f"{path} is a folder. Name a file with {option}.")
         if path.exists() and not path.is_file():
-            raise UserError(f"{path} is no regular file. Name one with {option}.")
+            raise UserError(
+                f"{path} is {'a folder' if path.is_dir() else 'no regular file'}. Name a file with {option}."
+            )
         if path.exists() and path.resolve() in {Path(file).expanduser().resolve() for file in read}:
             raise UserError(f"{path} is a file that is read. Name another one with {option}.")
-        for folder in reversed(path.parents):
-            if folder.exists() and not folder.is_dir():
-                raise UserError(f"{folder} is a file, not a folder. Choose another {option}.")
         path.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(path.parent, os.W_OK)
     except OSError as error:
@@ -108,13 +108,9 @@ def check_folder(path: Path, option: str = "--out", *, read: Iterable[str | Path
 
 def check_home(folder: Path, option: str = "--out") -> None:
     """Check a folder that will be filled after long work: its parents are made, the folder itself is not."""
-    if folder.is_dir():
-        if not os.access(folder, os.W_OK):
-            raise UserError(f"the folder {folder} cannot be written to. Choose another {option}.")
-        return
-    if folder.exists():
+    if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder. Choose another {option}.")
-    check_folder(folder, option)
+    check_folder(folder / "file" if folder.is_dir() else folder, option)
 
 
 def check_apart(**outputs: Path | None) -> None:
@@ -122,7 +118,6 @@ def check_apart(**outputs: Path | None) -> None:
     options: dict[Path, str] = {}
     for name, path in outputs.items():
         if path is not None:
-            option, place = f"--{name.replace('_', '-')}", path.expanduser().resolve()
-            if place in options:
-                raise UserError(f"{options[place]} and {option} name the same file. Give each another name.")
-            options[place] = option
+            other = options.setdefault(path.expanduser().resolve(), name)
+            if other != name:
+                raise UserError(f"{spelled(other)} and {spelled(name)} name the same file. Give each another name.")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, print_table, refuse_unused
-from anytouch_jax.config.parsing import COUNT, NOT_NEGATIVE, in_range
+from anytouch_jax.config.parsing import Count, NotNegative
 from anytouch_jax.errors import UserError
 
 
@@ -42,10 +42,10 @@ class LabelOptions(ProbeOptions):
     """Leave out each value of this column in turn instead of using the splits, such as object for slip."""
     where: tuple[str, float] | None = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
-    frames: int = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
+    frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
     pooling: Literal["class", "mean", "both"] = "class"
     """Features: the class token, the mean of the patch tokens, or both."""
-    seeds: int = 5  # Bootstrap resamples of the training groups.
+    seeds: NotNegative[int] = 5  # Bootstrap resamples of the training groups.
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says so."""
     save: Path | None = None  # Write the linear head of one --model as .npz, for embed --head and stream --head.
@@ -55,12 +55,12 @@ class LabelOptions(ProbeOptions):
 class BatteryOptions(ProbeOptions):
     """The options that tasks and benchmarks share."""
 
-    seeds: int = 5  # Random splits of the groups.
+    seeds: NotNegative[int] = 5  # Random splits of the groups.
     train_sensors: tuple[str, ...] = ()  # Train on these sensors only.
     test_sensors: tuple[str, ...] = ()  # Test on these sensors only.
     train_units: tuple[str, ...] = ()  # Train on these units only. Patterns such as cam0_* are allowed.
     test_units: tuple[str, ...] = ()  # Test on these units only.
-    max_rows: int | None = None  # Largest number of rows per task, drawn with a fixed seed.
+    max_rows: Count[int | None] = None  # Largest number of rows per task, drawn with a fixed seed.
     cache: Path | None = None  # Folder that caches features by content, so that each frame is encoded once.
 
 
@@ -77,7 +77,7 @@ class TasksOptions(BatteryOptions):
     """Heads. gradient is the authors': one layer trained by AdamW."""
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
-    frames: int | None = None  # Frames of a touch (default: those of each task).
+    frames: Count[int | None] = None  # Frames of a touch (default: those of each task).
     pooling: Literal["class", "mean", "both"] = "class"
     """Features: the class token, the mean of the patch tokens, or both."""
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a clip longer than the model's are joined.
@@ -102,17 +102,13 @@ def run_label(options: LabelOptions) -> int:
     from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_label
 
-    in_range("--", options, frames=COUNT)
     if options.leave_out is not None:
         refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
-    if options.save is not None:
-        if len(options.model) != 1:
-            raise UserError(f"--save writes the head of one encoder. Give one --model, not {len(options.model)}.")
-        check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
+    if options.save is not None and len(options.model) != 1:
+        raise UserError(f"--save writes the head of one encoder. Give one --model, not {len(options.model)}.")
+    check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
-    _prepare(options, options.seeds)
-    results = probe_label(options.model, options.data, **_settings(options), log=log)
-    print_table(probe_table(results))
+    print_table(probe_table(probe_label(**_settings(options), log=log)))
     return 0
 
 
@@ -121,14 +117,12 @@ def run_tasks(options: TasksOptions) -> int:
     from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_tasks
 
-    in_range("--", options, frames=COUNT, max_rows=COUNT)
     if options.frames is None:
         refuse_unused(options, ("join",), "without --frames: tasks use stills or single segments")
     if options.frames == 1:
         refuse_unused(options, ("order",), "on stills")
-    _prepare(options, options.seeds, options.cache)
-    settings = _settings(options) | {"tasks": "all" if options.tasks == ("all",) else options.tasks}
-    results = probe_tasks(options.model, options.data, **settings, log=log)
+    tasks = {"tasks": "all"} if options.tasks == ("all",) else {}
+    results = probe_tasks(**_settings(options) | tasks, log=log)
     print_table(probe_table(results["results"], results["paper"]))
     return 0
 
@@ -138,31 +132,22 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_benchmark
 
-    in_range("--", options, max_rows=COUNT)
-    _prepare(options, options.seeds, options.cache)
-    results = probe_benchmark(options.model, options.data, **_settings(options), log=log)
+    results = probe_benchmark(**_settings(options), log=log)
     print_table(probe_table(results["results"], results["paper"]))
     return 0
 
 
 def _settings(options: ProbeOptions) -> dict[str, Any]:
-    """Return all options except models and manifests, which probes take by these names."""
-    return {name: value for name, value in vars(options).items() if name not in ("model", "data")}
-
-
-def _prepare(options: ProbeOptions, seeds: int, cache: Path | None = None) -> None:
-    """Check where results go, before the work."""
+    """Return all options by the names that probes take them. Check where results go, before the work."""
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    if seeds < 0:
-        raise UserError(f"--seeds must be {NOT_NEGATIVE.words}, not {seeds}")
     if not options.model and not options.features and not options.controls:
         raise UserError("There is nothing to probe. Give --model or --features, or leave out --no-controls.")
-    if options.out is not None:
-        check_folder(options.out, read=_files_read(options))
-    if cache is not None:
-        check_home(cache, "--cache")
+    check_folder(options.out, read=_files_read(options))
+    if isinstance(options, BatteryOptions) and options.cache is not None:
+        check_home(options.cache, "--cache")
     enable_compilation_cache()
+    return {("models" if name == "model" else name): value for name, value in vars(options).items()}
 
 
 def _files_read(options: ProbeOptions) -> tuple[Path, ...]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from anytouch_jax.cli.output import check_home, log
-from anytouch_jax.config.parsing import COUNT, SEED, Range, in_range
+from anytouch_jax.config.parsing import Count, Range, Seed
 
 
 @dataclass(frozen=True)
@@ -18,14 +19,12 @@ class ReportOptions:
     """
 
     data: Path  # Manifest of simulated scenes, or one with the same columns.
-    stage1: Path
-    """Run folder of stage 1."""
-    stage2: Path
-    """Run folder of stage 2."""
+    stage1: Path  # Run folder of stage 1.
+    stage2: Path  # Run folder of stage 2.
     out: Path  # Folder for report.md, report.json and figures/.
-    touches: int = 200  # Touches of the test split to use, and half as many of train and val.
-    gallery: int = 50  # Touches in a retrieval gallery.
-    seed: int = 0  # Random seed.
+    touches: Count[int] = 200  # Touches of the test split to use, and half as many of train and val.
+    gallery: Annotated[int, Range(2, math.inf, "2 or more")] = 50  # Touches in a retrieval gallery.
+    seed: Seed = 0  # Random seed.
 
 
 def run(options: ReportOptions) -> int:
@@ -33,7 +32,6 @@ def run(options: ReportOptions) -> int:
     from anytouch_jax.evaluate.report import demo_report
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    in_range("--", options, touches=COUNT, gallery=Range(2, math.inf, "2 or more"), seed=SEED)
     check_home(options.out)
     enable_compilation_cache()
     demo_report(

@@ -6,16 +6,13 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Annotated, Any, Literal
 
 from anytouch_jax.cli.output import check_folder, log, print_table, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.config.parsing import COUNT, Range, in_range
+from anytouch_jax.config.parsing import Count, Range
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-
-if TYPE_CHECKING:
-    from anytouch_jax.encoder.encoder import Encoder
 
 
 @dataclass(frozen=True)
@@ -30,12 +27,14 @@ class RetrieveOptions:
     data: Path  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
     model: tuple[Path, ...] = ()  # Run folders or weights files to compare.
     split: str = "test"  # Split to retrieve in.
-    frames: int = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
+    frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
     pooling: Literal["class", "mean", "both"] = "class"
     """Features: the class token, the mean of the patch tokens, or both."""
-    gallery: int = 50  # Touches in a gallery.
+    gallery: Annotated[int, Range(2, math.inf, "2 or more, the touch and at least one other")] = (
+        50  # Touches in a gallery.
+    )
     by_chance: bool = False  # Draw the galleries at random, not by similarity.
-    seeds: int = 5  # Galleries drawn for each query, with --by-chance.
+    seeds: Count[int] = 5  # Galleries drawn for each query, with --by-chance.
     controls: bool = True
     """Also score a random encoder, background-subtracted pixels, and the contact's area, centroid and force."""
     out: Path | None = None  # Write the results as JSON.
@@ -51,24 +50,24 @@ def run(options: RetrieveOptions) -> int:
     from anytouch_jax.evaluate import retrieval
     from anytouch_jax.evaluate.feature_cache import background_difference
     from anytouch_jax.evaluate.report import PIXELS, VECTOR
-    from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
     from anytouch_jax.evaluate.statistics import markdown_table, plain
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    at_least_two = Range(2, math.inf, "2 or more, the touch and at least one other")
-    in_range("--", options, gallery=at_least_two, frames=COUNT, seeds=COUNT)
     if not options.by_chance:
         refuse_unused(options, ("seeds",), "without --by-chance")
-    if options.out is not None:
-        check_folder(options.out, read=(options.data, *options.model))
+    check_folder(options.out, read=(options.data, *options.model))
     enable_compilation_cache()
-    encoders = _encoders(options)
+    encoders = {str(path): features.load_encoder(path) for path in options.model}
+    if options.controls and encoders:
+        encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
+    if not encoders and not options.controls:
+        raise UserError("There is nothing to compare. Give --model, or leave out --no-controls.")
     for encoder in encoders.values():
         features.check_frames(encoder.config.model, options.frames)
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(embedding.text_column(table, "sensor")[rows], FIELD_SENSORS)]
-    rows = deepest_rows(table, rows, frames=options.frames)
+    rows = retrieval.deepest_rows(table, rows, frames=options.frames)
     settings: dict[str, Any] = {
         "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
         "seeds": options.seeds,
@@ -80,7 +79,7 @@ def run(options: RetrieveOptions) -> int:
         if len(kept) < len(rows):
             raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first.")
     if options.controls:
-        for name, make in ((PIXELS, background_difference), (VECTOR, contact_vector)):
+        for name, make in ((PIXELS, background_difference), (VECTOR, retrieval.contact_vector)):
             try:
                 values[name] = make(table, rows)
             except UserError as error:
@@ -94,17 +93,6 @@ def run(options: RetrieveOptions) -> int:
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
         atomic_write(options.out, json.dumps(about | {"results": plain(scores)}, indent=2) + "\n")
     return 0
-
-
-def _encoders(options: RetrieveOptions) -> dict[str, Encoder]:
-    from anytouch_jax.encoder import encoder as features
-
-    encoders = {str(path): features.load_encoder(path) for path in options.model}
-    if options.controls and encoders:
-        encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
-    if not encoders and not options.controls:
-        raise UserError("There is nothing to compare. Give --model, or leave out --no-controls.")
-    return encoders
 
 
 def _cells(score: Any) -> tuple[str, ...]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,23 +62,32 @@ def run(options: SimulateOptions) -> int:
     scenes = Scenes(**{name: value for name, value in vars(options).items() if name not in ("out", "threads")})
     if missing := _missing_splits(scenes):
         log(f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more.")
+    console, last = Console(stderr=True), -1
     columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar, _exit_on_interrupt(bar):
-        progress = _progress(bar, scenes.sensors)
-        path = simulate(scenes, options.out, threads=options.threads, progress=progress)
+    bar = Progress(*columns, console=console, disable=not console.is_terminal)
+    task = bar.add_task("touches")
+
+    def report(done: int, of: int) -> None:
+        nonlocal last
+        if last < 0 and done < of:
+            sensors = ", ".join(scenes.sensors)
+            bar.console.print(f"compiling the contact solver for {sensors}: about a minute the first time")
+        elif bar.disable and 10 * done // of > 10 * last // of:
+            log(f"{done} of {of} touches")
+        last = done
+        bar.update(task, completed=done, total=of)
+
+    with bar, _exit_on_interrupt(bar):
+        path = simulate(scenes, options.out, threads=options.threads, progress=report)
     log(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
     return 0
 
 
 @contextmanager
 def _exit_on_interrupt(bar: Progress) -> Iterator[None]:
-    """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are written atomically.
-
-    Nothing changes outside the main thread, or where another handler is set.
-    """
+    """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are written atomically."""
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+    if before is not signal.default_int_handler:  # ignored, as in a script's background
         yield
         return
 
@@ -114,22 +122,3 @@ def _unconverged(manifest: Path) -> str:
     column = pq.read_table(manifest, columns=["label.converged"])["label.converged"].drop_null().to_numpy()
     count = int((column < 1).sum())
     return f". {count} of {len(column)} frames did not converge (label.converged)" if count else ""
-
-
-def _progress(bar: Progress, sensors: tuple[str, ...]) -> Callable[[int, int], None]:
-    """Return a callback of (touches done, touches): a bar on a terminal, elsewhere a line every tenth."""
-    task, last = bar.add_task("touches"), -1
-
-    def report(done: int, of: int) -> None:
-        nonlocal last
-        line = ""
-        if last < 0 and done < of:
-            line = f"compiling the contact solver for {', '.join(sensors)}: about a minute the first time"
-        elif bar.disable and 10 * done // of > 10 * last // of:
-            line = f"{done} of {of} touches"
-        if line:
-            bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
-        last = done
-        bar.update(task, completed=done, total=of)
-
-    return report

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
-from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -42,21 +41,14 @@ def run(options: StreamOptions) -> int:
         refuse_unused(options, ("stride",), "on single frames. Ask for clips with --frames, or")
     encoder, pooling, head = embed.load_inputs(options)
     from anytouch_jax.encoder import stream
-    from anytouch_jax.encoder.embed import Features, save_npz
+    from anytouch_jax.encoder.embed import Features
 
     source, live = stream.open_source(data)
+    row, preprocess, about = embed.frames_input(encoder, options, data)
     embedded = stream.stream(
-        encoder,
-        source,
-        embed.preprocess_of(encoder, options, data),
-        live=live,
-        sensor=encoder.sensor_row(options.sensor or UNIVERSAL, log),
-        frames=options.frames,
-        stride=options.stride,
-        pooling=pooling,
-        join=options.join,
-        log=log,
-    )
+        encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
+        pooling=pooling, join=options.join, log=log,
+    )  # fmt: skip
     result = stream.collect(embedded, (lambda frame: _print_line(frame, live, head)) if lines else None)
     if result.error is not None and not result.total:
         raise result.error
@@ -65,13 +57,12 @@ def run(options: StreamOptions) -> int:
             raise UserError(f"{data} has too few frames for a clip of {options.frames} at stride {options.stride}")
         embed.log_if_cut(data, int(result.numbers[-1]) + 1)
     if not lines:
-        keys = {"frame_index": result.numbers, "time": result.time}
-        about = embed.frames_metadata(encoder, options, pooling, data) | {"stride": str(options.stride)}
+        about |= {"stride": str(options.stride), "pooling": pooling, "input": str(data)}
         if live and len(result.numbers):
             about |= {"started": f"{result.started:.6f}"}
             about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
-        features = Features(result.values, result.numbers, keys)
-        save_npz(options.out, embed.with_labels(features, head if len(result.numbers) else None), about)
+        features = Features(result.values, result.numbers, {"frame_index": result.numbers, "time": result.time})
+        embed.save_features(options.out, encoder, features, head, options, about)
     embed.log_universal(encoder, options)
     for line in stream.budget(result):
         log(line)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+from typing import Literal, NamedTuple, get_type_hints
 
-import tyro
-
-from anytouch_jax.cli.arguments import option_of, parse_options
+from anytouch_jax.cli.arguments import option_of, parse_options, spelled
 from anytouch_jax.cli.output import log
 from anytouch_jax.config import (
     Config,
@@ -25,15 +23,16 @@ from anytouch_jax.config import (
     baselines,
     preset,
 )
+from anytouch_jax.config.parsing import NotNegative
 from anytouch_jax.errors import UserError
 
-# Fields that one stage alone reads, by section.
-_STAGE_2_FIELDS: dict[str, tuple[str, ...]] = {
-    "objective": ("alpha_tv", "alpha_tl", "alpha_vl", "match_weight", "match_keep", "groups", "center_embeddings"),
-    "model": ("match_head", "lora_rank", "lora_alpha", "temperature"),
-    "data": ("negatives",),
-}
-_RECONSTRUCTION_FIELDS: dict[str, tuple[str, ...]] = {"objective": ("mask_ratio", "norm_pix_loss", "next_frame")}
+# Fields that one stage alone reads.
+_STAGE_2_FIELDS = (
+    "objective.alpha_tv", "objective.alpha_tl", "objective.alpha_vl", "objective.match_weight", "objective.match_keep",
+    "objective.groups", "objective.center_embeddings", "model.match_head", "model.lora_rank", "model.lora_alpha",
+    "model.temperature", "data.negatives",
+)  # fmt: skip
+_RECONSTRUCTION_FIELDS = ("objective.mask_ratio", "objective.norm_pix_loss", "objective.next_frame")
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class TrainOptions:
     init: Path | None = None  # Start from this stage-1 run or weights file.
     clip_weights: Path | None = None  # CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json.
     steps: int | None = None  # Steps of the whole schedule (default: 1000).
-    stop_after: int | None = None  # Stop after this many steps, without changing the schedule.
+    stop_after: NotNegative[int | None] = None  # Stop after this many steps, without changing the schedule.
     save_every: int | None = None  # Steps between checkpoints (default: 200).
     batch: int | None = None  # Samples per step (default: the preset's).
     seed: int = 0  # Random seed.
@@ -69,11 +68,11 @@ class TrainOptions:
 class Sections:
     """Every field of the configuration, with the defaults of the preset, the recipe and the options of --help."""
 
-    model: ModelConfig
-    objective: LossConfig
-    optim: OptimConfig
-    data: DataConfig
-    run: RunConfig
+    model: ModelConfig  # Network: its sizes, its parts, the table of sensors.
+    objective: LossConfig  # Weights and choices of the losses.
+    optim: OptimConfig  # AdamW and its schedule.
+    data: DataConfig  # Reading and augmentation of the data.
+    run: RunConfig  # Course of the run.
 
 
 class TrainRequest(NamedTuple):
@@ -95,50 +94,37 @@ def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequ
     config = _configure(options)
     if not sections and not list_all:
         return TrainRequest(options, config)
-    default = Sections(config.model, config.objective, config.optim, config.data, config.run)
-    if list_all:
-        parse_options(_documented_sections(), "train [the options of --help]", ["--help"], default)
+    default = Sections(*(getattr(config, section) for section in get_type_hints(Sections)))
+    help_name, words = "train [the options of --help]", ["--help"] if list_all else sections
     try:
-        section = parse_options(Sections, "train [the options of --help]", sections, default, add_help=False)
+        section = parse_options(Sections, help_name, words, default, add_help=list_all)
     except SystemExit:
-        print("For every field of the configuration, run anytouch train --help-all", file=sys.stderr)
+        if not list_all:
+            print("For every field of the configuration, run anytouch train --help-all", file=sys.stderr)
         raise
     return TrainRequest(options, replace(config, **vars(section)))
 
 
 def run(request: TrainRequest) -> int:
     """Train or continue, alone or as one of several processes; 0 after SIGTERM and 130 after Ctrl-C, both saved."""
-    from anytouch_jax.train.progress import Terminated, terminating
-
-    options, config = request
-    baseline = baselines.find(options.baseline)
-    if options.stage == 2 and options.init and not baseline.starts_from_stage1:
-        raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")
-    if options.stage == 1 and options.towers == "pretrained" and not options.clip_weights:
-        raise UserError("--towers pretrained starts the touch encoder of stage 1 from CLIP. Add --clip-weights.")
-    if options.stage == 2 and options.clip_weights and options.towers != "pretrained":
-        raise UserError("--clip-weights needs --towers pretrained in stage 2. Add it, or remove --clip-weights.")
-    if options.stop_after is not None and options.stop_after < 0:
-        raise UserError(f"--stop-after must be 0 or more, not {options.stop_after}")
-    _refuse_other_stage(options, config)
-    try:
-        with terminating():
-            return _train(options, config)
-    except Terminated:
-        log(f"stopped by SIGTERM before the first step of {options.run}. Run the same command again to continue.")
-        return 0
-
-
-def _train(options: TrainOptions, config: Config) -> int:
     from anytouch_jax.pretrain import pretrain
     from anytouch_jax.train.distributed import joined
     from anytouch_jax.train.mesh import enable_compilation_cache
+    from anytouch_jax.train.progress import Terminated, terminating
 
-    enable_compilation_cache()
-    with joined() as place:
-        result = pretrain(
-            config, options.run, init=options.init, clip=options.clip_weights, stop_after=options.stop_after, log=log
-        )
+    options, config = request
+    _refuse_unread(options, config)
+    try:
+        with terminating():
+            enable_compilation_cache()
+            with joined() as place:
+                result = pretrain(
+                    config, options.run, init=options.init, clip=options.clip_weights, stop_after=options.stop_after,
+                    log=log,
+                )  # fmt: skip
+    except Terminated:
+        log(f"stopped by SIGTERM before the first step of {options.run}. Run the same command again to continue.")
+        return 0
     if result.interrupted == signal.SIGINT:
         return 130
     if place is None or place.index == 0:
@@ -146,40 +132,41 @@ def _train(options: TrainOptions, config: Config) -> int:
     return 0
 
 
+def _preset(options: TrainOptions) -> Config:
+    return preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
+
+
 def _configure(options: TrainOptions) -> Config:
     """Return the configuration of the preset and recipe, changed by the short options and the baseline."""
-    config = preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
-    data = replace(
-        config.data,
-        manifests=tuple(str(path) for path in options.data),
-        on_bad_sample=options.on_bad_sample,
-        batch_size=config.data.batch_size if options.batch is None else options.batch,
-    )
-    run = replace(
-        config.run,
-        seed=options.seed,
-        steps=config.run.steps if options.steps is None else options.steps,
-        save_every=config.run.save_every if options.save_every is None else options.save_every,
-        tensorboard=options.tensorboard,
-    )
-    return baselines.apply(options.baseline, replace(config, data=data, run=run))
+    short = {
+        "data.manifests": tuple(map(str, options.data)), "data.on_bad_sample": options.on_bad_sample,
+        "data.batch_size": options.batch, "run.seed": options.seed, "run.steps": options.steps,
+        "run.save_every": options.save_every, "run.tensorboard": options.tensorboard,
+    }  # fmt: skip
+    config = _preset(options).with_settings({name: value for name, value in short.items() if value is not None})
+    return baselines.apply(options.baseline, config)
 
 
-def _refuse_other_stage(options: TrainOptions, config: Config) -> None:
-    """Raise UserError for settings that this stage, or these weights, do not read."""
-    usual = preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
-    usual = baselines.apply(options.baseline, usual)
-    where, unread = "in stage 1", _STAGE_2_FIELDS
+def _refuse_unread(options: TrainOptions, config: Config) -> None:
+    """Raise UserError for options that do not go together, and for settings that this stage does not read."""
+    baseline = baselines.find(options.baseline)
+    if options.stage == 2 and options.init and not baseline.starts_from_stage1:
+        raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")
+    if options.stage == 1 and options.towers == "pretrained" and not options.clip_weights:
+        raise UserError("--towers pretrained starts the touch encoder of stage 1 from CLIP. Add --clip-weights.")
+    if options.stage == 2 and options.clip_weights and options.towers != "pretrained":
+        raise UserError("--clip-weights needs --towers pretrained in stage 2. Add it, or remove --clip-weights.")
+    unread = dict.fromkeys(_STAGE_2_FIELDS, "in stage 1")
     if options.stage == 2:
-        where = "in stage 2 of the paper recipe"
-        unread = {} if config.reconstructs else _RECONSTRUCTION_FIELDS
-        if options.clip_weights and config.model.temperature != usual.model.temperature:
-            raise UserError("--model.temperature has no effect with --clip-weights, which has its own. Remove it.")
-    for section, names in unread.items():
-        ours, theirs = getattr(config, section), getattr(usual, section)
-        for name in names:
-            if getattr(ours, name) != getattr(theirs, name):
-                raise UserError(f"--{section}.{name.replace('_', '-')} has no effect {where}. Remove it.")
+        reads = () if config.reconstructs else _RECONSTRUCTION_FIELDS
+        unread = dict.fromkeys(reads, "in stage 2 of the paper recipe")
+        if options.clip_weights:
+            unread["model.temperature"] = "with --clip-weights, which has its own"
+    usual = baselines.apply(options.baseline, _preset(options))
+    for field, reason in unread.items():
+        value = attrgetter(field)
+        if value(config) != value(usual):
+            raise UserError(f"{spelled(field)} has no effect {reason}. Remove it.")
 
 
 def _split_sections(args: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -202,13 +189,3 @@ def _suggest_section(args: Sequence[str]) -> None:
         field = option.removeprefix("--").replace("-", "_")
         if option.startswith("--") and field in homes and field not in known:
             raise UserError(f"there is no {option}. Use --{homes[field]}.{option.removeprefix('--')}.")
-
-
-def _documented_sections() -> type[Sections]:
-    """Return `Sections` with the docstring of each section's class as its help."""
-    kinds: dict[str, Any] = {
-        name: Annotated[kind, tyro.conf.arg(help=inspect.cleandoc(kind.__doc__ or ""))]
-        for name, kind in get_type_hints(Sections).items()
-    }
-    about = {"__doc__": Sections.__doc__}
-    return make_dataclass("Sections", kinds.items(), bases=(Sections,), frozen=True, namespace=about)

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from anytouch_jax.cli.output import check_apart, check_folder, check_new, log, write_new
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-
-if TYPE_CHECKING:
-    from anytouch_jax.data.manifest.manifest import Manifest
-    from anytouch_jax.data.prepare.verify import VerifyReport
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ def run(options: VerifyOptions) -> int:
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.prepare import verify
     from anytouch_jax.data.prepare.licences import commercial_only
-    from anytouch_jax.data.prepare.repair import check_swap
+    from anytouch_jax.data.prepare.repair import check_swap, repair
 
     if options.swap and options.repair is None:
         raise UserError("--swap exchanges files in the repaired copy. Name that copy with --repair.")
@@ -56,8 +51,7 @@ def run(options: VerifyOptions) -> int:
             check_new(manifest, target)
     if options.commercial_only is not None:
         commercial_only(manifest)  # raises for a manifest without such rows, before the work
-    if options.out is not None:
-        check_folder(options.out, read=manifest.files)
+    check_folder(options.out, read=manifest.files)
     report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, log=log)
     print(report.to_markdown(), end="")
     if options.out is not None:
@@ -65,7 +59,13 @@ def run(options: VerifyOptions) -> int:
         log(f"{options.out}: the report")
     errors = [finding.sentence for finding in report.findings if finding.level == "error"]
     if options.repair is not None:
-        manifest, errors = _repair(manifest, report, options.repair, options.swap, errors)
+        repaired = repair(manifest, report, swap=options.swap)
+        target = write_new(repaired.manifest, options.repair)
+        print(f"\n{target}: {len(repaired.manifest):,} of {len(manifest):,} rows")
+        print("\n".join(f"* {sentence}" for sentence in repaired.done or ("nothing to repair",)))
+        for sentence in repaired.left:
+            print(f"* left to you: {sentence}")
+        manifest, errors = repaired.manifest, [sentence for sentence in errors if sentence in repaired.left]
     if options.commercial_only is not None:
         commercial = commercial_only(manifest)
         target = write_new(commercial.manifest, options.commercial_only)
@@ -74,18 +74,3 @@ def run(options: VerifyOptions) -> int:
             f"and {commercial.unknown:,} rows of unknown licence"
         )
     return 1 if errors else 0
-
-
-def _repair(
-    manifest: Manifest, report: VerifyReport, path: Path, swap: tuple[str, ...], errors: list[str]
-) -> tuple[Manifest, list[str]]:
-    """Write the repaired copy and return it with the errors that remain."""
-    from anytouch_jax.data.prepare.repair import repair
-
-    repaired = repair(manifest, report, swap=swap)
-    target = write_new(repaired.manifest, path)
-    print(f"\n{target}: {len(repaired.manifest):,} of {len(manifest):,} rows")
-    print("\n".join(f"* {sentence}" for sentence in repaired.done or ("nothing to repair",)))
-    for sentence in repaired.left:
-        print(f"* left to you: {sentence}")
-    return repaired.manifest, [sentence for sentence in errors if sentence in repaired.left]

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from anytouch_jax.config.parsing import ABOVE_0, COUNT, NOT_NEGATIVE, chosen, in_range
+from anytouch_jax.config.parsing import Above0, Count, NotNegative, check
 from anytouch_jax.errors import ConfigError
 
 UNIVERSAL = "universal"
@@ -26,27 +26,26 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
 
     Known are SENSORS, FIELD_SENSORS and `known`.
     """
-    names = {sensor: _plain(sensor) for sensor in (*SENSORS, *FIELD_SENSORS, *known)}
-    correct = next((sensor for sensor, plain in names.items() if plain == _plain(name)), None)
-    if name not in names and correct is not None:
-        raise SpellingError(f"sensor {name!r}: it is called {correct}")
 
+    def plain(sensor: str) -> str:
+        return sensor.lower().replace("-", "_").replace(" ", "_")
 
-def _plain(name: str) -> str:
-    return name.lower().replace("-", "_").replace(" ", "_")
+    names = {plain(sensor): sensor for sensor in (*known, *FIELD_SENSORS, *SENSORS)}
+    if names.get(plain(name), name) != name and name not in known:
+        raise SpellingError(f"sensor {name!r}: it is called {names[plain(name)]}")
 
 
 @dataclass(frozen=True)
 class Stack:
     """A stack of transformer blocks."""
 
-    width: int  # Channels.
-    depth: int  # Blocks.
-    heads: int  # Attention heads.
-    mlp: int  # Hidden channels of the MLP in a block.
+    width: Count[int]  # Channels.
+    depth: NotNegative[int]  # Blocks.
+    heads: Count[int]  # Attention heads.
+    mlp: Count[int]  # Hidden channels of the MLP in a block.
 
     def __post_init__(self) -> None:
-        in_range("", self, width=COUNT, depth=NOT_NEGATIVE, heads=COUNT, mlp=COUNT)
+        check(self)
         if self.width % self.heads:
             raise ConfigError(f"width {self.width} must be a multiple of heads {self.heads}")
 
@@ -56,12 +55,12 @@ class TextTower:
     """CLIP's text tower."""
 
     stack: Stack
-    vocab: int = 49408  # Tokens of the vocabulary.
-    length: int = 77  # Tokens of a caption, with start and end.
+    vocab: Count[int] = 49408  # Tokens of the vocabulary.
+    length: Count[int] = 77  # Tokens of a caption, with start and end.
     end_token: int | None = None  # Token to pool, at its first position. None pools the largest id (CLIP).
 
     def __post_init__(self) -> None:
-        in_range("--model.text.", self, vocab=COUNT, length=COUNT)
+        check(self, "--model.text.")
 
 
 @dataclass(frozen=True)
@@ -71,39 +70,34 @@ class ModelConfig:
     `sensors` names the rows of sensor tokens (Sec. 3.5), and of patch encoders if each has its own (T3).
     """
 
-    image_size: int  # Side of an image, pixels.
-    patch: int  # Side of a patch, pixels.
-    embed: int  # Values of an embedding.
+    image_size: Count[int]  # Side of an image, pixels.
+    patch: Count[int]  # Side of a patch, pixels.
+    embed: Count[int]  # Values of an embedding.
     touch: Stack  # Touch encoder.
     decoder: Stack  # Decoder of stage 1.
     image: Stack | None = None  # Image tower. Stage 1 has none.
     text: TextTower | None = None  # Text tower. Stage 1 has none.
-    frames: int = 3  # Frames of a clip.
+    frames: Count[int] = 3  # Frames of a clip.
     sensors: tuple[str, ...] = SENSORS  # Sensors with tokens. "universal" serves all other sensors.
-    sensor_tokens: int = 5  # Tokens of each sensor.
+    sensor_tokens: NotNegative[int] = 5  # Tokens of each sensor.
     activation: Literal["gelu", "quick_gelu"] = "gelu"  # Activation of the encoders. OpenAI CLIP needs quick_gelu.
-    norm_eps: float = 1e-5  # Epsilon of layer norms.
-    decoder_norm_eps: float = 1e-12  # Epsilon of the decoder's layer norms.
+    norm_eps: NotNegative[float] = 1e-5  # Epsilon of layer norms.
+    decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
-    lora_rank: int = 0  # Rank of the image tower's LoRA. 0: off.
+    lora_rank: NotNegative[int] = 0  # Rank of the image tower's LoRA. 0: off.
     lora_alpha: float = 16.0  # Scale of LoRA, divided by its rank.
-    temperature: float = 0.07  # Temperature of InfoNCE at the start. It is learned.
+    temperature: Above0[float] = 0.07  # Temperature of InfoNCE at the start. It is learned.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # Type of the arithmetic. Parameters are float32.
     attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"  # Implementation. auto takes the fastest here.
     remat: bool = False  # Recompute activations in the backward pass. Saves memory, takes time.
 
     def __post_init__(self) -> None:
-        chosen("--model.", self)
-        in_range("--model.", self, image_size=COUNT, patch=COUNT, embed=COUNT, frames=COUNT, temperature=ABOVE_0)
-        in_range("--model.", self, sensor_tokens=NOT_NEGATIVE, lora_rank=NOT_NEGATIVE)
-        in_range("--model.", self, norm_eps=NOT_NEGATIVE, decoder_norm_eps=NOT_NEGATIVE)
+        check(self, "--model.")
         if self.decoder.width % 4:
-            raise ConfigError(
-                f"--model.decoder.width must be a multiple of 4 (sines and cosines of rows and columns), "
-                f"not {self.decoder.width}"
-            )
+            width = f"a multiple of 4 (sines and cosines of rows and columns), not {self.decoder.width}"
+            raise ConfigError(f"--model.decoder.width must be {width}")
         if self.image_size % self.patch:
             raise ConfigError(f"image_size {self.image_size} must be a multiple of patch {self.patch}")
         if len(set(self.sensors)) != len(self.sensors):

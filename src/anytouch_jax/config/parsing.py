@@ -6,10 +6,9 @@ import dataclasses
 import functools
 import json
 import math
-import re
 import types
 import typing
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from anytouch_jax.errors import ConfigError
 
@@ -22,17 +21,15 @@ class Range(NamedTuple):
     words: str
 
 
-COUNT = Range(1, math.inf, "1 or more")
-NOT_NEGATIVE = Range(0, math.inf, "0 or more")
-ABOVE_0 = Range(math.ulp(0.0), math.inf, "above 0")
-FLOAT32 = 3.4e38  # larger numbers are infinite in float32
-NORMAL = Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")
-SHARE = Range(0, 1, "0 to 1")
-SEED = Range(0, 2**32 - 1, "0 to 4294967295")
-BELOW_1 = Range(0, math.nextafter(1, 0), "0 or more and below 1")
-_HALF_PAIR = re.compile("[\ud800-\udfff]")
-
-
+T = TypeVar("T")
+# Annotations of fields that `check` compares with their range, as in `steps: Count[int]`.
+Count = Annotated[T, Range(1, math.inf, "1 or more")]
+NotNegative = Annotated[T, Range(0, math.inf, "0 or more")]
+Above0 = Annotated[T, Range(math.ulp(0.0), math.inf, "above 0")]
+Share = Annotated[float, Range(0, 1, "0 to 1")]
+Seed = Annotated[int, Range(0, 2**32 - 1, "0 to 4294967295")]
+Below1 = Annotated[float, Range(0, math.nextafter(1, 0), "0 or more and below 1")]
+_FLOAT32 = 3.4e38  # larger numbers are infinite in float32
 _JSON_BYTES, _JSON_DEPTH, _JSON_DIGITS = 1 << 26, 64, 40
 
 
@@ -45,7 +42,7 @@ def parse_json(text: str | bytes) -> Any:
     if len(text) > _JSON_BYTES:
         raise ConfigError(f"has {len(text):,} bytes of JSON, more than {_JSON_BYTES:,}")
 
-    def number(digits: str, kind: type[int] | type[float] = int) -> float:
+    def number(digits: str, kind: type[int] | type[float] = float) -> float:
         if len(digits) > _JSON_DIGITS:
             raise ConfigError(f"has a number of {len(digits)} digits")
         if not math.isfinite(value := kind(digits)):
@@ -54,65 +51,57 @@ def parse_json(text: str | bytes) -> Any:
 
     try:
         text = text.decode("utf-8") if isinstance(text, bytes) else text
-        numbers: Any = {"parse_int": number, "parse_float": functools.partial(number, kind=float)}
-        value = json.loads(text, parse_constant=functools.partial(number, kind=float), **numbers)
+        integer: Any = functools.partial(number, kind=int)
+        value = json.loads(text, parse_int=integer, parse_float=number, parse_constant=number)
+        if _depth(value) > _JSON_DEPTH:
+            raise RecursionError
+        json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
         raise ConfigError(f"has more than {_JSON_DEPTH} levels of JSON") from None
+    except UnicodeEncodeError:
+        raise ConfigError("has half of a Unicode pair in a text") from None
     except ConfigError:
         raise
     except ValueError as error:
         raise ConfigError(f"is not JSON ({str(error)[:200]})") from None
-    level = [value]
-    for _ in range(_JSON_DEPTH):
-        inner: list[Any] = []
-        for item in level:
-            if isinstance(item, str):
-                if not item.isascii() and _HALF_PAIR.search(item):
-                    raise ConfigError("has half of a Unicode pair in a text")
-            elif isinstance(item, dict):
-                inner += [*item, *item.values()]
-            elif isinstance(item, list):
-                inner += item
-        if not inner:
-            return value
-        level = inner
-    raise ConfigError(f"has more than {_JSON_DEPTH} levels of JSON")
+    return value
 
 
-def in_range(prefix: str, settings: Any, **ranges: Range) -> None:
-    """Raise ConfigError for a field of `settings` outside its range. `prefix` is its section on the command line.
-
-    None is always valid. NaN and numbers that are infinite in float32 never are. Every entry of a tuple is checked.
-    """
-    for name, (low, high, words) in ranges.items():
-        value = getattr(settings, name)
-        for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not (low <= number <= high and number < FLOAT32):
-                raise ConfigError(f"{_spelled(prefix, name)} must be {words}, not {number}")
+def _depth(value: Any) -> int:
+    """Return the levels of lists and objects in a JSON value."""
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return 0 if inner is None else 1 + max(map(_depth, inner), default=0)
 
 
-def chosen(prefix: str, settings: Any) -> None:
-    """Raise ConfigError for a field of `settings` that is not a choice (Literal) of its annotation.
+def check(settings: Any, prefix: str = "") -> None:
+    """Raise ConfigError for a field of a dataclass outside its range, or that is not one of its choices (Literal).
 
-    `prefix` is its section on the command line. Every entry of a tuple is checked.
+    `prefix` is its section on the command line. None is always in a range. NaN and numbers that are infinite in float32
+    never are. Every entry of a tuple is checked.
     """
     kind: Any = type(settings)
-    for name, hint in _choices(kind).items():
-        read_value(hint, getattr(settings, name), _spelled(prefix, name))
+    for name, (hint, has_choices, bounds) in _rules(kind).items():
+        value, where = getattr(settings, name), f"{prefix}{name.replace('_', '-')}" if prefix else name
+        if has_choices:
+            read_value(hint, value, where)
+        for low, high, words in bounds:
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not (low <= number <= high and number < _FLOAT32):
+                    raise ConfigError(f"{where} must be {words}, not {number}")
 
 
 @functools.cache
-def _choices(kind: type) -> dict[str, Any]:
-    """Return the annotations of those fields of a dataclass that have choices, by name."""
+def _rules(kind: type) -> dict[str, tuple[Any, bool, list[Range]]]:
+    """Return the annotation of each field of a dataclass, whether it has choices, and its ranges."""
 
-    def has_some(hint: Any) -> bool:
-        return typing.get_origin(hint) is Literal or any(map(has_some, typing.get_args(hint)))
+    def has_choices(hint: Any) -> bool:
+        return typing.get_origin(hint) is Literal or any(map(has_choices, typing.get_args(hint)))
 
-    return {name: hint for name, hint in typing.get_type_hints(kind).items() if has_some(hint)}
-
-
-def _spelled(prefix: str, name: str) -> str:
-    return f"{prefix}{name.replace('_', '-')}" if prefix else name
+    full = typing.get_type_hints(kind, include_extras=True)
+    ranges = {
+        name: [x for x in getattr(hint, "__metadata__", ()) if isinstance(x, Range)] for name, hint in full.items()
+    }
+    return {name: (hint, has_choices(hint), ranges[name]) for name, hint in typing.get_type_hints(kind).items()}
 
 
 def read_value(kind: Any, value: Any, where: str) -> Any:
@@ -122,12 +111,10 @@ def read_value(kind: Any, value: Any, where: str) -> Any:
         if not isinstance(value, dict):
             raise ConfigError(f"{where} must be an object, not {value!r}")
         hints = typing.get_type_hints(kind)
-        unknown = sorted(set(value) - set(hints))
-        if unknown:
+        if unknown := sorted(set(value) - set(hints)):
             raise ConfigError(f"{where} has no setting called {', '.join(unknown)}. Choose from {', '.join(hints)}.")
-        required = [f.name for f in dataclasses.fields(kind) if _required(f)]
-        missing = [name for name in required if name not in value]
-        if missing:
+        no_default = (f.default is f.default_factory is dataclasses.MISSING for f in dataclasses.fields(kind))
+        if missing := [name for name, needed in zip(hints, no_default, strict=True) if needed and name not in value]:
             raise ConfigError(f"{where} has no {', '.join(missing)}")
         return kind(**{name: read_value(hints[name], item, f"{where}.{name}") for name, item in value.items()})
     if origin in (typing.Union, types.UnionType):
@@ -151,7 +138,3 @@ def read_value(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ConfigError(f"{where} must be {kind.__name__}, not {value!r}")
     return value
-
-
-def _required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING

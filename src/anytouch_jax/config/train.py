@@ -6,24 +6,14 @@ Frozen dataclasses without arrays. The comment of each field is its help text on
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any, Literal
 
+from anytouch_jax.config import parsing
 from anytouch_jax.config.model import ModelConfig
-from anytouch_jax.config.parsing import (
-    ABOVE_0,
-    BELOW_1,
-    COUNT,
-    NORMAL,
-    NOT_NEGATIVE,
-    SEED,
-    SHARE,
-    chosen,
-    in_range,
-    parse_json,
-    read_value,
-)
+from anytouch_jax.config.parsing import Above0, Below1, Count, NotNegative, Range, Seed, Share, check
 from anytouch_jax.errors import ConfigError
 
 Recipe = Literal["paper", "release"]
@@ -39,25 +29,22 @@ CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.261302
 class LossConfig:
     """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix)."""
 
-    mask_ratio: float = 0.75  # Share of the patches that is masked.
+    mask_ratio: Share = 0.75  # Share of the patches that is masked.
     norm_pix_loss: bool = False  # Predict pixels that are normalised within each patch.
     next_frame: bool = True  # Predict the next frame of a clip too.
-    alpha_tv: float = 1.0  # Weight of touch and vision (Eq. 4).
-    alpha_tl: float = 1.0  # Weight of touch and text (Eq. 4).
-    alpha_vl: float = 0.2  # Weight of vision and text (Eq. 4).
-    match_weight: float = 0.1  # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
-    match_keep: float = 1.0  # Share of the patches that matching encodes. Not in the paper (after FLIP).
-    groups: int = 1  # Parts of the batch within which negatives stay. 1 uses the whole batch.
+    alpha_tv: NotNegative[float] = 1.0  # Weight of touch and vision (Eq. 4).
+    alpha_tl: NotNegative[float] = 1.0  # Weight of touch and text (Eq. 4).
+    alpha_vl: NotNegative[float] = 0.2  # Weight of vision and text (Eq. 4).
+    match_weight: NotNegative[float] = 0.1  # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
+    match_keep: Annotated[float, Range(math.ulp(0.0), 1, "above 0, and 1 at most")] = 1.0
+    """Share of the patches that matching encodes. Not in the paper (after FLIP)."""
+    groups: Count[int] = 1  # Parts of the batch within which negatives stay. 1 uses the whole batch.
     center_embeddings: bool = False  # Subtract the batch mean from embeddings, against collapse of untrained towers.
-    universal_start: float = 0.0  # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
-    universal_end: float = 0.75  # Probability of the universal tokens at the last step, reached linearly.
+    universal_start: Share = 0.0  # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
+    universal_end: Share = 0.75  # Probability of the universal tokens at the last step, reached linearly.
 
     def __post_init__(self) -> None:
-        shares = ("mask_ratio", "match_keep", "universal_start", "universal_end")
-        in_range("--objective.", self, groups=COUNT, **dict.fromkeys(shares, SHARE))
-        in_range("--objective.", self, match_keep=ABOVE_0)
-        weights = ("alpha_tv", "alpha_tl", "alpha_vl", "match_weight")
-        in_range("--objective.", self, **dict.fromkeys(weights, NOT_NEGATIVE))
+        check(self, "--objective.")
 
     @property
     def keep_ratio(self) -> float:
@@ -69,25 +56,20 @@ class LossConfig:
 class OptimConfig:
     """AdamW and its schedule (appendix "Implementation details")."""
 
-    learning_rate: float = 2e-4  # Highest learning rate, reached after the warm-up.
-    min_rate: float = 0.0  # Learning rate at the end.
-    warmup: int | None = None  # Warm-up steps. None: one epoch, or a share of the run if that is shorter.
+    learning_rate: NotNegative[float] = 2e-4  # Highest learning rate, reached after the warm-up.
+    min_rate: NotNegative[float] = 0.0  # Learning rate at the end.
+    warmup: NotNegative[int | None] = None  # Warm-up steps. None: one epoch, or a share of the run if that is shorter.
     decay: Literal["linear", "cosine"] = "linear"  # Form of the decay after the warm-up.
-    beta1: float = 0.9  # AdamW's decay of the first moment.
-    beta2: float = 0.99  # AdamW's decay of the second moment.
-    eps: float = 1e-8  # AdamW's epsilon.
-    weight_decay: float = 0.1  # Weight decay of matrices. Vectors have none.
-    layer_decay: float = 1.0  # Learning-rate decay from one block of the touch encoder to the one before it. 1: off.
-    grad_clip: float | None = None  # Largest norm of the gradient. None: no limit.
-    accumulate: int = 1  # Batches whose gradients make one update.
+    beta1: Below1 = 0.9  # AdamW's decay of the first moment.
+    beta2: Below1 = 0.99  # AdamW's decay of the second moment.
+    eps: Annotated[float, Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")] = 1e-8  # AdamW's epsilon.
+    weight_decay: NotNegative[float] = 0.1  # Weight decay of matrices. Vectors have none.
+    layer_decay: Share = 1.0  # Learning-rate decay from a block of the touch encoder to the one before. 1: off.
+    grad_clip: Above0[float | None] = None  # Largest norm of the gradient. None: no limit.
+    accumulate: Count[int] = 1  # Batches whose gradients make one update.
 
     def __post_init__(self) -> None:
-        chosen("--optim.", self)
-        in_range("--optim.", self, beta1=BELOW_1, beta2=BELOW_1, grad_clip=ABOVE_0, accumulate=COUNT)
-        in_range("--optim.", self, layer_decay=SHARE)
-        in_range("--optim.", self, eps=NORMAL)  # without it a gradient of 0 is divided by 0
-        others = ("learning_rate", "min_rate", "warmup", "weight_decay")
-        in_range("--optim.", self, **dict.fromkeys(others, NOT_NEGATIVE))
+        check(self, "--optim.")
 
 
 @dataclass(frozen=True)
@@ -96,8 +78,8 @@ class DataConfig:
 
     manifests: tuple[str, ...] = ()  # Manifests to train on (--data).
     split: str = "train"  # Split to train on.
-    batch_size: int = 64  # Samples of a step (--batch).
-    clip_share: float = 0.5  # Share of clips. The rest are stills.
+    batch_size: Count[int] = 64  # Samples of a step (--batch).
+    clip_share: Share = 0.5  # Share of clips. The rest are stills.
     order: Literal["alternate", "random"] = "alternate"  # Batches of stills and clips: in turn, or mixed (release).
     weights: tuple[tuple[str, float], ...] | None = None  # Dataset and how often an epoch draws it. 0: never.
     negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
@@ -105,39 +87,41 @@ class DataConfig:
     contact_only: bool = False  # Leave out rows that label.contact marks as free. Unmarked rows stay.
     aligned_text: bool = True  # Use the text of touches that other sensors or units recorded too.
     background: Literal["keep", "subtract"] = "keep"  # Subtract the untouched gel (background_path). Not in the paper.
-    flip: float = 0.5  # Probability of a mirror image, for each direction.
-    affine: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Largest turn (degrees), shift and zoom (shares of the side).
-    jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.5, 0.3)  # Brightness, contrast, saturation, hue.
-    rotation: float = 20.0  # Largest rotation of photographs, degrees.
+    flip: Share = 0.5  # Probability of a mirror image, for each direction.
+    affine: NotNegative[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+    """Largest turn (degrees), shift and zoom (shares of the side)."""
+    jitter: NotNegative[tuple[float, float, float, float]] = (
+        0.4,
+        0.4,
+        0.5,
+        0.3,
+    )  # Brightness, contrast, saturation, hue.
+    rotation: NotNegative[float] = 20.0  # Largest rotation of photographs, degrees.
     tokenizer: str | None = None  # Tokenizer file. None: the run's, else CLIP's, else trained on the captions.
-    threads: int = 2  # Threads that read and augment.
-    prefetch: int = 4  # Batches prepared ahead.
-    cache: int = 512  # Memory for frames, MB.
+    threads: NotNegative[int] = 2  # Threads that read and augment.
+    prefetch: NotNegative[int] = 4  # Batches prepared ahead.
+    cache: NotNegative[int] = 512  # Memory for frames, MB.
     on_bad_sample: Literal["error", "skip"] = "error"  # Stop at a file that cannot be read, or replace and count it.
 
     def __post_init__(self) -> None:
-        chosen("--data.", self)
-        in_range("--data.", self, batch_size=COUNT, clip_share=SHARE, flip=SHARE)
-        others = ("affine", "jitter", "rotation", "threads", "prefetch", "cache")
-        in_range("--data.", self, **dict.fromkeys(others, NOT_NEGATIVE))
+        check(self, "--data.")
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """Course of one training run."""
 
-    seed: int = 0  # Seed of every random draw.
-    steps: int = 1000  # Steps of the whole schedule.
-    save_every: int = 200  # Steps between checkpoints. 0 saves the last one only.
-    keep: int = 3  # Latest checkpoints to keep, besides the best one.
-    figure_every: int = 200  # Steps between pictures. 0: none.
-    max_skipped: int = 20  # Steps in a row that may be skipped for a loss or gradient that is not finite.
+    seed: Seed = 0  # Seed of every random draw.
+    steps: Count[int] = 1000  # Steps of the whole schedule.
+    save_every: NotNegative[int] = 200  # Steps between checkpoints. 0 saves the last one only.
+    keep: Count[int] = 3  # Latest checkpoints to keep, besides the best one.
+    figure_every: NotNegative[int] = 200  # Steps between pictures. 0: none.
+    max_skipped: NotNegative[int] = 20  # Steps in a row that may be skipped for a loss or gradient that is not finite.
     tensorboard: bool = False  # Write TensorBoard events too.
-    fsdp: int = 1  # Devices that share parameters and optimiser moments.
+    fsdp: Count[int] = 1  # Devices that share parameters and optimiser moments.
 
     def __post_init__(self) -> None:
-        in_range("--run.", self, seed=SEED, steps=COUNT, keep=COUNT, fsdp=COUNT)
-        in_range("--run.", self, save_every=NOT_NEGATIVE, figure_every=NOT_NEGATIVE, max_skipped=NOT_NEGATIVE)
+        check(self, "--run.")
 
 
 @dataclass(frozen=True)
@@ -155,7 +139,15 @@ class Config:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
-        chosen("", self)
+        check(self)
+
+    def with_settings(self, settings: Mapping[str, Any]) -> Config:
+        """Return a copy with other values of some settings, by section.field."""
+        config = self
+        for place, value in settings.items():
+            section, name = place.split(".")
+            config = replace(config, **{section: replace(getattr(config, section), **{name: value})})
+        return config
 
     @property
     def warmup(self) -> int:
@@ -198,18 +190,16 @@ class Config:
         return ((r"(bias|scale|class_token)$", 0.0), (r"", self.optim.weight_decay))
 
 
-# Settings of version 0.1 by section. A new name, or the values that change nothing ("recipe": what the recipe implies).
+# Settings of version 0.1: new names, and those that are gone with the value that changes nothing.
 _RENAMED = {("objective", "centre"): "center_embeddings", ("optim", "clip_norm"): "grad_clip"}
-_RETIRED: dict[tuple[str, str], tuple[Any, ...] | str] = {
-    ("model", "force_head"): (False,),
-    ("objective", "differences"): (0.0,),
-    ("objective", "force"): (0.0,),
-    ("objective", "touch_text_sum"): "recipe",
-    ("objective", "reconstruct"): "recipe",
-    ("objective", "universal_shared"): "recipe",
-    ("optim", "ema"): (None,),
-    ("data", "split_steps"): "recipe",
-}
+_RECIPE = "what the recipe implies"
+_RETIRED: dict[str, dict[str, Any]] = {
+    "model": {"force_head": False},
+    "objective": {"differences": 0.0, "force": 0.0, "touch_text_sum": _RECIPE, "reconstruct": _RECIPE,
+                  "universal_shared": _RECIPE},
+    "optim": {"ema": None},
+    "data": {"split_steps": _RECIPE},
+}  # fmt: skip
 
 
 def to_json(config: Any) -> str:
@@ -224,33 +214,22 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
     the run cannot be continued. Raises ConfigError, which names an unknown, missing, mistyped or retired setting.
     """
     try:
-        data = parse_json(text)
+        data = parsing.parse_json(text)
     except ConfigError as error:
         raise ConfigError(f"the configuration {error}") from None
-    if cls is Config and isinstance(data, dict):
-        data = _modern(data, allow_retired)
-    elif isinstance(data, dict):
-        data = {name: value for name, value in data.items() if ("model", name) not in _RETIRED}
-    return read_value(cls, data, "config" if cls is Config else cls.__name__.lower())
-
-
-def _modern(data: Mapping[str, Any], allow_retired: bool) -> dict[str, Any]:
-    """Return the settings of a run under today's names, without the retired ones."""
-    modern = {name: dict(part) if isinstance(part, dict) else part for name, part in data.items()}
+    whole = data if cls is Config else {"model": data}
+    sections = {name: part for name, part in whole.items() if isinstance(part, dict)} if isinstance(whole, dict) else {}
     for (section, name), new_name in _RENAMED.items():
-        part = modern.get(section)
-        if isinstance(part, dict) and name in part:
-            part[new_name] = part.pop(name)
-    for (section, name), inert in _RETIRED.items():
-        part = modern.get(section)
-        if not isinstance(part, dict) or name not in part:
-            continue
-        value = part.pop(name)
-        release = data.get("recipe") == "release"
-        implied = (release and (data.get("stage") == 2 or name == "touch_text_sum"),) if inert == "recipe" else inert
-        if not allow_retired and value not in implied:
-            raise ConfigError(
-                f"the run sets {section}.{name} to {value!r}, which this version no longer has. "
-                "Continue it with version 0.1, or start a new run from it with --init."
-            )
-    return modern
+        if name in sections.get(section, ()):
+            sections[section][new_name] = sections[section].pop(name)
+    for section, settings in _RETIRED.items():
+        for name in settings.keys() & sections.get(section, ()):
+            value, inert = sections[section].pop(name), settings[name]
+            if inert == _RECIPE:
+                inert = whole.get("recipe") == "release" and (whole.get("stage") == 2 or name == "touch_text_sum")
+            if not allow_retired and value != inert:
+                raise ConfigError(
+                    f"the run sets {section}.{name} to {value!r}, which this version no longer has. "
+                    "Continue it with version 0.1, or start a new run from it with --init."
+                )
+    return parsing.read_value(cls, data, "config" if cls is Config else cls.__name__.lower())

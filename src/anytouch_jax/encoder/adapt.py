@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write
 from anytouch_jax.nn.attention import usable
-from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
 from anytouch_jax.weights import checkpoint, compatible
@@ -53,17 +54,9 @@ class Adapted(NamedTuple):
 
 
 def adapt(
-    run: str | Path,
-    manifest: Manifest,
-    sensor: str,
-    *,
-    frames: int = 100,
-    labels: str | None = None,
-    steps: int = 200,
-    rate: float = 3e-3,
-    seed: int = 0,
-    log: Log = print,
-) -> Adapted:
+    run: str | Path, manifest: Manifest, sensor: str, *, frames: int = 100, labels: str | None = None,
+    steps: int = 200, rate: float = 3e-3, seed: int = 0, log: Log = print,
+) -> Adapted:  # fmt: skip
     """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
 
     The tokens start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the
@@ -84,9 +77,18 @@ def adapt(
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", metadata)
     classes, prototypes = _classes(run, manifest, sensor, labels, log)
     fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
-    rows, measured = _measured_rows(manifest, sensor, classes, seed, fitted)
+    in_val = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
+    rows, measured = fitted[:MEASURED], "fitted"
+    if count := min(int(in_val.sum()), MEASURED):
+        rows, measured = choose_frames(manifest, sensor, "val", count, classes, seed), "val"
     net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
-    loss, touch = _class_loss(net, row, prototypes), {"touch": params["touch"]}
+    touch = {"touch": params["touch"]}
+
+    def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
+        z = net.encode_touch(params, normalise_touch(clip), jnp.full(clip.shape[0], row))
+        logits = losses.normalise(z) @ jnp.asarray(prototypes).T / net.model.temperature
+        return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, target))
+
     measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
     clip = _read(manifest, config, fitted)
     tokens, history = _fit(loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed)
@@ -101,37 +103,21 @@ def check_empty(out: Path) -> None:
 
 
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
-    """Write a run folder for embed, probe and retrieve, whole or not at all.
-
-    Raises UserError if `out` is not empty, and if the disk has no room.
-    """
-    out = Path(out)
-    check_empty(out)
-    disk = next(folder for folder in out.absolute().parents if folder.is_dir())
-    size, free = sum(leaf.nbytes for leaf in jax.tree.leaves(adapted.params)), shutil.disk_usage(disk).free
-    if size > free:
-        raise UserError(f"{out} takes {size / 1e6:.1f} MB and {disk} has {free / 1e6:.1f} MB left; free some space")
-    with atomic_folder(out) as folder:
-        _save(adapted, Path(run), folder)
-
-
-def _save(adapted: Adapted, run: Path, out: Path) -> None:
-    text = to_json(adapted.config)
-    atomic_write(out / "config.json", text + "\n")
-    if (run / "tokenizer.json").exists():
-        shutil.copyfile(run / "tokenizer.json", out / "tokenizer.json")
-    lines = (json.dumps({"step": step, "loss": loss}) + "\n" for step, loss in enumerate(adapted.losses))
-    atomic_write(out / "metrics.jsonl", "".join(lines))
-    touch = {name: leaf for name, leaf in adapted.params["touch"].items() if name != "sensor_tokens"}
-    state = {
-        "trainable": {"touch": {"sensor_tokens": adapted.params["touch"]["sensor_tokens"]}},
-        "frozen": adapted.params | {"touch": touch},
-    }
-    checkpoints = checkpoint.Checkpoints(out / "checkpoints", keep=1, config_json=text, metadata=adapted.metadata)
-    try:
-        checkpoints.save(len(adapted.losses), state, {"loss": adapted.after})
-    finally:
-        checkpoints.close()
+    """Write a run folder for embed, probe and retrieve, whole or not at all. Raises UserError if `out` is not empty."""
+    check_empty(Path(out))
+    text, tokenizer = to_json(adapted.config), Path(run) / "tokenizer.json"
+    touch = dict(adapted.params["touch"])
+    trainable = {"touch": {"sensor_tokens": touch.pop("sensor_tokens")}}
+    with atomic_folder(Path(out)) as folder:
+        atomic_write(folder / "config.json", text + "\n")
+        if tokenizer.exists():
+            shutil.copyfile(tokenizer, folder / tokenizer.name)
+        lines = (json.dumps({"step": step, "loss": loss}) + "\n" for step, loss in enumerate(adapted.losses))
+        atomic_write(folder / "metrics.jsonl", "".join(lines))
+        state = {"trainable": trainable, "frozen": adapted.params | {"touch": touch}}
+        store = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=text, metadata=adapted.metadata)
+        with contextlib.closing(store):
+            store.save(len(adapted.losses), state, {"loss": adapted.after})
 
 
 def choose_frames(
@@ -141,24 +127,19 @@ def choose_frames(
 
     With `classes` i32 (rows of the manifest,) only rows that have a class (not -1). Raises UserError for too few rows.
     """
-    usable_rows = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == split)
-    if classes is not None:
-        usable_rows &= classes >= 0
-    rows = np.flatnonzero(usable_rows)
-    if count < 0:
-        raise UserError(f"{count} frames cannot be chosen; 0 or more")
+    sensors = text_column(manifest, "sensor")
+    usable_rows = (sensors == sensor) & (text_column(manifest, "split") == split)
+    rows = np.flatnonzero(usable_rows if classes is None else usable_rows & (classes >= 0))
     if len(rows) < count:
-        known = ", ".join(sorted(set(text_column(manifest, "sensor"))))
         raise UserError(
             f"split {split!r} has {len(rows)} usable frames of {sensor}, not {count}; ask for fewer, or name another "
-            f"sensor ({known})"
+            f"sensor ({', '.join(sorted(set(sensors)))})"
         )
     rows = np.random.default_rng([seed % 2**63, 77]).permutation(rows)
     sequence = manifest.codes("sequence", own=True)[rows]
     order = np.argsort(sequence, kind="stable")
-    first = np.searchsorted(sequence[order], sequence[order])
-    turn = np.empty(len(rows), np.int64)
-    turn[order] = np.arange(len(rows)) - first  # rows of the same sequence before a row
+    turn = np.empty(len(rows), np.int64)  # rows of the same sequence before a row
+    turn[order] = np.arange(len(rows)) - np.searchsorted(sequence[order], sequence[order])
     return np.sort(rows[np.argsort(turn, kind="stable")[:count]])
 
 
@@ -221,32 +202,10 @@ def _classes(run: str | Path, manifest: Manifest, sensor: str, labels: str, log:
     return classes, mean / np.linalg.norm(mean, axis=1, keepdims=True)
 
 
-def _measured_rows(
-    manifest: Manifest, sensor: str, classes: np.ndarray, seed: int, fitted: np.ndarray
-) -> tuple[np.ndarray, str]:
-    """Return the rows on which to measure, and their name: frames of the sensor in split val, else the fitted ones."""
-    in_val = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
-    count = min(int(in_val.sum()), MEASURED)
-    if not count:
-        return fitted[:MEASURED], "fitted"
-    return choose_frames(manifest, sensor, "val", count, classes, seed), "val"
-
-
 def _read(manifest: Manifest, config: Config, rows: np.ndarray) -> np.ndarray:
     """Return stills u8 (rows, 1, H, W, 3)."""
-    config = replace(config, data=replace(config.data, batch_size=min(64, len(rows)), on_bad_sample="error"))
+    config = config.with_settings({"data.batch_size": min(64, len(rows)), "data.on_bad_sample": "error"})
     return np.concatenate([part.clip[: len(ids)] for ids, part in evaluation(manifest, rows, config)])
-
-
-def _class_loss(net: Net, row: int, prototypes: np.ndarray) -> Loss:
-    """Return the cross-entropy of stills of the sensor in `row` against the prototypes."""
-
-    def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
-        z = net.encode_touch(params, normalise_touch(clip), jnp.full(clip.shape[0], row))
-        logits = losses.normalise(z) @ jnp.asarray(prototypes).T / net.model.temperature
-        return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, target))
-
-    return loss
 
 
 def _fit(

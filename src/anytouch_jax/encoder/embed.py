@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -37,22 +38,11 @@ def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: i
     with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
     number. Without items the result is empty, of shape (0,). This is the only place that pads batches.
     """
-    values: list[np.ndarray] = []
-    waiting: list[Any] = []
-
-    def flush() -> None:
-        count = len(waiting)
-        full = waiting + waiting[-1:] * (size - count if values else 0)
+    values, left = list[np.ndarray](), iter(items)
+    while part := list(islice(left, size)):
+        full = part + part[-1:] * (size - len(part) if values else 0)
         batch = tuple(map(np.stack, zip(*full, strict=True))) if isinstance(full[0], tuple) else np.stack(full)
-        values.append(np.asarray(function(batch))[:count])
-        waiting.clear()
-
-    for item in items:
-        waiting.append(item)
-        if len(waiting) == size:
-            flush()
-    if waiting:
-        flush()
+        values.append(np.asarray(function(batch))[: len(part)])
     return np.concatenate(values) if values else np.zeros(0, np.float32)
 
 
@@ -72,19 +62,11 @@ class Features:
 
 
 def embed_rows(
-    encoder: Encoder,
-    manifest: Manifest,
-    rows: np.ndarray,
-    frames: int = 1,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    *,
-    batch: int = BATCH,
-    on_bad_sample: Literal["error", "skip"] = "error",
-    sensor_row: int | None = None,
-    edit: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    encoder: Encoder, manifest: Manifest, rows: np.ndarray, frames: int = 1, pooling: Pooling = "class",
+    join: Join = "mean", *, batch: int = BATCH, on_bad_sample: Literal["error", "skip"] = "error",
+    sensor_row: int | None = None, edit: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     log: Log = warn,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return (row numbers i64 (n,), features f32 (n, d)) of manifest rows, each frame encoded once.
 
     A row's clip is the `frames` frames that end at it. A sensor that the model does not know gets the universal tokens,
@@ -98,8 +80,8 @@ def embed_rows(
         encoder.sensor_row(name, log)
     if on_bad_sample == "error":
         check_backgrounds(encoder, manifest, rows)
-    data = replace(encoder.config.data, batch_size=min(batch, len(rows)), on_bad_sample=on_bad_sample)
-    config, ids = replace(encoder.config, data=data), []
+    settings = {"data.batch_size": min(batch, len(rows)), "data.on_bad_sample": on_bad_sample}
+    config, ids = encoder.config.with_settings(settings), []
 
     def touches() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
@@ -114,23 +96,17 @@ def embed_rows(
         sensor = sensor if sensor_row is None else np.full_like(sensor, sensor_row)
         return encoder.encode_touch(clips, sensor, pooling=pooling, join=join)
 
-    values = run_in_batches(encode, touches(), data.batch_size)
+    values = run_in_batches(encode, touches(), config.data.batch_size)
     if not ids:
         raise UserError(f"none of the {len(rows)} rows can be read; check them with `anytouch data verify`")
     return np.concatenate(ids), values
 
 
 def embed_frames(
-    encoder: Encoder,
-    frames: Iterable[tuple[int, str, np.ndarray | None]],
-    sensor_row: int,
-    preprocess: Callable[[np.ndarray], np.ndarray] | None = None,
-    *,
-    length: int = 1,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    batch: int = BATCH,
-) -> Features:
+    encoder: Encoder, frames: Iterable[tuple[int, str, np.ndarray | None]], sensor_row: int,
+    preprocess: Callable[[np.ndarray], np.ndarray] | None = None, *, length: int = 1, pooling: Pooling = "class",
+    join: Join = "mean", batch: int = BATCH,
+) -> Features:  # fmt: skip
     """Return features of every clip of `length` consecutive frames, keyed by the place of its last frame.
 
     `frames` yields number, name ("" for a video) and pixels of each frame, None for an unreadable one. No clip spans a

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,9 +24,11 @@ from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import vision_evaluation
+from anytouch_jax.encoder.arrays import rows_of_sensors
 from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
 from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.functional import Net, build
@@ -38,33 +41,13 @@ _PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matchin
 
 
 @dataclass(frozen=True)
-class Parts:
-    """The parts of a model beyond its touch encoder: towers, decoder and heads, as the whole `model` names them.
-
-    The arrays stay on the host until a part is called. `tokenizer_file` is None without a tokenizer.json.
-    """
-
-    model: ModelConfig
-    params: Params = field(repr=False)
-    tokenizer_file: Path | None = None
-
-    @cached_property
-    def tokenizer(self) -> Tokenizer | None:
-        return None if self.tokenizer_file is None else load_tokenizer(self.tokenizer_file)
-
-    @cached_property
-    def compiled(self) -> dict[str, Callable[..., jax.Array]]:
-        """The parts that were called, by the method that calls them."""
-        return {}
-
-
-@dataclass(frozen=True)
 class Encoder:
     """A touch encoder with its parameters, and the image and text towers if the weights have them.
 
     `config` and `params` are those of the touch encoder alone, `source` is the path of the weights. `trained_sensors`
     is None if the weights do not store them. If training never drew the universal tokens (`universal_drawn`), the mean
-    of the trained sensors' tokens is used instead.
+    of the trained sensors' tokens is used instead. `others` are the parameters of towers, decoder and heads of the
+    `whole` model: they stay on the host until they are used. `tokenizer_file` is None without a tokenizer.json.
     """
 
     config: Config
@@ -72,7 +55,9 @@ class Encoder:
     source: str
     trained_sensors: tuple[str, ...] | None = None
     universal_drawn: bool = True
-    parts: Parts | None = field(default=None, repr=False)
+    whole: ModelConfig | None = field(default=None, repr=False)
+    others: Params = field(default_factory=dict, repr=False)
+    tokenizer_file: Path | None = field(default=None, repr=False)
     metadata: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -101,8 +86,8 @@ class Encoder:
         """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its training."""
         if dtype == "trained":
             return self
-        parts = self.parts and replace(self.parts, model=replace(self.parts.model, dtype=dtype))
-        return replace(self, config=replace(self.config, model=replace(self.config.model, dtype=dtype)), parts=parts)
+        whole = self.whole and replace(self.whole, dtype=dtype)
+        return replace(self, config=self.config.with_settings({"model.dtype": dtype}), whole=whole)
 
     @property
     def subtracts(self) -> bool:
@@ -145,16 +130,12 @@ class Encoder:
             )
         check_frames(self.config.model, frames.shape[1])
         rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
-        count, run = len(frames), self._run(pooling, join)
-        if not count:  # the network has no shape for nothing: embed one touch and return none
-            frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
-        return np.asarray(run(self._placed, frames, rows))[:count]
-
-    def _run(self, pooling: Pooling, join: Join) -> Callable[..., jax.Array]:
-        key = (pooling, join)
+        count, key = len(frames), (pooling, join)
         if key not in self._compiled:
             self._compiled[key] = jax.jit(partial(touch_features, net=self.net, pooling=pooling, join=join))
-        return self._compiled[key]
+        if not count:  # the network has no shape for nothing: embed one touch and return none
+            frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
+        return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
 
     @cached_property
     def _placed(self) -> Params:
@@ -163,7 +144,13 @@ class Encoder:
 
     @cached_property
     def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
+        """What was called: touch by pooling and join, other parts by their method."""
         return {}
+
+    @cached_property
+    def tokenizer(self) -> Tokenizer | None:
+        """The tokenizer of the text tower."""
+        return None if self.tokenizer_file is None else load_tokenizer(self.tokenizer_file)
 
     def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
         """Return embeddings f32 (B, E) of photographs, RGB (h, w, 3) of any size each; not unit-norm.
@@ -189,13 +176,13 @@ class Encoder:
             return net.encode_text(params, *batch).astype(jnp.float32)
 
         tower = self._part("encode_text", run, "text")
-        assert self.parts is not None and self.parts.model.text is not None
-        tokenizer, text = self.parts.tokenizer, self.parts.model.text
+        assert self.whole is not None and self.whole.text is not None
+        tokenizer, text = self.tokenizer, self.whole.text
         if tokenizer is None:
             raise UserError(f"there is no tokenizer.json in the folder of {self.source}; copy the one of its training")
         if tokenizer.vocab_size > text.vocab:
             raise UserError(
-                f"{self.parts.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
+                f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
                 f"{text.vocab}; copy the tokenizer of its training"
             )
         texts = [texts] if isinstance(texts, str) else list(texts)
@@ -245,20 +232,18 @@ class Encoder:
 
     def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
         """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
-        params, parts = {name: self.part_params(name)}, self.parts
-        assert parts is not None
-        if method not in parts.compiled:
-            params |= {key: parts.params[key] for key in more if key in parts.params}
-            net = build(usable(parts.model))
-            parts.compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
-        return parts.compiled[method]
+        params = {name: self.part_params(name)}
+        if method not in self._compiled:
+            params |= {key: self.others[key] for key in more if key in self.others}
+            net = build(usable(self.whole or self.config.model))
+            self._compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
+        return self._compiled[method]
 
     def part_params(self, name: str) -> Params:
         """Return the parameters of a part: image, text, decoder, matcher or logit_scale. Raises UserError."""
-        if self.parts is None or name not in self.parts.params:
-            part = _PART_NAMES.get(name, name)
-            raise UserError(f"{self.source} has no {part}; give a run or a weights file that has one")
-        return dict(self.parts.params)[name]
+        if name not in self.others:
+            raise UserError(f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has one")
+        return dict(self.others)[name]
 
 
 def _unit(values: npt.ArrayLike) -> np.ndarray:
@@ -269,21 +254,6 @@ def check_frames(model: ModelConfig, frames: int) -> None:
     """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of the model's clips."""
     if frames != 1 and frames < model.frames:
         raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
-
-
-def rows_of_sensors(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
-    """Return rows i32 (count,) of one sensor name, of names (count,), or of row numbers below `rows`.
-
-    `row` returns the row of a name. Raises UserError for another shape or type.
-    """
-    ids = np.full(count, row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
-    if ids.dtype.kind in "UO":
-        ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)
-    if ids.shape != (count,) or ids.dtype.kind not in "iu":
-        raise UserError(f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}")
-    if ids.min(initial=0) < 0 or ids.max(initial=0) >= rows:
-        raise UserError(f"sensor rows must be 0 to {rows - 1}")
-    return ids.astype(np.int32)
 
 
 def touch_features(
@@ -306,16 +276,19 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     `step` chooses a checkpoint of a run, the latest by default. Image and text towers are loaded too, if there are
     any. Raises UserError for weights without a touch encoder, or with values that are not finite.
     """
-    path = Path(path)
-    if path.is_file():
-        _refuse_features(path)
+    path, names = Path(path), set[str]()
+    if path.suffix == ".npz":
+        with suppress(OSError, ValueError):  # the reader of weights reports a damaged file
+            names = set(read_arrays(path, only=lambda _: False))
+    if {"features", "rows"} <= names:
+        raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
     loaded = load.load_model(path, step=step)
     if "touch" not in loaded.params:
         raise UserError(f"{path} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
     others = {name: part for name, part in loaded.params.items() if name != "touch"}
     return Encoder(
         _touch_only(loaded.config), {"touch": loaded.params["touch"]}, str(path), loaded.trained_sensors,
-        loaded.universal_drawn, Parts(loaded.config.model, others, _tokenizer_file(path)), loaded.metadata,
+        loaded.universal_drawn, loaded.config.model, others, _tokenizer_file(path), loaded.metadata,
     )  # fmt: skip
 
 
@@ -324,17 +297,6 @@ def _tokenizer_file(path: Path) -> Path | None:
     is_checkpoint = path.is_dir() and not (path / "config.json").is_file()
     folders = [path, path.parent, path.parent.parent] if is_checkpoint else [path if path.is_dir() else path.parent]
     return next((folder / "tokenizer.json" for folder in folders if (folder / "tokenizer.json").is_file()), None)
-
-
-def _refuse_features(path: Path) -> None:
-    """Raise UserError for a features file of `anytouch embed`."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            is_features = {"features", "rows"} <= set(file.files)
-    except Exception:  # weights of any kind: their reader reports what is wrong
-        return
-    if is_features:
-        raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
 
 
 def random_encoder(config: Config, seed: int = 0) -> Encoder:

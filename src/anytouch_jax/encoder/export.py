@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL, parse_json
+from anytouch_jax.encoder.arrays import rows_of_sensors
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
 
@@ -30,6 +31,12 @@ if TYPE_CHECKING:
 FORMAT = "anytouch_jax.export.1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "float64": 1e-4}  # of the largest feature; the platform's own rounding
+# The fields of a description that a caller needs.
+_FIELDS: dict[str, type] = {
+    **dict.fromkeys(("bytes", "frames", "image_size", "features"), int),
+    **dict.fromkeys(("sha256", "jax", "background", "pooling", "join", "dtype"), str),
+    **{"platforms": list, "sensors": dict},
+}
 _CHECKED = (1, 5)  # batch sizes
 _EXAMPLE = """import pathlib
 import jax
@@ -55,22 +62,14 @@ class Exported:
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(f"touches must be uint8 RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
-        rows = np.full(len(frames), sensor) if isinstance(sensor, str) else np.asarray(sensor)
-        if rows.dtype.kind in "UO":
-            rows = np.array([self._row(name) for name in rows.reshape(-1)], np.int32).reshape(rows.shape)
-        if rows.shape != (len(frames),) or rows.dtype.kind not in "iu":
-            raise UserError(
-                f"sensor rows must be one integer for each of the {len(frames)} touches, not {rows.dtype} {rows.shape}"
-            )
-        if rows.min() < 0 or rows.max() >= len(self.about["sensors"]):
-            raise UserError(f"sensor rows must be 0 to {len(self.about['sensors']) - 1}")
-        return np.asarray(self._run(frames, rows.astype(np.int32)))
+        rows = rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
+        return np.asarray(self._run(frames, rows))
 
-    def _row(self, name: Any) -> int:
+    def _row(self, name: str) -> int:
         sensors: dict[str, int] = self.about["sensors"]
-        if str(name) not in sensors:
+        if name not in sensors:
             raise UserError(f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other")
-        return sensors[str(name)]
+        return sensors[name]
 
 
 def describes(path: Path) -> Path:
@@ -83,7 +82,9 @@ def load(path: str | Path) -> Exported:
     path = Path(path)
     data, about = read_checked(path)
     if _here() not in about["platforms"]:
-        raise UserError(f"{path} was exported for {', '.join(about['platforms'])}; this machine runs jax on {_here()}")
+        raise UserError(
+            f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}"
+        )
     try:
         module = jax_export.deserialize(bytearray(data))
     except Exception as error:  # its checksum is right, so it was written by another jax
@@ -95,14 +96,9 @@ def load(path: str | Path) -> Exported:
 
 
 def export(
-    encoder: Encoder,
-    path: str | Path,
-    *,
-    frames: int = 1,
-    platforms: Sequence[str] = ("cpu", "cuda"),
-    pooling: Pooling = "class",
-    join: Join = "mean",
-) -> dict[str, Any]:
+    encoder: Encoder, path: str | Path, *, frames: int = 1, platforms: Sequence[str] = ("cpu", "cuda"),
+    pooling: Pooling = "class", join: Join = "mean",
+) -> dict[str, Any]:  # fmt: skip
     """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
     The artefact is first called with 1 and 5 touches and compared with the live model. Raises CheckError if they
@@ -112,7 +108,11 @@ def export(
 
     path, model = Path(path), encoder.config.model
     check_frames(model, frames)
-    _check_platforms(platforms)
+    wrong = ", ".join(name for name in platforms if name not in PLATFORMS)
+    if wrong or not platforms:
+        raise UserError(f"platforms must be of {', '.join(PLATFORMS)}, not {wrong or 'none'}")
+    if _here() not in platforms:
+        raise UserError(f"this machine runs jax on {_here()}: add it to --platforms, to check the artefact")
     if path.suffix == ".json":
         raise UserError(f"{path} is the name of the description; name the artefact .bin")
     # The only form of attention that every platform has and that takes any number of touches.
@@ -159,16 +159,6 @@ def call_of(
         "sensors": {name: row for row, name in enumerate(model.sensors)},
         "trained_sensors": None if encoder.trained_sensors is None else list(encoder.trained_sensors),
     }
-
-
-def _check_platforms(platforms: Sequence[str]) -> None:
-    wrong = [name for name in platforms if name not in PLATFORMS]
-    if wrong or not platforms:
-        raise UserError(f"platforms must be of {', '.join(PLATFORMS)}, not {', '.join(wrong) or 'none'}")
-    if _here() not in platforms:
-        raise UserError(
-            f"this machine runs jax on {_here()}: add it to --platforms, so that the artefact can be checked"
-        )
 
 
 def _here() -> str:
@@ -220,29 +210,10 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
         raise UserError(f"{describes(path)} is not the description of an exported encoder; export it again") from None
     if not known:
         raise UserError(f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}")
-    if wrong := [name for name, valid in _SCHEMA.items() if name not in about or not valid(about[name])]:
-        raise UserError(f"{describes(path)} is damaged: {wrong[0]} is missing or of another type; export it again")
+    wrong = [name for name, kind in _FIELDS.items() if type(about.get(name)) is not kind]
+    if wrong or list(about["sensors"].values()) != list(range(len(about["sensors"]))):
+        name = (wrong or ["sensors"])[0]
+        raise UserError(f"{describes(path)} is damaged: {name} is missing or of another type; export it again")
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:
         raise UserError(f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again")
     return data, about
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 < value < 1 << 40
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_rows(value: Any) -> bool:
-    return isinstance(value, dict) and bool(value) and list(value.values()) == list(range(len(value)))
-
-
-# The fields of a description that a caller needs, and the check of each.
-_SCHEMA: dict[str, Callable[[Any], bool]] = {
-    **dict.fromkeys(("bytes", "frames", "image_size", "features"), _is_count),
-    **dict.fromkeys(("sha256", "jax", "background", "pooling", "join", "dtype"), _is_text),
-    "platforms": lambda value: isinstance(value, list) and bool(value) and all(map(_is_text, value)),
-    "sensors": _is_rows,
-}

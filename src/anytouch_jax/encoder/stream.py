@@ -16,7 +16,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -38,20 +38,7 @@ _PATIENCE = 2.0  # seconds to wait for the reader after the last frame
 _PAUSE = 0.01  # seconds from a missed read to the next
 
 
-class Source(Protocol):
-    """A camera or a video: the part of cv2.VideoCapture that is used."""
-
-    def grab(self) -> bool:
-        """Wait for the next frame. Return False at the end."""
-
-    def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        """Return whether the frame could be decoded, and its pixels BGR u8 (h, w, 3) or grey (h, w)."""
-
-    def get(self, propId: int, /) -> float:
-        """Return a property of a video, such as the time stamp of a frame. It is not called for cameras."""
-
-    def release(self) -> None:
-        """Release the device or the file."""
+Source = Any  # a cv2.VideoCapture, or another object with its methods grab, retrieve, get (of videos) and release
 
 
 class CameraError(UserError):
@@ -102,31 +89,25 @@ class Embedded(NamedTuple):
 
 
 class Mailbox:
-    """One slot between the reader and the encoder. With `replace` a newer clip replaces one that was not taken."""
+    """One slot between the reader and the encoder. With `replace` a newer clip replaces one that was not taken.
+
+    `is_closed`: one side has ended the stream. `alive`: when the reader last came back from the camera.
+    """
 
     def __init__(self, *, replace: bool) -> None:
-        self._replace, self._done = replace, False
+        self.is_closed, self.alive = False, time.perf_counter()
+        self._replace, self._changed = replace, threading.Condition()
         self._clip: Clip | None = None
         self._error: BaseException | None = None
-        self._changed, self._alive = threading.Condition(), time.perf_counter()
-
-    @property
-    def is_closed(self) -> bool:
-        """Return whether one of the sides has ended the stream."""
-        return self._done
-
-    def report_alive(self) -> None:
-        """Note that the reader has come back from the camera."""
-        self._alive = time.perf_counter()
 
     def put(self, clip: Clip) -> bool:
         """Leave a clip, after waiting for an empty slot unless it may be replaced. Return False once it is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._replace or self._clip is None or self._done)
-            if not self._done:
+            self._changed.wait_for(lambda: self._replace or self._clip is None or self.is_closed)
+            if not self.is_closed:
                 self._clip = clip
             self._changed.notify_all()
-            return not self._done
+            return not self.is_closed
 
     def take(self, hang: float | None = None) -> Clip | None:
         """Wait for a clip and return it, None after the last one.
@@ -134,8 +115,8 @@ class Mailbox:
         Raises the error of the reader, and CameraError after `hang` seconds in which the reader did not come back.
         """
         with self._changed:
-            while not self._changed.wait_for(lambda: self._clip is not None or self._done, hang):
-                if hang is not None and time.perf_counter() - self._alive > hang:
+            while not self._changed.wait_for(lambda: self._clip is not None or self.is_closed, hang):
+                if hang is not None and time.perf_counter() - self.alive > hang:
                     raise CameraError(f"the camera has not answered for {hang:g} s. Check its cable, and start again.")
             clip, self._clip = self._clip, None
             self._changed.notify_all()
@@ -146,7 +127,7 @@ class Mailbox:
     def close(self, error: BaseException | None = None) -> None:
         """End the stream, from either side. A clip in the slot can still be taken."""
         with self._changed:
-            self._done, self._error = True, self._error or error
+            self.is_closed, self._error = True, self._error or error
             self._changed.notify_all()
 
 
@@ -164,18 +145,9 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
 
 
 def stream(
-    encoder: Encoder,
-    source: Source,
-    preprocess: Preprocess | None = None,
-    *,
-    live: bool,
-    sensor: int,
-    frames: int = 1,
-    stride: int = 1,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    log: Log = warn,
-) -> Generator[Embedded]:
+    encoder: Encoder, source: Source, preprocess: Preprocess | None = None, *, live: bool, sensor: int,
+    frames: int = 1, stride: int = 1, pooling: Pooling = "class", join: Join = "mean", log: Log = warn,
+) -> Generator[Embedded]:  # fmt: skip
     """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
 
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
@@ -187,7 +159,34 @@ def stream(
     if stride < 1:
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
     embed = compile_for_one(encoder, sensor, frames, pooling, join)
-    return _stream(embed, source, live, preprocess or Preprocess(encoder), frames, stride, log)
+    mailbox = Mailbox(replace=live)
+    arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
+    arguments = (arrived, preprocess or Preprocess(encoder), frames, stride, mailbox)
+    reader = threading.Thread(target=_read, args=arguments, daemon=True)
+
+    def embedded() -> Generator[Embedded]:
+        started, start = time.time(), time.perf_counter()
+        try:
+            reader.start()  # Ctrl-C may come already while the thread starts
+            while (clip := mailbox.take(HANG if live else None)) is not None:
+                begin = time.perf_counter()
+                there = jax.device_put(clip.frames[None]).block_until_ready()
+                copied = time.perf_counter()
+                values = np.asarray(embed(there))[0]
+                end = time.perf_counter()
+                last, at = clip.last, clip.last.read - start
+                seconds = (last.decode, clip.resize, copied - begin, end - copied)
+                stamp = at if last.time is None else last.time
+                age = end - last.read
+                yield Embedded(last.number, at, values, seconds, age, started, stamp, last.picture, last.missed)
+        finally:
+            mailbox.close()
+            if reader.ident is not None:
+                reader.join(_PATIENCE)
+            if not reader.is_alive():  # releasing a camera that hangs would hang, too
+                source.release()
+
+    return embedded()
 
 
 def compile_for_one(
@@ -201,40 +200,6 @@ def compile_for_one(
     compiled(*given).block_until_ready()
     params, _, row = given
     return lambda clip: compiled(params, clip, row)
-
-
-def _stream(
-    embed: Callable[[jax.Array], jax.Array],
-    source: Source,
-    live: bool,
-    preprocess: Preprocess,
-    frames: int,
-    stride: int,
-    log: Log,
-) -> Generator[Embedded]:
-    mailbox = Mailbox(replace=live)
-    started, start = time.time(), time.perf_counter()
-    arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
-    reader = threading.Thread(target=_read, args=(arrived, preprocess, frames, stride, mailbox), daemon=True)
-    try:
-        reader.start()  # Ctrl-C may come already while the thread starts
-        while (clip := mailbox.take(HANG if live else None)) is not None:
-            begin = time.perf_counter()
-            there = jax.device_put(clip.frames[None]).block_until_ready()
-            copied = time.perf_counter()
-            values = np.asarray(embed(there))[0]
-            end = time.perf_counter()
-            last, at = clip.last, clip.last.read - start
-            seconds = (last.decode, clip.resize, copied - begin, end - copied)
-            stamp = at if last.time is None else last.time
-            age = end - last.read
-            yield Embedded(last.number, at, values, seconds, age, started, stamp, last.picture, last.missed)
-    finally:
-        mailbox.close()
-        if reader.ident is not None:
-            reader.join(_PATIENCE)
-        if not reader.is_alive():  # releasing a camera that hangs would hang, too
-            source.release()
 
 
 def _read(arrived: Iterator[Frame], preprocess: Preprocess, frames: int, stride: int, mailbox: Mailbox) -> None:
@@ -279,8 +244,7 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
     A read without a picture, one that raises cv2.error, and a picture of another shape than the first are missed and
     tried again. Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
     """
-    number, missed, failing, fault = 0, 0, None, ""
-    shape: tuple[int, ...] | None = None
+    number, missed, failing, fault, shape = 0, 0, None, "", None
     watch = _Watch(log)
     while True:
         pixels, reason = None, "the camera delivers nothing"
@@ -292,17 +256,14 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
                 pixels = pixels if whole else None
         except cv2.error as error:
             reason = " ".join(str(error).split())
-        decoded = time.perf_counter()
-        mailbox.report_alive()
+        mailbox.alive = decoded = time.perf_counter()
         if mailbox.is_closed:
             return
-        if pixels is not None and shape is not None and pixels.shape != shape:
+        if pixels is not None and shape not in (None, pixels.shape):
             reason = f"its pictures have shape {pixels.shape}, and the first had {shape}"
             pixels = None
         if pixels is None:
-            missed += 1
-            failing = decoded if failing is None else failing
-            fault = reason
+            missed, failing, fault = missed + 1, failing or decoded, reason
             if decoded - failing > RETRY:
                 raise CameraError(
                     f"no frame of the camera could be read for {RETRY:g} s after {number} frames: {reason}. "
@@ -335,15 +296,15 @@ class _Watch:
 
     def look(self, number: int, pixels: np.ndarray, now: float) -> str:
         """Return "black" or "frozen" if the picture has been so for STUCK seconds, else "ok"."""
-        data = pixels.tobytes()
-        faults = {"black": bool(pixels[::8, ::8].mean() < BLACK), "frozen": data == self._last}
-        self._last = data
-        advice = {"black": "Check its light and its cover.", "frozen": "It repeats the same bytes: check its cable."}
-        for kind, is_true in faults.items():
-            if not is_true:
+        last, self._last = self._last, pixels.tobytes()
+        for kind, is_so, advice in (
+            ("black", pixels[::8, ::8].mean() < BLACK, "Check its light and its cover."),
+            ("frozen", self._last == last, "It repeats the same bytes: check its cable."),
+        ):
+            if not is_so:
                 self._since.pop(kind, None)
             elif now - self._since.setdefault(kind, now) >= STUCK:
-                self.report(kind, f"the picture of the camera is {kind} at frame {number}. {advice[kind]}")
+                self.report(kind, f"the picture of the camera is {kind} at frame {number}. {advice}")
                 return kind
         return "ok"
 
@@ -351,9 +312,8 @@ class _Watch:
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 
-    `total` frames were embedded, `frozen` and `black` count those of such pictures, and `missed` reads gave nothing;
-    the arrays may have only the last frames. `interrupted`: Ctrl-C or SIGTERM ended the stream. `error`: a camera that
-    delivers nothing did.
+    `total` frames were embedded: the arrays may have only the last ones. `frozen` and `black` count such pictures.
+    `interrupted`: Ctrl-C or SIGTERM ended the stream. `error`: a camera that delivers nothing ended it.
     """
 
     values: np.ndarray
@@ -392,21 +352,14 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         interrupted = True
     except CameraError as error:
         failure = error
+    columns = (np.asarray([getattr(frame, name) for frame in stored]) for name in ("number", "at", "seconds", "age"))
+    numbers, at, seconds, age = columns
     return Result(
         np.stack([frame.values for frame in stored]) if stored else np.zeros((0, 0), np.float32),
-        np.asarray([frame.number for frame in stored], np.int64),
-        np.asarray([frame.at for frame in stored]),
-        np.asarray([frame.seconds for frame in stored]).reshape(-1, len(PARTS)),
-        np.asarray([frame.age for frame in stored]),
-        total,
-        interrupted,
-        stored[-1].started if stored else 0.0,
-        np.asarray([frame.time for frame in stored]),
-        stored[-1].missed if stored else 0,
-        pictures["frozen"],
-        pictures["black"],
-        failure,
-    )
+        numbers.astype(np.int64), at, seconds.reshape(-1, len(PARTS)), age, total, interrupted,
+        stored[-1].started if stored else 0.0, np.asarray([frame.time for frame in stored]),
+        stored[-1].missed if stored else 0, pictures["frozen"], pictures["black"], failure,
+    )  # fmt: skip
 
 
 @contextlib.contextmanager

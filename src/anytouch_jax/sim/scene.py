@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config.parsing import BELOW_1, COUNT, NOT_NEGATIVE, SHARE, chosen, in_range
+from anytouch_jax.config.parsing import Below1, Count, NotNegative, Share, check
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.sensing.sensors import SENSORS
 from anytouch_jax.sim.sensing.units import THINNEST, Unit, draw_drift, draw_unit
@@ -40,25 +40,25 @@ class Scenes:
     numbers, from `first` on, do not overlap. Raises UserError for a scene that cannot be simulated.
     """
 
-    touches: int = 400
+    touches: Count[int] = 400
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
-    seed: int = 0
+    seed: NotNegative[int] = 0
     grade: Grade = "fine"
     fidelity: Literal["exact", "fast"] = "fast"
-    frames: int = 10
-    objects: int = 200
+    frames: Count[int] = 10
+    objects: Count[int] = 200
     depth: tuple[float, float] = (0.3, 1.0)  # mm, range of the deepest press
-    vision: float = 0.7  # share of recordings with a photograph
-    text: float = 0.7  # share of recordings with a caption
+    vision: Share = 0.7  # share of recordings with a photograph
+    text: Share = 0.7  # share of recordings with a caption
     # Share of test objects, held out by whole (primitive, texture) pairs. Half this share of the rest is for val, if
     # enough objects are left. With fewer than 12 objects all are for training.
-    held_out: float = 0.25
+    held_out: Below1 = 0.25
     fields: tuple[str, ...] = ()  # of FIELDS, written next to the images
     size: int = 224  # pixels of the short side; 0 is each sensor's own resolution
     # "each" draws a sensor unit for every recording. "one" uses one unit of each sensor, mounted straight, as on the
     # paper's calibrated platform.
     units: Literal["each", "one"] = "each"
-    first: int = 0  # number of the first touch
+    first: NotNegative[int] = 0  # number of the first touch
 
     def __post_init__(self) -> None:
         for what, names, known in (("sensor", self.sensors, tuple(SENSORS)), ("field", self.fields, FIELDS)):
@@ -69,9 +69,7 @@ class Scenes:
                 raise UserError(f"name each {what} once, not {', '.join(names)}")
         if not self.sensors:
             raise UserError("name at least one sensor")
-        chosen("", self)
-        in_range("", self, touches=COUNT, frames=COUNT, objects=COUNT, held_out=BELOW_1, vision=SHARE, text=SHARE,
-                 seed=NOT_NEGATIVE, first=NOT_NEGATIVE)  # fmt: skip
+        check(self)
         if self.size and not 16 <= self.size <= _MAX_SIZE:
             raise UserError(f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not {self.size}")
         if self.fields and all(SENSORS[name].kind == "field" for name in self.sensors):

@@ -1,8 +1,13 @@
-"""Spread of features: are they nearly constant? Only numpy is imported, so that `anytouch info` answers at once."""
+"""Rows of sensors, and the spread of features. Only numpy is imported: `info` and an exported encoder need no more."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+
+from anytouch_jax.errors import UserError
 
 SPREAD_ROWS, SPREAD_LEAST = 2000, 0.99  # rows that are compared, and the mean cosine of nearly constant features
 
@@ -25,3 +30,18 @@ def spread_lines(values: np.ndarray) -> list[str]:
             "Train longer, and check background subtraction and that the frames differ."
         )
     return lines
+
+
+def rows_of_sensors(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
+    """Return rows i32 (count,) of one sensor name, of names (count,), or of row numbers below `rows`.
+
+    `row` returns the row of a name. Raises UserError for another shape or type.
+    """
+    ids = np.full(count, row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
+    if ids.dtype.kind in "UO":
+        ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)
+    if ids.shape != (count,) or ids.dtype.kind not in "iu":
+        raise UserError(f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}")
+    if ids.min(initial=0) < 0 or ids.max(initial=0) >= rows:
+        raise UserError(f"sensor rows must be 0 to {rows - 1}")
+    return ids.astype(np.int32)

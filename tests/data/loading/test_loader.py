@@ -395,10 +395,10 @@ def test_groups_that_do_not_divide_a_batch_are_refused(make, settings, rich):
         model, objective = replace(config.model, match_head=head), replace(config.objective, groups=groups)
         return Loader(manifest, replace(config, model=model, objective=objective))
 
-    with pytest.raises(UserError, match=r"a batch of 6 does not divide by --objective\.groups 4"):
+    with pytest.raises(UserError, match=r"a batch of 6 touches does not divide by --objective\.groups 4"):
         load(4, batch_size=6)
     # Of the release a batch to match has half the rows; only where these are each other's negatives must they divide.
-    with pytest.raises(UserError, match=r"2 touches to match do not divide by --objective\.groups 4"):
+    with pytest.raises(UserError, match=r"a batch of 2 touches does not divide by --objective\.groups 4"):
         load(4, "cosine", "release")
     for head, recipe in (("cosine", "paper"), ("linear", "release")):
         assert load(4, head, recipe)

@@ -19,7 +19,7 @@ def read(tmp_path: Path) -> Callable[..., Table]:
         table = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]
         check_laws(table, root)
         again = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]
-        assert again.report.content_hash == table.report.content_hash  # one order, always
+        assert again.manifest.content_hash == table.manifest.content_hash  # one order, always
         return table
 
     return run

@@ -84,4 +84,4 @@ def test_numbers_order_frames_and_folders_naturally(tmp_path):
     rows = DatasetIndex("x", tmp_path)
     folders, files = rows.listing(".")
     assert folders == ["f9", "f10"]
-    assert [name for _, name in rows.numbered(files, r"([0-9]+)\.png", "")] == ["1.png", "2.png", "10.png"]
+    assert list(rows.frames("", r"([0-9]+)\.png", files).values()) == ["1.png", "2.png", "10.png"]

@@ -104,7 +104,7 @@ def test_json_splits_and_an_object_in_both(tmp_path, read):
         with pytest.raises(UserError, match="expected the lists 'train' and 'test'"):
             read("feel")
     (tmp_path / "split_0.json").write_text(json.dumps({"train": ["mug"], "test": ["mug"]}))
-    with pytest.raises(UserError, match="the object mug is in train and in test"):
+    with pytest.raises(UserError, match=r"split_0.json: mug is in train and in test"):
         read("feel")
 
 

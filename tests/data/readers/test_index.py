@@ -84,7 +84,7 @@ def test_photographs_that_lie_elsewhere_are_refused(tmp_path):
     [
         ("visgel", "images/toch/a/frame0000.jpg", "images/touch"),
         ("cloth", "Data/nothing.txt.png", "no frame of cloth that could be used"),
-        ("cloth", "Daten/11/t/gelsight_frame/0000.png", "'Data_ICRA18/Data' or a folder 'Data'"),
+        ("cloth", "Daten/11/t/gelsight_frame/0000.png", "is ROOT the folder that holds 'Data_ICRA18'"),
         ("objectfolder_real", "tactile/1/0/gelsite/0.png", "gelsight/<n>.png"),
         ("ycb_slide", "real/mug/dataset_0/frame/frame_0000000.jpg", "is ROOT the folder that holds 'real'"),
         ("octopi", "dataset/apple_0.mov.png", "process_dataset.py"),

@@ -18,7 +18,7 @@ def test_octopi_follows_its_sample_files(tmp_path, read):
     assert (row["split"], row["object"], row["sensor"]) == ("test", "tea_towel", "gelsight_mini")
     assert len(table.clips(3)) == 4  # frames with gaps: only 0, 1, 2 of each sample
     (tmp_path / "processed/val_samples.json").write_text(json.dumps({"x": [samples[0]]}))
-    with pytest.raises(UserError, match=f"the sample {samples[0]} is also in train_samples.json"):
+    with pytest.raises(UserError, match=f"{samples[0]} is in train and in val"):
         read("octopi")
 
 

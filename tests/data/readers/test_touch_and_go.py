@@ -131,7 +131,7 @@ def test_broken_lists_name_the_line(tmp_path, read, name, line, says):
 
 def test_another_folder_is_refused(tmp_path, read):
     _both(tmp_path)
-    with pytest.raises(UserError, match=r"expected a folder 'dataset' in .*is ROOT the folder that holds it"):
+    with pytest.raises(UserError, match=r"expected dataset/.*is ROOT the folder that holds 'dataset'"):
         read("touch_and_go", tmp_path / "dataset")
 
 

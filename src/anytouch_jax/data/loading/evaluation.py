@@ -50,34 +50,30 @@ def _batches(
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     data, size = reader.config.data, reader.config.model.image_size
 
+    def write(clip: np.ndarray, is_good: np.ndarray, start: int, slot: int) -> int:
+        try:
+            clip[slot] = reader.touch(windows[start + slot], None)
+        except SampleError:
+            if data.on_bad_sample == "error":
+                raise
+            is_good[slot] = False
+        return 0
+
     def plan(start: int) -> BatchJobs[tuple[TouchBatch, np.ndarray]]:
         chosen = windows[start : start + data.batch_size]
         clip = np.zeros((data.batch_size, chosen.shape[1], size, size, 3), np.uint8)
         batch, is_good = TouchBatch(clip, np.zeros(data.batch_size, np.int32)), np.ones(len(chosen), bool)
         batch.sensor[: len(chosen)] = sensor[chosen[:, -1]]
-        jobs = [partial(_write, reader, clip, is_good, chosen, slot) for slot in range(len(chosen))]
-        return BatchJobs((batch, is_good), jobs)
+        return BatchJobs((batch, is_good), [partial(write, clip, is_good, start, slot) for slot in range(len(chosen))])
 
     starts = range(0, len(rows), data.batch_size)
     for start, (batch, is_good), _ in prefetch_batches(plan, starts, data.threads, data.prefetch):
         good = np.flatnonzero(is_good)
-        if not good.size:
-            continue
-        if good.size < data.batch_size:  # move the good rows to the front and repeat the last one
+        if good.size and good.size < data.batch_size:  # move the good rows to the front and repeat the last one
             order = np.concatenate([good, np.repeat(good[-1:], data.batch_size - good.size)])
             batch = TouchBatch(batch.clip[order], batch.sensor[order])
-        yield rows[start + good], batch
-
-
-def _write(reader: SampleReader, clip: np.ndarray, is_good: np.ndarray, windows: np.ndarray, slot: int) -> int:
-    try:
-        clip[slot] = reader.touch(windows[slot], None)
-    except SampleError:
-        if reader.config.data.on_bad_sample == "error":
-            raise
-        is_good[slot] = False
-        return 1
-    return 0
+        if good.size:
+            yield rows[start + good], batch
 
 
 def _clips_ending_at(manifest: Manifest, rows: np.ndarray, length: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.pools import CLIP, STILL, MatchPool, Pool, find_pools
 from anytouch_jax.data.loading.samples import SampleReader, fill_slot
-from anytouch_jax.data.loading.sampling import BOTH, TEXT, VISION, Shard, Slots, StepSchedule, uniform_per_step
+from anytouch_jax.data.loading.sampling import BOTH, TEXT, VISION, Shard, StepSchedule, uniform_per_step
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches, run_jobs
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.tokenizer import Tokenizer
@@ -52,14 +52,13 @@ class Loader:
             raise UserError(f"devices must be 1 or more, not {devices}")
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
         size, groups = config.data.batch_size, config.objective.groups
-        self._seed, self._match_size = config.run.seed % 2**63, size
-        if config.splits_steps:
-            self._match_size = max(1, size // 2)
+        self._seed = config.run.seed % 2**63
+        self._match_size = max(1, size // 2) if config.splits_steps else size
         self._in_batch_negatives = config.model.match_head == "cosine"  # instead of a third touch
-        if config.stage == 2 and size % groups:
-            raise UserError(f"a batch of {size} does not divide by --objective.groups {groups}")
-        if config.stage == 2 and self._in_batch_negatives and self._match_size % groups:
-            raise UserError(f"{self._match_size} touches to match do not divide by --objective.groups {groups}")
+        contrasted = [size, self._match_size] if self._in_batch_negatives else [size]
+        for rows in contrasted if config.stage == 2 else ():
+            if rows % groups:
+                raise UserError(f"a batch of {rows} touches does not divide by --objective.groups {groups}")
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
         self._reader = SampleReader(manifest, config)
@@ -71,8 +70,7 @@ class Loader:
         self._drawn = self._pools[1:] if clips_only else self._pools
         still, clip = self._match_pools
         self._drawn_matches = [pool for pool in ((clip,) if clip and clips_only else (still, clip)) if pool]
-        self._text_length = self._caption_length()
-        self._align_share = self._share_of_align_steps()
+        self._text_length, self._align_share = self._caption_length(), self._share_of_align_steps()
         self._align, self._match = StepSchedule(self._align_kinds), StepSchedule(self._match_kinds)
 
     def kind(self, step: int) -> Literal["still", "clip"]:
@@ -165,16 +163,13 @@ class Loader:
         batch = AlignBatch(*self._empty(rows, pool.windows.shape[1]), *self._empty_slots(image_row, text_row))
         jobs: list[Callable[[], int]] = []
         for slot, (stratum, index, epoch) in enumerate(draws):
-            mine = Slots(
-                self._shard.place(slot, rows),
-                self._shard.place(image_slot.get(slot), len(image_row)),
-                self._shard.place(text_slot.get(slot), len(text_row)),
-            )
-            if mine == Slots(None, None, None):
+            parts = ((slot, rows), (image_slot.get(slot), len(image_row)), (text_slot.get(slot), len(text_row)))
+            touch, image, text = mine = [self._shard.place(*part) for part in parts]
+            if mine == [None, None, None]:
                 continue
-            write = partial(self._write_align, batch, pool, stratum, mine)
+            write = partial(self._write_align, batch, pool, stratum, touch, image, text)
             job = partial(fill_slot, write, len(pool.members[stratum]), step, slot, self.config, index, epoch)
-            jobs.append(job if mine.touch is not None else partial(_uncounted, job))
+            jobs.append(job if touch is not None else partial(_uncounted, job))
         return BatchJobs(batch, jobs, {"images": len(with_image), "texts": len(with_text)})
 
     def _plan_match(self, step: int, kind: int, rank: int) -> BatchJobs[MatchBatch]:
@@ -198,10 +193,7 @@ class Loader:
         return BatchJobs(batch, jobs)
 
     def _gallery_sensor(self, step: int, pool: MatchPool) -> int | None:
-        """Return the one sensor of all positives of a step, for in-batch negatives of the positive's sensor.
-
-        It is drawn as a partner is, so that a sensor with few places is chosen as rarely.
-        """
+        """Return the one sensor of all positives of a step, drawn as a partner is, for negatives of that sensor."""
         if not (self._in_batch_negatives and self.config.data.negatives == "same_sensor"):
             return None
         rng = np.random.default_rng([self._seed, _GALLERY, step])
@@ -209,10 +201,7 @@ class Loader:
         return int(self._sensor[pool.windows[partner, -1]])
 
     def _caption_length(self) -> int:
-        """Return the padded length of captions: the longest of the manifest in eights, at most the text tower's.
-
-        The tower is causal and pools at the end token, so positions behind that token change nothing.
-        """
+        """Return the padded length of captions: the longest in eights, as positions behind its end change nothing."""
         tower = self.config.model.text
         if tower is None or self.tokenizer is None:
             return 0
@@ -224,36 +213,37 @@ class Loader:
         return np.zeros((rows, frames, size, size, 3), np.uint8), np.zeros(rows, np.int32)
 
     def _empty_slots(self, image_row: np.ndarray, text_row: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the empty image and text slots of this shard.
-
-        An unused text slot holds an empty caption. A text of padding alone could have a NaN gradient, even though its
-        value is dropped.
-        """
+        """Return the empty image and text slots of this shard."""
         size, length = self.config.model.image_size, self._text_length
         image_row, text_row = self._shard.cut(image_row), self._shard.cut(text_row)
         image = np.zeros((len(image_row), size, size, 3), np.uint8)
         if self.tokenizer is None or not len(text_row):
             text, mask = np.zeros((0, length), np.int32), np.zeros((0, length), bool)
         else:
-            text, mask = self.tokenizer.encode([""] * len(text_row), length)
+            text, mask = self.tokenizer.encode([""] * len(text_row), length)  # padding alone has a NaN gradient
         return image, image_row, text, mask, text_row
 
-    def _write_align(self, batch: AlignBatch, pool: Pool, stratum: int, slot: Slots, index: int, epoch: int) -> None:
+    def _write_align(
+        self, batch: AlignBatch, pool: Pool, stratum: int, touch: int | None, image: int | None, text: int | None,
+        index: int, epoch: int,
+    ) -> None:  # fmt: skip
+        """Write sample `index` into the slots `touch`, `image` and `text`, None for those of other shards."""
         rows = pool.windows[pool.members[stratum][index]]
         # The replacement of a bad sample must not depend on the shard, so with "skip" every part is read.
         read_all = self.config.data.on_bad_sample == "skip"
-        if read_all or slot.touch is not None:
-            self._reader.touch(rows, epoch, None if slot.touch is None else batch.clip[slot.touch])
-        image = None
-        if stratum in _WITH_IMAGE and (read_all or slot.image is not None):
-            image = self._reader.vision(rows[-1], epoch)
-        if slot.touch is not None:
-            batch.sensor[slot.touch] = self._sensor[rows[-1]]
-        if slot.image is not None:
-            batch.image[slot.image] = image
-        if slot.text is not None and self.tokenizer is not None:
-            ids, mask = self.tokenizer.encode([self._reader.caption(rows[-1])], batch.text.shape[1])
-            batch.text[slot.text], batch.text_mask[slot.text] = ids[0], mask[0]
+        if read_all or touch is not None:
+            self._reader.touch(rows, epoch, None if touch is None else batch.clip[touch])
+        photograph = None
+        if stratum in _WITH_IMAGE and (read_all or image is not None):
+            photograph = self._reader.vision(rows[-1], epoch)
+        if touch is not None:
+            batch.sensor[touch] = self._sensor[rows[-1]]
+        if image is not None:
+            batch.image[image] = photograph
+        if text is not None and self.tokenizer is not None:
+            caption = str(self.manifest.value(rows[-1], "text"))
+            ids, mask = self.tokenizer.encode([caption], batch.text.shape[1])
+            batch.text[text], batch.text_mask[text] = ids[0], mask[0]
 
     def _write_match(
         self, batch: MatchBatch, pool: MatchPool, slot: int, gallery: int | None, index: int, epoch: int
@@ -264,10 +254,8 @@ class Loader:
         positive, negative = pool.matches.draw(anchor, rng, gallery)
         if gallery is not None and self._sensor[row] == gallery:
             anchor, positive = positive, anchor
-        triple: list[tuple[Any, Any, int]] = [
-            (batch.clip, batch.sensor, anchor),
-            (batch.positive, batch.positive_sensor, positive),
-        ]
+        triple: list[tuple[Any, Any, int]] = [(batch.clip, batch.sensor, anchor)]
+        triple.append((batch.positive, batch.positive_sensor, positive))
         if batch.place is not None:
             batch.place[slot] = pool.matches.place(anchor)
         else:
@@ -279,6 +267,5 @@ class Loader:
 
 
 def _uncounted(job: Callable[[], int]) -> int:
-    """Run a job whose row another shard counts: that shard reports the skipped samples."""
-    job()
-    return 0
+    """Run a job whose skipped samples another shard counts."""
+    return 0 * job()

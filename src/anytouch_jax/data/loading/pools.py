@@ -64,16 +64,16 @@ class Pools(NamedTuple):
 
 
 class _Usable(NamedTuple):
-    """The rows that a run may use: `sensor` as in `Pools`, `rows` i64 ids that may be drawn.
+    """Rows that a run may use: `rows` i64 ids that may be drawn; the other arrays have a value per manifest row.
 
-    For every row of the manifest: `weights` f64 draws per epoch (None: 1), `ends` bool whether a clip may end there
-    (None: yes), `has_image` and `has_text` bool whether it has a modality that the model has a tower for.
+    `sensor` is as in `Pools`, `weights` f64 draws per epoch (None: 1), and `ends` bool whether a clip may end there.
+    `has_image` and `has_text` bool is whether it has a modality that the model has a tower for.
     """
 
     sensor: np.ndarray
     rows: np.ndarray
     weights: np.ndarray | None
-    ends: np.ndarray | None
+    ends: np.ndarray
     has_image: np.ndarray
     has_text: np.ndarray
 
@@ -101,11 +101,7 @@ def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, 
     data, frames = config.data, config.model.frames
     length = frames + config.reconstructs
     stills, clips = usable.rows[:, None], _clips(manifest, config, usable, length)
-    touch = tuple(
-        _pool(config, usable, kind, windows, devices)
-        for kind, windows in ((STILL, stills), (CLIP, clips))
-        if len(windows)
-    )
+    touch = tuple(_pool(config, usable, kind, ids, devices) for kind, ids in enumerate((stills, clips)) if len(ids))
     if len(touch) == 1 and data.clip_share:
         notes.append(f"split {data.split!r} has no clip of {length} frames, so all batches are stills")
     match: tuple[MatchPool | None, MatchPool | None] = (None, None)
@@ -130,11 +126,9 @@ def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> 
     if not config.data.clip_share:
         return np.empty((0, length), np.int64)
     clips = manifest.clips(length, config.data.split)
-    good = np.ones(len(clips), bool)
+    good = usable.ends[clips[:, -1]]
     for frame in clips.T:
         good &= usable.sensor[frame] >= 0
-    if usable.ends is not None:
-        good &= usable.ends[clips[:, -1]]
     return clips if good.all() else clips[good]
 
 
@@ -201,41 +195,39 @@ def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]
             )
         if len(missing):
             notes.append(f"left out {len(missing)} rows without background_path, which data.background needs")
-            sensor = sensor.copy()
+            sensor, rows = sensor.copy(), np.setdiff1d(rows, missing)
             sensor[missing] = -1
-            rows = rows[sensor[rows] >= 0]
     weights, note = _weights(manifest, config, rows)
     notes += note
     if weights is not None:
         rows, sensor = rows[weights[rows] > 0], np.where(weights > 0, sensor, -1)
-    rows, ends, note = _required(manifest, config, rows)
-    text = manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
-    model, none = config.model, np.zeros(len(manifest), bool)
-    has_image = manifest.present("image_path") if config.stage == 2 and model.image else none
-    return _Usable(
-        sensor, rows, weights, ends, has_image, text if config.stage == 2 and model.text else none
-    ), notes + note
-
-
-def _required(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Return the `rows` that `data.require` and `data.contact_only` allow, a mask over the manifest, and notes."""
-    wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
-    if not wanted:
-        return rows, None, []
     text = manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
     has = {"image": manifest.present("image_path"), "text": text}
+    allowed, note = _required(manifest, config, rows, has)
+    model, aligns, none = config.model, config.stage == 2, np.zeros(len(manifest), bool)
+    has_image, has_text = has["image"] if aligns and model.image else none, text if aligns and model.text else none
+    return _Usable(sensor, rows[allowed[rows]], weights, allowed, has_image, has_text), notes + note
+
+
+def _required(
+    manifest: Manifest, config: Config, rows: np.ndarray, has: dict[str, np.ndarray]
+) -> tuple[np.ndarray, list[str]]:
+    """Return which rows of the manifest `data.require` and `data.contact_only` allow, bool (rows,), and notes."""
+    wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
+    if not wanted:
+        return np.ones(len(manifest), bool), []
     if config.data.contact_only:
         if "label.contact" not in manifest.table.column_names:
             raise UserError(
                 "--data.contact-only needs the column 'label.contact', which `anytouch data contact` writes"
             )
-        has["contact"] = known_contact(manifest) != 0  # rows of unknown contact stay
+        has = {**has, "contact": known_contact(manifest) != 0}  # rows of unknown contact stay
     allowed = np.logical_and.reduce([has[name] for name in wanted])
-    remaining, words = rows[allowed[rows]], " and ".join(wanted)
+    count, words = int(allowed[rows].sum()), " and ".join(wanted)
     option = "data.contact_only" if wanted == ["contact"] else "data.require"
-    if not remaining.size:
+    if not count:
         raise UserError(f"{option}: no row of split {config.data.split!r} has {words}")
-    return remaining, allowed, [f"{len(remaining)} of {len(rows)} rows have {words}; only they are drawn ({option})"]
+    return allowed, [f"{count} of {len(rows)} rows have {words}; only they are drawn ({option})"]
 
 
 def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
@@ -268,7 +260,7 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
 def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
     """Return the rows whose text is not trained on, bool (rows,).
 
-    These are frames in a test split of a downstream task (column `downstream_test`), whose text may name the label
+    They are in a test split of a downstream task (column `downstream_test`), so that their text may name the label
     (paper, appendix). Without `aligned_text` they include touches shared by sensors or units (Table 6, "w/o Text in
     TacQuad").
     """
@@ -292,11 +284,8 @@ def _withheld_notes(manifest: Manifest, config: Config, rows: np.ndarray) -> lis
     if count := int((text & _in_downstream_test(manifest)[rows]).sum()):
         notes.append(f"the text of {count} rows is withheld: they are in a test split of a downstream task")
     if not config.data.aligned_text:
-        count = int((text & _is_aligned(manifest)[rows]).sum())
-        notes.append(
-            f"the text of {count} of {int(text.sum())} rows is withheld: other sensors or units share the touch "
-            "(data.aligned_text)"
-        )
+        shared = f"the text of {int((text & _is_aligned(manifest)[rows]).sum())} of {int(text.sum())} rows is withheld"
+        notes.append(f"{shared}: other sensors or units share the touch (data.aligned_text)")
     return notes
 
 

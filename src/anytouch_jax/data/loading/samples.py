@@ -74,10 +74,6 @@ class SampleReader:
         rng = transforms.augmentation_rng(self.config.run.seed, epoch, int(row), transforms.VISION)
         return transforms.vision_transform(image, size, rng, self.config.data.rotation)
 
-    def caption(self, row: int) -> str:
-        """Return the caption of a row."""
-        return str(self.manifest.value(row, "text"))
-
     @cached_property
     def _decode_background(self) -> Callable[[Path], np.ndarray]:
         """`decode` with a cache of this reader's lifetime: many frames share a background."""

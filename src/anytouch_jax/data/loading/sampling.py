@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import gcd, lcm
-from typing import NamedTuple
 
 import numpy as np
 
@@ -163,14 +162,6 @@ def _fill(shares: list[Fraction], images: int, texts: int) -> list[Fraction]:
     move(TEXT, BOTH, no_image)
     move(VISION, BOTH, no_text)
     return shares
-
-
-class Slots(NamedTuple):
-    """Where a shard writes the touch, image and caption of a sample; None for the parts of other shards."""
-
-    touch: int | None
-    image: int | None
-    text: int | None
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Generic, TypeVar
 
 Batch = TypeVar("Batch")
@@ -44,21 +45,15 @@ def prefetch_batches(
         for step in steps:
             yield (step, *run_jobs(plan(step)))
         return
-    queue: deque[tuple[int, BatchJobs[Batch], list[Future[int]]]] = deque()
-    remaining = iter(steps)
     executor = ThreadPoolExecutor(threads, thread_name_prefix="anytouch-data")
 
-    def submit() -> None:
-        while len(queue) < max(1, prefetch) and (step := next(remaining, None)) is not None:
-            work = plan(step)
-            chunks = [work.jobs[at : at + _CHUNK] for at in range(0, len(work.jobs), _CHUNK)]
-            queue.append((step, work, [executor.submit(_run, chunk) for chunk in chunks]))
+    def begin(step: int) -> tuple[int, BatchJobs[Batch], list[Future[int]]]:
+        work = plan(step)
+        chunks = [work.jobs[at : at + _CHUNK] for at in range(0, len(work.jobs), _CHUNK)]
+        return step, work, [executor.submit(_run, chunk) for chunk in chunks]
 
     try:
-        submit()
-        while queue:
-            step, work, futures = queue.popleft()
-            submit()
+        for step, work, futures in _ahead(map(begin, steps), prefetch):
             yield (step, *work.finish(sum(future.result() for future in futures)))
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
@@ -74,17 +69,21 @@ def bounded_map(
     if threads < 1:
         yield from map(function, items)
         return
-    queue: deque[Future[Result]] = deque()
     executor = ThreadPoolExecutor(threads, thread_name_prefix="anytouch-files")
     try:
-        for item in items:
-            queue.append(executor.submit(function, item))
-            if len(queue) >= (ahead or 4 * threads):
-                yield queue.popleft().result()
-        while queue:
-            yield queue.popleft().result()
+        for future in _ahead((executor.submit(function, item) for item in items), ahead or 4 * threads):
+            yield future.result()
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _ahead(items: Iterator[Item], count: int) -> Iterator[Item]:
+    """Yield `items` in order, with `count` of them drawn before they are needed."""
+    queue = deque(islice(items, max(1, count)))
+    while queue:
+        first = queue.popleft()
+        queue.extend(islice(items, 1))
+        yield first
 
 
 def _run(jobs: Sequence[Callable[[], int]]) -> int:

@@ -17,30 +17,14 @@ import pyarrow.parquet
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest, table_suffix
-from anytouch_jax.data.readers import (
-    cloth,
-    feel,
-    objectfolder,
-    objectfolder_real,
-    octopi,
-    real_touch,
-    recordings,
-    ssvtp,
-    tacquad,
-    taxim_presses,
-    touch_and_go,
-    tvl,
-    visgel,
-    ycb_slide,
-)
+from anytouch_jax.data.readers import feel, objectfolder, packs, recordings, robots, tacquad, touch_and_go, tvl
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, IndexOptions
 from anytouch_jax.errors import UserError
 
 __all__ = ["READERS", "DatasetError", "DatasetIndex", "DatasetReader", "IndexOptions", "IndexReport", "index"]
 
-_MODULES = (touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel, objectfolder,
-            real_touch, taxim_presses, recordings)  # fmt: skip
-READERS: dict[str, DatasetReader] = {module.__name__.rpartition(".")[2]: module.READER for module in _MODULES}
+_MODULES = (touch_and_go, robots, tvl, tacquad, feel, objectfolder, packs, recordings)
+READERS = {name: reader for module in _MODULES for name, reader in module.READERS.items()}
 _INDEX_KEY = b"anytouch.index"  # in the schema of a Parquet file: the content hash with which `index` wrote it
 _OTHER_OUT = "name another file with --out, in a folder that contains the data"
 _FROM_FILES = ("path", "sequence", "frame_index", "stride")  # columns that come from the files, never from the user
@@ -72,11 +56,6 @@ class IndexReport:
         """Touch frames: rows that are neither background nor unused."""
         return sum(count for split, count in self.splits.items() if split not in ("background", "unused"))
 
-    @property
-    def content_hash(self) -> str:
-        """The content hash of the manifest."""
-        return self.manifest.content_hash
-
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         reader, manifest = self.reader, self.manifest
@@ -95,7 +74,7 @@ class IndexReport:
             *(f"left out or noted, {reason}: {count:,} (first: {example})"
               for reason, (count, example) in self.skipped.items()),
             *(f"note: {sentence}" for sentence in self.notes),
-            f"content hash {self.content_hash}",
+            f"content hash {manifest.content_hash}",
         ]  # fmt: skip
 
 
@@ -126,18 +105,20 @@ def index(
         if field.name not in reader.uses and getattr(options, field.name) != field.default:
             uses = ", ".join(reader.uses) or "no option"
             raise UserError(f"the reader {name} does not use the option {field.name}; it uses {uses}")
-    if options.lists is not None:
-        options = replace(options, lists=(lists := options.lists.expanduser()))
-        if not lists.is_dir():
-            raise UserError(f"there is no folder {lists}; --lists is the folder that holds the dataset's lists")
+    lists = options.lists and options.lists.expanduser()
+    if lists is not None and not lists.is_dir():
+        raise UserError(f"there is no folder {lists}; --lists is the folder that holds the dataset's lists")
     target = _target(base, name, out)
-    rows = DatasetIndex(name, base, options)
+    rows = DatasetIndex(name, base, replace(options, lists=lists))
     reader.read(rows)
     columns = rows.columns()
     size = len(columns["path"])
     if not size:
         reasons = "; ".join(f"{reason}: {count} (first: {first})" for reason, (count, first) in rows.skipped.items())
-        raise DatasetError(f"{base} has no frame of {name} that could be used. Left out: {reasons or 'nothing'}")
+        raise DatasetError(
+            f"{base} has no frame of {name} that could be used: expected {reader.layout} in it; is ROOT "
+            f"the folder that holds {reader.layout.split('/')[0]!r}? Left out: {reasons or 'nothing'}"
+        )
     constant = {"dataset": name, "license": reader.license, "commercial": reader.commercial}
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
     above = base.relative_to(target.parent)
@@ -148,8 +129,8 @@ def index(
     _check_links(manifest, base)
     groups = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
     manifest = _carry_over(manifest, target, rows.notes, keep=keep, groups=groups)
-    marked = manifest.table.replace_schema_metadata({_INDEX_KEY: manifest.content_hash.encode()})
     try:
+        marked = manifest.table.replace_schema_metadata({_INDEX_KEY: manifest.content_hash.encode()})
         manifests.write(replace(manifest, table=marked), target)
     except OSError as error:
         raise UserError(f"the manifest {target} cannot be written: {error.strerror}; {_OTHER_OUT}") from None
@@ -161,10 +142,8 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
     target = Path(out).expanduser().resolve() if out is not None else base / f"{name}.parquet"
     table_suffix(target)
     if not base.is_relative_to(target.parent):
-        raise UserError(
-            f"the manifest {target} must lie in {base} or in a folder above it, because its paths may not leave its "
-            "folder; leave out --out, or move the data"
-        )
+        raise UserError(f"the manifest {target} must lie in {base} or in a folder above it, because its paths may not "
+                        "leave its folder; leave out --out, or move the data")  # fmt: skip
     if name == "real_touch" and target == base / "manifest.csv":
         raise UserError(f"{target} is the pack's own manifest; name another file with --out")
     if target.exists() and not is_manifest(target):
@@ -194,43 +173,27 @@ def _carry_over(new: Manifest, target: Path, notes: list[str], *, keep: bool, gr
     if not target.exists():
         return new
     old = manifests.read(target)
-    if not keep and _is_as_written(old, target):
+    is_parquet = target.suffix.lower() == ".parquet"  # which holds the content hash that `index` wrote
+    written = (pa.parquet.read_schema(target).metadata or {}).get(_INDEX_KEY) if is_parquet else None
+    if not keep and written == old.content_hash.encode():
         return new
     at = pc.index_in(new.column("path").combine_chunks(), value_set=old.column("path").combine_chunks())
     merged, edits = new, []
     for name in (column for column in old.table.column_names if column not in _FROM_FILES):
         before, is_new = old.column(name).take(at), name not in new.table.column_names
-        differs = np.asarray(pc.is_valid(before)) if is_new else _differ(before, new.column(name))
+        now = pa.chunked_array([pa.nulls(len(new), before.type)]) if is_new else new.column(name)
+        if before.type != now.type:  # 1 in a CSV may be "1" elsewhere
+            before, now = before.cast(pa.string()), now.cast(pa.string())
+        differs = np.asarray(pc.and_(pc.is_valid(before), pc.invert(pc.fill_null(pc.equal(before, now), False))))
         if differs.any():
             edits.append(name if is_new else f"other values of {name} ({differs.sum()} rows)")
-            merged = replace_column(merged, name, before if is_new else _first_of(before, new.column(name)))
+            merged = replace_column(merged, name, pc.coalesce(before, now))
     if edits and not keep:
-        raise UserError(
-            f"{target} has {', '.join(edits)}, which index does not write: give another --out, pass --keep to carry "
-            "them over by path, or remove it"
-        )
+        raise UserError(f"{target} has {', '.join(edits)}, which index does not write: give another --out, pass --keep "
+                        "to carry them over by path, or remove it")  # fmt: skip
     if edits:
         notes.append(f"kept from {target.name} by path: {', '.join(edits)}")
     return _with_splits_of_groups(merged, np.asarray(pc.is_valid(at)), groups) if keep else merged
-
-
-def _is_as_written(old: Manifest, target: Path) -> bool:
-    """Return whether a Parquet file is unedited since `index` wrote it."""
-    if target.suffix.lower() != ".parquet":
-        return False
-    return (pa.parquet.read_schema(target).metadata or {}).get(_INDEX_KEY) == old.content_hash.encode()
-
-
-def _differ(before: pa.ChunkedArray, new: pa.ChunkedArray) -> np.ndarray:
-    """Return where `before` has another value than `new`, bool (rows,): 1 in a CSV may be "1" elsewhere."""
-    same = pc.equal(before.cast(pa.string()), new.cast(pa.string()))
-    return np.asarray(pc.and_(pc.is_valid(before), pc.invert(pc.fill_null(same, False))))
-
-
-def _first_of(before: pa.ChunkedArray, new: pa.ChunkedArray) -> pa.ChunkedArray:
-    if before.type != new.type:
-        before, new = before.cast(pa.string()), new.cast(pa.string())
-    return pc.coalesce(before, new)
 
 
 def _with_splits_of_groups(merged: Manifest, is_old: np.ndarray, groups: Collection[str]) -> Manifest:

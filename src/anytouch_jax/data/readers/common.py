@@ -1,26 +1,31 @@
-"""Helpers of the dataset readers: folder listings, frame numbers, contact lists, hash splits, counts of skipped files.
+"""Helpers of the dataset readers: folder listings, frame numbers, contact lists, splits, counts of skipped files.
 
 No reader opens or stats a frame. Each folder is listed once, and frames are known by their names.
+A folder is its path below the root with a slash at the end, "" for the root itself, so that paths are joined as text.
 """
 
 from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
+from anytouch_jax.config import parse_json
 from anytouch_jax.data.images import natural
 from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.errors import UserError
 
 Columns = dict[str, list[Any]]
-Frames = list[tuple[int, str]]  # (frame number, file name), by number
+Frames = dict[int, str]  # frame number -> file name, by number
+Folder = tuple[str, list[str], list[str]]  # its path below a base, its folders, its files
+Key = TypeVar("Key")
+PARTS = ("train", "val", "test")  # published splits
+NUMBERED = r"(\d+)\.(?:png|jpe?g)"
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
 
 
@@ -57,11 +62,13 @@ class IndexOptions:
 class DatasetReader:
     """A dataset: how to read it, and facts about it.
 
-    `read` adds the rows of a `DatasetIndex`. `paper` is the number of contact frames in the paper's dataset table, None
-    if it is not there.
+    `read` adds the rows of a `DatasetIndex`. `layout` is the path of one frame, whose first folder is in ROOT, for the
+    error of a folder without frames. `paper` is the number of contact frames in the paper's dataset table, None if it
+    is not there.
     """
 
     read: Callable[[DatasetIndex], None]
+    layout: str
     citation: str
     license: str = "not stated"
     url: str = ""
@@ -96,30 +103,21 @@ class DatasetIndex:
             before, first = self.skipped.get(reason, (0, example))
             self.skipped[reason] = before + count, first
 
-    def find_folder(self, *choices: str, inside: Sequence[str] = ()) -> Path:
-        """Return the first of the folders `choices` under the root that exists and holds one of `inside` (if any).
-
-        Raises DatasetError, which names the expected folders.
-        """
+    def find_folder(self, *choices: str, inside: Sequence[str] = ("",)) -> str | None:
+        """Return the first of the folders `choices` that exists and holds one of `inside` (if any), else None."""
         for choice in choices:
             folder = self.root / choice
-            if folder.is_dir() and (not inside or any((folder / name).is_dir() for name in inside)):
-                return folder
-        expected = " or ".join(f"a folder {name!r}" for name in inside or [c for c in choices if c != "."])
-        places = ", ".join(str(self.root / choice) for choice in choices) if inside else str(self.root)
-        raise DatasetError(f"expected {expected} in {places}; is ROOT the folder that holds it?")
+            if folder.is_dir() and any((folder / name).exists() for name in inside):
+                return f"{choice}/" if choice else ""
+        return None
 
-    def find_file(self, names: Collection[str], *folders: Path) -> Path | None:
+    def find_file(self, names: Collection[str], *folders: str) -> Path | None:
         """Return the first file called one of `names` in `options.lists` or `folders` (default: the root)."""
-        places = [folder for folder in (self.options.lists, *(folders or (self.root,))) if folder is not None]
-        files = (folder / name for folder in places for name in names)
+        places = [self.options.lists, *(self.root / folder for folder in folders or ("",))]
+        files = (folder / name for folder in places if folder is not None for name in names)
         return next((file for file in files if file.is_file()), None)
 
-    def prefix(self, folder: Path) -> str:
-        """Return the path of a folder relative to the root with a slash, "" for the root itself."""
-        return "" if folder == self.root else f"{folder.relative_to(self.root).as_posix()}/"
-
-    def listing(self, folder: str | Path, *, count: bool = True) -> tuple[list[str], list[str]]:
+    def listing(self, folder: str, *, count: bool = True) -> tuple[list[str], list[str]]:
         """Return the names of the folders (2 before 10) and files in `folder`; links and system files are skipped."""
         folders: list[str] = []
         files: list[str] = []
@@ -129,45 +127,74 @@ class DatasetIndex:
             raise DatasetError(f"{self.root / folder} cannot be listed: {error.strerror}") from None
         for entry in entries:
             name, reason = entry.name, None
+            is_text = name.encode(errors="ignore").decode() == name
             if name.startswith(".") or name in SYSTEM_FILES:
                 reason = "hidden or system file"
-            elif not _is_text(name):
+            elif not is_text:
                 reason = "name that is not UTF-8"
             elif entry.is_symlink():
                 reason = "symbolic link (a manifest's paths may not leave its folder)"
             else:
                 (folders if entry.is_dir(follow_symlinks=False) else files).append(name)
             if reason and count:
-                self.skip(reason, entry.path if _is_text(name) else repr(entry.path))
+                self.skip(reason, entry.path if is_text else repr(entry.path))
         return sorted(folders, key=natural), sorted(files)
 
-    def walk(self, base: Path, inside: str = "", *, count: bool = True) -> Iterator[tuple[str, list[str], list[str]]]:
-        """Yield (folder relative to `base`, its folders, its files) of `base` and all folders below, in order."""
-        folders, files = self.listing(base / inside, count=count)
+    def walk(self, base: str = "", inside: str = "", *, count: bool = True) -> Iterator[Folder]:
+        """Yield `base` and all folders below it, in order."""
+        folders, files = self.listing(f"{base}{inside}", count=count)
         yield inside, folders, files
         for folder in folders:
-            yield from self.walk(base, f"{inside}/{folder}" if inside else folder, count=count)
+            yield from self.walk(base, f"{inside}/{folder}".lstrip("/"), count=count)
 
-    def numbered(self, files: Sequence[str], pattern: str, where: str, *, count: bool = True) -> Frames:
-        """Return the files whose whole name matches `pattern`, with the number in its first group, by number.
+    def frames(
+        self, folder: str, pattern: str = NUMBERED, files: Sequence[str] | None = None, *, count: bool = True
+    ) -> Frames:
+        """Return the files of a folder (none if it is missing) whose whole name matches `pattern`.
 
-        Other files, and a second file of one number, are skipped.
+        They are sorted by the number in its first group. Other files, and a second file of one number, are skipped.
         """
+        if files is None:
+            files = self.listing(folder)[1] if (self.root / folder).is_dir() else []
         match = re.compile(pattern, re.IGNORECASE).fullmatch
-        frames: dict[int, str] = {}
+        frames: Frames = {}
         for name in files:
             parts = match(name)
             if not parts or len(parts[1]) > 18:  # a manifest holds numbers of 64 bits
-                self.skip("file that is not a frame by its name", f"{where}/{name}", int(count))
+                self.skip("file that is not a frame by its name", f"{folder}/{name}", int(count))
             elif int(parts[1]) in frames:
-                self.skip("second file of one frame number", f"{where}/{name}", int(count))
+                self.skip("second file of one frame number", f"{folder}/{name}", int(count))
             else:
                 frames[int(parts[1])] = name
-        return sorted(frames.items())
+        return dict(sorted(frames.items()))
+
+    def photographs(self, folder: str, names: Iterable[str], on_disk: Collection[str]) -> list[str | None]:
+        """Return the path of each of `names` in `folder`, None for those that are not `on_disk`, which are counted."""
+        paths = [f"{folder}/{name}" if name in on_disk else None for name in names]
+        self.skip("photograph missing (kept without)", folder, paths.count(None))
+        return paths
 
     def split_of(self, group: str) -> str:
         """Return the hash split of a group (an object or a recording) of this dataset."""
         return hash_split(self.name, group, self.options)
+
+    def read_captions(self, folder: str, key: Callable[[str], str]) -> tuple[set[str], dict[str, str]]:
+        """Return the frames of test.csv, and the captions of train.csv and test.csv, by `key` of their `tactile`."""
+        tests: set[str] = set()
+        captions: dict[str, str] = {}
+        for split in ("train", "test"):
+            path = self.root / folder / f"{split}.csv"
+            if not path.is_file():
+                what = "captions and no test frames" if split == "test" else "captions"
+                self.notes.append(f"no {folder}{split}.csv: no {what} of it")
+                continue
+            for row in read_table(path, "tactile"):
+                frame = key(row["tactile"])
+                if row.get("caption"):
+                    captions[frame] = row["caption"]
+                if split == "test":
+                    tests.add(frame)
+        return tests, captions
 
     def read_contact_list(self, names: Collection[str], marker: str) -> None:
         """Read the authors' list of contact frames, if one of the CSV files `names` is there.
@@ -176,8 +203,13 @@ class DatasetIndex:
         """
         path = self.find_file(names)
         if path is not None:
-            rows = ((row[0].replace("\\", "/"), row) for row in read_csv(path))
+            rows = ((row[0].replace("\\", "/"), row) for _, row in read_lines(path))
             self.contact = {name.rpartition(f"{marker}/")[2]: row for name, row in rows}
+
+    def listed(self, key: str, frames: Frames, cell: int) -> list[str]:
+        """Return one cell of the contact list for each frame, "" for those without it."""
+        rows = [(self.contact or {}).get(f"{key}/{name}", []) for name in frames.values()]
+        return [row[cell] if len(row) > cell else "" for row in rows]
 
     def add(self, paths: Sequence[str], **cells: Any) -> None:
         """Add a row for each path; a cell is a list (a value for each row) or one value for all rows (None: null)."""
@@ -195,16 +227,13 @@ class DatasetIndex:
 
         With a contact list the frames in it have contact, and all other frames get the split `unused`.
         """
-        names = [name for _, name in frames]
         cells["split"] = split
         if self.contact is not None:
-            is_contact = [f"{key}/{name}" in self.contact for name in names]
+            is_contact = [f"{key}/{name}" in self.contact for name in frames.values()]
             self._contact_rows += sum(is_contact)
             cells |= {"label.contact": [int(touched) for touched in is_contact]}
             cells |= {"split": [split if touched else "unused" for touched in is_contact]}
-        self.add(
-            [f"{folder}/{name}".lstrip("/") for name in names], frame_index=[number for number, _ in frames], **cells
-        )
+        self.add([f"{folder}/{name}".lstrip("/") for name in frames.values()], frame_index=list(frames), **cells)
 
     def columns(self) -> Columns:
         """Return all columns, without optional ones that are null on every row; report unmatched contact frames."""
@@ -226,13 +255,20 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
     return "val" if share < options.val else "test" if share < options.val + options.test else "train"
 
 
-def read_csv(path: Path) -> list[list[str]]:
-    """Return the rows of a CSV file (UTF-8, with or without BOM) without blank lines. Raises DatasetError."""
-    return [row for _, row in read_lines(path)]
+def published_splits(path: Path, members: Iterable[tuple[Key, str]]) -> dict[Key, str]:
+    """Return member -> split of (member, split) pairs from the list `path`. Raises DatasetError for one in two."""
+    splits: dict[Key, str] = {}
+    for member, split in members:
+        if splits.setdefault(member, split) != split:
+            raise DatasetError(f"{path}: {member} is in {splits[member]} and in {split}")
+    return splits
 
 
 def read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the rows as `read_csv` does, each with the number of its last line in the file, from 1."""
+    """Return (number of its last line, from 1, cells) of the rows of a CSV file (UTF-8) that are not blank.
+
+    Raises DatasetError.
+    """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.reader(file)
@@ -242,27 +278,22 @@ def read_lines(path: Path) -> list[tuple[int, list[str]]]:
         raise DatasetError(f"{path} cannot be read as a CSV list: {error}") from None
 
 
-def read_table(path: Path, column: str | None = None) -> list[dict[str, str]]:
-    """Return the rows of a CSV file with a header as dicts. Raises DatasetError, also if `column` is missing."""
-    rows = read_csv(path)
+def read_table(path: Path, column: str) -> list[dict[str, str]]:
+    """Return the rows of a CSV file with a header as dicts. Raises DatasetError, also if a row has no `column`."""
+    rows = [row for _, row in read_lines(path)]
     table = [dict(zip(rows[0], row, strict=False)) for row in rows[1:]]
-    for row in table:
-        if column is not None and column not in row:
-            raise DatasetError(f"{path}: expected a column {column!r}, found {', '.join(row)}")
+    if any(column not in row for row in table):
+        raise DatasetError(f"{path}: expected a column {column!r} in every row, found {', '.join(rows[0])}")
     return table
 
 
 def read_json(path: Path, values: type = object) -> dict[str, Any]:
     """Return the object in a JSON file, whose values are of one type. Raises DatasetError."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path} cannot be read as JSON: {error}") from None
+        content = parse_json(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, UserError) as error:
+        raise DatasetError(f"{path} cannot be read as JSON: it {error}") from None
     if not isinstance(content, dict) or not all(isinstance(value, values) for value in content.values()):
         kind = "" if values is object else f" with a {values.__name__} for every name"
         raise DatasetError(f"{path}: expected a JSON object{kind}")
     return content
-
-
-def _is_text(name: str) -> bool:
-    return name.encode(errors="ignore").decode() == name

@@ -26,11 +26,18 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.images import natural
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_csv, read_json
+from anytouch_jax.data.readers.common import (
+    PARTS,
+    DatasetError,
+    DatasetIndex,
+    DatasetReader,
+    published_splits,
+    read_json,
+    read_lines,
+)
 from anytouch_jax.files import atomic_write
 
 PHASES = ("before", "during", "after")
-PARTS = ("train", "val", "test")
 PICTURES = {
     **{f"kinectA_rgb_{phase}": (f"vision_{phase}", "") for phase in PHASES},
     **{f"gelsight{finger}_{phase}": (f"touch_{phase}", f"_{finger}") for phase in PHASES for finger in "AB"},
@@ -38,37 +45,32 @@ PICTURES = {
 
 
 def read(index: DatasetIndex) -> None:
-    """Add every picture of every grasp in feel.csv. Raises DatasetError if it is missing."""
-    root = index.root
-    base = next((root / name for name in ("feel", ".") if (root / name / "feel.csv").is_file()), root)
-    if not (base / "feel.csv").is_file():
-        original = [name for name in index.listing(root)[1] if name.endswith(".h5")]
+    """Add every picture of every grasp in feel.csv. Raises DatasetError for .h5 files without it and `export`."""
+    base = index.find_folder("feel", "", inside=("feel.csv",))
+    if base is None:
+        original = [name for name in index.listing("")[1] if name.endswith(".h5")]
         if not original:
-            raise DatasetError(f"expected feel.csv and <object>/touch_during/0_A.png under {root}; is ROOT the folder "
-                               "that holds 'feel.csv'?")  # fmt: skip
+            return
         if not index.options.export:
-            raise DatasetError(f"{root} has {len(original)} original .h5 files and no feel.csv; add --export to write "
-                               "the pictures next to them (needs pip install h5py)")  # fmt: skip
-        index.notes.append(f"{export_grasps(root, original)} grasps written from {len(original)} .h5 files")
-    splits = _published_splits(index, base)
-    prefix, table = index.prefix(base), base / "feel.csv"
+            raise DatasetError(f"{index.root} has {len(original)} original .h5 files and no feel.csv; add --export to "
+                               "write the pictures next to them (needs pip install h5py)")  # fmt: skip
+        count = export_grasps(index.root, original)
+        index.notes.append(f"{count} grasps written from {len(original)} .h5 files")
+        base = ""
+    splits = _splits_of_fold(index, base)
+    table = index.root / base / "feel.csv"
     files: dict[str, set[str]] = {}
-    for line, row in enumerate(read_csv(table), 1):
+    for line, row in read_lines(table):
         if len(row) != 3 or not row[1].isdecimal() or row[2] not in ("0", "1"):
             raise DatasetError(f"{table}, line {line}: expected object,number,0 or 1, found {','.join(row)}")
-        name, number, success = row
+        name = row[0]
         if name not in files:
-            files[name] = _files(index, base / name)
+            folders = index.listing(f"{base}{name}")[0] if (index.root / base / name).is_dir() else []
+            files[name] = {f"{sub}/{file}" for sub in folders for file in index.listing(f"{base}{name}/{sub}")[1]}
         if splits is not None and name not in splits:
             index.skip(f"grasp of an object that is in no list of split {index.options.fold} (split unused)", name)
         split = index.split_of(name) if splits is None else splits.get(name, "unused")
-        _add_grasp(index, f"{prefix}{name}", name, int(number), int(success), split, files[name])
-
-
-def _files(index: DatasetIndex, folder: Path) -> set[str]:
-    if not folder.is_dir():
-        return set()
-    return {f"{sub}/{file}" for sub in index.listing(folder)[0] for file in index.listing(folder / sub)[1]}
+        _add_grasp(index, f"{base}{name}", name, int(row[1]), int(row[2]), split, files[name])
 
 
 def _add_grasp(
@@ -98,24 +100,19 @@ def _add_grasp(
             )  # fmt: skip
 
 
-def _published_splits(index: DatasetIndex, base: Path) -> dict[str, str] | None:
+def _splits_of_fold(index: DatasetIndex, base: str) -> dict[str, str] | None:
     """Return object -> split from split_<fold>.json or .npy, None without a file."""
     fold = index.options.fold
     path = index.find_file([f"split_{fold}.json", f"split_{fold}.npy"], base)
     if path is None and fold:
-        raise DatasetError(f"there is no split_{fold}.npy or .json for --fold {fold} under {base}")
+        raise DatasetError(f"there is no split_{fold}.npy or .json for --fold {fold} in {index.root / base}")
     if path is None:
         index.notes.append(f"no split_{fold}.npy or .json: split by hash of the object")
         return None
     table = read_json(path) if path.suffix == ".json" else strings_in_pickle(path)
     if not {"train", "test"} <= table.keys() or not all(isinstance(names, list) for names in table.values()):
         raise DatasetError(f"{path}: expected the lists 'train' and 'test' of object names")
-    splits: dict[str, str] = {}
-    for part in PARTS:
-        for name in map(str, table.get(part, [])):
-            if splits.setdefault(name, part) != part:
-                raise DatasetError(f"{path}: the object {name} is in {splits[name]} and in {part}")
-    return splits
+    return published_splits(path, ((str(name), part) for part in PARTS for name in table.get(part, [])))
 
 
 def strings_in_pickle(path: Path) -> dict[str, list[str]]:
@@ -128,10 +125,7 @@ def strings_in_pickle(path: Path) -> dict[str, list[str]]:
     memo: dict[int, str] = {}
     last, current = "", ""
     try:
-        with path.open("rb") as file:
-            is_old = np.lib.format.read_magic(file) == (1, 0)
-            (np.lib.format.read_array_header_1_0 if is_old else np.lib.format.read_array_header_2_0)(file)
-            ops = list(pickletools.genops(file.read()))
+        ops = list(pickletools.genops(path.read_bytes().partition(b"\n")[2]))  # behind the header, a line of text
     except (OSError, ValueError, IndexError) as error:
         raise DatasetError(f"{path} is not a .npy file with a pickled dict: {error}") from None
     for op, argument, _ in ops:
@@ -167,10 +161,15 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
         try:
             with h5py.File(root / name, "r") as file:
                 for grasp in _grasps(file):
-                    obj = _object_name(_value(grasp, "object_name"))
+                    obj, success = (_value(grasp, key) for key in ("object_name", "is_gripping"))
+                    obj = _object_name(obj)
                     number = numbers[obj] = numbers.get(obj, -1) + 1
-                    _write_grasp(root / obj, number, grasp)
-                    lines.append([obj, number, int(np.ravel(_value(grasp, "is_gripping"))[0])])
+                    for key in PICTURES.keys() & grasp.keys():
+                        pixels = cv2.cvtColor(np.asarray(grasp[key][()]), cv2.COLOR_RGB2BGR)
+                        sub, ending = PICTURES[key]
+                        picture = root / obj / sub / f"{number}{ending}.png"
+                        atomic_write(picture, cv2.imencode(".png", pixels)[1].tobytes(), sync=False)
+                    lines.append([obj, number, int(np.ravel(success)[0])])
         except (OSError, KeyError, ValueError) as error:
             raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None
     text = io.StringIO()
@@ -195,27 +194,22 @@ def _value(group: Any, key: str) -> Any:
 
 
 def _object_name(value: Any) -> str:
-    value = value.item() if isinstance(value, np.generic | np.ndarray) and np.size(value) == 1 else value
-    if isinstance(value, np.ndarray):
-        value = value.astype(np.uint8).tobytes()
-    text = value.decode() if isinstance(value, bytes) else str(value)
+    """Return the name of an object as a folder, from text, bytes or an array of codes."""
+    array = np.asarray(value)
+    data = array.item() if array.size == 1 else array.astype(np.uint8).tobytes()
+    text = data.decode() if isinstance(data, bytes) else str(data)
     name = text.rstrip("\0").strip().replace("/", "_").replace("\\", "_")
     if name.strip(".") == "":
         raise ValueError(f"a grasp has the object name {text!r}")
     return name
 
 
-def _write_grasp(folder: Path, number: int, grasp: Any) -> None:
-    for key, (sub, ending) in PICTURES.items():
-        if key in grasp:
-            pixels = cv2.cvtColor(np.asarray(grasp[key][()]), cv2.COLOR_RGB2BGR)
-            data = cv2.imencode(".png", pixels)[1].tobytes()
-            atomic_write(folder / sub / f"{number}{ending}.png", data, sync=False)
-
-
-READER = DatasetReader(
-    read,
-    url="https://sites.google.com/view/the-feeling-of-success",
-    citation="Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, CoRL 2017",
-    uses=("val", "test", "lists", "fold", "export"),
-)
+READERS = {
+    "feel": DatasetReader(
+        read,
+        "feel.csv and <object>/touch_during/0_A.png",
+        "Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, CoRL 2017",
+        url="https://sites.google.com/view/the-feeling-of-success",
+        uses=("val", "test", "lists", "fold", "export"),
+    )
+}

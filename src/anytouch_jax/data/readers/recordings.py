@@ -48,9 +48,9 @@ def read(index: DatasetIndex) -> None:
     check_spelling(options.sensor)
     if options.export:
         _export_videos(index)
-    recordings: list[tuple[str, dict[str, Frames]]] = []
+    recordings: dict[str, dict[str, Frames]] = {}  # folder -> finger -> frames
     shared: dict[str, dict[str, Any]] = {}  # folder -> cells from the files in it and in the folders above
-    for folder, folders, files in index.walk(root):
+    for folder, folders, files in index.walk():
         shared[folder] = shared.get(folder.rpartition("/")[0], {}) | _shared_cells(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             index.skip(f"folder called {BACKGROUND} or {PHOTO}, where one picture is expected", folder)
@@ -58,23 +58,19 @@ def read(index: DatasetIndex) -> None:
         # A video with a folder of its name has been exported.
         files = [name for name in files if not (_is_video(name) and Path(name).stem in folders)]
         if fingers := _fingers(index, files, folder):
-            recordings.append((folder, fingers))
-    splits = _splits(index, [folder for folder, _ in recordings])
-    for folder, fingers in recordings:
+            recordings[folder] = fingers
+    splits = _splits(index, list(recordings))
+    for folder, fingers in recordings.items():
         for unit, frames in fingers.items():
             sequence = f"{folder}/{unit}".strip("/") or "."
             index.add_recording(frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
-                                unit=unit or None, object=_object(folder) or None, dataset=root.name,
+                                unit=unit or None, object=folder.split("/")[0] or None, dataset=root.name,
                                 **shared[folder])  # fmt: skip
     if options.labels is not None and recordings:
         _join_labels(index, options.labels.expanduser())
     for split in ("val", "test"):
         if recordings and split not in splits.values() and getattr(options, split):
             index.notes.append(f"there are too few objects or recordings for split {split}")
-
-
-def _object(folder: str) -> str:
-    return folder.split("/")[0]
 
 
 def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]:
@@ -98,13 +94,13 @@ def _splits(index: DatasetIndex, folders: list[str]) -> dict[str, str]:
     options = index.options
     objects: dict[str, list[str]] = {}
     for folder in folders:
-        objects.setdefault(_object(folder), []).append(folder)
+        objects.setdefault(folder.split("/")[0], []).append(folder)
     if options.split_by == "recording":
         return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
     if len(objects) > 1 and options.val + options.test > 0:
         index.notes.append("whole objects are held out; for a classifier of objects: --split-by recording")
     split = ranked_split(objects, options)
-    return {folder: split[_object(folder)] for folder in folders}
+    return {folder: split[folder.split("/")[0]] for folder in folders}
 
 
 def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
@@ -140,9 +136,8 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Fr
         names = [name for name in names if name not in arrays]
     if not names:
         return {}
-    return {
-        unit: list(zip(images.frame_numbers(one), one, strict=True)) for unit, one in images.split_series(names).items()
-    }
+    series = images.split_series(names)
+    return {unit: dict(zip(images.frame_numbers(one), one, strict=True)) for unit, one in series.items()}
 
 
 def _is_video(name: str) -> bool:
@@ -154,30 +149,25 @@ def _export_videos(index: DatasetIndex) -> None:
 
     A video that cannot be read is skipped. Raises UserError if nothing can be written.
     """
-    for folder, folders, files in list(index.walk(index.root, count=False)):  # before any folder is made
-        existing = set(folders)
-        for name in files:
-            video = index.root / folder / name
-            if not _is_video(name) or video.stem in existing:
+    for folder, folders, files in list(index.walk(count=False)):  # before any folder is made
+        for video in (index.root / folder / name for name in files if _is_video(name)):
+            if video.stem in folders:
                 continue
-            existing.add(video.stem)
+            folders.append(video.stem)
+            count = 0
             try:
-                _write_frames(index, video)
+                with atomic_folder(video.with_suffix("")) as target:
+                    for frame in images.frames_from_video(video):
+                        data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
+                        (target / f"{count:06d}.png").write_bytes(data)
+                        count += 1
             except images.ImageError:
                 index.skip("video that cannot be read", str(video))
             except OSError as error:
                 raise UserError(f"the frames of {video} cannot be written next to it: {error.strerror}") from None
-
-
-def _write_frames(index: DatasetIndex, video: Path) -> None:
-    count = 0
-    with atomic_folder(video.with_suffix("")) as target:
-        for frame in images.frames_from_video(video):
-            data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
-            (target / f"{count:06d}.png").write_bytes(data)
-            count += 1
-    if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
-        index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
+            else:
+                if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
+                    index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
 
 
 def _join_labels(index: DatasetIndex, path: Path) -> None:
@@ -217,17 +207,14 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
     rows = read_lines(path)
     names = rows[0][1] if rows else []
     if not set(LABEL_KEYS) & set(names):
-        raise DatasetError(
-            f"{path} has no column object or sequence, by which labels are joined; it has {', '.join(names)}"
-        )
+        raise DatasetError(f"{path} has no column object or sequence, by which labels are joined; it has "
+                           f"{', '.join(names)}")  # fmt: skip
     if repeated := [name for name in names if names.count(name) > 1]:
         raise DatasetError(f"{path} has the column {repeated[0]!r} twice")
     lines: dict[tuple[str | None, str | None], dict[str, str]] = {}
     for line, row in rows[1:]:
         if any(row[len(names) :]):
-            raise DatasetError(
-                f"{path}, line {line}: it has {len(row)} cells for {len(names)} columns; quote its commas"
-            )
+            raise DatasetError(f"{path}, line {line}: {len(row)} cells for {len(names)} columns; quote its commas")
         cells = dict(zip(names, row, strict=False))
         key = (_plain(cells.pop("object", None)), _plain((cells.pop("sequence", "") or "").replace("\\", "/")))
         if not any(key):
@@ -246,9 +233,12 @@ def _plain(name: str | None) -> str | None:
     return unicodedata.normalize("NFC", name) if name else None
 
 
-READER = DatasetReader(
-    read,
-    license="as their owner says",
-    citation="nothing, unless their owner asks for it",
-    uses=("val", "test", "split_by", "sensor", "labels", "export"),
-)
+READERS = {
+    "recordings": DatasetReader(
+        read,
+        "<object>/<recording>/0.png",
+        "nothing, unless their owner asks for it",
+        "as their owner says",
+        uses=("val", "test", "split_by", "sensor", "labels", "export"),
+    )
+}

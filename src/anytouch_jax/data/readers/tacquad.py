@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_csv
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_lines
 
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
 COARSE = ("indoor", "outdoor")
@@ -26,49 +26,44 @@ ON_DISK = {"shuttlecock": "yumaoqiu"}  # folder -> its name in the list, the Chi
 
 
 def read(index: DatasetIndex) -> None:
-    """Add every item of every `data_*` subset. Raises DatasetError without one, or without its contact list."""
-    subsets = [name for name in index.listing(index.root)[0] if name.startswith("data_")]
-    if not subsets:
-        raise DatasetError(f"expected data_indoor/<item>/gelsight under {index.root}; is ROOT the folder that holds "
-                           "'data_indoor'?")  # fmt: skip
-    for subset in COARSE:
-        if f"data_{subset}" not in subsets:
-            index.notes.append(f"no data_{subset}: that subset is left out")
-    for folder in subsets:
-        subset = folder.removeprefix("data_")
+    """Add every item of every `data_*` subset. Raises DatasetError for one without its contact list."""
+    subsets = [name.removeprefix("data_") for name in index.listing("")[0] if name.startswith("data_")]
+    index.notes += [f"no data_{subset}: that subset is left out" for subset in COARSE if subset not in subsets]
+    for subset in subsets:
         contact = _contact_spans(index, subset)
-        for item in index.listing(folder)[0]:
+        for item in index.listing(f"data_{subset}")[0]:
+            place = f"data_{subset}/{item}"
             listed = item if item in contact else ON_DISK.get(item, item)
             if listed not in contact:
-                index.skip(f"item that is not in contact_{subset}.csv", f"{folder}/{item}")
+                index.skip(f"item that is not in contact_{subset}.csv", place)
                 continue
             if listed != item:
-                index.notes.append(f"{folder}/{item} is {listed!r} in contact_{subset}.csv: its lines are used")
-            line, spans = contact.pop(listed)
+                index.notes.append(f"{place} is {listed!r} in contact_{subset}.csv: its lines are used")
+            number, spans = contact.pop(listed)
             split = index.split_of(item) if subset in COARSE else "unused"
             cells = {"object": item, "touch": f"{subset}/{item}", "subset": subset, "split": split,
-                     "caption_id": f"tacquad_{subset}_{line}"}  # fmt: skip
-            _add_item(index, f"{folder}/{item}", spans, cells)
+                     "caption_id": f"tacquad_{subset}_{number}"}  # fmt: skip
+            _add_item(index, place, spans, cells)
         for item in contact:
-            index.skip(f"item of contact_{subset}.csv that is not on disk", f"{folder}/{item}")
+            index.skip(f"item of contact_{subset}.csv that is not on disk", f"data_{subset}/{item}")
 
 
 def _contact_spans(index: DatasetIndex, subset: str) -> dict[str, tuple[int, list[tuple[int, int]]]]:
-    """Return item -> its line in the list (from 0) and (first, last contact frame) of each sensor."""
+    """Return item -> its number in the list (from 0) and (first, last contact frame) of each sensor."""
     path = index.find_file([f"contact_{subset}.csv"])
     if path is None:
         place = index.options.lists or index.root
         raise DatasetError(f"expected the list contact_{subset}.csv in {place}, next to data_{subset}")
     spans: dict[str, tuple[int, list[tuple[int, int]]]] = {}
-    for line, row in enumerate(read_csv(path)):
+    for number, (line, row) in enumerate(read_lines(path)):
         try:
             ends = [int(cell) for cell in row[1 : 2 * len(SENSORS) + 1]]
             if len(ends) != 2 * len(SENSORS) or row[0] in spans:
                 raise ValueError
         except ValueError:
-            raise DatasetError(f"{path}, line {line + 1}: expected a new item and six frame numbers, "
+            raise DatasetError(f"{path}, line {line}: expected a new item and six frame numbers, "
                                f"found {','.join(row)}") from None  # fmt: skip
-        spans[row[0]] = line, list(zip(ends[::2], ends[1::2], strict=True))
+        spans[row[0]] = number, list(zip(ends[::2], ends[1::2], strict=True))
     return spans
 
 
@@ -82,40 +77,33 @@ def _add_item(index: DatasetIndex, place: str, spans: list[tuple[int, int]], cel
         if folder not in folders:
             index.skip("item without a sensor", path)
             continue
-        frames = index.numbered(index.listing(path)[1], r"(\d+)\.(?:png|jpe?g)", path)
-        numbers = [number for number, _ in frames]
-        contact = [first <= number <= last for number in numbers]
+        frames = index.frames(path)
+        contact = [first <= number <= last for number in frames]
         index.skip("contact frame that is not on disk", path, max(last - first + 1, 0) - sum(contact))
-        has_background = frames and not contact[0] and numbers[0] < first
-        is_unused = cells["split"] == "unused"
-        split = [cells["split"] if touched or is_unused else "background" for touched in contact]
+        start, free = min(frames, default=0), "unused" if cells["split"] == "unused" else "background"
+        photos = index.frames(f"{place}/img_{folder}")  # of the same fraction of the recording
+        names = [photos.get(number * len(photos) // len(frames), "") for number in frames]
         index.add(
-            [f"{path}/{name}" for _, name in frames],
+            [f"{path}/{name}" for name in frames.values()],
             sensor=sensor,
             sequence=path,
-            frame_index=numbers,
-            image_path=_photos(index, f"{place}/img_{folder}", numbers),
-            background_path=f"{path}/{frames[0][1]}" if has_background else None,
-            **cells | {"split": split, "label.contact": [int(touched) for touched in contact]},
-        )
+            frame_index=list(frames),
+            image_path=index.photographs(f"{place}/img_{folder}", names, set(photos.values())),
+            background_path=f"{path}/{frames[start]}" if frames and start < first and not contact[0] else None,
+            **cells | {"split": [cells["split"] if touched else free for touched in contact],
+                       "label.contact": [int(touched) for touched in contact]},
+        )  # fmt: skip
 
 
-def _photos(index: DatasetIndex, folder: str, numbers: list[int]) -> list[str | None]:
-    """Return the photograph at the same fraction of the recording: floor(n / touch frames x photographs)."""
-    files = index.listing(folder)[1] if (index.root / folder).is_dir() else []
-    photos = dict(index.numbered(files, r"(\d+)\.(?:png|jpe?g)", folder))
-    wanted = [n * len(photos) // len(numbers) for n in numbers]
-    paths = [f"{folder}/{photos[n]}" if n in photos else None for n in wanted]
-    index.skip("photograph missing (kept without)", folder, paths.count(None))
-    return paths
-
-
-READER = DatasetReader(
-    read,
-    url="https://huggingface.co/datasets/xxuan01/TacQuad",
-    citation="Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple Visuo-tactile "
-    "Sensors, ICLR 2025",
-    uses=("val", "test", "lists"),
-    paper=55_082,
-    paper_note="coarse; 17,524 fine; both with Tac3D",
-)
+READERS = {
+    "tacquad": DatasetReader(
+        read,
+        "data_indoor/<item>/gelsight/0.png",
+        "Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple Visuo-tactile Sensors, "
+        "ICLR 2025",
+        url="https://huggingface.co/datasets/xxuan01/TacQuad",
+        uses=("val", "test", "lists"),
+        paper=55_082,
+        paper_note="coarse; 17,524 fine; both with Tac3D",
+    )
+}

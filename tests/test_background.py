@@ -15,7 +15,7 @@ from anytouch_jax.config import DataConfig, preset
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.loading.loader import Loader
-from anytouch_jax.data.loading.samples import SampleError
+from anytouch_jax.data.loading.samples import SampleError, SampleReader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.embed import embed_rows
@@ -201,3 +201,38 @@ def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
     np.testing.assert_array_equal(shown[2, 1], frames[2, 1].astype(int) - frames[0, 1] + 128)
     plain = Encoder(replace(encoder.config, data=DataConfig()), encoder.params, "")
     assert policy.subtracted(plain, frames, frames[0]) is frames
+
+
+def test_either_subtracts_half_of_the_samples_and_every_known_background_in_evaluation(touches):
+    """Each row is drawn by itself, again in every epoch; a row without a background is never subtracted."""
+    table = manifests.read(touches)
+    readers = {mode: SampleReader(table, settings(touches, mode)) for mode in ("keep", "subtract", "either")}
+    rows = np.flatnonzero(table.column("split").to_numpy(zero_copy_only=False) == "train")
+
+    def subtracted(epoch):
+        either = [readers["either"].touch(rows[i : i + 1], epoch) for i in range(len(rows))]
+        plain, less = (
+            [readers[m].touch(rows[i : i + 1], epoch) for i in range(len(rows))] for m in ("keep", "subtract")
+        )
+        assert all(np.array_equal(e, p) or np.array_equal(e, s) for e, p, s in zip(either, plain, less, strict=True))
+        return np.array([np.array_equal(e, s) for e, s in zip(either, less, strict=True)])
+
+    draws = np.stack([subtracted(epoch) for epoch in range(40)])
+    assert 0.4 < draws.mean() < 0.6 and draws.std(0).min() > 0.2 and draws.std(1).min() > 0
+    assert subtracted(None).all()
+    bare = manifests.from_columns(
+        {n: [None] * len(table) if n == "background_path" else table.column(n) for n in table.table.column_names},
+        touches,
+    )
+    plain = SampleReader(bare, settings(touches, "either")).touch(rows[:1], None)
+    assert np.array_equal(plain, readers["keep"].touch(rows[:1], None))
+
+
+def test_an_encoder_of_either_kind_works_with_and_without_a_background(encoder):
+    either = replace(encoder, config=replace(encoder.config, data=replace(encoder.config.data, background="either")))
+    side = either.config.model.image_size
+    gel = np.full((side, side, 3), 90, np.uint8)
+    assert (either.preprocess(gel, gel) == 128).all() and (either.preprocess(gel) == 90).all()
+    assert either.subtracts and not either.needs_background
+    camera = Preprocess(either)
+    assert (camera(gel) == 90).all() and (camera(gel) == 90).all()

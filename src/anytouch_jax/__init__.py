@@ -26,8 +26,10 @@ _HOMES = {
     "evaluate.probing": "probe_benchmark probe_label probe_tasks",
     "data.loading.loader": "Loader",
     "data.manifest.manifest": "Manifest",
+    "weights.registry": "list_encoders",
     "weights.tree": "interpolate",
     "encoder.encoder": "Encoder load_encoder random_encoder",
+    "encoder.examples": "example_touches",
     "encoder.preprocess": "Preprocess",
 }
 _ALIASES = {  # public names that say more outside their module

@@ -7,7 +7,7 @@ import re
 
 from places import ROOT
 
-PAGE = (ROOT / "docs" / "way_of_a_clip.md").read_text()
+PAGE = (ROOT / "docs" / "how" / "way_of_a_clip.md").read_text()
 STOP = re.compile(r"^\*\*(\d)\. `([\w/]+\.py)`\*\*(.*)$", re.MULTILINE)
 
 

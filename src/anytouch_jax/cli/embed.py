@@ -138,10 +138,10 @@ def frames_input(encoder: Encoder, options: FrameOptions, data: Path) -> tuple[i
     row, gel = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.background
     if gel is None and encoder.subtracts and data.is_dir():
         gel = list_images(data)[1].get(BACKGROUND)
-    background = "the first frame" if gel is None else str(gel)
+    background = str(gel) if gel is not None else "the first frame" if encoder.needs_background else "not subtracted"
     if gel is not None and not encoder.subtracts:
         log("--background is not used: this encoder was trained on frames without background subtraction")
-    if options.background is None and encoder.subtracts:
+    if options.background is None and encoder.needs_background:
         log(f"this encoder needs background-subtracted frames: {background} is the background (see --background)")
     preprocess = Preprocess(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
     about = {"background": background if encoder.subtracts else "not subtracted", "rotate": str(options.rotate)}

@@ -142,7 +142,7 @@ def embed_frames(
 def check_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray) -> None:
     """Raise UserError if the encoder needs background-subtracted frames and one of `rows` has no background_path."""
     missing = rows[~manifest.present("background_path")[rows]]
-    if encoder.subtracts and len(missing):
+    if encoder.needs_background and len(missing):
         raise UserError(
             f"{manifest.where(int(missing[0]))} and {len(missing) - 1} other rows have no background_path, which "
             f"{encoder.source} subtracts; add backgrounds, or pass --on-bad-sample skip to embed"

@@ -34,7 +34,7 @@ from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_image, normalise_touch
 from anytouch_jax.ops import losses
-from anytouch_jax.weights import load
+from anytouch_jax.weights import load, registry
 
 Params = dict[str, Any]
 _PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matching head", "logit_scale": "temperature"}
@@ -91,7 +91,12 @@ class Encoder:
 
     @property
     def subtracts(self) -> bool:
-        """Whether it was trained on background-subtracted touches (`data.background`), and needs such frames."""
+        """Whether it subtracts the background of a touch that has one (`data.background`)."""
+        return self.config.data.background != "keep"
+
+    @property
+    def needs_background(self) -> bool:
+        """Whether it was trained on background-subtracted touches only."""
         return self.config.data.background == "subtract"
 
     @cached_property
@@ -100,12 +105,12 @@ class Encoder:
         return f"{zlib.crc32(b''.join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(self.params))):08x}"
 
     def preprocess(self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder needs it.
+        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder does so.
 
         Raises UserError if the encoder needs a `background`, the picture of the untouched gel, and there is none. Use
         `Preprocess` for a camera: it stores the background.
         """
-        if self.subtracts and background is None:
+        if self.needs_background and background is None:
             raise UserError(f"{self.source} needs background-subtracted frames. Give the background, an untouched gel.")
         return Preprocess(self, background)(frame)
 
@@ -271,12 +276,14 @@ def touch_features(
 
 
 def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
-    """Load the encoder of a run folder, a checkpoint folder or a weights file (.pth, .bin, .safetensors, .npz).
+    """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
-    `step` chooses a checkpoint of a run, the latest by default. Image and text towers are loaded too, if there are
-    any. Raises UserError for weights without a touch encoder, or with values that are not finite.
+    Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
+    are .pth, .bin, .safetensors or .npz. `step` chooses a checkpoint of a run, the latest by default. Image and text
+    towers are loaded too, if there are any. Raises UserError for weights without a touch encoder, or with values that
+    are not finite.
     """
-    path, names = Path(path), set[str]()
+    name, path, names = str(path), registry.resolve(path), set[str]()
     if path.suffix == ".npz":
         with suppress(OSError, ValueError):  # the reader of weights reports a damaged file
             names = set(read_arrays(path, only=lambda _: False))
@@ -284,10 +291,10 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
         raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
     loaded = load.load_model(path, step=step)
     if "touch" not in loaded.params:
-        raise UserError(f"{path} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
+        raise UserError(f"{name} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
     others = {name: part for name, part in loaded.params.items() if name != "touch"}
     return Encoder(
-        _touch_only(loaded.config), {"touch": loaded.params["touch"]}, str(path), loaded.trained_sensors,
+        _touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
         loaded.universal_drawn, loaded.config.model, others, _tokenizer_file(path), loaded.metadata,
     )  # fmt: skip
 

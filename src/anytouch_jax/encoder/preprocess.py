@@ -19,8 +19,8 @@ class Preprocess:
     """Frames of one sensor in the form that an encoder was trained on.
 
     They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and resized. For an encoder
-    that `subtracts`, the `background` (a frame of the untouched gel) is subtracted first. Without a background the
-    first frame is taken as the background.
+    that `subtracts`, the `background` (a frame of the untouched gel) is subtracted first. Without a background an
+    encoder that needs one takes the first frame, and another takes frames without subtraction.
 
     >>> preprocess = Preprocess(encoder, background=camera.read())
     >>> features = encoder.encode_touch(preprocess(camera.read()), "digit")
@@ -29,7 +29,8 @@ class Preprocess:
     def __init__(
         self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
     ) -> None:
-        self._subtracts, self._size = encoder.subtracts, encoder.config.model.image_size
+        self._size = encoder.config.model.image_size
+        self._subtracts = encoder.needs_background or (encoder.subtracts and background is not None)
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
         self._background = None
         if background is not None:

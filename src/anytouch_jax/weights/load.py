@@ -12,7 +12,7 @@ import numpy as np
 
 from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json, to_json
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights import checkpoint, compatible
+from anytouch_jax.weights import checkpoint, compatible, registry
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
 from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
 from anytouch_jax.weights.keymaps import Weights
@@ -75,14 +75,17 @@ class Start(NamedTuple):
 
 
 def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool = False) -> Loaded:
-    """Load a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
+    """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
 
     `step` chooses a checkpoint of a run, the latest by default. With `stored_rows` the rows of a file for sensors
     outside its training are unchanged, as a conversion needs them. Raises UserError.
     """
-    path = Path(path)
+    path = registry.resolve(path)
     if not path.exists():
-        raise UserError(f"there is no run folder or weights file at {path}; give another path")
+        raise UserError(
+            f"there is no run folder or weights file at {path}; give another path, or one of "
+            f"{', '.join(registry.list_encoders())}"
+        )
     trained: Any
     if path.is_dir() and not any(path.glob("*.pth")) and (checkpoint.is_run(path) or not _weights_files(path)):
         params, text, metadata = checkpoint.load_params(path, step)

@@ -16,7 +16,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.errors import UserError
 
 TRIES = 20  # bad samples in a row before a slot gives up
-_REPLACE = 51  # tag of the random stream of replacements
+_REPLACE, _SUBTRACT = 51, 52  # tags of the random streams of replacements and of subtracted backgrounds
 
 
 class SampleError(UserError):
@@ -39,16 +39,17 @@ class SampleReader:
         """Return the frames of a window of rows, u8 (T, size, size, 3); `epoch` None means no augmentation.
 
         They are written into `out` once all frames could be read, else into a new array. The last row seeds the
-        augmentation of the whole clip. With `data.background` "subtract" the background is augmented too: otherwise
-        the change of brightness would be stronger than the contact. Raises SampleError.
+        augmentation of the whole clip. A background that is subtracted is augmented too: otherwise the change of
+        brightness would be stronger than the contact. Raises SampleError.
         """
         size, data = self.config.model.image_size, self.config.data
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
         # Frames are resized once and cached, unless the background is subtracted at their original size.
-        load = None if epoch is None or (plain and data.background == "subtract") else self._resized
+        subtracts = self._subtracts(int(rows[-1]), epoch)
+        load = None if epoch is None or (plain and subtracts) else self._resized
         frames = [read_image(self.manifest, row, load=load) for row in rows]
         background = None
-        if data.background == "subtract":
+        if subtracts:
             if self.manifest.value(rows[-1], "background_path") is None:
                 raise SampleError(
                     f"{self.manifest.where(rows[-1])} has no background_path, which --data.background subtract "
@@ -64,6 +65,16 @@ class SampleReader:
             return transforms.touch_transform(frames, size, rng, data, out)
         *augmented, background = transforms.touch_transform([*frames, background], size, rng, data)
         return np.stack(transforms.subtract_background(augmented, background), out=out)
+
+    def _subtracts(self, row: int, epoch: int | None) -> bool:
+        """Return whether the background of a row is subtracted. "either" draws it, and always does in evaluation."""
+        if self.config.data.background != "either":
+            return self.config.data.background == "subtract"
+        if self.manifest.value(row, "background_path") is None:
+            return False
+        return epoch is None or bool(
+            np.random.default_rng([self.config.run.seed, epoch, row, _SUBTRACT]).random() < 0.5
+        )
 
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """Return the photograph of a row, u8 (size, size, 3); `epoch` None means no augmentation."""

@@ -1,0 +1,118 @@
+"""Pages of the documentation site that are made from the package: commands, API and results.
+
+python -m docs.generate        writes docs/reference/commands.md, docs/reference/api.md and docs/results/
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shutil
+from pathlib import Path
+
+import anytouch_jax as at
+from anytouch_jax.cli.app import COMMANDS, main
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+RESULTS = ROOT / "experiments" / "results"
+_ROOMS = {
+    "encoder": "Encoders",
+    "evaluate": "Probes",
+    "ops": "Pure functions",
+    "objectives": "Losses of the two stages",
+    "nn": "Networks",
+    "train": "Training",
+    "pretrain": "Training",
+    "batch": "Batches",
+    "config": "Settings",
+    "data": "Data",
+    "weights": "Weights",
+    "errors": "Errors",
+}
+
+
+def help_of(command: str) -> str:
+    """Return the help text of a command, 100 columns wide, without the frames that a terminal draws."""
+    os.environ["COLUMNS"] = "100"
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        main([*command.split(), "--help"])
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
+    lines = [re.sub(r"[╭╮╰╯─│]+", " ", line).rstrip() for line in plain.splitlines()]
+    return "\n".join(lines).strip()
+
+
+def commands_page() -> str:
+    """Return the command reference: each command with its help."""
+    parts = ["# Command reference\n\nEach command answers `--help` with this text.\n"]
+    parts += [
+        f"## anytouch {name}\n\n{command.summary}\n\n```text\n{help_of(name)}\n```\n"
+        for name, command in COMMANDS.items()
+    ]
+    return "\n".join(parts)
+
+
+def api_page() -> str:
+    """Return the API reference: every public name, by room."""
+    rooms: dict[str, list[str]] = {}
+    for name in at.__all__:
+        module, attribute = at._HOME[name]
+        title = _ROOMS[module.split(".")[0]]
+        rooms.setdefault(title, []).append(f"::: anytouch_jax.{module}.{attribute}\n")
+    parts = ["# API reference\n\nImport these names from `anytouch_jax`.\n"]
+    for title in dict.fromkeys(_ROOMS.values()):
+        parts += [f"## {title}\n", *rooms.get(title, [])]
+    return "\n".join(parts)
+
+
+def write() -> None:
+    """Write the generated pages."""
+    (DOCS / "reference").mkdir(exist_ok=True)
+    (DOCS / "reference" / "commands.md").write_text(commands_page(), encoding="utf-8")
+    (DOCS / "reference" / "api.md").write_text(api_page(), encoding="utf-8")
+    shutil.rmtree(DOCS / "results", ignore_errors=True)
+    (DOCS / "results").mkdir()
+    if (RESULTS / "figures").is_dir():
+        shutil.copytree(RESULTS / "figures", DOCS / "results" / "figures")
+    pages = {
+        page: DOCS / "results" / ("paper.md" if page.name == "README.md" else page.name)
+        for page in RESULTS.glob("*.md")
+    }
+    pages |= {ROOT / name: DOCS / name.lower() for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
+    for page, target in sorted(pages.items()):
+        target.write_text(_inside(page.read_text(encoding="utf-8"), page, target, pages), encoding="utf-8")
+    titles = {
+        t: t.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+        for t in pages.values()
+        if t.parent.name == "results"
+    }
+    listed = "\n".join(f"* [{title}]({target.name})" for target, title in sorted(titles.items()))
+    (DOCS / "results" / "index.md").write_text(
+        f"# Results\n\nEach page is made from its data alone.\n\n{listed}\n", encoding="utf-8"
+    )
+
+
+def _inside(text: str, page: Path, target: Path, pages: dict[Path, Path]) -> str:
+    """Return a copied page whose links stay inside the site. Other links become text."""
+
+    def link(match: re.Match[str]) -> str:
+        whole, title, address = match[0], match[1], match[2]
+        if address.startswith(("http", "#")):
+            return whole
+        file, _, anchor = address.partition("#")
+        source = (page.parent / file).resolve()
+        home = pages.get(source, source)
+        if home in pages.values() or (home.is_relative_to(DOCS) and home.exists()):
+            return f"[{title}]({os.path.relpath(home, target.parent)}{'#' + anchor if anchor else ''})"
+        if source.is_relative_to(RESULTS / "figures"):
+            return whole
+        return title
+
+    return re.sub(r"\[([^\]]*)\]\(([^)\s]+)\)", link, text)
+
+
+if __name__ == "__main__":
+    write()

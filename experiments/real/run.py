@@ -1,0 +1,84 @@
+"""What is an encoder worth on real recordings? Scores of encoders beside pixels and a classical baseline.
+
+    python -m experiments.real.run DATA=../shared/real_touch2/manifest.csv anytouch-tiny runs/weights/stage1
+
+Each model is a name, a run folder or a weights file; `untrained:MODEL` is the same network without training. Every row
+goes to `experiments/results/real.jsonl`, and the page `real.md` is made from that file alone (`--page`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.files import atomic_write
+from experiments.benchmarks import machine
+from experiments.real import features, page, recordings, scores
+from experiments.records import write_record
+
+BASELINES = {"pixels": features.pixel_values, "HOG and local binary patterns": features.classical_values}
+UNTRAINED = "untrained:"
+
+
+def load(name: str) -> Encoder:
+    """Load an encoder by name or path; `untrained:` gives the same network without training."""
+    if name.startswith(UNTRAINED):
+        return random_encoder(load_encoder(name.removeprefix(UNTRAINED)).config)
+    return load_encoder(name)
+
+
+def milliseconds(encoder: Encoder, data: recordings.Recordings, rounds: int = 30) -> float:
+    """Return the median time of one frame, preprocessing included."""
+    times = []
+    for frame, place in zip(data.frames[: rounds + 5], data.background, strict=False):
+        begun = time.perf_counter()
+        encoder.encode_touch(encoder.preprocess(frame, data.backgrounds[place]), "gelsight_mini")
+        times.append(1000 * (time.perf_counter() - begun))
+    return float(np.median(times[5:]))
+
+
+def record_of(x: np.ndarray, data: recordings.Recordings, about: dict[str, Any]) -> dict[str, Any]:
+    """Return the scores of features (n, d) on every task, with whether each recording was right."""
+    tasks = {}
+    for task, row in scores.table({"": x}, data).items():
+        score = row[""]
+        tasks[task] = {
+            "share": score.share, "interval": score.interval(), "option": score.option,
+            "correct": score.correct.astype(int).tolist(), "groups": score.groups.tolist(),
+        }  # fmt: skip
+    curve = {str(count): scores.label_curve(x, data, count) for count in (1, 2, 5)}
+    return about | {"tasks": tasks, "label_curve": curve, "machine": dataclasses.asdict(machine.describe())}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("models", nargs="*")
+    parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"))
+    parser.add_argument("--out", type=Path, default=Path("experiments/results/real.jsonl"))
+    parser.add_argument("--page", action="store_true", help="make the page from the records, and nothing else")
+    options = parser.parse_args()
+    if not options.page:
+        data = recordings.read(options.data)
+        common = {"data": data.content_hash}
+        for name, compute in BASELINES.items():
+            write_record(options.out, name, record_of(compute(data), data, common | {"kind": "baseline"}))
+            print(name, flush=True)
+        for name in options.models:
+            encoder = load(name)
+            about = {"kind": "encoder", "config": json.loads(json.dumps(dataclasses.asdict(encoder.config))),
+                     "fingerprint": encoder.fingerprint, "milliseconds": milliseconds(encoder, data)}  # fmt: skip
+            x = features.encoder_features(encoder, data)
+            write_record(options.out, name, record_of(x, data, common | about))
+            print(name, flush=True)
+    atomic_write(options.out.with_suffix(".md"), page.page(options.out))
+
+
+if __name__ == "__main__":
+    main()

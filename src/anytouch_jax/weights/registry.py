@@ -1,0 +1,169 @@
+"""Encoders by name: those in the package, and those on the Hugging Face hub.
+
+>>> list_encoders()
+['anytouch-tiny']
+>>> resolve("anytouch-tiny")  # a file of the installed package
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anytouch_jax.config import parse_json, to_json
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write
+from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors
+from anytouch_jax.weights.tree import flatten
+
+if TYPE_CHECKING:
+    from anytouch_jax.weights.load import Loaded
+
+DEFAULT = "anytouch-tiny"
+FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md
+WEIGHTS, CARD = "model.safetensors", "config.json"
+PARTS = ("touch", "text", "logit_scale")  # what features and zero-shot questions need
+_HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
+_FILES = ["*.safetensors", "*.safetensors.index.json", "*.pth", "*.pt", "*.bin", "config.json", "tokenizer.json"]
+
+
+def list_encoders() -> list[str]:
+    """Return the names of the encoders in the package, which `load_encoder` takes."""
+    return sorted(file.parent.name for file in FOLDER.glob(f"*/{CARD}"))
+
+
+def read_card(name: str) -> dict[str, Any]:
+    """Return what the package knows of an encoder: summary, licence, sensors, sizes, the SHA-256 of its weights."""
+    card = parse_json((FOLDER / name / CARD).read_text(encoding="utf-8"))
+    return dict(card)
+
+
+def resolve(model: str | Path) -> Path:
+    """Return the path that a name, an address on the hub, or a path stands for.
+
+    A name of `list_encoders` comes before a folder of that name: write ./anytouch-tiny for the folder. An address is
+    hf://user/repo or hf://user/repo@revision; its files are kept in the cache of `huggingface_hub`. Raises UserError
+    for a damaged package, and for a repository that cannot be read.
+    """
+    if str(model) in list_encoders():
+        return _packaged(str(model))
+    if address := _HUB.fullmatch(str(model)):
+        return _download(address[1], address[2])
+    if str(model).startswith("hf:"):
+        raise UserError(f"{model} is not an address on the hub. Write hf://user/repo or hf://user/repo@revision.")
+    path = Path(model)
+    return path.absolute() if str(path) in list_encoders() else path  # a Path drops ./
+
+
+@lru_cache
+def _packaged(name: str) -> Path:
+    file, expected = FOLDER / name / WEIGHTS, read_card(name).get("sha256")
+    if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != expected:
+        raise UserError(f"The weights of {name} in the package are damaged or missing. Install anytouch_jax again.")
+    return file
+
+
+def _download(repository: str, revision: str | None) -> Path:
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError:
+        raise UserError("An address hf://... needs huggingface_hub. Install it with pip.") from None
+    try:
+        return Path(snapshot_download(repository, revision=revision, allow_patterns=_FILES))
+    except Exception as error:  # the client raises many types, and each of its messages fills a screen
+        reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
+        raise UserError(f"Cannot get hf://{repository}{f'@{revision}' if revision else ''}: {reason}") from None
+
+
+def write_encoder(
+    folder: str | Path,
+    loaded: Loaded,
+    notes: str = "",
+    *,
+    parts: tuple[str, ...] = PARTS,
+    tokenizer: Path | None = None,
+) -> Path:
+    """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16, config.json, README.md.
+
+    `parts` of the model are kept if it has them. `notes` is Markdown for the card: data with licences, results, limits.
+    Raises WeightsError for values that float16 cannot hold.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    params = {name: loaded.params[name] for name in parts if name in loaded.params}
+    with np.errstate(over="ignore"):  # reported below, by name
+        arrays = {name: np.asarray(leaf, np.float32).astype(np.float16) for name, leaf in flatten(params).items()}
+    if wrong := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
+        raise WeightsError(f"{wrong[0]} has values above 65504, which float16 cannot hold; use --to safetensors")
+    model = loaded.config.model
+    model = replace(
+        model, image=model.image if "image" in params else None, text=model.text if "text" in params else None,
+        match_head=model.match_head if "matcher" in params else "none", lora_rank=0,
+    )  # fmt: skip
+    write_safetensors(folder / WEIGHTS, arrays, loaded.export_metadata() | {MODEL_KEY: to_json(model), "source": ""})
+    if tokenizer is not None and "text" in params:
+        shutil.copyfile(tokenizer, folder / "tokenizer.json")
+    card = {
+        "name": folder.name,
+        "parameters": {
+            name: int(sum(np.size(leaf) for leaf in flatten(tree).values())) for name, tree in params.items()
+        },
+        "image_size": model.image_size,
+        "frames": model.frames,
+        "features": model.embed,
+        "background": loaded.config.data.background,
+        "trained_sensors": loaded.trained_sensors,
+        "stage": loaded.config.stage,
+        "steps": loaded.config.run.steps,
+        "recipe": loaded.config.recipe,
+        "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
+    }
+    atomic_write(folder / CARD, json.dumps(card, indent=2) + "\n")
+    atomic_write(folder / "README.md", _page(card, notes))
+    return folder
+
+
+def _page(card: Mapping[str, Any], notes: str) -> str:
+    """Return the model card in the form of the hub: a header that machines read, then Markdown."""
+    count, sensors = sum(card["parameters"].values()), card["trained_sensors"]
+    subtracted = {
+        "subtract": "It needs the picture of the untouched gel, which is subtracted.",
+        "either": "A picture of the untouched gel is subtracted where there is one. It works without.",
+        "keep": "The picture of the untouched gel is not used.",
+    }[card["background"]]
+    return f"""---
+library_name: anytouch_jax
+tags: [tactile, touch, jax]
+---
+
+# {card["name"]}
+
+An encoder of touch for camera-based tactile sensors, by AnyTouch (ICLR 2025) in JAX.
+
+```python
+import anytouch_jax as at
+
+encoder = at.load_encoder("{card["name"]}")
+features = encoder.encode_touch(encoder.preprocess(frame), "digit")  # (1, {card["features"]})
+```
+
+| | |
+| --- | --- |
+| parameters | {count / 1e6:.1f} M, stored as float16 |
+| input | RGB, {card["image_size"]} x {card["image_size"]} pixels, 1 frame or {card["frames"]} |
+| features | {card["features"]} |
+| background | {subtracted} |
+| sensors in training | {", ".join(sensors) if sensors else "not stored"} |
+| training | stage {card["stage"]}, recipe {card["recipe"]}, {card["steps"]} steps |
+
+{notes.strip()}
+"""

@@ -1,0 +1,170 @@
+"""Prose rules for pages and docstrings: `python -m tests.prose.check` prints file, line and reason.
+
+A sentence has at most 30 words, and in a page at most three numbers and no semicolon. A table cell has at most 25
+words. Some phrases are not used anywhere. The README has at most 700 words. Code, links' addresses and tables' numbers
+are not prose.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+WORDS, NUMBERS, CELL, README_WORDS = 30, 3, 25, 700
+PAGES = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "experiments/*/README.md", "experiments/README.md")
+MADE = ("docs/results/", "docs/reference/", "docs/contributing.md", "docs/changelog.md")  # copies, and help texts
+CODE = ("src/**/*.py",)
+PHRASES = (
+    "told", "tells", "tell", "less the", "anew", "likewise", "of its own", "as it is", "as they are",
+    "where there is none", "where there are none", "so far as", "by heart",
+)  # fmt: skip
+_FORBIDDEN = re.compile(r"\b(" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
+_SENTENCE_END = re.compile(r"(?<=[.!?:])[\"')\]*]*\s+(?=[\"'(\[*`]*[A-Z0-9`*])")
+_ABBREVIATION = re.compile(r"\b(e\.g|i\.e|Eq|Sec|Fig|App|No|vs|cf|al)\.\s")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,.]*%?(?!\w)")
+
+
+class Fault(NamedTuple):
+    """A place that breaks a rule."""
+
+    file: Path
+    line: int
+    reason: str
+
+
+class Block(NamedTuple):
+    """A paragraph, list item, heading or table cell, with its first line."""
+
+    line: int
+    text: str
+    kind: str  # prose, heading or cell
+
+
+def plain(text: str) -> str:
+    """Return Markdown without code, addresses and emphasis. A code span counts as one word."""
+    text = re.sub(r"``.+?``|`[^`]*`", "code", text)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    text = re.sub(r"<[^>]+>|https?://\S+", "", text)
+    return re.sub(r"[*_]{1,2}(\S(?:.*?\S)?)[*_]{1,2}", r"\1", text)
+
+
+def sentences(text: str) -> list[str]:
+    """Split prose into sentences."""
+    text = _ABBREVIATION.sub(lambda match: match[0].replace(". ", ".\u00a0"), text)
+    return [part.strip() for part in _SENTENCE_END.split(text) if part.strip()]
+
+
+def words(text: str) -> list[str]:
+    """Return the words of a text: what has a letter or a digit."""
+    return [word for word in text.split() if re.search(r"\w", word)]
+
+
+def markdown_blocks(text: str) -> Iterator[Block]:
+    """Yield the prose of a page, block by block; code blocks and front matter are left out."""
+    waiting: list[str] = []
+    start, fence = 0, ""
+    lines = text.splitlines()
+    front = lines and lines[0] == "---"
+
+    def flush() -> Iterator[Block]:
+        if waiting:
+            yield Block(start, " ".join(waiting), "prose")
+            waiting.clear()
+
+    for number, line in enumerate(lines, 1):
+        bare = line.strip()
+        if front:
+            front = number == 1 or bare != "---"
+            continue
+        if fence or bare.startswith(("```", "~~~")):
+            yield from flush()
+            if not fence:
+                fence = bare[:3]
+            elif bare.startswith(fence):
+                fence = ""
+            continue
+        if re.match(r"( {4}|\t)", line) and not waiting:
+            continue  # an indented block of code
+        if not bare or bare.startswith(("|", "#", "<!--", "!!!", "???", ":::")):
+            yield from flush()
+            if bare.startswith("#"):
+                yield Block(number, bare.lstrip("# "), "heading")
+            elif bare.startswith("|") and not re.fullmatch(r"[|\s:-]+", bare):
+                yield from (Block(number, cell.strip(), "cell") for cell in re.split(r"(?<!\\)\|", bare.strip("|")))
+            continue
+        if item := re.match(r"([-*+]|\d+\.)\s+(.*)", bare):
+            yield from flush()
+            bare = item[2]
+        if not waiting:
+            start = number
+        waiting.append(bare)
+    yield from flush()
+
+
+def page_faults(file: Path, text: str) -> Iterator[Fault]:
+    """Yield the faults of a page."""
+    total = 0
+    for block in markdown_blocks(text):
+        prose = plain(block.text)
+        total += len(words(prose))
+        if found := _FORBIDDEN.search(prose):
+            yield Fault(file, block.line, f"the phrase {found[0]!r}")
+        if block.kind == "cell":
+            if len(words(prose)) > CELL:
+                yield Fault(file, block.line, f"a table cell of {len(words(prose))} words, at most {CELL}")
+            continue
+        for sentence in sentences(prose):
+            if len(words(sentence)) > WORDS:
+                yield Fault(file, block.line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+            if ";" in sentence:
+                yield Fault(file, block.line, f"a semicolon: {sentence[:60]}...")
+            if len(_NUMBER.findall(sentence)) > NUMBERS:
+                yield Fault(file, block.line, f"more than {NUMBERS} numbers: {sentence[:60]}...")
+    if file.name == "README.md" and file.parent == Path() and total > README_WORDS:
+        yield Fault(file, 1, f"{total} words, at most {README_WORDS}")
+
+
+def docstring_faults(file: Path, text: str) -> Iterator[Fault]:
+    """Yield the faults of the docstrings of a module: long sentences and phrases."""
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if not (docstring := ast.get_docstring(node)):
+            continue
+        line = node.body[0].lineno
+        for block in re.split(r"\n\s*\n|\n(?=\s*[-*>]\s)", docstring):
+            if block.lstrip().startswith(">>>"):
+                continue
+            prose = plain(" ".join(block.split()))
+            if found := _FORBIDDEN.search(prose):
+                yield Fault(file, line, f"the phrase {found[0]!r}")
+            for sentence in sentences(prose.replace("; ", ". ")):
+                if len(words(sentence)) > WORDS:
+                    yield Fault(file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+
+
+def faults(root: Path) -> list[Fault]:
+    """Return the faults of all pages and docstrings below `root`."""
+    result: list[Fault] = []
+    for patterns, check in ((PAGES, page_faults), (CODE, docstring_faults)):
+        for file in sorted({file for pattern in patterns for file in root.glob(pattern)}):
+            if file.relative_to(root).as_posix().startswith(MADE):
+                continue
+            result += check(file.relative_to(root), file.read_text(encoding="utf-8"))
+    return result
+
+
+def main(argv: Sequence[str] = ()) -> int:
+    """Print all faults; 1 if there are any."""
+    result = faults(Path(argv[0]) if argv else Path())
+    for fault in result:
+        print(f"{fault.file}:{fault.line}: {fault.reason}")
+    return int(bool(result))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,69 @@
+"""The prose rules find what they name, and pass what is fine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.prose import check
+
+PAGE, README = Path("docs/page.md"), Path("README.md")
+LONG = " ".join(["word"] * 31) + "."
+
+
+def reasons(text: str, file: Path = PAGE) -> list[str]:
+    return [fault.reason for fault in check.page_faults(file, text)]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (LONG, "31 words"),
+        ("One idea; another idea.", "a semicolon"),
+        ("It has 1, 2, 3 and 4 parts.", "more than 3 numbers"),
+        ("The sensor told us so.", "the phrase 'told'"),
+        ("| a | " + LONG + " |\n| --- | --- |", "a table cell of 31 words"),
+        ("* an item\n* " + LONG, "31 words"),
+        ("line one\ngoes " + LONG, "words, at most"),
+    ],
+)
+def test_a_fault_is_found_with_its_line(text, reason):
+    assert any(reason in found for found in reasons("# Title\n\n" + text))
+    assert all(fault.line >= 3 for fault in check.page_faults(PAGE, "# Title\n\n" + text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        " ".join(["word"] * 30) + ".",
+        LONG[:40] + ". " + LONG[:40] + ".",
+        "```\n" + LONG + "; 1 2 3 4 5\n```",
+        "    " + LONG,
+        "See `a; b; c` and [a page](x;y).",
+        "By e.g. Eq. 3 of the paper, Sec. 4 holds. " + " ".join(["word"] * 25),
+        "| 1 | 2 | 3 | 4 | 5 |",
+        "---\ntitle: a; b\n---\nFine.",
+    ],
+)
+def test_what_is_fine_passes(text):
+    assert reasons(text) == []
+
+
+def test_a_long_readme_is_a_fault_and_a_long_page_is_not():
+    text = "Five short words stand here.\n\n" * 141
+    assert reasons(text, README) == ["705 words, at most 700"] and reasons(text) == []
+
+
+def test_docstrings_are_checked_and_code_is_not():
+    text = f'"""{LONG}"""\n\n\ndef f():\n    """It tells.\n\n    >>> {LONG}\n    """\n    return "{LONG} told"\n'
+    found = [(fault.line, fault.reason) for fault in check.docstring_faults(Path("a.py"), text)]
+    assert [line for line, _ in found] == [1, 5] and "31 words" in found[0][1] and "'tells'" in found[1][1]
+
+
+def test_the_exit_status_says_whether_there_are_faults(tmp_path, capsys):
+    (tmp_path / "README.md").write_text("Fine.\n")
+    assert check.main([str(tmp_path)]) == 0
+    (tmp_path / "README.md").write_text("Not fine; here.\n")
+    assert check.main([str(tmp_path)]) == 1
+    assert capsys.readouterr().out.startswith("README.md:1: a semicolon")

@@ -9,6 +9,7 @@ PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.made
 TORCH  := .venv-torch
 ONNX   := .venv-onnx
+DOCS   := .venv-docs
 
 PRESET     ?= tiny
 SCENES     ?= data/scenes
@@ -22,6 +23,9 @@ ARGS       ?=
 LABEL      ?= material
 GOLDEN     ?= tests/parity/golden
 WORKERS    ?= 2
+CORPUS     ?= data/corpus
+REAL       ?=
+WEIGHTS    ?= runs/anytouch-tiny
 
 DEMO       ?= runs/demo
 DEMO_STEPS ?= 200
@@ -45,13 +49,13 @@ DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_ST
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
-CHECKED  := src tests $(wildcard experiments)
+CHECKED  := src tests docs $(wildcard experiments)
 OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if $(STOP_AFTER), --stop-after $(STOP_AFTER))$(if $(SAVE), --save-every $(SAVE))$(if $(BATCH), --batch $(BATCH))
 # Simulated data are made when they are what is asked for and are not there.
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments notebooks clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments notebooks corpus weights docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -98,10 +102,11 @@ test: $(STAMP) ## the quick tests, some minutes on two cores
 test-all: $(STAMP) ## every test
 	$(PYTEST)
 
-lint: $(STAMP) ## ruff (rules and format) and mypy
+lint: $(STAMP) ## ruff (rules and format), mypy and the rules of prose
 	$(PY) -m ruff check $(CHECKED)
 	$(PY) -m ruff format --check $(CHECKED)
 	$(PY) -m mypy
+	$(PY) -m tests.prose.check
 
 format: $(STAMP) ## rewrite the sources in the project's format
 	$(PY) -m ruff check --fix $(CHECKED)
@@ -141,8 +146,19 @@ notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/
 	  PYTHONPATH=$(CURDIR) $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
 	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
 
+corpus: $(STAMP) ## the simulated touches that the shipped encoders are trained on: [CORPUS=data/corpus]
+	$(PY) -m experiments.encoders.corpus $(CORPUS)
+
+weights: $(STAMP) ## train the shipped encoder again: [CORPUS= REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
+	$(PY) -m experiments.encoders.train --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
+
+docs: $(DOCS)/.made
+docs: $(STAMP) ## the documentation site, in build/site, in a venv of its own
+	$(PY) -m docs.generate
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+
 clean: ## remove .venv, builds and caches; runs stay
-	rm -rf $(VENV) $(TORCH) $(ONNX) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(TORCH) $(ONNX) $(DOCS) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES)/manifest.parquet: | $(STAMP)
@@ -158,6 +174,12 @@ $(ONNX)/.made: experiments/onnx_export/requirements.txt
 	$(PYTHON) -m venv $(ONNX)
 	@echo '*' > $(ONNX)/.gitignore
 	$(ONNX)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
+$(DOCS)/.made: docs/requirements.txt
+	$(PYTHON) -m venv $(DOCS)
+	@echo '*' > $(DOCS)/.gitignore
+	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
 $(STAMP): requirements.txt pyproject.toml

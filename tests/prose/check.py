@@ -16,7 +16,13 @@ from typing import NamedTuple
 
 WORDS, NUMBERS, CELL, README_WORDS = 30, 3, 25, 700
 PAGES = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "experiments/*/README.md", "experiments/README.md")
-MADE = ("experiments/results/", "docs/results/", "docs/reference/", "docs/contributing.md", "docs/changelog.md")  # copies, and help texts
+MADE = (
+    "experiments/results/",
+    "docs/results/",
+    "docs/reference/",
+    "docs/contributing.md",
+    "docs/changelog.md",
+)  # copies, and help texts
 CODE = ("src/**/*.py",)
 PHRASES = (
     "told", "tells", "tell", "less the", "anew", "likewise", "of its own", "as it is", "as they are",

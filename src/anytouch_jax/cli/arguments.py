@@ -10,6 +10,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 from anytouch_jax.config.parsing import check
 from anytouch_jax.errors import UserError
 
+DEFAULT = "anytouch-tiny"  # the encoder of commands without --model; `weights.registry` has its files
+
 # Old names of commands, and of options: each applies to a command without an option of the old name.
 RENAMED = {
     "simulate": "anytouch data simulate",

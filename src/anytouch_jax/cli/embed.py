@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
 from anytouch_jax.config.parsing import Count
@@ -21,11 +22,12 @@ if TYPE_CHECKING:
     from anytouch_jax.evaluate.heads import LinearHead
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrameOptions:
     """The options that embed and stream share."""
 
-    model: Path  # Run folder or weights file (.pth, .safetensors).
+    model: Path = Path(DEFAULT)
+    """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
     sensor: str | None = None
     """Sensor of the frames. Without it, and for an unknown sensor, the universal tokens are used."""
     background: Path | None = None  # Picture of the untouched gel, for an encoder of background-subtracted touches.
@@ -46,7 +48,7 @@ class FrameOptions:
 class EmbedOptions(FrameOptions):
     """Embed a manifest, a folder of frames, a picture or a video. Writes an .npz of features.
 
-    Example: anytouch embed --model runs/stage2 --data manifest.csv --split test --out features.npz
+    Example: anytouch embed --data frames/ --sensor digit --out features.npz
     """
 
     data: tuple[Path, ...]  # Manifests (.csv, .parquet), or one folder of frames, picture or video.
@@ -100,6 +102,8 @@ def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean"
     head = None if options.head is None else load_head(options.head)
     pooling = options.pooling or ("class" if head is None else head.pooling)
     enable_compilation_cache()
+    if str(options.model) == DEFAULT:
+        log(f"encoder: {DEFAULT} (name another with --model)")
     encoder = load_encoder(options.model).computed_in(options.dtype)
     check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)

@@ -27,7 +27,10 @@ class ExportOptions:
     """
 
     model: Path  # Run folder or weights file (.pth, .safetensors).
-    out: Path  # The file to write. Weights must end in .safetensors.
+    out: Path | None = None  # The file to write. Weights must end in .safetensors.
+    card: Path | None = None
+    """Write a folder to upload instead: config.json, model.safetensors as float16, and README.md, the model card."""
+    notes: Path | None = None  # Markdown for the card: the data with their licences, results, limits.
     to: Literal["jax", "safetensors", "release"] = "jax"
     """jax: the touch encoder as a program. safetensors: all weights by this package's names. release: weights by the
     names of the authors' files."""
@@ -43,7 +46,12 @@ class ExportOptions:
 
 
 def run(options: ExportOptions) -> int:
-    """Write an encoder for jax, or weights."""
+    """Write an encoder for jax, weights, or a folder to upload."""
+    if options.card is not None:
+        return _export_card(options, options.card)
+    refuse_unused(options, ("notes",), "without --card")
+    if options.out is None:
+        raise UserError("Name the file to write with --out, or a folder to upload with --card.")
     if options.to != "jax":
         refuse_unused(options, ("frames", "platforms", "pooling", "join", "dtype"), f"with --to {options.to}")
         return _export_weights(options)
@@ -64,7 +72,25 @@ def run(options: ExportOptions) -> int:
     return 0
 
 
+def _export_card(options: ExportOptions, folder: Path) -> int:
+    from anytouch_jax.encoder.encoder import find_tokenizer
+    from anytouch_jax.weights import load, registry
+
+    jax_only = ("to", "frames", "platforms", "pooling", "join", "dtype", "between", "share", "out")
+    refuse_unused(options, jax_only, "with --card, which writes all weights of MODEL")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UserError(f"{folder} is not an empty folder. Name a new one with --card.")
+    check_folder(folder)
+    notes = "" if options.notes is None else options.notes.read_text(encoding="utf-8")
+    source = registry.resolve(options.model)
+    written = registry.write_encoder(folder, load.load_model(source), notes, tokenizer=find_tokenizer(source))
+    size = (written / registry.WEIGHTS).stat().st_size
+    print(f"{written}: {size / 1e6:.1f} MB of weights, {registry.CARD} and README.md")
+    return 0
+
+
 def _export_weights(options: ExportOptions) -> int:
+    assert options.out is not None
     from anytouch_jax.weights import convert, load, safetensors, tree
 
     source, before = options.model, options.between

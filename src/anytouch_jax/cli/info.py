@@ -19,12 +19,14 @@ _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Describe files and folders: a run, weights, a manifest, features, a head or an exported encoder.
+    """Describe an encoder by name, a run, weights, a manifest, features, a head or an exported encoder.
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
+
+    `anytouch info encoders` lists the encoders in the package.
     """
 
-    paths: Positional[tuple[Path, ...]]  # Files and folders.
+    paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
 
 
 def run(options: InfoOptions) -> int:
@@ -37,6 +39,12 @@ def run(options: InfoOptions) -> int:
 
 
 def _lines(path: Path) -> list[str]:
+    from anytouch_jax.weights import registry
+
+    if str(path) == "encoders":
+        return [_named(name) for name in registry.list_encoders()]
+    if str(path) in registry.list_encoders():
+        return [_named(str(path)), *_weights(registry.resolve(path))]
     if not path.exists():
         raise UserError(f"there is no {path}")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
@@ -55,6 +63,15 @@ def _lines(path: Path) -> list[str]:
         return _weights(path)
     known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
     raise UserError(f"{path} has no known format. Known are {known}.")
+
+
+def _named(name: str) -> str:
+    """Return a line about an encoder of the package."""
+    from anytouch_jax.weights import registry
+
+    card = registry.read_card(name)
+    size, sensors = sum(card["parameters"].values()) / 1e6, ", ".join(card["trained_sensors"] or ["unknown"])
+    return f"{name}: {size:.1f} M parameters, {card['image_size']} pixels, trained on {sensors}"
 
 
 def _folder(path: Path) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from anytouch_jax.cli.arguments import spelled
+from anytouch_jax.cli.arguments import DEFAULT, spelled
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,6 +32,12 @@ def print_table(markdown: str) -> None:
         console.print(Markdown(markdown))
     else:
         print(markdown)
+
+
+def default_models() -> tuple[Path, ...]:
+    """Return the encoder that commands use when none is named, and report it."""
+    log(f"encoder: {DEFAULT} (name others with --model)")
+    return (Path(DEFAULT),)
 
 
 def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, print_table, refuse_unused
+from anytouch_jax.cli.output import (
+    check_apart,
+    check_folder,
+    check_home,
+    default_models,
+    log,
+    print_table,
+    refuse_unused,
+)
 from anytouch_jax.config.parsing import Count, NotNegative
 from anytouch_jax.errors import UserError
+
+Options = TypeVar("Options", bound="ProbeOptions")
 
 
 @dataclass(frozen=True)
@@ -16,7 +26,8 @@ class ProbeOptions:
     """The options that all probes share."""
 
     data: tuple[Path, ...]  # Manifests to probe on.
-    model: tuple[Path, ...] = ()  # Run folders or weights files to compare.
+    model: tuple[Path, ...] = ()
+    """Encoders to compare: names, run folders or weights files (default: anytouch-tiny, without --features)."""
     features: tuple[Path, ...] = ()
     """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed writes it."""
     controls: bool = True  # Also probe raw pixels and a random encoder.
@@ -102,6 +113,7 @@ def run_label(options: LabelOptions) -> int:
     from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_label
 
+    options = _with_default(options)
     if options.leave_out is not None:
         refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
     if options.save is not None and len(options.model) != 1:
@@ -117,6 +129,7 @@ def run_tasks(options: TasksOptions) -> int:
     from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_tasks
 
+    options = _with_default(options)
     if options.frames is None:
         refuse_unused(options, ("join",), "without --frames: tasks use stills or single segments")
     if options.frames == 1:
@@ -132,17 +145,20 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     from anytouch_jax.evaluate.array_probes import probe_table
     from anytouch_jax.evaluate.probing import probe_benchmark
 
-    results = probe_benchmark(**_settings(options), log=log)
+    results = probe_benchmark(**_settings(_with_default(options)), log=log)
     print_table(probe_table(results["results"], results["paper"]))
     return 0
+
+
+def _with_default(options: Options) -> Options:
+    """Return options that probe the default encoder if they name none."""
+    return options if options.model or options.features else replace(options, model=default_models())
 
 
 def _settings(options: ProbeOptions) -> dict[str, Any]:
     """Return all options by the names that probes take them. Check where results go, before the work."""
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    if not options.model and not options.features and not options.controls:
-        raise UserError("There is nothing to probe. Give --model or --features, or leave out --no-controls.")
     check_folder(options.out, read=_files_read(options))
     if isinstance(options, BatteryOptions) and options.cache is not None:
         check_home(options.cache, "--cache")

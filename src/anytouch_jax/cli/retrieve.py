@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from anytouch_jax.cli.output import check_folder, log, print_table, refuse_unused
+from anytouch_jax.cli.output import check_folder, default_models, log, print_table, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.config.parsing import Count, Range
 from anytouch_jax.errors import UserError
@@ -25,7 +25,7 @@ class RetrieveOptions:
     """
 
     data: Path  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
-    model: tuple[Path, ...] = ()  # Run folders or weights files to compare.
+    model: tuple[Path, ...] = ()  # Encoders to compare: names, run folders or weights files (default: anytouch-tiny).
     split: str = "test"  # Split to retrieve in.
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
     pooling: Literal["class", "mean", "both"] = "class"
@@ -57,11 +57,9 @@ def run(options: RetrieveOptions) -> int:
         refuse_unused(options, ("seeds",), "without --by-chance")
     check_folder(options.out, read=(options.data, *options.model))
     enable_compilation_cache()
-    encoders = {str(path): features.load_encoder(path) for path in options.model}
-    if options.controls and encoders:
+    encoders = {str(path): features.load_encoder(path) for path in options.model or default_models()}
+    if options.controls:
         encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
-    if not encoders and not options.controls:
-        raise UserError("There is nothing to compare. Give --model, or leave out --no-controls.")
     for encoder in encoders.values():
         features.check_frames(encoder.config.model, options.frames)
     table = manifests.read(options.data)

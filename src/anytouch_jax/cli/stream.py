@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class StreamOptions(embed.FrameOptions):
     """Embed a camera or a video frame by frame, and report the latency of each part.
 
-    Example: anytouch stream --model runs/stage2 --data 0 --sensor digit --out -
+    Example: anytouch stream --data 0 --sensor digit --out -
 
     A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save. A camera that delivers no
     frame for 2 seconds ends the stream with an error, after the features are saved.

@@ -295,11 +295,11 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     others = {name: part for name, part in loaded.params.items() if name != "touch"}
     return Encoder(
         _touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
-        loaded.universal_drawn, loaded.config.model, others, _tokenizer_file(path), loaded.metadata,
+        loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata,
     )  # fmt: skip
 
 
-def _tokenizer_file(path: Path) -> Path | None:
+def find_tokenizer(path: Path) -> Path | None:
     """Return the tokenizer.json of a run, of the run of a checkpoint, or of the folder of a file."""
     is_checkpoint = path.is_dir() and not (path / "config.json").is_file()
     folders = [path, path.parent, path.parent.parent] if is_checkpoint else [path if path.is_dir() else path.parent]

@@ -82,7 +82,7 @@ def _export_card(options: ExportOptions, folder: Path) -> int:
         raise UserError(f"{folder} is not an empty folder. Name a new one with --card.")
     check_folder(folder)
     notes = "" if options.notes is None else options.notes.read_text(encoding="utf-8")
-    source = registry.resolve(options.model)
+    source = registry.locate(options.model)
     written = registry.write_encoder(folder, load.load_model(source), notes, tokenizer=find_tokenizer(source))
     size = (written / registry.WEIGHTS).stat().st_size
     print(f"{written}: {size / 1e6:.1f} MB of weights, {registry.CARD} and README.md")

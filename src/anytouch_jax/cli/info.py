@@ -44,7 +44,7 @@ def _lines(path: Path) -> list[str]:
     if str(path) == "encoders":
         return [_named(name) for name in registry.list_encoders()]
     if str(path) in registry.list_encoders():
-        return [_named(str(path)), *_weights(registry.resolve(path))]
+        return [_named(str(path)), *_weights(registry.locate(path))]
     if not path.exists():
         raise UserError(f"there is no {path}")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")

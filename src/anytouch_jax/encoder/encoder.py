@@ -283,7 +283,7 @@ def load_encoder(path: str | Path, *, step: int | None = None) -> Encoder:
     towers are loaded too, if there are any. Raises UserError for weights without a touch encoder, or with values that
     are not finite.
     """
-    name, path, names = str(path), registry.resolve(path), set[str]()
+    name, path, names = str(path), registry.locate(path), set[str]()
     if path.suffix == ".npz":
         with suppress(OSError, ValueError):  # the reader of weights reports a damaged file
             names = set(read_arrays(path, only=lambda _: False))

@@ -80,7 +80,7 @@ def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool =
     `step` chooses a checkpoint of a run, the latest by default. With `stored_rows` the rows of a file for sensors
     outside its training are unchanged, as a conversion needs them. Raises UserError.
     """
-    path = registry.resolve(path)
+    path = registry.locate(path)
     if not path.exists():
         raise UserError(
             f"there is no run folder or weights file at {path}; give another path, or one of "

@@ -2,7 +2,7 @@
 
 >>> list_encoders()
 ['anytouch-tiny']
->>> resolve("anytouch-tiny")  # a file of the installed package
+>>> locate("anytouch-tiny")  # a file of the installed package
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def read_card(name: str) -> dict[str, Any]:
     return dict(card)
 
 
-def resolve(model: str | Path) -> Path:
+def locate(model: str | Path) -> Path:
     """Return the path that a name, an address on the hub, or a path stands for.
 
     A name of `list_encoders` comes before a folder of that name: write ./anytouch-tiny for the folder. An address is

@@ -113,3 +113,25 @@ def test_arrays_are_read_only_if_they_are_as_their_headers_say(tmp_path):
     for damaged in (whole[:-30], whole[:80] + b"\xff" * 60 + whole[140:], b"", b"PK"):
         with pytest.raises(ValueError):
             files.read_arrays(io.BytesIO(damaged))
+
+
+def test_an_array_is_read_only_if_it_is_as_its_header_says():
+    def npy(array: np.ndarray) -> bytes:
+        file = io.BytesIO()
+        np.save(file, array)
+        return file.getvalue()
+
+    whole = npy(np.arange(6.0).reshape(2, 3))
+    np.testing.assert_array_equal(files.read_array(whole), [[0, 1, 2], [3, 4, 5]])
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, {"descr": "<f4", "fortran_order": False, "shape": (1 << 30, 1 << 10)})
+    for damaged in (
+        whole[:-1],
+        whole + b"x",
+        whole[:20] + b"\xff" * 9 + whole[29:],
+        b"",
+        huge.getvalue(),
+        npy(np.array([{}])),
+    ):
+        with pytest.raises(ValueError):
+            files.read_array(damaged)

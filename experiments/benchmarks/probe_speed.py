@@ -16,7 +16,7 @@ import numpy as np
 from sklearn.linear_model import LogisticRegression
 
 from anytouch_jax.evaluate import logistic
-from anytouch_jax.evaluate.array_probes import probe_features
+from anytouch_jax.evaluate.probing import probe_features
 from experiments.tables import env
 
 ROWS, OTHERS = env.number("ROWS", 100_000), 10_000

@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 from anytouch_jax.config import PresetName
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import plots
 from experiments.benchmarks import compilation, loading, machine, simulator, speed, workloads
+from experiments.benchmarks.pareto import pareto
 from experiments.benchmarks.speed import NAN
 from experiments.command import run_script
 
@@ -80,7 +80,7 @@ def run(options: Bench) -> int:
         for title, rows in SECTIONS[name](options, name):
             if found := _figure(title, rows):
                 path, points, axes = found
-                plots.pareto(options.out / path, points, title=title, **axes)
+                pareto(options.out / path, points, title=title, **axes)
             numbers["results"][title] = [speed.record_of(row) for row in rows]
             speed.write_page(options.out, options.stem, page_of(numbers), numbers)
             print(section_of(title, rows))

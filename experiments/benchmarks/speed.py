@@ -376,7 +376,7 @@ def format_error(value: float | None) -> str:
 
 
 def pareto_points(rows: Sequence[SpeedRow]) -> dict[str, tuple[float, float]]:
-    """(time ratio, error) of the rows that have both, for `plots.pareto`: of the gradient, or of the output."""
+    """(time ratio, error) of the rows that have both, for `pareto`: of the gradient, or of the output."""
     found = {}
     for row in rows:
         wrong = row.error_output if row.error_gradient is None else row.error_gradient

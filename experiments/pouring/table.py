@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown_table, seed_interval, verdict
+from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.pouring.physics import Task
 from experiments.pouring.trials import Error, Trials, error
 from experiments.records import read_records
+from experiments.verdicts import seed_interval, verdict
 
 Array = npt.NDArray[Any]
 MODES = ("fine-tuned", "frozen")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, statistics
+from anytouch_jax.evaluate import probing, statistics
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.statistics import markdown_table
 
@@ -29,10 +29,10 @@ def probed(
     the test split, by label; `commonest` is the commonest answer of train there."""
     found = {}
     for label, values in labels.items():
-        results = {"commonest": array_probes.majority_baseline(values, groups, split)}
+        results = {"commonest": probing.majority_baseline(values, groups, split)}
         for name, x in features.items():
             head = ProbeHead("linear", "common" if name == "pixels" else "column")
-            results[name] = array_probes.probe_features(x, values, groups, split, head, name=name, seeds=0)
+            results[name] = probing.probe_features(x, values, groups, split, head, name=name, seeds=0)
         outcomes = {name: one.outcome for name, one in results.items() if one.outcome is not None}
         found[label] = by_object(outcomes["commonest"].groups, {name: one.correct for name, one in outcomes.items()})
     return found

@@ -31,7 +31,7 @@ from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
-from anytouch_jax.evaluate.statistics import markdown_table, seed_interval
+from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim.dataset import VERSION
@@ -42,6 +42,7 @@ from experiments.records import read_records, write_record
 from experiments.tables import cuts, env, plan
 from experiments.tables.by_object import probe_table, probed
 from experiments.tables.work import Work
+from experiments.verdicts import seed_interval
 
 QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
 SIZE = plan.QUICK if QUICK else plan.FULL

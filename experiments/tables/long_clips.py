@@ -25,11 +25,12 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, plots, tasks
+from anytouch_jax.evaluate import probing, tasks
 from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
+from experiments.benchmarks.pareto import pareto
 from experiments.benchmarks.speed import interleaved
 from experiments.records import read_records, write_record
 from experiments.tables import env
@@ -75,10 +76,10 @@ def scores(of: Moments, values: np.ndarray) -> dict[str, dict[str, Any]]:
     for name, one in of.tasks.items():
         given = (values[np.searchsorted(of.rows, one.rows[:, 0])], one.labels, one.groups, one.split)
         if name == "force":
-            fit = array_probes.probe_features(*given, measured=True)
+            fit = probing.probe_features(*given, measured=True)
             result[name] = {"mean": fit.r2, "low": fit.low, "high": fit.high, "test": fit.n_test, "chance": 0.0}
         else:
-            hit = array_probes.probe_features(*given, seeds=0)
+            hit = probing.probe_features(*given, seeds=0)
             result[name] = {"mean": hit.accuracy, "low": hit.low, "high": hit.high, "test": hit.n_test}
             result[name] |= {"chance": hit.baseline, "balanced": hit.balanced_accuracy}
     return result
@@ -157,7 +158,7 @@ Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
         f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"])
         for one in rows
     }
-    plots.pareto(OUT / "figures" / f"{NAME}.png", points, x="ms a clip", y="share of slips classified wrongly")
+    pareto(OUT / "figures" / f"{NAME}.png", points, x="ms a clip", y="share of slips classified wrongly")
     print(text)
 
 

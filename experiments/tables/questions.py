@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import markdown_table, seed_interval, verdict
+from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.tables import paper, plan, scores
 from experiments.tables.real import OURS, PIXELS, UNTRAINED
 from experiments.tables.results import Change, Column, Run, spread
 from experiments.tables.tables import Pair, Statement, Table, against, block, cell, judge, published, sentence, title
+from experiments.verdicts import seed_interval, verdict
 
 
 def four(task: str) -> tuple[Column, ...]:

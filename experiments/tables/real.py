@@ -15,16 +15,16 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, random_encoder
-from anytouch_jax.evaluate import array_probes, statistics
-from anytouch_jax.evaluate.array_probes import leave_groups_out, probe_features
-from anytouch_jax.evaluate.feature_cache import pixel_features
+from anytouch_jax.evaluate import probing, statistics
+from anytouch_jax.evaluate.feature_cache import pixel_components, pixel_features
 from anytouch_jax.evaluate.heads import ProbeHead
-from anytouch_jax.evaluate.probing import label_rows, pixel_components
+from anytouch_jax.evaluate.probing import label_rows, leave_groups_out, probe_features
 from anytouch_jax.evaluate.tasks import TaskRows
 from experiments.tables.plan import Leaf
+from experiments.verdicts import accuracy_difference
 
 Row = dict[str, Any]
-Fit = Callable[[np.ndarray, Any], array_probes.ProbeResult]
+Fit = Callable[[np.ndarray, Any], probing.ProbeResult]
 FIRM: dict[str, Any] = {"where": ("label.contact_score", 7.0), "sensor": "gelsight_mini"}
 OURS, UNTRAINED, PIXELS = "trained", "untrained", "pixels"
 FOLDS = "object, every recording tested"  # in ten folds: the test split alone has fourteen
@@ -77,7 +77,7 @@ def _features(leaf: Leaf, encoder: Encoder, table: Manifest, task: TaskRows) -> 
     return found | {PIXELS: pixel_components(pixel_features(table), task)}
 
 
-def _fitted(features: dict[str, np.ndarray], fit: Fit) -> dict[str, array_probes.ProbeResult]:
+def _fitted(features: dict[str, np.ndarray], fit: Fit) -> dict[str, probing.ProbeResult]:
     return {name: fit(x, "common" if name == PIXELS else "column") for name, x in features.items()}
 
 
@@ -104,7 +104,7 @@ def _compared(task: str, features: dict[str, np.ndarray], fit: Fit) -> list[Row]
             named = {"view": f"{name}, {part.name}", "test": part.n_test}
             found.append(shared | named | {"mean": part.accuracy, "low": part.low, "high": part.high})
     for name in (UNTRAINED, PIXELS):
-        mean, low, high = array_probes.accuracy_difference(by_name[OURS], by_name[name])
+        mean, low, high = accuracy_difference(by_name[OURS], by_name[name])
         found.append(shared | {"view": f"{OURS} - {name}", "mean": mean, "low": low, "high": high})
     return found
 

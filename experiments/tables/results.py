@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import CLAIM, verdict
-from anytouch_jax.evaluate.statistics import seed_interval as interval
 from experiments.records import read_records
 from experiments.tables.plan import LABELS
+from experiments.verdicts import CLAIM, verdict
+from experiments.verdicts import seed_interval as interval
 
 NO_SIGN = "no sign in the paper"
 NOT_NOTED = "not noted"

@@ -21,8 +21,14 @@ from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
-from anytouch_jax.evaluate.feature_cache import background_difference, encoder_digest
-from anytouch_jax.evaluate.probing import score_tasks
+from anytouch_jax.evaluate.feature_cache import (
+    FeatureSource,
+    background_difference,
+    encoder_digest,
+    encoder_features,
+    pixel_features,
+)
+from anytouch_jax.evaluate.probing import probe_tasks
 from anytouch_jax.evaluate.retrieval import contact_vector
 from anytouch_jax.evaluate.tasks import Task
 from anytouch_jax.files import atomic_write
@@ -33,7 +39,7 @@ Row = dict[str, Any]
 STATIC = ("material", "roughness", "hardness")
 FORM = "indenter"  # no caption names it
 DYNAMIC = ("slip", "force", "twist", "slide")
-BOTH = ("honest", "published")
+BOTH = "published"  # reports both protocols
 PIXELS, CONTACT = "pixels", "contact"
 SHOWN = ("gelsight", "digit", "gelsight_mini")  # of the t-SNE, as the paper shows three
 TOUCHES = 30
@@ -76,12 +82,18 @@ def quiet(_: str) -> None:
 def _probes(
     leaf: Leaf, work: Places, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
-    """Rows of `score_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
+    """Results of `probe_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
     table = manifests.read(work.folder / dataset / file)
-    shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows, "cache": work.folder / "cache"}
-    shared |= options
-    return [{"view": view} | one for one in score_tasks(encoder, table, tasks, **shared)]
+    shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows} | options
+    encoding = {name: shared.pop(name) for name in ("pooling", "join", "universal") if name in shared}
+    encoding |= {"order": shared.get("order", "right"), "folder": work.folder / "cache"}
+    if encoder is None:
+        source = FeatureSource(PIXELS, pixel_features(table, **encoding), None, "common")
+    else:
+        source = FeatureSource("encoder", encoder_features(encoder, table, **encoding), encoder)
+    results = probe_tasks([source], table, tasks, controls=False, log=quiet, **shared)["results"]
+    return [{"view": view} | {key: value for key, value in one.items() if key != "features"} for one in results]
 
 
 def _four_columns(leaf: Leaf, work: Places, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
@@ -98,7 +110,7 @@ def _four_columns(leaf: Leaf, work: Places, seen: Sequence[str], tasks: Sequence
         ("unseen, other data", "other", (plan.UNSEEN,), ("material",)),
     ):
         labels = (*labels, FORM)
-        options = {"train_sensors": sensors, "test_sensors": sensors, "protocols": BOTH}
+        options = {"train_sensors": sensors, "test_sensors": sensors, "protocol": BOTH}
         rows += _probes(leaf, work, f"{name}/{cuts.WHOLE}", labels, view, encoder, **options)
     return rows
 
@@ -114,8 +126,8 @@ def _q3(leaf: Leaf, work: Places) -> dict[str, Any]:
 
 READ = ("anytouch", "untrained")  # the models whose features are read in every way
 WAYS: Mapping[str, dict[str, Any]] = {
-    "kNN": {"head_names": ("knn",)},
-    "gradient": {"head_names": ("gradient",)},
+    "kNN": {"heads": ("knn",)},
+    "gradient": {"heads": ("gradient",)},
     "class token": {"pooling": "class"},
     "mean of patches": {"pooling": "mean"},
 }
@@ -123,7 +135,7 @@ WAYS: Mapping[str, dict[str, Any]] = {
 
 def _read(leaf: Leaf, work: Places) -> list[Row]:
     """The static tasks and the form by other heads and poolings than the tables': views `read: <way>`."""
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH}
     encoder, labels = encoder_of(leaf, work), (*STATIC, FORM)
     return [
         row
@@ -150,7 +162,7 @@ _VIEWS: Mapping[str, dict[str, Any]] = {
 
 def _dynamic(leaf: Leaf, work: Places, views: Sequence[str]) -> list[Row]:
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH}
     return [
         row
         for view in views
@@ -160,7 +172,7 @@ def _dynamic(leaf: Leaf, work: Places, views: Sequence[str]) -> list[Row]:
 
 def _dynamics(leaf: Leaf, work: Places) -> dict[str, Any]:
     """Dynamic tasks under every view, and what the same training makes of static ones."""
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocols": BOTH}
+    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH}
     static = _probes(leaf, work, f"own/{cuts.WHOLE}", STATIC, "static", encoder_of(leaf, work), **sensors)
     return {"rows": _dynamic(leaf, work, tuple(_VIEWS)) + static, "data": ["own"]}
 
@@ -228,7 +240,7 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
 def _grasp(leaf: Leaf, work: Places) -> dict[str, Any]:
     """Held or slipped, from the frame in which the press is done and from the last frame."""
     encoder, found = encoder_of(leaf, work), []
-    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocols": BOTH}
+    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocol": BOTH}
     for view in ("during", "after"):
         task = Task("grasp", "label.held", which="all", where=(("label.moment", view),))
         found += _probes(leaf, work, f"own/{cuts.GRASP}", (task,), view, encoder, **options)
@@ -248,7 +260,7 @@ def _new_sensor(leaf: Leaf, work: Places) -> dict[str, Any]:
     assert leaf.model is not None
     run, own = work.run_of(leaf.model), work.folder / "own"
     encoder, read = load_encoder(run), ["own/static", f"own/{plan.UNSEEN}"]
-    options = {"test_sensors": (plan.UNSEEN,), "max_rows": None, "protocols": BOTH}
+    options = {"test_sensors": (plan.UNSEEN,), "max_rows": None, "protocol": BOTH}
     if leaf.name == "seen":
         rows = _probes(leaf, work, f"own/{cuts.STATIC}", STATIC, "seen", encoder, **options)
         return {"rows": rows, "data": read}

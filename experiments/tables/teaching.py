@@ -134,7 +134,7 @@ def retrieve(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, A
     found = features(encoders, seed, table, rows, "class")
     found |= {"pixels": background_difference(table, rows), "vector": contact_vector(table, rows)}
     scored = retrieval.cross_sensor_retrieval(table, found, rows, centre=(True,), metrics={"vector": "euclidean"})
-    pooled = {one.name: one.found for one in scored if one.query_sensor == retrieval.ALL and one.found}
+    pooled = {one.name: one.per_query for one in scored if one.query_sensor == retrieval.ALL and one.per_query}
     groups = pooled["stage 2"].groups
     parts = {part: {name: getattr(one, part) for name, one in pooled.items()} for part in ("top1", "top5")}
     return {"data": table.content_hash} | {part: by_object(groups, right) for part, right in parts.items()}

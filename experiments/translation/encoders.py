@@ -93,7 +93,7 @@ def score_retrieval(results: Path, name: str, seed: int, encoder: Encoder, sourc
     rows = deepest_rows(table, table.rows_of("test"))
     features = {name: embed_rows(encoder, table, rows, log=silent)[1]}
     scored = retrieval.cross_sensor_retrieval(table, features, rows, centre=(True,))
-    pooled = next(one.found for one in scored if one.query_sensor == retrieval.ALL)
+    pooled = next(one.per_query for one in scored if one.query_sensor == retrieval.ALL)
     assert pooled is not None
     shares = {part: float(np.mean(getattr(pooled, part))) for part in ("top1", "top5")}
     write_record(results, key, {"encoder": source, "queries": len(pooled.top1)} | shares)

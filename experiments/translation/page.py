@@ -11,11 +11,12 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.plots import sample_grid
-from anytouch_jax.evaluate.statistics import markdown_table, seed_interval, verdict
+from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.records import read_records
 from experiments.translation import training
 from experiments.translation.encoders import retrieval_table
 from experiments.translation.generator import Generator
+from experiments.verdicts import seed_interval, verdict
 
 Task = tuple[str, str]
 Record = dict[str, Any]

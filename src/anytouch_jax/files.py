@@ -1,9 +1,10 @@
-"""Atomic writes, file locks, and .npz files read with limits."""
+"""Atomic writes, file locks, and .npy and .npz files read with limits."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import math
 import os
 import shutil
@@ -89,7 +90,10 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
             members = [(info, info.filename.removesuffix(".npy")) for info in archive.infolist()]
             if len({name for _, name in members}) < len(members):
                 raise ValueError("two of its arrays have one name")
-            arrays = {name: _check_header(archive, info, name) for info, name in members}
+            arrays = {}
+            for info, name in members:
+                with archive.open(info) as member:
+                    arrays[name] = _check_header(member, info.file_size, name)
             total = sum(array.nbytes for name, array in arrays.items() if only(name))
             stored = sum(info.compress_size for info, _ in members)
             if total > max(1 << 30, 4 * stored):
@@ -105,19 +109,31 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
         raise ValueError(f"it is damaged or not an .npz file ({type(error).__name__}: {str(error)[:200]})") from error
 
 
-def _check_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> np.ndarray:
+def read_array(data: bytes) -> np.ndarray:
+    """Return the array of the bytes of an .npy file. Raises ValueError for pickled objects and for any other file."""
+    import numpy as np
+
+    try:
+        _check_header(io.BytesIO(data), len(data), "data")
+        return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    except ValueError:
+        raise
+    except Exception as error:  # damaged bytes raise any type of error
+        raise ValueError(f"it is damaged or not an .npy file ({type(error).__name__}: {str(error)[:200]})") from error
+
+
+def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:
     """Return zeros of the form of an array. Raises ValueError if it does not have the bytes that its header gives."""
     import numpy as np
 
-    with archive.open(info) as member:
-        version = np.lib.format.read_magic(member)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-        if read is None:
-            raise ValueError(f"its array {name[:80]} has an unknown form")
-        shape, _, dtype = read(member)
-        size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or min(shape, default=0) < 0 or size != info.file_size - member.tell():
-            raise ValueError(f"its array {name[:80]} of shape {shape} has other bytes than its header says")
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"its array {name[:80]} has an unknown form")
+    shape, _, dtype = read(file)
+    size = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or min(shape, default=0) < 0 or size != file_size - file.tell():
+        raise ValueError(f"its array {name[:80]} of shape {shape} has other bytes than its header says")
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 

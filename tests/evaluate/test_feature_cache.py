@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import jax
 import numpy as np
 import pytest
 from task_world import painted, simulated
@@ -175,6 +176,13 @@ def test_universal_tokens_for_sensors_that_the_model_knows(encoder, pictures):
     known, universal = (encoder_features(encoder, pictures, universal=one) for one in (False, True))
     rows = np.flatnonzero(np.array(pictures.column("sensor").to_pylist()) == "digit")[:3]
     assert np.abs(known.get(rows[:, None], 1) - universal.get(rows[:, None], 1)).max() > 1e-4
+
+
+def test_features_do_not_depend_on_the_precision_of_jax(encoder, pictures):
+    rows = np.arange(4)[:, None]
+    plain = encoder_features(encoder, pictures).get(rows, 1)
+    with jax.enable_x64(True):
+        np.testing.assert_array_equal(encoder_features(encoder, pictures).get(rows, 1), plain)
 
 
 # ---- raw pixels ---------------------------------------------------------------------------------------------

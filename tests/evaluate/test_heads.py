@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -105,6 +106,15 @@ def test_scaling_of_the_features_does_not_matter_to_the_linear_head():
     assert np.mean(predicted(7, 0, scaling="common") == predicted(1, 0, scaling="common")) > 0.99
 
 
+@pytest.mark.parametrize("power", [66, -66])  # 7e19, 1e-20
+@pytest.mark.parametrize("scaling", ["column", "common"])
+@pytest.mark.parametrize(("name", "classes"), [("linear", 4), ("linear", 0), ("knn", 4)])
+def test_features_of_any_magnitude_give_the_same_predictions(name, classes, scaling, power):
+    (x, y), head = data(classes), ProbeHead(name, scaling)
+    plain, scaled = (fit_head(head, rows[FIT], y[FIT], classes).predict(rows[TEST]) for rows in (x, np.ldexp(x, power)))
+    np.testing.assert_array_equal(plain, scaled)
+
+
 def test_a_start_changes_no_prediction():
     x, y = data()
     start = linear_path(x[FIT], y[FIT], [0.01])[0]
@@ -186,6 +196,14 @@ def test_the_gradient_head_is_drawn_from_its_seed_and_its_rate_falls_to_zero(mon
     assert (first != other).any()
     assert len(rates) == 45 and rates[0] == pytest.approx(0.01) and 0 < rates[14] < 0.0002
     assert np.all(np.diff(rates[:15]) < 0)
+
+
+@pytest.mark.parametrize("classes", [0, 4])
+def test_the_gradient_head_does_not_depend_on_the_precision_of_jax(classes):
+    (x, y), head = data(classes), ProbeHead("gradient", recipe=GradientRecipe(epochs=3, batch=100))
+    plain = fit_head(head, x[FIT], y[FIT], classes).predict(x[TEST])
+    with jax.enable_x64(True):
+        np.testing.assert_array_equal(fit_head(head, x[FIT], y[FIT], classes).predict(x[TEST]), plain)
 
 
 def test_the_gradient_head_reads_unscaled_features():

@@ -22,18 +22,16 @@ from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, heads
-from anytouch_jax.evaluate.array_probes import probe_table
-from anytouch_jax.evaluate.feature_cache import FeatureStore
+from anytouch_jax.evaluate.feature_cache import RAW, FeatureSource, FeatureStore, pixel_components
 from anytouch_jax.evaluate.heads import load_head
 from anytouch_jax.evaluate.probing import (
     label_rows,
-    pixel_components,
     probe_benchmark,
     probe_label,
+    probe_table,
     probe_tasks,
-    score_tasks,
 )
-from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, find_benchmark, label_task, select
+from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, label_task, select
 
 WORLD = simulated()
 MANY = simulated(objects=60, each=4)  # enough groups for intervals that mean something
@@ -58,6 +56,30 @@ def labelled_features(world: Manifest, task: str, noise: float = 0.3) -> Any:
 
 def noise(rows: Any) -> np.ndarray:
     return np.stack([np.random.default_rng([5, row]).normal(size=12) for row in rows])
+
+
+def quiet(_: str) -> None:
+    pass
+
+
+def score_tasks(
+    of: Encoder | FeatureStore | None, world: Manifest, names: Any, *, cache: Any = None, head_names: Any = ("linear",),
+    protocols: Any = ("honest",), **options: Any,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Results of one source of features: an encoder, a store, or (None) raw pixels."""
+    source = (
+        FeatureSource(RAW, feature_cache.pixel_features(world, folder=cache), None, "common")
+        if of is None
+        else FeatureSource("planted", of)
+        if isinstance(of, FeatureStore)
+        else FeatureSource("encoder", feature_cache.encoder_features(of, world, folder=cache), of)
+    )
+    protocol = "published" if "published" in protocols else protocols[0]
+    report = probe_tasks(
+        [source], world, names, heads=head_names, protocol=protocol, controls=False, log=quiet, **options
+    )
+    json.dumps(report, allow_nan=False)
+    return report["results"]
 
 
 @pytest.mark.parametrize("task", ["material", "slip", "twist", "slide", "object"])
@@ -361,7 +383,7 @@ def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
 
 @pytest.mark.parametrize("name", list(BENCHMARKS))
 def test_honest_parts_videos_and_objects(name, trees):
-    results = select(manifests.read(trees[source_of(name)]), find_benchmark(name).task)
+    results = select(manifests.read(trees[source_of(name)]), BENCHMARKS[name].task)
     kinds = {one.split(" ")[0] for one in results.groups}
     assert kinds == ({"recording"} if "touch_and_go" in name else {"object"})
 
@@ -417,10 +439,6 @@ def test_a_fit_that_does_not_converge_is_reported(monkeypatch):
 
 
 # A label column.
-
-
-def quiet(_: str) -> None:
-    pass
 
 
 def test_a_label_probe_of_models_files_and_controls(touches, tiny_run, tmp_path):

@@ -8,6 +8,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -27,7 +28,6 @@ from anytouch_jax.evaluate.report import (
     VECTOR,
     Section,
     demo_report,
-    matching_section,
     retrieval_section,
     samples_section,
     write_report,
@@ -147,6 +147,9 @@ def test_samples_of_a_force_field_and_of_a_missing_sensor(touched: Path, tmp_pat
     _, images, _, columns = grids[0]
     assert columns == ["gelsight", "tac3d", "photograph"]
     assert all(line[1].shape == (20, 20) and line[1][3, 4] == 5.0 for line in images)
+    (touched.parent / "field.npy").write_bytes(b"no array")
+    with pytest.raises(UserError, match=r"column 'field_path', is no field of forces"):
+        samples_section(manifest, tmp_path)
 
 
 def scored(manifest: manifests.Manifest, size: int = 10) -> dict[str, Any]:
@@ -178,16 +181,17 @@ def test_the_table_of_retrieval(touched: Path, tmp_path: Path) -> None:
     assert empty.figure is None and not none and "nothing scored" in empty.notes
 
 
-def test_the_section_of_matching_shows_both_ways() -> None:
+def test_the_section_of_matching_shows_both_ways(monkeypatch: Any) -> None:
     found = [
         MatchScore("any", 0.8, 0.7, 0.9, 0.85, 0.65, 300, 60),
         MatchScore("same_sensor", 0.6, 0.5, 0.7, 0.7, 0.5, 9, 3),
     ]
-    section = matching_section(found, ["a note"])
+    study = SimpleNamespace(test=lambda values: values, classes={"stage 2": None}, rows=None, manifest=None)
+    monkeypatch.setattr("anytouch_jax.evaluate.retrieval.score_matching", lambda *_: found)
+    section, numbers = report._matching(study, None)  # type: ignore[arg-type]
     lines = section.table.splitlines()
     assert lines[2] == "| of any sensor | 80.0 % (70.0 to 90.0) | 0.850 | 65.0 % | 300 |" and len(lines) == 4
-    assert section.notes == "- a note" and section.figure is None
-    assert matching_section([], ["not scored"]).table == ""
+    assert section.notes == "" and section.figure is None and numbers["found"] == found
 
 
 @pytest.fixture(scope="module")
@@ -282,7 +286,7 @@ def test_a_report_says_what_it_could_not_score(
     for words in (
         "no baseline by pixels minus background: row ", f"no baseline by {VECTOR}: the manifest has none",
         "test: a sensor has 12 touches only, so galleries have 12, not 50",
-        "test, gallery matched: not scored: the manifest has none of label.x",
+        "test, gallery matched: not scored: The manifest has none of label.x",
         "force: the manifest has no column label.force",
     ):  # fmt: skip
         assert words in text, words
@@ -297,10 +301,10 @@ def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, later: Pat
     with pytest.raises(UserError, match=r"--stage2 .*w\.safetensors is a weights file"):
         (tmp_path / "w.safetensors").write_bytes(b"")
         demo_report(touched, tiny_run, tmp_path / "w.safetensors", tmp_path / "out")
-    with pytest.raises(UserError, match="have 3 frames, and it needs 4; give more --touches"):
+    with pytest.raises(UserError, match=r"needs 4 frames .* gives 3 with --touches 1, 90 at most"):
         demo_report(touched, tiny_run, later, tmp_path / "out", lambda _: None, touches=1)
     few = make_touches(tmp_path / "few", touches={"train": 2, "test": 1})
-    with pytest.raises(UserError, match=r"test split has 1 touches, .* 3 frames, .* needs 4; simulate or record more"):
+    with pytest.raises(UserError, match=r"needs 4 frames .* gives 3 with --touches 200, 3 at most"):
         demo_report(few, tmp_path / "none", later, tmp_path / "out", lambda _: None)  # before a run is looked at
     assert not (tmp_path / "out").exists()
 
@@ -321,9 +325,9 @@ def test_runs_that_do_not_belong_together_are_told_of(tiny_run: Path, init: str 
 
 
 def test_a_run_stands_for_its_own_stage_alone(touched: Path, tiny_run: Path, later: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"--stage1 .* is a run of stage 2; give the stage 1"):
+    with pytest.raises(UserError, match=r"--stage1 .* is a run of stage 2. Give the stage 1"):
         demo_report(touched, later, later, tmp_path / "never")
-    with pytest.raises(UserError, match=r"--stage2 .* is a run of stage 1; give a stage 2"):
+    with pytest.raises(UserError, match=r"--stage2 .* is a run of stage 1. Give a stage 2"):
         demo_report(touched, tiny_run, tiny_run, tmp_path / "never")
     assert not (tmp_path / "never").exists()
 

@@ -44,7 +44,7 @@ def ask(
     query: Array, gallery: Array, *, match: Array | None = None, names: Any = NAMES, others: Any = NAMES,
     things: Any = THINGS, name: str = "features", metric: Any = "cosine", centre: bool = False, seeds: int = 5,
 ) -> retrieval.Retrieval:  # fmt: skip
-    """Touches of `names` by digit looked for among those of `others` by gelsight; `match` has a row for each other."""
+    """Touches of `names` by digit are queries among those of `others` by gelsight; `match` has a row for each other."""
     near = {} if match is None else {f"label.{i}": [*np.zeros(len(names)), *match[:, i]] for i in range(match.shape[1])}
     count = len(names) + len(others)
     columns = {
@@ -54,7 +54,7 @@ def ask(
     }  # fmt: skip
     return cross_sensor_retrieval(
         manifests.from_columns(columns | near, "touches.parquet"), {name: np.concatenate([query, gallery])},
-        np.arange(count), pairs=[("digit", "gelsight")], match=tuple(near) or None, centre=(centre,),
+        np.arange(count), match=tuple(near) or None, centre=(centre,),
         metrics={name: metric}, seeds=seeds,
     )[0]  # fmt: skip
 
@@ -84,12 +84,21 @@ def test_constant_features_score_chance_exactly(metric: Any, centre: bool, level
 
 
 @pytest.mark.parametrize("centre", [False, True])
-@pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 1e7), (1e-12, 0.0)])
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 1e7), (1e-12, 0.0), (1e170, 0.0), (1e-170, 0.0)]
+)
 def test_neither_scale_nor_offset_changes_an_order_of_distances(centre: bool, scale: float, offset: float) -> None:
     query, gallery = noise(seed=1), noise(seed=1) + 2.0 * noise(seed=2)
     plain = ask(query, gallery, metric="euclidean", centre=centre)
     other = ask(query * scale + offset, gallery * scale + offset, metric="euclidean", centre=centre)
     assert 0.05 < plain.top1 < 1 and other.top1 == pytest.approx(plain.top1)
+
+
+@pytest.mark.parametrize("power", [600, -600])  # whose squares are infinite, or 0
+def test_no_magnitude_changes_an_order_of_angles(power: int) -> None:
+    query, gallery = noise(seed=1), noise(seed=1) + 2.0 * noise(seed=2)
+    plain, other = ask(query, gallery), ask(np.ldexp(query, power), np.ldexp(gallery, power))
+    assert 0.05 < plain.top1 < 1 and other == plain
 
 
 @pytest.mark.parametrize("centre", [False, True])
@@ -240,9 +249,6 @@ BAD[3, 2] = np.nan
         ({"gallery_size": 1}, "too small"),
         ({"gallery_touch": ["touch 0"] * COUNT}, "'touch 0' twice"),
         ({"gallery_touch": [f"other {i}" for i in range(COUNT)]}, "share no touch"),
-        ({"match": BAD}, "covariate row 3"),
-        ({"match": noise(9)}, "match has 9 rows"),
-        ({"query_unit": ["a"]}, "one name for each touch"),
     ],
 )
 def test_mistakes_in_a_draw_are_one_sentence(options: dict[str, Any], words: str) -> None:
@@ -343,10 +349,6 @@ def test_only_the_deepest_frames_count(touched: manifests.Manifest) -> None:
 def test_a_sensor_is_not_found_by_itself(touched: manifests.Manifest) -> None:
     rows = touched.rows_of("test")
     features = {"x": texture_features(touched, rows)}
-    with pytest.raises(UserError, match="both by 'digit'"):
-        cross_sensor_retrieval(touched, features, rows, pairs=[("digit", "digit")], gallery_size=5)
-    with pytest.raises(UserError, match="no touch is by the sensor 'tacto'"):
-        cross_sensor_retrieval(touched, features, rows, pairs=[("digit", "tacto")], gallery_size=5)
     with pytest.raises(UserError, match="by two sensors"):
         cross_sensor_retrieval(with_columns(touched, sensor=["digit"] * len(touched)), features, rows, gallery_size=5)
 
@@ -383,7 +385,7 @@ def test_what_a_manifest_lacks_is_said(touched: manifests.Manifest) -> None:
     assert "1 touches without" in found[-1].notes[0] and found[-1].queries == 236
     with pytest.raises(UserError, match="have 2 rows"):
         cross_sensor_retrieval(touched, {"x": np.ones((2, 3))}, rows)
-    with pytest.raises(UserError, match="a gallery of 50 needs 49"):
+    with pytest.raises(UserError, match="A gallery of 50 needs 49"):
         cross_sensor_retrieval(touched, features, rows)
     field = with_columns(
         touched, sensor=["tac3d" if one == "gelslim" else one for one in touched.column("sensor").to_pylist()]
@@ -406,7 +408,7 @@ def test_the_vector_of_a_contact(touched: manifests.Manifest) -> None:
     area = [None, *touched.table["label.area"].to_pylist()[1:]]
     with pytest.raises(UserError, match=r"row 0 of .* has no value"):
         contact_vector(with_columns(touched, **{"label.area": area}), np.array([0]))
-    with pytest.raises(UserError, match=r"'label\.area' has text"):
+    with pytest.raises(UserError, match=r"'label\.area' contains text"):
         contact_vector(with_columns(touched, **{"label.area": ["big"] * len(touched)}), rows)
 
 

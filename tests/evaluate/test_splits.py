@@ -18,7 +18,7 @@ def rows(kind: str = "apart", **changes) -> RowRoles:
     test = {"apart": group % 4 == 3, "shared": np.arange(N) % 4 == 3, "new": group % 4 == 3}[kind]
     y = np.where(test, 3 + group // 4 % 3, group % 3) if kind == "new" else group // 4 % 3
     everything = np.ones(N, bool)
-    return RowRoles(y, np.array([f"g{one}" for one in group]), ~test, test, everything, everything)._replace(**changes)
+    return RowRoles(y, np.array([f"g{one}" for one in group]), test, everything, everything)._replace(**changes)
 
 
 @pytest.mark.parametrize("kind", ["apart", "shared", "new"])
@@ -39,8 +39,8 @@ def test_a_split_that_parts_the_groups_is_kept():
     (cut,) = seeded_splits(roles, 0, "honest")
     assert split_scheme(roles)[0] == "split"
     np.testing.assert_array_equal(cut.test, np.flatnonzero(roles.test))
-    assert sorted([*cut.fit, *cut.val]) == np.flatnonzero(roles.train).tolist()
-    assert len(cut.val) == len(np.flatnonzero(roles.train)) // FOLDS
+    assert sorted([*cut.fit, *cut.val]) == np.flatnonzero(~roles.test).tolist()
+    assert len(cut.val) == len(np.flatnonzero(~roles.test)) // FOLDS
 
 
 def test_new_classes_are_folded_within_the_test_rows():
@@ -84,7 +84,7 @@ def test_seeds_deal_anew_and_equal_seeds_equally():
 def test_published_keeps_the_manifests_split_whatever_it_shares(kind):
     roles = rows(kind)
     (cut,) = seeded_splits(roles, 3, "published")
-    np.testing.assert_array_equal(cut.fit, np.flatnonzero(roles.train))
+    np.testing.assert_array_equal(cut.fit, np.flatnonzero(~roles.test))
     np.testing.assert_array_equal(cut.test, np.flatnonzero(roles.test))
     assert not len(cut.val)
 

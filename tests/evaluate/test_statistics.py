@@ -13,10 +13,9 @@ from anytouch_jax.evaluate.statistics import (
     markdown_table,
     mean_interval,
     mean_of,
-    r2_interval,
     r2_of,
     regression_sums,
-    verdict,
+    unit_rows,
 )
 
 
@@ -47,6 +46,10 @@ def test_the_interval_covers_the_truth_about_95_times_in_100() -> None:
         low, high = mean_interval(values, groups)
         hits += low <= 0.5 <= high
     assert 180 <= hits <= 200
+
+
+def r2_interval(error: np.ndarray, truth: np.ndarray, groups: np.ndarray) -> tuple[float | None, float | None]:
+    return bootstrap_interval([regression_sums(error, truth - truth.mean(), groups)], r2_of)
 
 
 def test_one_group_has_no_interval() -> None:
@@ -101,25 +104,17 @@ def test_a_value_that_no_draw_has_has_no_interval() -> None:
     assert bootstrap_interval([GroupSums(np.array([f"g{i // 2}" for i in range(20)]), still)], r2_of) == (None, None)
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "seeds", "wanted", "word"),
-    [
-        (0.1, 2.0, 3, 1, "agrees"),
-        (0.1, 2.0, 3, -1, "disagrees"),
-        (-2.0, -0.1, 3, -1, "agrees"),
-        (-2.0, -0.1, 5, 1, "disagrees"),
-        (-0.1, 2.0, 3, 1, "undecided"),
-        (0.0, 2.0, 3, 1, "undecided"),
-        (None, None, 3, 1, "undecided"),
-        (0.1, 2.0, 2, 1, "2 seeds, no claim"),
-        (0.1, 2.0, 1, 1, "1 seed, no claim"),
-    ],
-)
-def test_a_sign_is_told_of_an_interval_that_leaves_zero_out(low, high, seeds, wanted, word):
-    assert verdict(low, high, seeds, wanted=wanted) == word
-
-
 def test_a_table_escapes_its_cells_and_aligns_its_columns() -> None:
     table = markdown_table(("a", "b|c"), [("1", "two\nlines"), (2.5, None)], "lr")
     assert table.splitlines() == ["| a | b\\|c |", "| :--- | ---: |", "| 1 | two lines |", "| 2.5 | None |"]
     assert markdown_table(("a",), []).splitlines() == ["| a |", "| --- |"]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rows_of_any_magnitude_have_length_one(dtype: type) -> None:
+    rows = np.random.default_rng(0).normal(size=(20, 7)).astype(dtype)
+    unit = unit_rows(rows)
+    np.testing.assert_array_equal(unit, rows / np.linalg.norm(rows, axis=1, keepdims=True))  # no digit changes
+    for power in (67, 120, -67, -130):  # 1e20, 1e36, 1e-20, 1e-39
+        np.testing.assert_allclose(unit_rows(np.ldexp(rows, power)), unit, rtol=1e-6 if power > -127 else 1e-3)
+    assert not unit_rows(np.zeros((2, 3), dtype)).any() and unit_rows(np.zeros((0, 3), dtype)).shape == (0, 3)

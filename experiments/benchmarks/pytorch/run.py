@@ -23,10 +23,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from anytouch_jax.evaluate import plots, statistics
+from anytouch_jax.evaluate import statistics
 from anytouch_jax.train.step import merge
 from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import machine, speed, variants
+from experiments.benchmarks.pareto import pareto
 from experiments.benchmarks.pytorch.keys import renamed
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
 
@@ -303,7 +304,7 @@ def main() -> None:
             y = f"relative error of the {'gradient' if work.trains else 'output'}, against float64"
             title = f"{work.name}, preset {options.preset}"
             figure = options.out / _figure(work.name, options.preset)
-            plots.pareto(figure, points, x="time / ours in float32", y=y, title=title)
+            pareto(figure, points, x="time / ours in float32", y=y, title=title)
     path = speed.write_page(options.out, f"torch_{options.preset}", page_of(numbers), numbers)
     print(path, file=sys.stderr)
 

@@ -110,8 +110,7 @@ class BenchmarkOptions(BatteryOptions):
 
 def run_label(options: LabelOptions) -> int:
     """Probe a label column, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.array_probes import probe_table
-    from anytouch_jax.evaluate.probing import probe_label
+    from anytouch_jax.evaluate.probing import probe_label, probe_table
 
     options = _with_default(options)
     if options.leave_out is not None:
@@ -126,8 +125,7 @@ def run_label(options: LabelOptions) -> int:
 
 def run_tasks(options: TasksOptions) -> int:
     """Probe named tasks, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.array_probes import probe_table
-    from anytouch_jax.evaluate.probing import probe_tasks
+    from anytouch_jax.evaluate.probing import probe_table, probe_tasks
 
     options = _with_default(options)
     if options.frames is None:
@@ -142,8 +140,7 @@ def run_tasks(options: TasksOptions) -> int:
 
 def run_benchmark(options: BenchmarkOptions) -> int:
     """Probe a public benchmark, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.array_probes import probe_table
-    from anytouch_jax.evaluate.probing import probe_benchmark
+    from anytouch_jax.evaluate.probing import probe_benchmark, probe_table
 
     results = probe_benchmark(**_settings(_with_default(options)), log=log)
     print_table(probe_table(results["results"], results["paper"]))

@@ -6,31 +6,34 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import jax
 import numpy as np
-import numpy.typing as npt
 from sklearn.decomposition import PCA
 
+from anytouch_jax.config import preset
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, save_npz, text_column
-from anytouch_jax.encoder.encoder import Encoder
+from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.heads import Scaling
+from anytouch_jax.evaluate.statistics import Array
+from anytouch_jax.evaluate.tasks import TaskRows
 from anytouch_jax.files import read_arrays
 
-Array = npt.NDArray[Any]
 Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
 Size = tuple[int, int]  # rows, columns
 
+RAW, RANDOM = "raw pixels", "random encoder"
 VERSION = 3  # of the features; a change to their computation raises it
 RAW_SIZE = (240, 320)  # of a picture before its area averages
 SMALL = (24, 32)
@@ -48,36 +51,32 @@ class FeatureStore:
     ) -> None:
         self._compute, self._folder = compute, folder
         self._about = {} if folder is None else dict(describe())
-        self._rows: dict[int, Array] = {}
-        self._values: dict[int, Array] = {}
+        self._known: dict[int, tuple[Array, Array]] = {}  # rows, in order, and their features by length of clip
 
     def add(self, rows: Array, frames: int) -> None:
         """Compute the missing features of these rows (any shape) in one pass."""
-        if frames not in self._rows:
-            self._rows[frames], self._values[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
-            if self._folder is not None and self.file(frames).exists():
-                # a damaged file is written again
-                with contextlib.suppress(OSError, ValueError, KeyError), self.file(frames).open("rb") as file:
-                    arrays = read_arrays(file)
-                    self._rows[frames], self._values[frames] = arrays["rows"], arrays["features"]
-        missing = np.setdiff1d(rows, self._rows[frames])
+        if frames not in self._known:
+            self._known[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
+            if self._folder is not None:
+                with contextlib.suppress(OSError, ValueError, KeyError):  # a damaged file is written again
+                    arrays = read_arrays(self.file(frames))
+                    self._known[frames] = arrays["rows"], arrays["features"]
+        known, values = self._known[frames]
+        missing = np.setdiff1d(rows, known)
         if not len(missing):
             return
-        values = self._compute(missing, frames)
-        known = [self._values[frames], values] if len(self._rows[frames]) else [values]
-        every = np.concatenate([self._rows[frames], missing])
+        computed, every = self._compute(missing, frames), np.concatenate([known, missing])
         order = np.argsort(every)
-        self._rows[frames], self._values[frames] = every[order], np.concatenate(known)[order]
+        every, values = every[order], np.concatenate([values, computed] if len(known) else [computed])[order]
+        self._known[frames] = every, values
         if self._folder is not None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            features = Features(self._values[frames], self._rows[frames], {})
-            save_npz(self.file(frames), features, {"about": self._text(frames)})
+            save_npz(self.file(frames), Features(values, every, {}), {"about": self._text(frames)})
 
     def get(self, rows: Array, frames: int) -> Array:
         """Return features f32 (n, k * d) of `rows` (n, k), those of a row joined."""
         self.add(rows, frames)
-        places = np.searchsorted(self._rows[frames], rows)
-        return self._values[frames][places].reshape(len(rows), -1)
+        known, values = self._known[frames]
+        return values[np.searchsorted(known, rows)].reshape(len(rows), -1)
 
     def file(self, frames: int) -> Path:
         """Return the file of features of clips of this length."""
@@ -97,27 +96,27 @@ def encoder_features(
     """
 
     def describe() -> dict[str, Any]:
-        return _content(table, encoder_digest(encoder), order) | {
-            "pooling": pooling, "join": join, "universal": universal, "background": encoder.config.data.background,
-        }  # fmt: skip
+        about = {"pooling": pooling, "join": join, "universal": universal, "background": encoder.config.data.background}
+        return _content(table, encoder_digest(encoder), order) | about
 
     def compute(rows: Array, frames: int) -> Array:
         sensor_row = encoder.config.model.universal_row if universal else None
         edit = partial(reorder_frames, order=order)
-        return embed_rows(encoder, table, rows, frames, pooling, join, sensor_row=sensor_row, edit=edit, log=log)[1]
+        with jax.enable_x64(encoder.config.model.dtype == "float64"):  # JAX_ENABLE_X64 changes no feature
+            return embed_rows(encoder, table, rows, frames, pooling, join, sensor_row=sensor_row, edit=edit, log=log)[1]
 
     return FeatureStore(compute, describe, folder)
 
 
 def pixel_features(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> FeatureStore:
     """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
-    backgrounds: dict[Path, Any] = {}
+    read = _pair_reader(table, _same_size)
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
         windows = reorder_frames(clips[np.searchsorted(clips[:, -1], rows)], rows, order)
         single, places = np.unique(windows, return_inverse=True)
-        pixels = np.stack([raw_pixels(*_read_pair(table, int(row), _same_size, backgrounds)) for row in single])
+        pixels = np.stack([raw_pixels(*read(int(row))) for row in single])
         last, differences = np.split(pixels, 2, axis=1)
         places = places.reshape(windows.shape)
         return np.concatenate([last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1)
@@ -135,12 +134,10 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
         arrays = read_arrays(path)
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not an npz file of plain arrays: {error}") from error
-    if not {"features", "rows"} <= arrays.keys():
-        raise UserError(f"{path} needs the arrays features (n, d) and rows (n,). It has {', '.join(arrays) or 'none'}.")
-    values, rows = arrays["features"], arrays["rows"]
+    values, rows = (arrays.get(name, np.zeros(0, str)) for name in ("features", "rows"))
     numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
     if values.ndim != 2 or not numeric or not len(rows) or rows.shape != values.shape[:1]:
-        raise UserError(f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}.")
+        raise UserError(f"{path} needs numeric arrays features (n, d) and rows (n,), not {values.shape}, {rows.shape}.")
     if not values.shape[1] or not np.isfinite(values).all():
         raise UserError(f"{path}: the array features has no columns, or values that are not finite (NaN or infinite).")
     if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
@@ -233,19 +230,22 @@ def raw_pixels(frame: Array, background: Array | None, size: Size = SMALL) -> Ar
     return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background, size)])
 
 
-def _read_pair(
-    table: Manifest, row: int, prepare: Callable[[Array], Any], backgrounds: dict[Path, Any]
-) -> tuple[Any, Any]:
-    """Return a row's prepared frame and background (None without one); `backgrounds` caches what many rows share."""
-    frame = prepare(read_image(table, row))
-    if table.value(row, "background_path") is None:
-        return frame, None
-    file = table.file(row, "background_path")
-    if file not in backgrounds:
-        if len(backgrounds) >= 256:  # 230 kB each
-            backgrounds.clear()
-        backgrounds[file] = prepare(read_image(table, row, "background_path"))
-    return frame, backgrounds[file]
+def _pair_reader(table: Manifest, prepare: Callable[[Array], Any]) -> Callable[[int], tuple[Any, Any]]:
+    """Return a function from a row to its prepared frame and background, None without one."""
+    backgrounds: dict[Path, Any] = {}  # many rows share one
+
+    def read(row: int) -> tuple[Any, Any]:
+        frame = prepare(read_image(table, row))
+        if table.value(row, "background_path") is None:
+            return frame, None
+        file = table.file(row, "background_path")
+        if file not in backgrounds:
+            if len(backgrounds) >= 256:  # 230 kB each
+                backgrounds.clear()
+            backgrounds[file] = prepare(read_image(table, row, "background_path"))
+        return frame, backgrounds[file]
+
+    return read
 
 
 def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> Array:
@@ -253,14 +253,10 @@ def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> A
 
     Raises UserError that names a row without a background, or whose background has other proportions.
     """
-    backgrounds: dict[Path, Any] = {}
+    read = _pair_reader(table, lambda image: (_small(image, size), image.shape[1] / image.shape[0]))
     values = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
-
-    def prepare(image: Array) -> tuple[Array, float]:
-        return _small(image, size), image.shape[1] / image.shape[0]
-
     for place, row in enumerate(map(int, rows)):
-        (frame, proportion), background = _read_pair(table, row, prepare, backgrounds)
+        (frame, proportion), background = read(row)
         if background is None:
             raise UserError(f"{table.where(row)} has no background_path. Add one, or leave this baseline out.")
         if abs(proportion / background[1] - 1) > 0.05:
@@ -292,3 +288,54 @@ def _same_size(image: Array) -> Array:
 def _small(image: Array, size: Size) -> Array:
     """Return area averages, f32 (rows * columns * 3,) in 0..1, of a picture u8 (h, w, 3)."""
     return cv2.resize(image.astype(np.float32) / 255, size[::-1], interpolation=cv2.INTER_AREA).ravel()
+
+
+def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
+    """Return the principal components of raw pixels, fitted on the rows of train (on all without these)."""
+    train = rows.split == "train"
+    return principal_components(store.get(rows.rows, 1), train if train.any() else ~train)
+
+
+class FeatureSource(NamedTuple):
+    """Features with their name; `encoder` is None for a features file and for raw pixels."""
+
+    name: str
+    store: FeatureStore
+    encoder: Encoder | None = None
+    scaling: Scaling = "column"
+
+    def notes(self, sensors: Array) -> list[str]:
+        """Return a note on sensors that the encoder was not trained on, or nothing."""
+        if self.encoder is None:
+            return []
+        trained = self.encoder.trained_sensors
+        unknown = sorted(set(sensors) - set(self.encoder.config.model.sensors if trained is None else trained))
+        return [f"universal tokens for {', '.join(unknown)}"] if unknown else []
+
+
+def sources(
+    table: Manifest, models: Sequence[str | Path | FeatureSource], features: Sequence[str | Path], controls: bool,
+    cache: Path | None, rows: dict[int, Array], order: Order = "right", least: int = 1, **encoding: Any,
+) -> list[FeatureSource]:  # fmt: skip
+    """Return models, the random encoder, features files and raw pixels, in this order.
+
+    `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of every clip.
+    """
+    several = [model for model in models if isinstance(model, FeatureSource)]
+    encoders = {str(model): load_encoder(model) for model in models if not isinstance(model, FeatureSource)}
+    if controls:
+        first = next((one for one in (*encoders.values(), *(source.encoder for source in several)) if one), None)
+        encoders[RANDOM] = random_encoder(first.config if first else preset("tiny"))
+    for name, encoder in encoders.items():
+        check_frames(encoder.config.model, least)
+        store = encoder_features(encoder, table, order=order, folder=cache, **encoding)
+        several.append(FeatureSource(name, store, encoder))
+    for path in features:
+        several.append(FeatureSource(str(path), file_features(Path(path), table)))
+        for frames, ids in rows.items():
+            several[-1].store.add(ids, frames)
+    if controls:
+        several.append(FeatureSource(RAW, pixel_features(table, order=order, folder=cache), None, "common"))
+    if not several:
+        raise UserError("There is nothing to probe. Give --model or --features, or keep the controls.")
+    return several

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.splits import subsample
+from anytouch_jax.evaluate.statistics import Array, unit_rows
 
-Array = npt.NDArray[Any]
 MOST = 4000  # rows that are compared in pairs
 
 
@@ -27,12 +27,12 @@ class Space:
     rows: int
 
 
-def alignment(first: Array, second: Array, *, power: float = 2.0) -> float:
-    """Return the mean distance, to the `power`, of unit-norm positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
+def alignment(first: Array, second: Array) -> float:
+    """Return the mean squared distance of unit-norm positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
     first, second = _unit(first), _unit(second)
     if first.shape != second.shape or not len(first):
-        raise UserError(f"alignment needs pairs of rows, not {first.shape} and {second.shape}")
-    return float(np.mean(np.linalg.norm(first - second, axis=1) ** power))
+        raise UserError(f"Alignment needs pairs of rows, not {first.shape} and {second.shape}.")
+    return float(np.mean(np.linalg.norm(first - second, axis=1) ** 2))
 
 
 def uniformity(features: Array) -> float:
@@ -42,7 +42,7 @@ def uniformity(features: Array) -> float:
     """
     x = _unit(subsample(np.asarray(features), MOST))
     if len(x) < 2:
-        raise UserError("uniformity needs two rows or more")
+        raise UserError("Uniformity needs two rows or more.")
     likeness = (x @ x.T)[np.triu_indices(len(x), 1)]
     return float(np.log(np.mean(np.exp(-2.0 * np.maximum(2 - 2 * likeness, 0.0)))))
 
@@ -61,16 +61,16 @@ def silhouette(features: Array, labels: Any) -> float | None:
     return float(silhouette_score(_unit(subsample(np.asarray(features), MOST)), labels, metric="cosine"))
 
 
-def tsne(features: Array, *, seed: int = 0, perplexity: float = 30.0) -> Array:
+def tsne(features: Array, *, seed: int = 0) -> Array:
     """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2). Raises UserError below 4 rows."""
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits
 
     x = _unit(features)
     if len(x) < 4:
-        raise UserError(f"t-SNE needs 4 rows or more, not {len(x)}")
+        raise UserError(f"A t-SNE needs 4 rows or more, not {len(x)}.")
     # Squared Euclidean distances of unit-norm rows are twice the cosine distances.
-    model = TSNE(perplexity=min(perplexity, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
+    model = TSNE(perplexity=min(30.0, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
     with threadpool_limits(1):  # its threads wait for each other at every step, very long on a busy machine
         return np.asarray(model.fit_transform(x.astype(np.float32)), np.float32)
 
@@ -81,30 +81,19 @@ def describe(features: Array, sensors: Any, objects: Any, touches: Any, *, name:
     Rows whose object is not known ("") have no part in the silhouette by object.
     """
     x, sensors, objects = np.asarray(features), np.asarray(sensors).astype(str), np.asarray(objects).astype(str)
-    known = objects != ""
-    first, second = _positive_pairs(sensors, np.asarray(touches).astype(str))
-    return Space(
-        name=name,
-        alignment=alignment(x[first], x[second]) if len(first) else None,
-        uniformity=uniformity(x),
-        silhouette_sensor=silhouette(x, sensors),
-        silhouette_object=silhouette(x[known], objects[known]),
-        rows=len(x),
-    )
-
-
-def _positive_pairs(sensors: Array, touches: Array) -> tuple[Array, Array]:
-    pairs: list[tuple[int, int]] = []
-    _, codes = np.unique(touches, return_inverse=True)
-    order = np.argsort(codes, kind="stable")
-    for members in np.split(order, np.cumsum(np.bincount(codes))[:-1]):
-        pairs += [(a, b) for i, a in enumerate(members) for b in members[i + 1 :] if sensors[a] != sensors[b]]
-    found = np.array(pairs, np.int64).reshape(-1, 2)
-    return found[:, 0], found[:, 1]
+    known, members = objects != "", dict[str, list[int]]()
+    for row, touch in enumerate(np.asarray(touches).astype(str)):
+        members.setdefault(touch, []).append(row)
+    several = [combinations(rows, 2) for _, rows in sorted(members.items())]
+    pairs = [(a, b) for a, b in chain.from_iterable(several) if sensors[a] != sensors[b]]
+    first, second = np.array(pairs, np.int64).reshape(-1, 2).T
+    aligned = alignment(x[first], x[second]) if pairs else None
+    by_sensor, by_object = silhouette(x, sensors), silhouette(x[known], objects[known])
+    return Space(name, aligned, uniformity(x), by_sensor, by_object, len(x))
 
 
 def _unit(features: Array) -> Array:
     x = np.asarray(features, np.float64)
     if x.ndim != 2 or not np.isfinite(x).all():
-        raise UserError(f"features must be finite numbers (n, d), not {x.shape} with NaN or Inf")
-    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+        raise UserError(f"Features must be finite numbers (n, d), not {x.shape} with NaN or Inf.")
+    return unit_rows(x)

@@ -19,12 +19,12 @@ from scipy.special import expit, softmax
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import logistic
 from anytouch_jax.evaluate.logistic import Logistic
+from anytouch_jax.evaluate.statistics import Array, binary_scale, unit_rows
 from anytouch_jax.files import atomic_path, read_arrays
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Pooling
 
-Array = npt.NDArray[Any]
 HeadName = Literal["linear", "knn", "gradient"]
 Scaling = Literal["column", "common"]
 Predict = Callable[[Array], list[Array]]  # features (m, d) -> class numbers or numbers (m,) for each option
@@ -84,21 +84,14 @@ class FittedHead(NamedTuple):
 
 
 class LinearModel(NamedTuple):
-    """Standardised logistic regression: features (m, d) -> class numbers (m,); `fit` is None for a single class."""
+    """Standardised logistic regression: features (m, d) -> class numbers (m,)."""
 
     mean: Array
     scale: Array
     classes: Array
-    fit: Logistic | None
-
-    @property
-    def finished(self) -> bool:
-        """Whether the fit converged."""
-        return self.fit is None or self.fit.finished
+    fit: Logistic
 
     def __call__(self, x: Array) -> Array:
-        if self.fit is None:
-            return np.repeat(self.classes, len(x))
         return self.classes[self.fit((x - self.mean) / self.scale)]
 
 
@@ -110,11 +103,10 @@ def fit_head(
     `weights` (n,): how often each row counts, a whole number except in logistic regression. `start`: a fit that it
     starts from.
     """
-    defaults = {
-        "linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": range(1, head.recipe.epochs + 1)
-    }  # fmt: skip
+    epochs = range(1, head.recipe.epochs + 1)
+    defaults = {"linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": epochs}
     options = head.options or tuple(map(float, defaults[head.name]))
-    if classes and len(np.unique(y)) == 1:  # a small fold may hold one class only
+    if classes and len(np.unique(y)) == 1:  # a small fold or bootstrap may hold one class only
         return FittedHead(options, lambda rows: [np.full(len(rows), y[0])] * len(options))
     if head.name == "linear" and classes:
         models = linear_path(x, y, options, scaling=head.scaling, weights=weights, start=start)
@@ -124,9 +116,17 @@ def fit_head(
         x, y = np.repeat(x, times, 0), np.repeat(y, times)
     if head.name == "gradient":
         return FittedHead(options, _fit_gradient(x, y, classes, options, head.recipe, head.seed))
-    if head.name == "knn":
-        return FittedHead(options, _fit_neighbours(x, y, classes, options))
-    return FittedHead(options, fit_ridge(x, y, options, head.scaling))
+    if head.name == "linear":
+        return FittedHead(options, fit_ridge(x, y, options, head.scaling))
+    z_train, numbers = unit_rows(x), list(map(int, options))
+
+    def neighbours(rows: Array) -> list[Array]:
+        near, cosines = nearest(z_train, unit_rows(rows), max(numbers))
+        if classes:
+            return [vote(y[near[:, :k]], cosines[:, :k], classes) for k in numbers]
+        return [y[near[:, :k]].mean(1) for k in numbers]
+
+    return FittedHead(options, neighbours)
 
 
 def head_score(predicted: Array, truth: Array, classes: int) -> float:
@@ -138,31 +138,26 @@ def linear_path(
     x: Array, y: Array, penalties: Sequence[float], *, scaling: Scaling = "column", weights: Array | None = None,
     start: LinearModel | None = None,
 ) -> list[LinearModel]:  # fmt: skip
-    """Return logistic regression of `y` (n,) for each penalty, strongest first, each started from the one before.
+    """Return logistic regression of `y` (n,), of two classes or more, for each penalty, strongest first.
 
-    `weights` (n,): how often each row counts. `start`: a fit of the same classes to start from.
+    Each starts from the one before, the first from `start`. `weights` (n,): how often each row counts.
     """
     mean, scale = _mean_and_scale(x, weights, scaling)
     classes, numbers = np.unique(y, return_inverse=True)
-    if len(classes) == 1:  # a small fold or bootstrap may hold one class only
-        return [LinearModel(mean, scale, classes, None)] * len(penalties)
     first = start.fit if start is not None and np.array_equal(start.classes, classes) else None
     fits = logistic.path((x - mean) / scale, numbers, len(classes), penalties, first, weights)
     return [LinearModel(mean, scale, classes, fit) for fit in fits]
 
 
 def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "column") -> tuple[Array, Array]:
-    """Return the mean and standard deviation (d,) of each column; a constant column gets deviation 1.
-
-    `scaling` "common": one deviation for all columns, the root of their mean variance.
-    """
-    if weights is None:
-        mean = x.mean(0, dtype=np.float64).astype(np.float32)
-        variance = np.mean((x - mean) ** 2, 0, dtype=np.float64)
-    else:
-        shares = weights / weights.sum(dtype=np.float64)
-        mean = (shares @ x).astype(np.float32)
-        variance = shares @ (x - mean) ** 2
+    """Return the mean and deviation (d,) of each column, "common": one for all; a constant column gets deviation 1."""
+    shares = None if weights is None else weights / weights.sum(dtype=np.float64)
+    mean = (x.mean(0, dtype=np.float64) if shares is None else shares @ x).astype(np.float32)
+    centred = x - mean
+    power = binary_scale(centred, 0)
+    squares = np.ldexp(centred, -power) ** 2
+    variance = np.mean(squares, 0, dtype=np.float64) if shares is None else shares @ squares
+    variance = np.ldexp(variance, 2 * power[0])
     if scaling == "common":
         variance = np.full_like(variance, variance.mean())
     scale = np.sqrt(variance)
@@ -186,21 +181,6 @@ def fit_ridge(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling =
     return predict
 
 
-def _fit_neighbours(x: Array, y: Array, classes: int, options: Sequence[float]) -> Predict:
-    def unit(rows: Array) -> Array:
-        return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12))
-
-    z_train, numbers = unit(x), list(map(int, options))
-
-    def predict(rows: Array) -> list[Array]:
-        near, cosines = nearest(z_train, unit(rows), max(numbers))
-        if classes:
-            return [vote(y[near[:, :k]], cosines[:, :k], classes) for k in numbers]
-        return [y[near[:, :k]].mean(1) for k in numbers]
-
-    return predict
-
-
 def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
     """Return row numbers in `z_train` and cosines of the k nearest of each unit row of `z_rows`, nearest first."""
     # scikit-learn's NearestNeighbors, brute force, takes 1.5 (euclidean) to 6 times longer (cosine) on 100,000 rows.
@@ -213,10 +193,8 @@ def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
 
 
 def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
-    """Return columns and values of the k largest of each row, largest first.
-
-    They lie in the k blocks of columns with the largest maxima. Partitioning whole rows takes ten times longer.
-    """
+    """Return columns and values of the k largest of each row, largest first."""
+    # They lie in the k blocks of columns with the largest maxima. Partitioning whole rows takes ten times longer.
     blocks = values.shape[1] // block
     columns = np.broadcast_to(np.arange(values.shape[1]), values.shape)
     if blocks > 2 * k:
@@ -236,11 +214,6 @@ def vote(labels: Array, cosines: Array, classes: int) -> Array:
     rows = np.repeat(np.arange(len(labels)), labels.shape[1])
     np.add.at(votes, (rows, labels.ravel()), (1 + 1e-3 * cosines / labels.shape[1]).ravel())
     return votes.argmax(1)
-
-
-def majority_class(y: Array) -> int:
-    """Return the class number that occurs most often in `y`, the smallest of equals."""
-    return int(np.bincount(y).argmax())
 
 
 def _fit_gradient(
@@ -293,7 +266,7 @@ def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., 
         updates, state = tx.update(jax.grad(loss)(params, x, target), state, params)
         return optax.apply_updates(params, jax.tree.map(lambda update: rate * update, updates)), state
 
-    return tx.init, jax.jit(step)
+    return tuple(jax.enable_x64(False)(function) for function in (tx.init, jax.jit(step)))  # whatever JAX_ENABLE_X64
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,8 +299,8 @@ class LinearHead:
 
     def check(self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean") -> None:
         """Raise UserError unless the head was fitted on features of that encoder, pooling and number of frames."""
-        fitted = {"pooling": (self.pooling, pooling), "frames": (self.frames, frames), "join": ("mean", join)}
-        wrong = [f"--{name} {own}" for name, (own, other) in fitted.items() if own != other]
+        pairs = (("pooling", self.pooling, pooling), ("frames", self.frames, frames), ("join", "mean", join))
+        wrong = [f"--{name} {own}" for name, own, other in pairs if own != other]
         if wrong:
             raise UserError(f"The head was fitted on other features. Give {' '.join(wrong)}.")
         if fingerprint != self.fingerprint:
@@ -341,7 +314,6 @@ def linear_head(
     model: LinearModel, names: Array, *, label: str, pooling: Pooling, frames: int, fingerprint: str
 ) -> LinearHead:
     """Return the head of a fitted `LinearModel`, whose class numbers index `names`."""
-    assert model.fit is not None  # a probe has two classes
     classes = np.asarray(names)[model.classes].astype(str)
     arrays = (classes, model.fit.weights, model.fit.bias, model.mean, model.scale)
     return LinearHead(*arrays, label, pooling, frames, fingerprint)
@@ -349,10 +321,9 @@ def linear_head(
 
 def save_head(path: str | Path, head: LinearHead) -> None:
     """Write a head as `.npz` atomically. Raises OSError."""
-    arrays: dict[str, Any] = {"format": FORMAT, **vars(head)}
-    arrays["mark"] = arrays.pop("fingerprint")  # its name in the file format
+    arrays = {"mark" if name == "fingerprint" else name: value for name, value in vars(head).items()}
     with atomic_path(path) as part, open(part, "wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, format=FORMAT, **arrays)
 
 
 def load_head(path: str | Path) -> LinearHead:
@@ -360,13 +331,14 @@ def load_head(path: str | Path) -> LinearHead:
     if not Path(path).is_file():
         raise UserError(f"There is no head {path}. `anytouch probe label --save` writes one.")
     try:
-        arrays = read_arrays(path)
-        if str(arrays.pop("format")) != FORMAT:
+        arrays: dict[str, Any] = read_arrays(path)
+        for name in ("format", "label", "pooling", "mark"):
+            if arrays[name].shape != () or arrays[name].dtype.kind != "U" or arrays[name].dtype.itemsize > 4096:
+                raise ValueError(f"{name} is not a short text")
+            arrays[name] = str(arrays[name])
+        if arrays.pop("format") != FORMAT:
             raise ValueError("it has no format of a head")
-        words: dict[str, Any] = {name: _text(arrays.pop(name)) for name in ("label", "pooling")}
-        frames, fingerprint = int(arrays.pop("frames")), _text(arrays.pop("mark"))
-        words |= arrays
-        head = LinearHead(frames=frames, fingerprint=fingerprint, **words)
+        head = LinearHead(frames=int(arrays.pop("frames")), fingerprint=arrays.pop("mark"), **arrays)
         _check_head(head)
         return head
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
@@ -374,12 +346,6 @@ def load_head(path: str | Path) -> LinearHead:
         raise UserError(
             f"{path} is not the head of a probe ({reason}). `anytouch probe label --save` writes one."
         ) from None
-
-
-def _text(array: Array) -> str:
-    if array.shape != () or array.dtype.kind != "U" or array.dtype.itemsize > 4096:
-        raise ValueError("a text has another type")
-    return str(array)
 
 
 def _check_head(head: LinearHead) -> None:

@@ -13,12 +13,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 from threadpoolctl import ThreadpoolController
 
-Array = npt.NDArray[Any]
+from anytouch_jax.evaluate.statistics import Array
 
 STEPS = 300
 

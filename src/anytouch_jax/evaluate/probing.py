@@ -1,8 +1,11 @@
-"""Probes of frozen features from models and manifests: a label column, named tasks, or a public benchmark.
+"""Probes of frozen features: of arrays, a label column, named tasks, or a public benchmark; their results and tables.
 
 A task selects rows and labels. Features are computed once, groups are split, heads are fitted and scored. Frames are
-never flipped or otherwise augmented. The protocols are those of `array_probes`. In tasks, "honest" splits whole groups
+never flipped or otherwise augmented. The protocols are those of `splits`. In tasks, "honest" splits whole groups
 (objects, recordings) again by every seed, and "published" keeps the manifest's split.
+
+Probes of arrays take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups` (n,), recordings or
+objects that no fold or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that take part.
 """
 
 from __future__ import annotations
@@ -10,59 +13,296 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Callable, Sequence
-from fnmatch import fnmatch
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import Join, Pooling
-from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, feature_cache, heads, logistic, splits, statistics, tasks
-from anytouch_jax.evaluate.array_probes import LabelledFeatures, ProbeResult
-from anytouch_jax.evaluate.feature_cache import FeatureStore, Order
-from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, ProbeHead, Scaling
-from anytouch_jax.evaluate.splits import RowRoles, Split
-from anytouch_jax.evaluate.statistics import GroupSums, Protocol
+from anytouch_jax.evaluate import feature_cache, logistic, splits, statistics, tasks
+from anytouch_jax.evaluate import heads as probe_heads
+from anytouch_jax.evaluate.feature_cache import RANDOM, RAW, FeatureSource, Order
+from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearModel, ProbeHead, Scaling
+from anytouch_jax.evaluate.splits import SIDES, LabelledFeatures, RowRoles, Selection, Split
+from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
 from anytouch_jax.files import atomic_write
 
-Array = npt.NDArray[Any]
+Subsets = Mapping[str, Array]
 Log = Callable[[str], None]
 Paths = Sequence[str | Path]
+Models = Sequence[str | Path | FeatureSource]
 Names = Sequence[str] | None
-RAW, RANDOM = "raw pixels", "random encoder"
-SIDES = ("train_sensors", "test_sensors", "train_units", "test_units")
+
+NAN = float("nan")
+OF_CLASSES = ("accuracy", "balanced_accuracy", "baseline", "refit_mean", "refit_std", "seeds", "classes", "parts")
+OF_NUMBERS = ("r2", "mae", "mae_low", "mae_high", "baseline_mae")
 
 
-class _Source(NamedTuple):
-    """Features with their name; `encoder` is None for a features file and for raw pixels."""
+@dataclass(frozen=True)
+class SubsetResult:
+    """Accuracy on a named part of the test rows; `low`, `high` as in `ProbeResult`."""
 
     name: str
-    store: FeatureStore
-    encoder: Encoder | None = None
-    scaling: Scaling = "column"
+    accuracy: float
+    low: float | None
+    high: float | None
+    n_test: int
 
 
-class _Plan(NamedTuple):
-    """A task with the rows that can be fitted on or tested, their roles and class names, and the length of a clip."""
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The test rows, whether each was right, and its group; `fitted`: the linear model and the names of its classes."""
 
-    task: Task
-    rows: TaskRows
-    roles: RowRoles
-    names: Array
-    frames: int
-    notes: list[str]
+    rows: Array
+    correct: Array
+    groups: Array
+    fitted: tuple[Any, Array] | None = None
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """The score of a head fitted on all of train, on the test rows. Shares are in 0..1.
+
+    `low`, `high`: 95 % interval of the accuracy or R2 under a bootstrap over the test groups, None with fewer than two.
+    `penalty` (k, epoch) was selected on `chosen_on`. If that is test, the score is an upper estimate.
+
+    Of classes: a test row of a class that train lacks counts as an error. `baseline` is the accuracy of the most
+    frequent class of train. `refit_mean`, `refit_std`: accuracy of `seeds` heads fitted on bootstraps of the train
+    groups. Each has some 63 % of the groups, so the mean is a little below `accuracy`.
+
+    Of numbers: `r2` and the mean absolute error `mae` in units of the label. `baseline_mae` is that of train's mean.
+    """
+
+    probe: str
+    protocol: Protocol
+    low: float | None
+    high: float | None
+    penalty: float | None
+    chosen_on: str
+    n_train: int
+    n_test: int
+    test_groups: int
+    accuracy: float = NAN
+    balanced_accuracy: float = NAN
+    baseline: float = NAN
+    refit_mean: float | None = None
+    refit_std: float | None = None
+    seeds: int = 0
+    classes: tuple[str, ...] = ()
+    parts: tuple[SubsetResult, ...] = ()
+    r2: float = NAN
+    mae: float = NAN
+    mae_low: float | None = None
+    mae_high: float | None = None
+    baseline_mae: float = NAN
+    notes: tuple[str, ...] = ()
+    outcome: Outcome | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the label is a number."""
+        return not np.isnan(self.r2)
+
+
+def probe_features(
+    features: Array, labels: Any, groups: Any, split: Any, head: ProbeHead | None = None, *, measured: bool = False,
+    protocol: Protocol = "honest", seeds: int = 5, subsets: Subsets | None = None, name: str = "linear",
+) -> ProbeResult:  # fmt: skip
+    """Probe with a head (default: linear) that is selected and fitted on train, and tested on test.
+
+    `measured`: labels are numbers. `seeds` heads of classes are fitted on bootstraps of the train groups too. `subsets`
+    (name -> mask over all rows) report parts of test. Raises UserError as `check_rows`.
+    """
+    data, rows, notes = splits.check_rows(features, labels, groups, split, measured=measured)
+    head = head or ProbeHead()
+    selected, model, predicted = _predict(data, rows, head, protocol, refit=True)
+    if selected.chosen_on == "test":
+        notes += ("chosen on test, as the authors' code does: an upper estimate",)
+    scores = np.asarray(selected.scores)
+    at_edge = len(scores) and selected.place in (0, len(scores) - 1) and np.sum(scores == scores.max()) == 1
+    if at_edge and head.name == "linear":
+        notes += (f"the chosen penalty {selected.option:g} lies at the edge of those tried",)
+    if model is not None and not model.fit.finished:
+        notes += ("the fit stopped at its limit of iterations",)
+    result = _result(name, protocol, data, rows, predicted, selected, notes, subsets)
+    refits, head = [], replace(head, options=(selected.option,))
+    for ids, weights in splits.group_bootstraps(rows.fit, data.groups, 0 if measured else seeds):
+        (again,) = data.fit(head, ids, weights=weights, start=model).predict(data.x[rows.test])
+        refits.append(float(np.mean(again == data.y[rows.test])))
+    if refits:
+        spread = float(np.std(refits, ddof=1)) if len(refits) > 1 else None
+        result = replace(result, refit_mean=float(np.mean(refits)), refit_std=spread, seeds=len(refits))
+    return replace(result, outcome=result.outcome and replace(result.outcome, fitted=(model, data.names)))
+
+
+def majority_baseline(labels: Any, groups: Any, split: Any, *, subsets: Subsets | None = None) -> ProbeResult:
+    """Score the most frequent class of train on test."""
+    nothing = np.zeros((len(labels), 1), np.float32)
+    data, rows, _ = splits.check_rows(nothing, labels, groups, split, least_classes=1)
+    return _result("commonest class", "honest", data, rows, _constant(data, rows), None, (), subsets)
+
+
+def leave_groups_out(
+    features: Array, labels: Any, groups: Any, *, folds: int | None = 10,
+    penalties: Sequence[float] = (10.0, *probe_heads.PENALTIES), scaling: Scaling = "column",
+    subsets: Subsets | None = None, name: str = "linear, groups left out",
+) -> ProbeResult:  # fmt: skip
+    """Probe each row with a linear fit on no row of its group, for instance on held-out objects.
+
+    The groups are assigned to `folds` folds (None: each group alone). The penalty is selected by folds over the other
+    groups. `baseline` is the most frequent class of the same other rows. Every labelled row is tested.
+    """
+    data, rows, notes = splits.check_rows(features, labels, groups, np.full(len(labels), "train"), tested=False)
+    used, chosen = rows.fit, []
+    predicted, baseline = np.full(len(data.y), -1), np.full(len(data.y), -1)
+    head = ProbeHead("linear", scaling, tuple(penalties))
+    count = len(np.unique(data.groups[used])) if folds is None else folds
+    for fit, out in splits.group_folds(used, data.groups, data.y, count):
+        cut = Split(fit, fit[:0], out)
+        selected, _, predicted[out] = _predict(data, cut, head, "honest", refit=True)
+        chosen.append(selected.option)
+        baseline[out] = _constant(data, cut)
+    values, times = np.unique(chosen, return_counts=True)
+    counts = ", ".join(f"{value:g} ({count} x)" for value, count in zip(values, times, strict=True))
+    selected = Selection(0, float(np.median(chosen)), "cross-validation, median of the folds")
+    notes += (f"penalties of the folds: {counts}",)
+    rows = Split(used, used[:0], used)
+    return _result(name, "honest", data, rows, predicted[used], selected, notes, subsets, baseline[used])
+
+
+def _predict(
+    data: LabelledFeatures, cut: Split, head: ProbeHead, protocol: Protocol, *, refit: bool = False
+) -> tuple[Selection, LinearModel | None, Array]:
+    """Return the selected option, its logistic model and its predictions for the test rows; `refit` without a start."""
+    selected = splits.select_option(head, data, cut, protocol)
+    fitted, place = selected.fitted, selected.place
+    if refit or fitted is None or (head.name != "gradient" and len(cut.fit) > splits.SELECT_ROWS):
+        start = fitted.models[place] if fitted and fitted.models and not refit else None
+        fitted, place = data.fit(replace(head, options=(selected.option,)), cut.fit, start=start), 0
+    return selected, fitted.models[place] if fitted.models else None, fitted.predict(data.x[cut.test])[place]
+
+
+def _constant(data: LabelledFeatures, cut: Split) -> Array:
+    """Return the most frequent class (the smallest of equals) or the mean of the fitted rows for each test row."""
+    y = data.y[cut.fit]
+    return np.full(len(cut.test), np.bincount(y).argmax() if len(data.names) else y.mean())
+
+
+def _sums(data: LabelledFeatures, predicted: Array, tested: Array) -> GroupSums:
+    truth, groups = data.y[tested], data.groups[tested]
+    if len(data.names):
+        return statistics.classification_sums(predicted == truth, groups)
+    return statistics.regression_sums(predicted - truth, truth - truth.mean(), groups)
+
+
+def _result(
+    name: str, protocol: Protocol, data: LabelledFeatures, rows: Split, predicted: Array, selected: Selection | None,
+    notes: tuple[str, ...], subsets: Subsets | None, constant: Array | None = None,
+) -> ProbeResult:  # fmt: skip
+    """Return the scores of predictions for the test rows, and of a constant (default: that of train)."""
+    truth, groups, measured = data.y[rows.test], data.groups[rows.test], not len(data.names)
+    constant = _constant(data, rows) if constant is None else constant
+    scored = statistics.scores([_sums(data, predicted, rows.test)], [_sums(data, constant, rows.test)], measured)
+    if measured:
+        scores = {name: scored[name] for name in ("mae", "mae_low", "mae_high")}
+        scores |= {"r2": scored["mean"], "baseline_mae": scored["chance_mae"]}
+    else:
+        correct, parts = predicted == truth, []
+        for part, mask in (subsets or {}).items():
+            kept = np.asarray(mask, bool)[rows.test]
+            accuracy = float(correct[kept].mean()) if kept.any() else NAN
+            parts.append(
+                SubsetResult(part, accuracy, *statistics.mean_interval(correct[kept], groups[kept]), int(kept.sum()))
+            )
+        scores = {
+            "accuracy": scored["mean"], "baseline": scored["chance"], "parts": tuple(parts),
+            "balanced_accuracy": float(np.mean([correct[truth == number].mean() for number in np.unique(truth)])),
+            "classes": tuple(map(str, data.names[np.unique(data.y[rows.fit])])),
+            "outcome": Outcome(rows.test, correct, groups),
+        }  # fmt: skip
+        notes = notes if scored["low"] is not None else (*notes, "test has one group only: no interval")
+    option, chosen_on = (selected.option, selected.chosen_on) if selected else (None, "")
+    sizes = (len(rows.fit), len(rows.test), len(np.unique(groups)))
+    return ProbeResult(name, protocol, scored["low"], scored["high"], option, chosen_on, *sizes, **scores, notes=notes)
+
+
+def probe_json(results: Sequence[ProbeResult]) -> str:
+    """Return the results as a JSON list of objects, without outcomes; a number that does not exist is null."""
+    records = []
+    for result in results:
+        others = OF_CLASSES if result.measured else OF_NUMBERS
+        records.append({name: value for name, value in statistics.plain(result).items() if name not in others})
+    return json.dumps(records, indent=2, allow_nan=False)
+
+
+def probe_table(results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None) -> str:
+    """Return results, or results of `probe_tasks`, as one Markdown table, with the notes below.
+
+    `paper`: the accuracy of AnyTouch in the paper.
+    """
+    lines, notes = list[dict[str, str]](), list[str]()
+    for result in results:
+        if isinstance(result, ProbeResult):
+            lines += _result_lines(result)
+            notes += [f"- {result.probe} ({result.protocol}): {note}" for note in result.notes]
+        else:
+            names = {name: result.get(name, "") for name in ("features", "task", "head", "protocol")}
+            lines.append(names | _score_cells(result))
+            notes += [f"- {result['task']}: {note}" for note in result["notes"]]
+    if paper is not None:
+        notes.append(f"- the paper reports {100 * paper:.2f} % for AnyTouch, its epoch chosen on test")
+    header = list(dict.fromkeys(column for line in lines for column in line))
+    table = statistics.markdown_table(header, [[line.get(column, "") for column in header] for line in lines])
+    return "\n\n".join([table, *(["\n".join(dict.fromkeys(notes))] if notes else [])]) + "\n"
+
+
+def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
+    """Return the cells of a result, and of its parts, by column."""
+    line = {"probe": result.probe, "protocol": result.protocol} | _score_cells({
+        "metric": "r2" if result.measured else "accuracy", "mean": result.r2 if result.measured else result.accuracy,
+        "low": result.low, "high": result.high, "chance": result.baseline, "mae": result.mae, "unit": "",
+        "chance_mae": result.baseline_mae, "train": result.n_train, "test": result.n_test, "groups": result.test_groups,
+    })  # fmt: skip
+    if result.measured:
+        line["MAE 95 %"] = _interval(result.mae_low, result.mae_high, 1.0, 3)
+    else:
+        refits = f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}" if result.seeds else "-"
+        line |= {"balanced": _share(result.balanced_accuracy), "refits": refits, "classes": str(len(result.classes))}
+    line["penalty or k"] = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
+    parts = [
+        {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol, "score": _share(part.accuracy),
+         "95 %": _interval(part.low, part.high), "test (groups)": str(part.n_test)}
+        for part in result.parts
+    ]  # fmt: skip
+    return [line, *parts]
+
+
+def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
+    """Return the cells of a result of `probe_tasks` that every table has."""
+    cells = {"score": _share(row["mean"]), "95 %": _interval(row["low"], row["high"]), "chance": _share(row["chance"])}
+    if row["metric"] == "r2":
+        mae, chance = (f"{row[name]:.3g} {row['unit']}".strip() for name in ("mae", "chance_mae"))
+        interval = _interval(row["low"], row["high"], 1.0, 3)
+        cells = {"score": f"R2 {row['mean']:.3f}, {mae}", "95 %": interval, "chance": chance}
+    return cells | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None or np.isnan(value) else f"{100 * value:.1f} %"
+
+
+def _interval(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
+    return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
 
 
 def probe_label(
-    models: Paths, data: Paths, label: str = "object", *, features: Paths = (), group: str = "",
+    models: Models, data: Paths, label: str = "object", *, features: Paths = (), group: str = "",
     leave_out: str | None = None, where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
     pooling: Pooling = "class", join: Join = "mean", seeds: int = 5, protocol: Protocol = "honest",
     controls: bool = True, cache: Path | None = None, save: Path | None = None, out: Path | None = None,
@@ -86,22 +326,24 @@ def probe_label(
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
-    array_probes.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
+    splits.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
     results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join)
-    for source in _sources(table, models, features, controls, cache, {frames: rows.rows}, **encoding):
-        values = pixel_components(source.store, rows) if source.name == RAW else source.store.get(rows.rows, frames)
-        results += probe_rows(values, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds,
+    for source in feature_cache.sources(table, models, features, controls, cache, {frames: rows.rows}, **encoding):
+        pixels = source.name == RAW
+        x = feature_cache.pixel_components(source.store, rows) if pixels else source.store.get(rows.rows, frames)
+        results += probe_rows(x, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds,
                               scaling=source.scaling, subsets=subsets)  # fmt: skip
         log(f"probed {source.name}")
         if save is not None and source.encoder is not None and source.name != RANDOM and (tested := results[0].outcome):
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             assert tested.fitted is not None
-            heads.save_head(save, heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint))
+            head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
+            probe_heads.save_head(save, head)
             log(f"{save}: the linear head")
     if leave_out is None:
-        results.append(array_probes.majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
+        results.append(majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
     if out is not None:
-        atomic_write(out, array_probes.probe_json(results))
+        atomic_write(out, probe_json(results))
     return results
 
 
@@ -116,12 +358,6 @@ def label_rows(
     return rows, tasks.described_subsets(table, column, rows.rows[:, 0], name)
 
 
-def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
-    """Return the principal components of raw pixels, fitted on the rows of train (on all without these)."""
-    train = rows.split == "train"
-    return feature_cache.principal_components(store.get(rows.rows, 1), train if train.any() else ~train)
-
-
 def probe_rows(
     features: Array, rows: TaskRows, name: str, *, leave_out: str | None = None, protocol: Protocol = "honest",
     seeds: int = 5, scaling: Scaling = "column", subsets: dict[str, Array] | None = None,
@@ -130,119 +366,94 @@ def probe_rows(
     arrays = (features, rows.labels, rows.groups)
     if leave_out is not None:
         name = f"{name}: linear, {leave_out} left out"
-        return [array_probes.leave_groups_out(*arrays, name=name, scaling=scaling, subsets=subsets)]
+        return [leave_groups_out(*arrays, name=name, scaling=scaling, subsets=subsets)]
     options: dict[str, Any] = {"protocol": protocol, "seeds": seeds, "subsets": subsets}
-    probes = {"linear": ProbeHead("linear", scaling), "kNN": ProbeHead("knn")}
+    kinds = {"linear": ProbeHead("linear", scaling), "kNN": ProbeHead("knn")}
     return [
-        array_probes.probe_features(*arrays, rows.split, head, name=f"{name}: {kind}", **options)
-        for kind, head in probes.items()
+        probe_features(*arrays, rows.split, head, name=f"{name}: {kind}", **options) for kind, head in kinds.items()
     ]
 
 
+class _Plan(NamedTuple):
+    """A task with the rows that can be fitted on or tested, their roles and class names, and the length of a clip."""
+
+    task: Task
+    rows: TaskRows
+    roles: RowRoles
+    names: Array
+    frames: int
+    notes: list[str]
+
+
 def probe_tasks(
-    models: Paths, data: Paths, tasks: Sequence[str | Task] | Literal["all"] = "all", *, features: Paths = (),
-    heads: Sequence[HeadName] = ("linear",), seeds: int = 5, protocol: Protocol = "honest", frames: int | None = None,
-    pooling: Pooling = "class", join: Join = "mean", order: Order = "right", max_rows: int | None = None,
-    universal: bool = False, recipe: GradientRecipe | None = None, paper: float | None = None, controls: bool = True,
-    cache: Path | None = None, out: Path | None = None, log: Log = print, **sides: Names,
+    models: Models, data: Paths | Manifest, tasks: Sequence[str | Task] | Literal["all"] = "all", *,
+    features: Paths = (), heads: Sequence[HeadName] = ("linear",), seeds: int = 5, protocol: Protocol = "honest",
+    frames: int | None = None, pooling: Pooling = "class", join: Join = "mean", order: Order = "right",
+    max_rows: int | None = None, universal: bool = False, recipe: GradientRecipe | None = None,
+    paper: float | None = None, controls: bool = True, cache: Path | None = None, out: Path | None = None,
+    log: Log = print, **sides: Names,
 ) -> dict[str, Any]:  # fmt: skip
     """Probe named tasks with features of every model, of features files, and of the controls.
 
-    Parameters are those of `score_tasks`. `protocol` "published" reports both protocols. `paper`: the accuracy that the
-    report names. `out` writes JSON. Tasks that cannot be probed are left out with their reason. Print the "results"
-    with `probe_table`. Raises UserError.
+    The "results" have a JSON-ready dict for each source of features, task, head and protocol. Keys: features, task,
+    head, protocol; metric, "accuracy" in 0..1 or "r2"; mean over seeds, low, high (95 % over seeds and test groups),
+    values (one a seed); train, test (rows); groups (tested); classes; chance, the score of the most frequent class or
+    the mean of train; chosen options; frames; order; notes. A regression also has mae, mae_low, mae_high and chance_mae
+    in `unit`. Print them with `probe_table`. Tasks that cannot be probed are left out with their reason.
+
+    `protocol` "published" reports both protocols. `frames` replaces that of each task. `order` shuffles the frames of
+    clips, or repeats the last. `universal`: the universal tokens for all sensors. `paper`: the accuracy that the report
+    names. `out` writes JSON. `sides`: train_sensors, test_sensors, train_units and test_units, names or patterns to fit
+    on and to test on. Raises UserError.
     """
-    table = manifests.read([str(path) for path in data])
+    if seeds < 1:
+        raise UserError(f"seeds must be at least 1, not {seeds}.")
+    table = data if isinstance(data, Manifest) else manifests.read([str(path) for path in data])
     plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log)
     if order != "right" and (features or all(plan.frames == 1 for plan in plans)):
         raise UserError("--order has no effect on stills or on --features. Leave it out, or give --frames.")
+    lengths = sorted({plan.frames for plan in plans})  # one pass computes the features of all tasks
+    rows = {n: np.concatenate([plan.rows.rows.ravel() for plan in plans if plan.frames == n]) for n in lengths}
     encoding: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
-    sources = _sources(table, models, features, controls, cache, _rows_by_length(plans), least=frames or 1, **encoding)
+    sources = feature_cache.sources(table, models, features, controls, cache, rows, least=frames or 1, **encoding)
     if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
         raise UserError("--join has no effect without --frames longer than a clip of the model.")
-    protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else ("honest",)
+    protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else (protocol,)
     results = []
     for source in sources:
-        scored = _run_plans(source, plans, seeds, heads, protocols, recipe, order)
-        results += [{"features": source.name} | row for row in scored]
+        for length, ids in rows.items():
+            source.store.add(ids, length)
+        for plan in plans:
+            labelled = _labelled(source, plan)
+            notes, about = [*plan.notes, *source.notes(plan.rows.sensors)], {"frames": plan.frames, "order": order}
+            about |= {"order": "right"} if plan.frames == 1 else {}
+            for name, each in itertools.product(heads, protocols):
+                head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
+                scored = _score(labelled, plan, head, each, seeds)
+                names = {"features": source.name, "task": plan.task.name, "head": name, "protocol": each}
+                results.append(names | scored | about | {"notes": notes + scored["notes"]})
         log(f"probed {source.name}")
-    configs = {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder}
     report = {
-        "manifest": table.content_hash, "data": [str(path) for path in data], "paper": paper, "seeds": seeds,
-        "sides": {name: list(sides.get(name) or ()) or None for name in SIDES}, "runs": configs, "left_out": left_out,
-        "results": results,
+        "manifest": table.content_hash, "data": [str(path) for path in table.files], "paper": paper, "seeds": seeds,
+        "sides": {name: list(sides.get(name) or ()) or None for name in SIDES},
+        "runs": {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder},
+        "left_out": left_out, "results": results,
     }  # fmt: skip
     if out is not None:
         atomic_write(out, json.dumps(report, indent=2, allow_nan=False))
     return report
 
 
-def probe_benchmark(models: Paths, data: Paths, benchmark: str, **options: Any) -> dict[str, Any]:
+def probe_benchmark(models: Models, data: Paths | Manifest, benchmark: str, **options: Any) -> dict[str, Any]:
     """Probe a public benchmark with the authors' pooling, head and settings, by both protocols.
 
     `options` are the others of `probe_tasks`, which returns the result. Raises UserError.
     """
-    setting = tasks.find_benchmark(benchmark)
+    setting = tasks.find(tasks.BENCHMARKS, benchmark, "benchmark")
     return probe_tasks(
         models, data, [setting.task], heads=("gradient",), protocol="published", pooling=setting.pooling,
         universal=setting.universal, recipe=setting.recipe, paper=setting.paper, **options,
     )  # fmt: skip
-
-
-def score_tasks(
-    encoder: Encoder | FeatureStore | None, table: Manifest, names: Sequence[str | Task], *, cache: Path | None = None,
-    seeds: int = 5, frames: int | None = None, pooling: Pooling = "class", join: Join = "mean",
-    protocols: Sequence[Protocol] = ("honest",), order: Order = "right", head_names: Sequence[HeadName] = ("linear",),
-    recipe: GradientRecipe | None = None, universal: bool = False, max_rows: int | None = None, **sides: Names,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Probe features of an encoder, of a store, or (None) of raw pixels on tasks of a manifest.
-
-    Returns a JSON-ready dict for each task, head and protocol. Keys: task, head, protocol; metric, "accuracy" in 0..1
-    or "r2"; mean over seeds, low, high (95 % over seeds and test groups), values (one a seed); train, test (rows);
-    groups (tested); classes; chance, the score of the most frequent class or the mean of train; chosen options; frames;
-    order; notes. A regression also has mae, mae_low, mae_high and chance_mae in `unit`.
-
-    `frames` replaces that of each task. `order` shuffles the frames of clips, or repeats the last. `universal`: the
-    universal tokens for all sensors. `sides`: train_sensors, test_sensors, train_units and test_units, names or
-    patterns to fit on and to test on. Raises UserError.
-    """
-    if encoder is None:
-        source = _Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common")
-    elif isinstance(encoder, FeatureStore):
-        source = _Source("features", encoder)
-    else:
-        options: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
-        source = _Source("encoder", feature_cache.encoder_features(encoder, table, folder=cache, **options), encoder)
-    plans = [_plan(table, tasks.find_task(name), frames, sides, max_rows) for name in names]
-    return _run_plans(source, plans, seeds, head_names, protocols, recipe, order)
-
-
-def _sources(
-    table: Manifest, models: Paths, features: Paths, controls: bool, cache: Path | None, rows: dict[int, Array],
-    order: Order = "right", least: int = 1, **encoding: Any,
-) -> list[_Source]:  # fmt: skip
-    """Return models, the random encoder, features files and raw pixels, in this order.
-
-    `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of every clip.
-    """
-    encoders = {str(path): load_encoder(path) for path in models}
-    if controls:
-        first = next(iter(encoders.values()), None)
-        encoders[RANDOM] = random_encoder(first.config if first else preset("tiny"))
-    sources = []
-    for name, encoder in encoders.items():
-        check_frames(encoder.config.model, least)
-        store = feature_cache.encoder_features(encoder, table, order=order, folder=cache, **encoding)
-        sources.append(_Source(name, store, encoder))
-    for path in features:
-        sources.append(_Source(str(path), feature_cache.file_features(Path(path), table)))
-        for frames, ids in rows.items():
-            sources[-1].store.add(ids, frames)
-    if controls:
-        sources.append(_Source(RAW, feature_cache.pixel_features(table, order=order, folder=cache), None, "common"))
-    if not sources:
-        raise UserError("There is nothing to probe. Give --model or --features, or keep the controls.")
-    return sources
 
 
 def _plan_tasks(
@@ -278,88 +489,28 @@ def _plan(table: Manifest, task: Task, frames: int | None, sides: dict[str, Name
     if unknown := sides.keys() - set(SIDES):
         raise TypeError(f"Unknown options {', '.join(sorted(unknown))}.")
     rows = tasks.select(table, task, frames)
-    rows = rows.take(np.flatnonzero(np.logical_or(*_side_masks(rows, sides))))
-    used = np.flatnonzero(splits.split_scheme(_roles(task, rows, sides)[0])[1])
+    roles, _ = splits.assign_roles(task, rows, sides)
+    used = np.flatnonzero(splits.split_scheme(roles)[1] & (roles.may_fit | roles.may_test))
     rows = rows.take(splits.subsample(used, max_rows or len(used)))
-    roles, names = _roles(task, rows, sides)
+    roles, names = splits.assign_roles(task, rows, sides)
     scheme, _, why = splits.split_scheme(roles)
     notes = [*rows.notes, why]
     notes += [f"{name.replace('_', ' ')} {', '.join(patterns)}" for name in SIDES if (patterns := sides.get(name))]
     if scheme == "split" and not roles.measured:
-        notes += array_probes.unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
+        notes += splits.unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
     return _Plan(task, rows, roles, names, frames or task.frames, [note for note in notes if note])
 
 
-def _side_masks(rows: TaskRows, sides: dict[str, Names]) -> list[Array]:
-    """Return which rows may be fitted on and which may be tested. Raises UserError for an unknown sensor or unit."""
-    masks = []
-    for side in ("train", "test"):
-        mask = np.ones(len(rows.labels), bool)
-        for kind, column in (("sensor", rows.sensors), ("unit", rows.units)):
-            patterns, known = sides.get(f"{side}_{kind}s") or (), np.unique(column)
-            for pattern in patterns:
-                if not any(fnmatch(name, pattern) for name in known):
-                    raise UserError(f"No row has the {kind} {pattern!r}. There are {', '.join(known) or 'none'}.")
-            if patterns:
-                mask &= np.isin(column, [name for name in known if any(fnmatch(name, each) for each in patterns)])
-        masks.append(mask)
-    return masks
-
-
-def _roles(task: Task, rows: TaskRows, sides: dict[str, Names]) -> tuple[RowRoles, Array]:
-    """Return the roles of the rows and the class names. Raises UserError if nothing is left to fit on or to test."""
-    measured = task.kind == "regression"
-    names, y = (np.array([], str), rows.labels) if measured else np.unique(rows.labels, return_inverse=True)
-    test = rows.split == "test"
-    may_fit, may_test = _side_masks(rows, sides)
-    roles = RowRoles(y, rows.groups, ~test, test, may_fit, may_test, measured)
-    for mask, purpose in ((roles.tested, "test"), (roles.may_fit, "train")):
-        if not mask.any():
-            raise UserError(f"Task {task.name}: no row is left to {purpose}. Check the splits, sensors and units.")
-    if measured and np.ptp(y[roles.tested]) == 0:
-        raise UserError(f"Task {task.name}: {task.label} is constant on test. R2 has no meaning there.")
-    if not measured and len(names) < 2:
-        raise UserError(f"Task {task.name}: the label is {str(names[0])!r} on every row. A probe needs two classes.")
-    return roles, names
-
-
-def _rows_by_length(plans: Sequence[_Plan]) -> dict[int, Array]:
-    """Return the rows of all tasks by length of clip: one pass computes their features."""
-    lengths = sorted({plan.frames for plan in plans})
-    return {n: np.concatenate([plan.rows.rows.ravel() for plan in plans if plan.frames == n]) for n in lengths}
-
-
-def _run_plans(
-    source: _Source, plans: Sequence[_Plan], seeds: int, head_names: Sequence[HeadName], protocols: Sequence[Protocol],
-    recipe: GradientRecipe | None, order: Order,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Return the rows of `score_tasks`."""
-    if seeds < 1:
-        raise UserError(f"seeds must be at least 1, not {seeds}.")
-    for length, ids in _rows_by_length(plans).items():
-        source.store.add(ids, length)
-    results = []
-    for plan in plans:
-        x = source.store.get(plan.rows.rows, plan.frames)
-        if not np.isfinite(x).all():
-            raise UserError(f"Task {plan.task.name}: features are NaN or infinite. Did the training diverge?")
-        if source.scaling == "common":  # components are fitted on rows that are never tested, if there are any
-            fitted = plan.roles.train if splits.split_scheme(plan.roles)[0] == "split" else np.ones(len(x), bool)
-            with logistic.threads(x.size * feature_cache.COMPONENTS):
-                x = feature_cache.principal_components(x, fitted, solver="randomized")
-        labelled = LabelledFeatures(x, plan.roles.y, plan.names, plan.roles.groups)
-        notes, encoder = list(plan.notes), source.encoder
-        if encoder is not None:
-            trained = encoder.config.model.sensors if encoder.trained_sensors is None else encoder.trained_sensors
-            unknown = sorted(set(plan.rows.sensors) - set(trained))
-            notes += [f"universal tokens for {', '.join(unknown)}"] if unknown else []
-        about = {"frames": plan.frames, "order": order if plan.frames > 1 else "right"}
-        for name, protocol in itertools.product(head_names, protocols):
-            head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
-            scored = _score(labelled, plan, head, protocol, seeds)
-            names = {"task": plan.task.name, "head": name, "protocol": protocol}
-            results.append(names | scored | about | {"notes": notes + scored["notes"]})
-    return results
+def _labelled(source: FeatureSource, plan: _Plan) -> LabelledFeatures:
+    """Return the features and labels of a task; of raw pixels their principal components."""
+    x = source.store.get(plan.rows.rows, plan.frames)
+    if not np.isfinite(x).all():
+        raise UserError(f"Task {plan.task.name}: features are NaN or infinite. Did the training diverge?")
+    if source.scaling == "common":  # components are fitted on rows that are never tested, if there are any
+        fitted = ~plan.roles.test if splits.split_scheme(plan.roles)[0] == "split" else np.ones(len(x), bool)
+        with logistic.threads(x.size * feature_cache.COMPONENTS):
+            x = feature_cache.principal_components(x, fitted, solver="randomized")
+    return LabelledFeatures(x, plan.roles.y, plan.names, plan.roles.groups)
 
 
 def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Protocol, seeds: int) -> dict[str, Any]:
@@ -371,49 +522,16 @@ def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Proto
         if seed and protocol == "published" and len(cuts) == 1 and head.name != "gradient":
             runs.append(runs[0])  # nothing is drawn: every seed is the same fit
             continue
-        predictions, constants = [], []
-        for cut in cuts:
-            option, predicted, finished = _predict(data, cut, dataclasses.replace(head, seed=seed), protocol)
-            unfinished += not finished
-            fitted = roles.y[cut.fit]
-            constants.append(np.full(len(cut.test), fitted.mean() if roles.measured else heads.majority_class(fitted)))
-            predictions.append(predicted)
-            chosen.append(option)
-            sizes.append(len(cut.fit))
+        parts = [_predict(data, cut, replace(head, seed=seed), protocol) for cut in cuts]
         tested = np.concatenate([cut.test for cut in cuts])
-        truth, groups = roles.y[tested], roles.groups[tested]
-        for several, parts in ((runs, predictions), (baselines, constants)):
-            if roles.measured:
-                sums = statistics.regression_sums(np.concatenate(parts) - truth, truth - roles.y.mean(), groups)
-            else:
-                sums = statistics.classification_sums(np.concatenate(parts) == truth, groups)
-            several.append(sums)
-
-    def values(of: Callable[[Array], Array], several: Sequence[GroupSums] = runs) -> list[float]:
-        return [float(of(run.sums.sum(0))) for run in several]
-
-    metric = statistics.r2_of if roles.measured else statistics.mean_of
-    low, high = statistics.bootstrap_interval(runs, metric)
-    result: dict[str, Any] = {
-        "metric": "r2" if roles.measured else "accuracy", "mean": float(np.mean(values(metric))), "low": low,
-        "high": high, "values": values(metric), "train": round(float(np.mean(sizes))), "test": len(runs[0].groups),
-        "classes": data.names.tolist(), "chance": float(np.mean(values(metric, baselines))),
+        runs.append(_sums(data, np.concatenate([predicted for *_, predicted in parts]), tested))
+        baselines.append(_sums(data, np.concatenate([_constant(data, cut) for cut in cuts]), tested))
+        chosen += [selected.option for selected, *_ in parts]
+        sizes += [len(cut.fit) for cut in cuts]
+        unfinished += sum(model is not None and not model.fit.finished for _, model, _ in parts)
+    scores = statistics.scores(runs, baselines, roles.measured) | ({"unit": plan.task.unit} if roles.measured else {})
+    return scores | {
+        "train": round(float(np.mean(sizes))), "test": len(runs[0].groups), "classes": data.names.tolist(),
+        "groups": len(np.unique(runs[0].groups)), "chosen": chosen,
+        "notes": [f"{unfinished} of {len(chosen)} fits did not converge"] if unfinished else [],
     }  # fmt: skip
-    if roles.measured:
-        mae_low, mae_high = statistics.bootstrap_interval(runs, statistics.mae_of)
-        mae, chance = (float(np.mean(values(statistics.mae_of, several))) for several in (runs, baselines))
-        result |= {"mae": mae, "mae_low": mae_low, "mae_high": mae_high, "chance_mae": chance, "unit": plan.task.unit}
-    notes = [f"{unfinished} of {len(chosen)} fits did not converge"] if unfinished else []
-    return result | {"groups": len(np.unique(runs[0].groups)), "chosen": chosen, "notes": notes}
-
-
-def _predict(data: LabelledFeatures, cut: Split, head: ProbeHead, protocol: Protocol) -> tuple[float, Array, bool]:
-    """Return the selected option, its predictions for the test rows, and whether its fit converged."""
-    selected = array_probes.select_option(head, data, cut, protocol)
-    fitted, index = selected.fitted, selected.place
-    assert fitted is not None  # an honest cut has rows of val
-    if head.name != "gradient" and len(cut.fit) > splits.SELECT_ROWS:
-        start = fitted.models[index] if fitted.models else None
-        fitted, index = data.fit(dataclasses.replace(head, options=(selected.option,)), cut.fit, start=start), 0
-    finished = all(model.finished for model in fitted.models[index : index + 1])
-    return selected.option, fitted.predict(data.x[cut.test])[index], finished

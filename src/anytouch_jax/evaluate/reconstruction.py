@@ -22,7 +22,7 @@ from anytouch_jax.ops import losses, tokens
 if TYPE_CHECKING:
     from anytouch_jax.nn.functional import Net
 
-_GREY, _GAP = 128, 4
+_GREY, _GAP, _TITLE = np.uint8(128), 4, 16
 
 
 def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config) -> dict[str, float]:
@@ -39,7 +39,7 @@ def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net,
     frames = config.model.frames + config.objective.next_frame
     for ids, batch in evaluation(manifest, ends, config, "clip", frames=frames, unknown="universal"):
         n = len(ids)  # the rest of the last batch repeats its last row
-        noise = jax.random.uniform(jax.random.key(count), (len(batch.sensor), config.model.patches))
+        noise = jax.random.uniform(jax.random.key(count), (len(batch.sensor), config.model.patches), jnp.float32)
         errors = _errors(params, batch.clip[:n], batch.sensor[:n], noise[:n], net=net, config=config)
         sums = {name: sums.get(name, 0.0) + float(value) * n for name, value in errors.items()}
         count += n
@@ -83,52 +83,36 @@ def reconstruction_panels(
     `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). Visible patches are copied from the input. With `norm_pix_loss` the
     prediction is scaled back by the true mean and spread of each patch.
     """
-    noise = jax.random.uniform(jax.random.key(seed), (len(sensor), net.model.patches))
+    patch, size, frames = net.model.patch, net.model.image_size, net.model.frames
+    noise = jax.random.uniform(jax.random.key(seed), (len(sensor), net.model.patches), jnp.float32)
     pixels, hidden = _predict(params, clip, sensor, noise, net=net, config=config)
-    return _panels(np.asarray(clip), np.asarray(pixels), np.asarray(hidden), net, config)
+    if config.objective.norm_pix_loss:
+        target = tokens.patchify(normalise_touch(jnp.asarray(clip)), patch)
+        spread = jnp.sqrt(target.var(axis=-1, ddof=1, keepdims=True) + 1e-6)
+        pixels = pixels * spread + target.mean(axis=-1, keepdims=True)
+    predicted = np.asarray(tokens.unpatchify(pixels, patch, size)) * IMAGENET_STD + IMAGENET_MEAN
+    predicted = np.clip(np.nan_to_num(predicted * 255), 0, 255).astype(np.uint8)
+    of_pixels = hidden[:, :, None, None].repeat(patch**2 * 3, 3)
+    cover, clip = np.asarray(tokens.unpatchify(of_pixels, patch, size)) > 0, np.asarray(clip)
+    shown = clip[:, :frames]
+    masked, filled = np.where(cover, _GREY, shown), np.where(cover, predicted[:, : shown.shape[1]], shown)
+    blocks = {"original": shown, "visible": masked, "reconstructed": filled}
+    if clip.shape[1] > frames:
+        blocks |= {"next frame": clip[:, frames : frames + 1], "predicted": predicted[:, frames : frames + 1]}
+    gap = ((0, 0), (0, 0), (0, _GAP), (0, _GAP), (0, 0))
+    columns = []
+    for name, block in blocks.items():
+        pictures = np.pad(block, gap, constant_values=255)  # (B, T, h, w, 3)
+        column = pictures.transpose(0, 2, 1, 3, 4).reshape(len(block) * (size + _GAP), -1, 3)
+        title = np.full((_TITLE, column.shape[1], 3), 255, np.uint8)
+        cv2.putText(title, name, (2, _TITLE - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+        columns.append(np.concatenate([title, column]))
+    return np.concatenate(columns, axis=1)
 
 
 @partial(jax.jit, static_argnames=("net", "config"))
 def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
-    pixels, hidden = reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
-    return pixels, hidden
-
-
-def _panels(clip: np.ndarray, pred: np.ndarray, hidden: np.ndarray, net: Net, config: Config) -> np.ndarray:
-    patch, size, frames = net.model.patch, net.model.image_size, net.model.frames
-    if config.objective.norm_pix_loss:
-        target = np.asarray(tokens.patchify(normalise_touch(jnp.asarray(clip)), patch))
-        spread = np.sqrt(target.var(axis=-1, ddof=1, keepdims=True) + 1e-6)
-        pred = pred * spread + target.mean(axis=-1, keepdims=True)
-    predicted = _to_pixels(np.asarray(tokens.unpatchify(jnp.asarray(pred), patch, size)))
-    of_pixels = jnp.asarray(hidden)[:, :, None, None].repeat(patch**2 * 3, 3)
-    cover = np.asarray(tokens.unpatchify(of_pixels, patch, size)) > 0
-    count = min(clip.shape[1], frames)
-    masked = np.where(cover, _GREY, clip[:, :count])
-    filled = np.where(cover, predicted[:, :count], clip[:, :count])
-    blocks = {"original": clip[:, :count], "visible": masked, "reconstructed": filled}
-    if clip.shape[1] > frames:
-        blocks |= {"next frame": clip[:, frames : frames + 1], "predicted": predicted[:, frames : frames + 1]}
-    rows = [np.concatenate([_strip(block[i]) for block in blocks.values()], axis=1) for i in range(len(clip))]
-    titles = [_title(name, block.shape[1] * (size + _GAP)) for name, block in blocks.items()]
-    return np.concatenate([np.concatenate(titles, axis=1), *rows], axis=0)
-
-
-def _title(name: str, width: int) -> np.ndarray:
-    """Return a white strip (16, width, 3) with a word on it."""
-    strip = np.full((16, width, 3), 255, np.uint8)
-    cv2.putText(strip, name, (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-    return strip
-
-
-def _strip(frames: np.ndarray) -> np.ndarray:
-    """Return frames (T, H, W, 3) in a row, with a white edge."""
-    return np.concatenate([np.pad(f, ((0, _GAP), (0, _GAP), (0, 0)), constant_values=255) for f in frames], axis=1)
-
-
-def _to_pixels(normalised: np.ndarray) -> np.ndarray:
-    pixels = (normalised * np.asarray(IMAGENET_STD) + np.asarray(IMAGENET_MEAN)) * 255
-    return np.clip(np.nan_to_num(pixels), 0, 255).astype(np.uint8)
+    return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
 
 
 def write_png(path: Path, image: np.ndarray) -> None:

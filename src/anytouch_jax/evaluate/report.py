@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import tempfile
 import time
@@ -11,9 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
+import jax
 import numpy as np
-import numpy.typing as npt
 
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.images import decode
@@ -25,27 +23,26 @@ from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import array_probes, geometry, plots, retrieval, statistics
-from anytouch_jax.evaluate.array_probes import ProbeResult
-from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
+from anytouch_jax.evaluate import geometry, plots, probing, retrieval, statistics
+from anytouch_jax.evaluate.feature_cache import RANDOM, background_difference, principal_components
 from anytouch_jax.evaluate.heads import ProbeHead
+from anytouch_jax.evaluate.plots import ShareBar
+from anytouch_jax.evaluate.probing import ProbeResult
 from anytouch_jax.evaluate.reconstruction import pixel_scores, reconstruction_panels, write_png
 from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
-from anytouch_jax.files import atomic_write
+from anytouch_jax.evaluate.statistics import Array
+from anytouch_jax.evaluate.tasks import best_rows
+from anytouch_jax.files import atomic_write, read_array
 
-Array = npt.NDArray[Any]
 Log = Callable[[str], None]
 Change = tuple[float, float | None, float | None]  # a difference with its interval
 
-RANDOM, PIXELS, VECTOR = "random encoder", "pixels minus background", "area, centroid, force"
-LABELS = ("hardness", "roughness", "material", "indenter")
-QUANTITIES = ("force",)
+PIXELS, VECTOR = "pixels minus background", "area, centroid, force"
+LABELS = ("hardness", "roughness", "material", "indenter", "force")
 FEWEST = 4  # rows of a t-SNE
 _T_SNE_ROWS = 800
 _CLIPS = 240  # on which reconstruction errors are measured
 _SHOWN = 5  # touches in a sample grid
-_SIDE = 200  # pixels of the longer side of a sample
-_COLUMNS = (("matched", False), ("matched", True), ("by chance", False), ("by chance", True))
 
 
 @dataclass(frozen=True)
@@ -62,59 +59,30 @@ class Section:
 def write_report(
     folder: Path, sections: Sequence[Section], *, title: str = "Report", numbers: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write `folder`/report.md, report.json (`numbers`) and figures/, and return the path of report.md.
+    """Write `folder`/report.md, report.json (`numbers`) and copies of the figures, and return the path of report.md.
 
-    Figures from elsewhere are copied. The figures are written first and report.md last, each atomically, so an existing
-    report is always complete. Raises UserError for a missing figure, OSError for a full disk.
+    The figures are written first and report.md last, each atomically, so an existing report is always complete. Raises
+    UserError for a missing figure, OSError for a full disk.
     """
-    lines = [f"# {title}"]
-    drawn = [section.figure.name for section in sections if section.figure is not None]
-    for number, section in enumerate(sections, 1):
-        lines.append(f"## {section.title}")
-        if section.text:
-            lines.append(section.text.strip())
+    parts = [f"# {title}"]
+    for section in sections:
+        parts += [f"## {section.title}", section.text]
         if section.figure is not None:
-            own = section.figure.name
-            target = folder / "figures" / (f"{number:02d}_{own}" if drawn.count(own) > 1 else own)
             if not section.figure.is_file():
-                raise UserError(f"there is no figure {section.figure} for the report; draw it first or leave it out")
-            if section.figure.resolve() != target.resolve():
-                atomic_write(target, section.figure.read_bytes())
-            lines.append(f"![{section.title}](figures/{target.name})")
-        lines += [part.strip() for part in (section.table, section.notes) if part]
+                raise UserError(f"There is no figure {section.figure} for the report. Draw it first, or leave it out.")
+            atomic_write(folder / "figures" / section.figure.name, section.figure.read_bytes())
+            parts.append(f"![{section.title}](figures/{section.figure.name})")
+        parts += [section.table, section.notes]
     if numbers is not None:
         atomic_write(folder / "report.json", json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n")
-    atomic_write(folder / "report.md", "\n\n".join(lines) + "\n")
+    atomic_write(folder / "report.md", "\n\n".join(part.strip() for part in parts if part) + "\n")
     return folder / "report.md"
 
 
-@dataclass(frozen=True, eq=False)
-class _Study:
-    """The chosen rows of a manifest with the features of each encoder: class token, and mean of the patch tokens."""
-
-    manifest: Manifest
-    rows: Array
-    split: Array
-    classes: dict[str, Array]
-    patches: dict[str, Array]
-    pixels: Array | None
-    notes: tuple[str, ...]
-
-    def test(self, values: Array) -> Array:
-        return values[self.split == "test"]
-
-
 def demo_report(
-    manifest: str | Path,
-    stage1: str | Path,
-    stage2: str | Path,
-    out: str | Path,
-    log: Log = print,
-    *,
-    touches: int = 200,
-    gallery_size: int = retrieval.GALLERY,
-    seed: int = 0,
-) -> Path:
+    manifest: str | Path, stage1: str | Path, stage2: str | Path, out: str | Path, log: Log = print, *,
+    touches: int = 200, gallery_size: int = retrieval.GALLERY, seed: int = 0,
+) -> Path:  # fmt: skip
     """Write a report of two runs on the split test of a manifest, and return the path of report.md.
 
     It has samples, losses, reconstructions, the feature space, retrieval, matching and probes. `touches` is the largest
@@ -122,13 +90,33 @@ def demo_report(
     written at the end, so a report that fails leaves an earlier one unchanged. Raises UserError, also for a run of the
     other stage and for weights files.
     """
-    clock, out = time.perf_counter(), Path(out)
-    table = manifests.read(manifest)
-    _check_touches(table, touches, seed)
-    with tempfile.TemporaryDirectory(prefix="anytouch-report-") as drawn:
-        sections, numbers = _contents(table, Path(stage1), Path(stage2), Path(drawn), log, touches, gallery_size, seed)
-        numbers = {"manifest": str(manifest), **numbers, "seconds": round(time.perf_counter() - clock, 1)}
-        path = write_report(out, sections, title="What the demo learned", numbers=numbers)
+    clock, table = time.perf_counter(), manifests.read(manifest)
+    if (count := len(_chosen(table, "test", touches, seed))) < FEWEST:
+        raise UserError(
+            f"The report needs {FEWEST} frames of deepest contact. The split test gives {count} with --touches "
+            f"{touches}, {len(_chosen(table, 'test', len(table), seed))} at most. Give more touches."
+        )
+    runs = {"stage 1": Path(stage1), "stage 2": Path(stage2)}
+    first, second = (_encoder_of_stage(run, stage) for stage, run in enumerate(runs.values(), 1))
+    numbers: dict[str, Any] = {"manifest": str(manifest), "data": table.content_hash}
+    numbers |= {name.replace(" ", ""): str(run) for name, run in runs.items()}
+    double = first.config.model.dtype == "float64"
+    with tempfile.TemporaryDirectory(prefix="anytouch-report-") as folder, jax.enable_x64(double):
+        drawn = Path(folder)
+        sections = [_facts(table, first, second, _lineage(runs["stage 1"], second))]
+        sections += [*samples_section(table, drawn, seed=seed), _losses(runs, drawn)]
+        parts: dict[str, tuple[Section, Any]] = {"pixels": reconstructions_section(table, first, drawn)}
+        log("report: samples, losses and reconstructions are drawn")
+        encoders = {RANDOM: random_encoder(first.config, seed), "stage 1": first, "stage 2": second}
+        study = _study(table, encoders, touches, seed, log)
+        log(f"report: {len(study.rows)} frames embedded by {len(encoders)} encoders")
+        parts |= {"space": _space(study, drawn, seed), "retrieval": _retrieval(study, drawn, gallery_size)}
+        log("report: t-SNE is drawn, retrieval is scored")
+        parts |= {"matching": _matching(study, second), "probes": _probes(study, drawn)}
+        sections += [section for section, _ in parts.values()]
+        numbers |= {name: scored for name, (_, scored) in parts.items()}
+        numbers["seconds"] = round(time.perf_counter() - clock, 1)
+        path = write_report(Path(out), sections, title="What the demo learned", numbers=numbers)
     log(f"{path}: written in {numbers['seconds']:.0f} s")
     return path
 
@@ -136,38 +124,12 @@ def demo_report(
 def _encoder_of_stage(run: Path, stage: int) -> Encoder:
     """Return the encoder of a run. Raises UserError for a weights file, which has no losses, and for another stage."""
     if run.is_file():
-        raise UserError(f"--stage{stage} {run} is a weights file; give the folder of a run of stage {stage}")
+        raise UserError(f"--stage{stage} {run} is a weights file. Give the folder of a run of stage {stage}.")
     encoder = load_encoder(run)
     if encoder.config.stage != stage:
         meant = "the stage 1 from which stage 2 started" if stage == 1 else "a stage 2 that started from stage 1"
-        raise UserError(f"--stage{stage} {run} is a run of stage {encoder.config.stage}; give {meant}")
+        raise UserError(f"--stage{stage} {run} is a run of stage {encoder.config.stage}. Give {meant}.")
     return encoder
-
-
-def _contents(
-    table: Manifest, stage1: Path, stage2: Path, out: Path, log: Log, touches: int, gallery_size: int, seed: int
-) -> tuple[list[Section], dict[str, Any]]:
-    """Return the sections of a report, their figures drawn in `out`, and its numbers."""
-    first, second = _encoder_of_stage(stage1, 1), _encoder_of_stage(stage2, 2)
-    encoders = {RANDOM: random_encoder(first.config, seed), "stage 1": first, "stage 2": second}
-    numbers: dict[str, Any] = {"data": table.content_hash, "stage1": str(stage1), "stage2": str(stage2)}
-    sections = [_facts(table, first, second, _lineage(stage1, second)), *samples_section(table, out, seed=seed)]
-    sections.append(losses_section({"stage 1": stage1, "stage 2": stage2}, out))
-    section, numbers["pixels"] = reconstructions_section(table, first, out)
-    sections.append(section)
-    log("report: samples, losses and reconstructions are drawn")
-    study = _study(table, encoders, touches, seed, log)
-    log(f"report: {len(study.rows)} touches embedded by {len(encoders)} encoders")
-    section, numbers["space"] = _space(study, out, seed)
-    sections.append(section)
-    log("report: t-SNE is drawn")
-    section, numbers["retrieval"] = _retrieval(study, out, gallery_size)
-    sections.append(section)
-    section, numbers["matching"] = _matching(study, second)
-    sections.append(section)
-    log("report: retrieval and matching are scored")
-    section, numbers["probes"] = _probes(study, out)
-    return [*sections, section], numbers
 
 
 def _lineage(stage1: Path, second: Encoder) -> str:
@@ -188,7 +150,7 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
         part = split == name
         if part.any():
             counts = (part.sum(), len(np.unique(touch[part & (touch >= 0)])), len(set(objects[part]) - {""}))
-            rows.append((name, *map(str, counts), ", ".join(sorted(set(sensors[part])))))
+            rows.append((name, *counts, ", ".join(sorted(set(sensors[part])))))
     text = (
         f"Data {table.content_hash[:12]}. Stage 1: preset {first.config.preset}, {first.config.run.steps} steps of "
         f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of {second.config.data.batch_size}, "
@@ -201,17 +163,137 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
     return Section("Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else "")
 
 
-def _check_touches(table: Manifest, touches: int, seed: int) -> None:
-    """Raise UserError for too few touches in split test, or in `touches`."""
-    count = len(_chosen(table, "test", touches, seed))
-    if count < FEWEST:
-        every = _chosen(table, "test", len(table), seed)
-        all_touches = len(np.unique(table.codes("touch", own=True)[every]))
-        advice = "give more --touches" if len(every) >= FEWEST else "simulate or record more"
-        raise UserError(
-            f"the manifest's test split has {all_touches} touches, of which the report would have {count} frames, and "
-            f"it needs {FEWEST}; {advice}"
-        )
+def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
+    """Return a section for each grade of alignment: a picture with a touch per row and a sensor per column, captions.
+
+    The touches are those by most sensors, of different objects if possible.
+    """
+    rows, sections = deepest_rows(manifest), []
+    grades = _grades(manifest, rows, "")
+    for grade in np.unique(grades):
+        part = rows[grades == grade]
+        sensor, touch = text_column(manifest, "sensor")[part], manifest.codes("touch", own=True)[part]
+        objects, names = text_column(manifest, "object")[part], np.unique(sensor).tolist()
+        images, titles, captions = [], [], []
+        for code in _varied_touches(touch, sensor, objects, seed):
+            row_of = {str(sensor[i]): int(part[i]) for i in np.flatnonzero(touch == code)[::-1]}
+            texts = [manifest.value(row, "text") for row in row_of.values()]
+            pictured = [row for row in row_of.values() if manifest.value(row, "image_path") is not None]
+            photo = decode(manifest.file(pictured[0], "image_path")) if pictured else None
+            images.append([_picture(manifest, row_of.get(name)) for name in names] + [photo])
+            titles.append(str(objects[touch == code][0]) or f"touch {code}")
+            captions.append(next((" ".join(text.split()) for text in texts if text), "no caption"))
+        suffix = "".join(letter if letter.isalnum() else "_" for letter in f"_{grade}" if grade)
+        path = folder / "figures" / f"samples{suffix}.png"
+        plots.sample_grid(path, images, titles, [*names, "photograph"])
+        notes = "\n".join(f"{i + 1}. *{title}*: {captions[i]}" for i, title in enumerate(titles))
+        text = "Rows are touches, columns are sensors, each at the deepest frame. Captions are below."
+        sections.append(Section(f"Samples{', ' if grade else ''}{grade}", text, figure=path, notes=notes))
+    return sections
+
+
+def _grades(table: Manifest, rows: Array, default: str) -> Array:
+    known = "grade" in table.table.column_names
+    return text_column(table, "grade")[rows] if known else np.full(len(rows), default)
+
+
+def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> list[int]:
+    """Return the touches by most sensors, one per object before any object comes again."""
+    codes, first = np.unique(touch, return_index=True)
+    sensors = np.array([len(set(sensor[touch == code])) for code in codes])
+    order = np.lexsort((np.random.default_rng(seed).random(len(codes)), -sensors))
+    names = objects[first[order]]
+    turn = [np.sum(names[:place] == name) for place, name in enumerate(names)]  # how often the object came before
+    return codes[order[np.argsort(turn, kind="stable")]][:_SHOWN].tolist()
+
+
+def _picture(manifest: Manifest, row: int | None) -> Array | None:
+    """Return the frame of a row; of a force-field sensor the length of its displacement (three channels), mm."""
+    if row is None:
+        return None
+    if manifest.value(row, "sensor") not in FIELD_SENSORS:
+        return decode(manifest.file(row))
+    column = "field_path" if manifest.value(row, "field_path") is not None else "path"
+    try:
+        field = read_array(read_file(manifest.file(row, column)))
+    except ValueError as error:
+        raise UserError(f"{manifest.where(row)}, column {column!r}, is no field of forces: {error}.") from None
+    return np.linalg.norm(field[..., :3], axis=-1) if field.ndim == 3 else field
+
+
+def _losses(runs: Mapping[str, Path], folder: Path) -> Section:
+    """Return the loss curves of runs {title: run folder}, and the first and last smoothed value of each term."""
+    path, rows = folder / "figures" / "losses.png", []
+    plots.loss_curves(path, runs)
+    for title, run in runs.items():
+        lines = plots.read_metrics(run)
+        for name in plots.TERMS:
+            values = np.array([line[name] for line in lines if line.get(name) is not None])
+            if len(values):
+                smooth = plots.smoothed(values)
+                rows.append((title, name.replace("_", " "), len(lines), f"{smooth[0]:.3f}", f"{smooth[-1]:.3f}"))
+    table = statistics.markdown_table(("run", "term", "steps", "at the start", "at the end"), rows)
+    return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
+
+
+def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) -> tuple[Section, dict[str, Any]]:
+    """Return masked patches and next frames of stage 1 on a test clip of each sensor, and its errors."""
+    config, params = encoder.config, encoder.params | {"decoder": encoder.part_params("decoder")}
+    rows, frames = _with_images(manifest, manifest.rows_of("test")), config.model.frames + 1
+    if config.objective.next_frame and config.data.clip_share > 0:  # else the head for clips is untrained
+        ends = np.intersect1d(manifest.clips(frames, "test")[:, -1], rows)
+    else:
+        ends = rows[:0]
+    scores = _pixel_errors(params, manifest, ends, encoder)
+    kind: Literal["still", "clip"] = "clip" if len(ends) else "still"
+    rows, frames = (ends, frames) if len(ends) else (rows, 1)
+    sensor = manifest.codes("sensor")[rows]
+    force = np.array([manifest.value(int(row), "label.force") or 0.0 for row in rows], np.float64)
+    rows = np.sort(best_rows(rows, sensor, force, rows))  # the last without forces
+    config = replace(config, data=replace(config.data, batch_size=len(rows)))
+    _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))
+    image = reconstruction_panels(params, batch.clip, batch.sensor, net=encoder.net, config=config)
+    path = folder / "figures" / "reconstructions.png"
+    write_png(path, image)
+    names = ", ".join(text_column(manifest, "sensor")[rows])
+    share = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
+    text = f"Stage 1 reads {share} of the patches of a held-out object. From above: {names}."
+    title, table = "Reconstructions", ""
+    if frames > 1:
+        title, text = f"{title} and next frames", f"{text} The last pair is the next frame and its prediction."
+    if scores:
+        kinds = {"untouched ": "untouched gel", "plain ": "mean of the visible patches; copy of the last frame"}
+        kinds = {"": "stage 1"} | {kind: name for kind, name in kinds.items() if f"{kind}reconstruction" in scores}
+        terms = {"reconstruction": "hidden patches", "next_frame": "next frame"}
+        lines = [(name, *(f"{scores[kind + term]:.4f}" for kind in kinds)) for term, name in terms.items()]
+        table = statistics.markdown_table((f"error on {scores['clips']} clips in contact", *kinds.values()), lines)
+    return Section(title, text, table, path), scores
+
+
+def _pixel_errors(params: Any, manifest: Manifest, ends: Array, encoder: Encoder) -> dict[str, Any]:
+    """Return errors of stage 1 and of its baselines on clips in contact, {} if there are none."""
+    ends, config = ends[known_contact(manifest)[ends] != 0], encoder.config  # in contact or unknown
+    if config.objective.norm_pix_loss or not len(ends):
+        return {}
+    ends = ends[np.linspace(0, len(ends) - 1, min(_CLIPS, len(ends))).astype(int)]
+    config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
+    return {"clips": len(ends)} | pixel_scores(params, manifest, ends, net=encoder.net, config=config)
+
+
+@dataclass(frozen=True, eq=False)
+class _Study:
+    """The chosen rows of a manifest with the features of each encoder: class token, and mean of the patch tokens."""
+
+    manifest: Manifest
+    rows: Array
+    split: Array
+    classes: dict[str, Array]
+    patches: dict[str, Array]
+    pixels: Array | None
+    notes: tuple[str, ...]
+
+    def test(self, values: Array) -> Array:
+        return values[self.split == "test"]
 
 
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, log: Log) -> _Study:
@@ -219,25 +301,28 @@ def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed:
     rows = np.concatenate([_chosen(table, name, count, seed) for name, count in most.items()])
     classes, patches = {}, {}
     for name, encoder in encoders.items():
-        embedded, values = embed_rows(encoder, table, rows, pooling="both", log=log)
-        if not np.array_equal(embedded, rows):
-            raise UserError(f"{len(rows) - len(embedded)} rows could not be read; repair the manifest first")
+        values = embed_rows(encoder, table, rows, pooling="both", log=log)[1]
         classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
-    pixels: Array | None = None
-    notes: tuple[str, ...] = ()
+    pixels, notes = _baseline(PIXELS, lambda: background_difference(table, rows))
+    return _Study(table, rows, text_column(table, "split")[rows], classes, patches, pixels, tuple(notes))
+
+
+def _baseline(name: str, make: Callable[[], Array]) -> tuple[Array | None, list[str]]:
     try:
-        pixels = background_difference(table, rows)
+        return make(), []
     except UserError as error:
-        notes = (f"no baseline by {PIXELS}: {error}",)
-    return _Study(table, rows, text_column(table, "split")[rows], classes, patches, pixels, notes)
+        return None, [f"no baseline by {name}: {error}"]
+
+
+def _with_images(table: Manifest, rows: Array) -> Array:
+    return rows[~np.isin(text_column(table, "sensor")[rows], FIELD_SENSORS)]
 
 
 def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
     """Return the deepest rows of at most `touches` whole touches of a split; none of an empty train or val."""
     if split != "test" and split not in set(text_column(table, "split")):
         return np.zeros(0, np.int64)
-    rows = table.rows_of(split)
-    rows = deepest_rows(table, rows[~np.isin(text_column(table, "sensor")[rows], FIELD_SENSORS)])
+    rows = deepest_rows(table, _with_images(table, table.rows_of(split)))
     codes = table.codes("touch", own=True)[rows]
     names = np.unique(codes)
     if len(names) > touches:
@@ -251,19 +336,16 @@ def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[geometry.
     sensors, objects = text_column(study.manifest, "sensor")[rows], text_column(study.manifest, "object")[rows]
     touch = study.manifest.codes("touch", own=True)[rows]
     drawn = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_T_SNE_ROWS])
-    spaces, points = [], {}
-    for name, values in study.classes.items():
-        features = study.test(values)
-        spaces.append(geometry.describe(features, sensors, objects, touch, name=name))
-        points[name] = geometry.tsne(features[drawn], seed=seed)
+    features = {name: study.test(values) for name, values in study.classes.items()}
+    spaces = [geometry.describe(values, sensors, objects, touch, name=name) for name, values in features.items()]
+    points = {name: geometry.tsne(values[drawn], seed=seed) for name, values in features.items()}
     path = out / "figures" / "tsne.png"
     plots.tsne_panels(path, points, sensors[drawn], objects[drawn])
-    head = ("features", "alignment", "uniformity", "silhouette by sensor", "silhouette by object", "touches")
     lines = []
     for space in spaces:
         figures = (space.alignment, space.uniformity, space.silhouette_sensor, space.silhouette_object)
-        cells = ("-" if value is None else f"{value:.3f}" for value in figures)
-        lines.append((space.name, *cells, str(space.rows)))
+        lines.append((space.name, *("-" if value is None else f"{value:.3f}" for value in figures), space.rows))
+    head = ("features", "alignment", "uniformity", "silhouette by sensor", "silhouette by object", "frames")
     text = (
         "The same touches by several sensors. Alignment: mean squared distance of one touch by two sensors (0 is "
         "best). Uniformity: lower is more even. Silhouette (-1 to 1): good alignment makes it low by sensor and high "
@@ -278,12 +360,11 @@ def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, 
     features = {name: study.test(values) for name, values in study.classes.items()}
     features |= {f"{name} (patches)": study.test(values) for name, values in study.patches.items()}
     features |= {} if study.pixels is None else {PIXELS: study.test(study.pixels)}
-    try:
-        features[VECTOR] = contact_vector(table, rows)
-    except UserError as error:
-        notes.append(f"no baseline by {VECTOR}: {error}")
-    grades = text_column(table, "grade")[rows] if "grade" in table.table.column_names else np.full(len(rows), "test")
-    sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
+    vector, missing = _baseline(VECTOR, lambda: contact_vector(table, rows))
+    features |= {} if vector is None else {VECTOR: vector}
+    notes += missing
+    grades, sensors = _grades(table, rows, "test"), text_column(table, "sensor")[rows]
+    touch = table.codes("touch", own=True)[rows]
     results: dict[str, dict[str, list[retrieval.Retrieval]]] = {}
     for grade in map(str, np.unique(grades)):
         part = np.flatnonzero(grades == grade)
@@ -302,182 +383,6 @@ def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, 
     return section, {"found": results, "differences": changes, "notes": notes}
 
 
-def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]:
-    """Return the scores of the matching head of stage 2 on the test rows."""
-    scores: list[retrieval.MatchScore] = []
-    notes: list[str] = []
-    try:
-        features = study.test(study.classes["stage 2"])
-        scores = retrieval.score_matching(encoder, study.manifest, study.test(study.rows), features)
-    except UserError as error:
-        notes.append(f"not scored: {error}")
-    return matching_section(scores, notes), {"found": scores, "notes": notes}
-
-
-def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
-    """Return probes of labels on held-out objects; a note names each label that cannot be probed."""
-    table, rows, notes = study.manifest, study.rows, list(study.notes)
-    features = {name: np.concatenate([study.classes[name], study.patches[name]], 1) for name in study.classes}
-    if study.pixels is not None:
-        features[PIXELS] = principal_components(study.pixels, study.split == "train")
-    objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
-    groups = np.where(objects == "", sequences, objects)
-    results: dict[str, list[ProbeResult]] = {}
-    for label in (*LABELS, *QUANTITIES):
-        name = f"label.{label}"
-        if name not in table.table.column_names:
-            notes.append(f"{label}: the manifest has no column {name}")
-            continue
-        values = [table.value(int(row), name) for row in rows]
-        is_measured = any(isinstance(value, float) and value % 1 for value in values)
-        results[label] = []
-        try:
-            for key, x in features.items():
-                results[label].append(_probe(x, values, groups, study.split, key, is_measured))
-        except UserError as error:
-            notes.append(f"{label}: not probed: {error}")
-    results = {label: several for label, several in results.items() if several}
-    return probes_section(results, notes, out), {"found": results, "notes": notes}
-
-
-def _probe(x: Array, labels: list[Any], groups: Array, split: Array, name: str, measured: bool) -> ProbeResult:
-    # Principal components share one scale: unit spread for each would amplify the smallest.
-    head = ProbeHead("linear", "common" if name == PIXELS and not measured else "column")
-    return array_probes.probe_features(x, labels, groups, split, head, measured=measured, name=name, seeds=0)
-
-
-# Sections -----------------------------------------------------------------------------------------------------------
-
-
-def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
-    """Return a section for each grade of alignment: a picture with a touch per row and a sensor per column, captions.
-
-    The touches are those by most sensors, of different objects if possible.
-    """
-    rows = deepest_rows(manifest)
-    grades = text_column(manifest, "grade")[rows] if "grade" in manifest.table.column_names else np.full(len(rows), "")
-    return [_samples(manifest, folder, rows[grades == grade], str(grade), seed) for grade in np.unique(grades)]
-
-
-def _samples(manifest: Manifest, folder: Path, rows: Array, grade: str, seed: int) -> Section:
-    sensor, touch = text_column(manifest, "sensor")[rows], manifest.codes("touch", own=True)[rows]
-    objects, names = text_column(manifest, "object")[rows], [str(name) for name in np.unique(sensor)]
-    images, titles, captions = [], [], []
-    for code in _varied_touches(touch, sensor, objects, seed):
-        row_of = {str(sensor[i]): int(rows[i]) for i in np.flatnonzero(touch == code)[::-1]}
-        pictured = next((row for row in row_of.values() if manifest.value(row, "image_path") is not None), None)
-        photo = None if pictured is None else _shrunk(decode(manifest.file(pictured, "image_path")))
-        images.append([_picture(manifest, row_of.get(name)) for name in names] + [photo])
-        titles.append(str(objects[np.flatnonzero(touch == code)[0]]) or f"touch {code}")
-        texts = [manifest.value(row, "text") for row in row_of.values()]
-        captions.append(next((" ".join(text.split()) for text in texts if text), "no caption"))
-    suffix = "".join(letter if letter.isalnum() else "_" for letter in grade)
-    path = folder / "figures" / f"samples{'_' if grade else ''}{suffix}.png"
-    plots.sample_grid(path, images, titles, [*names, "photograph"])
-    notes = "\n".join(f"{i + 1}. *{title}*: {captions[i]}" for i, title in enumerate(titles))
-    text = "Rows are touches, columns are sensors, each at the deepest frame. Captions are below."
-    return Section(f"Samples{', ' if grade else ''}{grade}", text, figure=path, notes=notes)
-
-
-def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> list[int]:
-    """Return the touches by most sensors, one per object before any object comes again."""
-    codes, first = np.unique(touch, return_index=True)
-    sensors = np.array([len(set(sensor[touch == code])) for code in codes])
-    order = np.lexsort((np.random.default_rng(seed).random(len(codes)), -sensors))
-    counts: dict[str, int] = {}
-    turn = []
-    for i in order:
-        name = str(objects[first[i]])
-        turn.append(counts.get(name, 0))
-        counts[name] = turn[-1] + 1
-    return [int(codes[i]) for _, i in sorted(zip(turn, order, strict=True), key=lambda pair: pair[0])][:_SHOWN]
-
-
-def _picture(manifest: Manifest, row: int | None) -> Array | None:
-    """Return the frame of a row; of a force-field sensor the length of its displacement (three channels), mm."""
-    if row is None:
-        return None
-    if manifest.value(row, "sensor") not in FIELD_SENSORS:
-        return _shrunk(decode(manifest.file(row)))
-    column = "field_path" if manifest.value(row, "field_path") is not None else "path"
-    field = np.load(io.BytesIO(read_file(manifest.file(row, column))), allow_pickle=False)
-    return np.linalg.norm(field[..., :3], axis=-1) if field.ndim == 3 else field
-
-
-def _shrunk(image: Array) -> Array:
-    ratio = _SIDE / max(image.shape[:2])
-    if ratio >= 1:
-        return image
-    size = (max(1, round(image.shape[1] * ratio)), max(1, round(image.shape[0] * ratio)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def losses_section(runs: Mapping[str, Path], folder: Path) -> Section:
-    """Return the loss curves of runs {title: run folder}, and the first and last smoothed value of each term."""
-    path, rows = folder / "figures" / "losses.png", []
-    plots.loss_curves(path, runs)
-    for title, run in runs.items():
-        lines = plots.read_metrics(run)
-        for name in plots.TERMS:
-            values = np.array([line[name] for line in lines if line.get(name) is not None])
-            if len(values):
-                smooth = plots.smoothed(values)
-                rows.append((title, name.replace("_", " "), str(len(lines)), f"{smooth[0]:.3f}", f"{smooth[-1]:.3f}"))
-    table = statistics.markdown_table(("run", "term", "steps", "at the start", "at the end"), rows)
-    return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
-
-
-def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) -> tuple[Section, dict[str, Any]]:
-    """Return masked patches and next frames of stage 1 on a test clip of each sensor, and its errors."""
-    config, params = encoder.config, encoder.params | {"decoder": encoder.part_params("decoder")}
-    rows = manifest.rows_of("test")
-    rows = rows[~np.isin(text_column(manifest, "sensor")[rows], FIELD_SENSORS)]
-    frames = config.model.frames + 1
-    is_predicted = config.objective.next_frame and config.data.clip_share > 0  # else the head for clips is untrained
-    ends = np.intersect1d(manifest.clips(frames, "test")[:, -1], rows) if is_predicted else rows[:0]
-    scores = _pixel_errors(params, manifest, ends, encoder)
-    kind: Literal["still", "clip"] = "clip" if len(ends) else "still"
-    frames = frames if len(ends) else 1
-    rows = _deepest_of_sensors(manifest, ends if len(ends) else rows)
-    config = replace(config, data=replace(config.data, batch_size=len(rows)))
-    _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))
-    image = reconstruction_panels(params, batch.clip, batch.sensor, net=encoder.net, config=config)
-    path = folder / "figures" / "reconstructions.png"
-    write_png(path, image)
-    names = ", ".join(text_column(manifest, "sensor")[rows])
-    text = f"Stage 1 sees a quarter of the patches of a held-out object. From above: {names}."
-    title, table = "Reconstructions", ""
-    if frames > 1:
-        title, text = f"{title} and next frames", f"{text} The last pair is the next frame and its prediction."
-    if scores:
-        kinds = {"untouched": "untouched gel", "plain": "mean of the visible patches; copy of the last frame"}
-        kinds = {kind: name for kind, name in kinds.items() if f"{kind} reconstruction" in scores}
-        head = (f"error on {scores['clips']} clips in contact", "stage 1", *kinds.values())
-        terms = {"reconstruction": "hidden patches", "next_frame": "next frame"}
-        keys = {name: (term, *(f"{kind} {term}" for kind in kinds)) for term, name in terms.items()}
-        lines = [(name, *(f"{scores[key]:.4f}" for key in several)) for name, several in keys.items()]
-        table = statistics.markdown_table(head, lines)
-    return Section(title, text, table, path), scores
-
-
-def _pixel_errors(params: Any, manifest: Manifest, ends: Array, encoder: Encoder) -> dict[str, Any]:
-    """Return errors of stage 1 and of its baselines on clips in contact, {} if there are none."""
-    ends, config = ends[known_contact(manifest)[ends] != 0], encoder.config  # in contact or unknown
-    if config.objective.norm_pix_loss or not len(ends):
-        return {}
-    ends = ends[np.linspace(0, len(ends) - 1, min(_CLIPS, len(ends))).astype(int)]
-    config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
-    return {"clips": len(ends)} | pixel_scores(params, manifest, ends, net=encoder.net, config=config)
-
-
-def _deepest_of_sensors(manifest: Manifest, rows: Array) -> Array:
-    """Return the row of the largest force for each sensor, the last row without forces."""
-    sensor = text_column(manifest, "sensor")[rows]
-    force = np.array([manifest.value(int(row), "label.force") or 0.0 for row in rows], np.float64)
-    order = np.lexsort((rows, force))
-    return np.sort([rows[order][np.flatnonzero(sensor[order] == name)[-1]] for name in np.unique(sensor)])
-
-
 def retrieval_section(
     results: Mapping[str, Mapping[str, Sequence[retrieval.Retrieval]]], best: str, notes: Sequence[str], folder: Path
 ) -> tuple[Section, dict[str, dict[str, Change]]]:
@@ -491,21 +396,20 @@ def retrieval_section(
             (result.name, kind, result.centred): result
             for kind, several in kinds.items() for result in several if result.query_sensor == retrieval.ALL
         }  # fmt: skip
-        names = list(dict.fromkeys(name for name, _, _ in pooled))
         kind = "matched" if "matched" in kinds else "by chance"
-        plain = {name: pooled[name, kind, False] for name in names}
+        plain = {name: result for (name, other, centred), result in pooled.items() if other == kind and not centred}
         panels[f"{grade}, gallery {kind}"] = {
-            name: plots.ShareBar(result.top1, result.low, result.high, result.chance1) for name, result in plain.items()
+            name: ShareBar(result.top1, result.low, result.high, result.chance1) for name, result in plain.items()
         }
-        others = [name for name in names if name != best] if best in names else []
+        others = [name for name in plain if name != best] if best in plain else []
         changes[grade] = {name: retrieval.difference(plain[best], plain[name]) for name in others}
-        for name in names:
-            cells = [pooled.get((name, *key)) for key in _COLUMNS]
-            shares = ["-" if cell is None else _share(cell.top1, cell.low, cell.high) for cell in cells]
-            fifth = "-" if cells[0] is None else f"{100 * cells[0].top5:.1f} %"
-            sizes = (str(plain[name].gallery), str(plain[name].queries))
-            rows.append((grade, name, shares[0], fifth, *shares[1:], *sizes))
-        ahead += [(grade, name, _signed(*change)) for name, change in changes[grade].items()]
+        ahead += [(grade, name, _shares(*change, sign="+")) for name, change in changes[grade].items()]
+        for name, result in plain.items():
+            columns = [(way, centred) for way in ("matched", "by chance") for centred in (False, True)]
+            cells = [pooled.get((name, *column)) for column in columns]
+            shares = ["-" if cell is None else _shares(cell.top1, cell.low, cell.high) for cell in cells]
+            fifth = "-" if cells[0] is None else _shares(cells[0].top5)
+            rows.append((grade, name, shares[0], fifth, *shares[1:], result.gallery, result.queries))
     head = ("data", "features", "top-1 matched", "top-5 matched", "top-1 matched, centred", "top-1 by chance",
             "top-1 by chance, centred", "gallery", "queries")  # fmt: skip
     table = statistics.markdown_table(head, rows)
@@ -526,8 +430,13 @@ def retrieval_section(
     return Section("Cross-sensor retrieval", text, table, path if panels else None, _listed(notes)), changes
 
 
-def matching_section(scores: Sequence[retrieval.MatchScore], notes: Sequence[str]) -> Section:
-    """Return the scores of the matching head of stage 2 for both kinds of negatives."""
+def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]:
+    """Return the scores of the matching head of stage 2 on the test rows, for both kinds of negatives."""
+    scores, notes, features = list[retrieval.MatchScore](), list[str](), study.test(study.classes["stage 2"])
+    try:
+        scores = retrieval.score_matching(encoder, study.manifest, study.test(study.rows), features)
+    except UserError as error:
+        notes.append(f"not scored: {error}")
     text = (
         "Did two touches, by two sensors, come from the same place (Eq. 5)? Half of the pairs are positives. With "
         "negatives of any sensor, the two sensors alone reveal part of the answer. With negatives of the positive's "
@@ -536,40 +445,56 @@ def matching_section(scores: Sequence[retrieval.MatchScore], notes: Sequence[str
     )
     names = {"any": "of any sensor", "same_sensor": "of the positive's sensor"}
     head = ("negatives", "accuracy (chance 50 %)", "AUC", "by the sensors alone", "triples")
-    rows = []
-    for score in scores:
-        share, alone = _share(score.accuracy, score.low, score.high), f"{100 * score.sensors_alone:.1f} %"
-        rows.append((names[score.negatives], share, f"{score.auc:.3f}", alone, str(score.triples)))
+    rows = [
+        (names[score.negatives], _shares(score.accuracy, score.low, score.high), f"{score.auc:.3f}",
+         _shares(score.sensors_alone), score.triples) for score in scores
+    ]  # fmt: skip
     table = statistics.markdown_table(head, rows) if rows else ""
-    return Section("Cross-sensor matching", text, table, notes=_listed(notes))
+    return Section("Cross-sensor matching", text, table, notes=_listed(notes)), {"found": scores, "notes": notes}
 
 
-def probes_section(results: Mapping[str, Sequence[ProbeResult]], notes: Sequence[str], folder: Path) -> Section:
-    """Return probes {label: results}: accuracy of classes and R2 of quantities on held-out objects."""
-    parts: list[str] = []
-    panels: dict[str, dict[str, plots.ShareBar]] = {}
-    for label, several in results.items():
-        parts.append(f"### {label}\n\n{array_probes.probe_table(several).strip()}")
-        bars = {
-            result.probe: plots.ShareBar(result.accuracy, result.low, result.high, result.baseline)
-            for result in several if not result.measured
-        }  # fmt: skip
-        panels |= {label: bars} if bars else {}
-    path = folder / "figures" / "probes.png"
-    if panels:
-        plots.bars(path, panels, label="accuracy")
+def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
+    """Return probes of labels on held-out objects; a note names each label that cannot be probed."""
+    table, rows, notes = study.manifest, study.rows, list(study.notes)
+    features = {name: np.concatenate([study.classes[name], study.patches[name]], 1) for name in study.classes}
+    if study.pixels is not None:
+        features[PIXELS] = principal_components(study.pixels, study.split == "train")
+    objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
+    groups = np.where(objects == "", sequences, objects)
+    results: dict[str, list[ProbeResult]] = {}
+    for label in LABELS:
+        if f"label.{label}" not in table.table.column_names:
+            notes.append(f"{label}: the manifest has no column label.{label}")
+            continue
+        values = [table.value(int(row), f"label.{label}") for row in rows]
+        measured = any(isinstance(value, float) and value % 1 for value in values)
+        scored = list[ProbeResult]()
+        try:
+            for name, x in features.items():
+                # Principal components share one scale: unit spread for each would amplify the smallest.
+                head = ProbeHead("linear", "common" if name == PIXELS else "column")
+                options: dict[str, Any] = {"measured": measured, "name": name, "seeds": 0}
+                scored.append(probing.probe_features(x, values, groups, study.split, head, **options))
+        except UserError as error:
+            notes.append(f"{label}: not probed: {error}")
+        results |= {label: scored} if scored else {}
+    bars = {
+        label: {one.probe: ShareBar(one.accuracy, one.low, one.high, one.baseline) for one in scored}
+        for label, scored in results.items() if not scored[0].measured
+    }  # fmt: skip
+    path = out / "figures" / "probes.png"
+    if bars:
+        plots.bars(path, bars, label="accuracy")
     text = "A linear probe on frozen features (class token and mean of patches), fitted on train, tested on test."
-    return Section("Probes", text, "\n\n".join(parts), path if panels else None, _listed(notes))
+    parts = "\n\n".join(f"### {label}\n\n{probing.probe_table(scored).strip()}" for label, scored in results.items())
+    return Section("Probes", text, parts, path if bars else None, _listed(notes)), {"found": results, "notes": notes}
 
 
 def _listed(notes: Sequence[str]) -> str:
     return "\n".join(f"- {note}" for note in notes)
 
 
-def _share(value: float, low: float | None, high: float | None) -> str:
-    interval = "" if low is None or high is None else f" ({100 * low:.1f} to {100 * high:.1f})"
-    return f"{100 * value:.1f} %{interval}"
-
-
-def _signed(mean: float, low: float | None, high: float | None) -> str:
-    return f"{100 * mean:+.1f}" + ("" if low is None or high is None else f" ({100 * low:+.1f} to {100 * high:+.1f})")
+def _shares(value: float, low: float | None = None, high: float | None = None, sign: str = "") -> str:
+    """Return a share in percent (with `sign` "+": a difference in points) and its interval."""
+    interval = "" if low is None or high is None else f" ({100 * low:{sign}.1f} to {100 * high:{sign}.1f})"
+    return f"{100 * value:{sign}.1f}{'' if sign else ' %'}{interval}"

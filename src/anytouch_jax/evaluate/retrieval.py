@@ -8,15 +8,12 @@ chance.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, permutations, product
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
-import pyarrow as pa
 from sklearn.metrics import roc_auc_score
 
 from anytouch_jax.config import FIELD_SENSORS
@@ -25,9 +22,9 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.evaluate.statistics import Array, mean_interval, unit_rows
+from anytouch_jax.evaluate.tasks import best_rows, number_column
 
-Array = npt.NDArray[Any]
 Metric = Literal["cosine", "euclidean"]
 
 ALL = "all"
@@ -84,38 +81,36 @@ class Retrieval:
 
 
 def cross_sensor_retrieval(
-    manifest: Manifest,
-    features: Mapping[str, Array],
-    rows: Array,
-    *,
-    pairs: Sequence[tuple[str, str]] | None = None,
-    gallery_size: int = GALLERY,
-    match: Sequence[str] | None = COVARIATES,
-    centre: Sequence[bool] = (False, True),
-    metrics: Mapping[str, Metric] | None = None,
-    seeds: int = 5,
-) -> list[Retrieval]:
+    manifest: Manifest, features: Mapping[str, Array], rows: Array, *, gallery_size: int = GALLERY,
+    match: Sequence[str] | None = COVARIATES, centre: Sequence[bool] = (False, True),
+    metrics: Mapping[str, Metric] | None = None, seeds: int = 5,
+) -> list[Retrieval]:  # fmt: skip
     """Return retrieval for each set of features, ordered pair of sensors and kind of centring; pooled results last.
 
     `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch, sensor and unit is
     used. `match` names label columns, of which those in the manifest are used; None draws random galleries. `metrics`
     {name: metric}, cosine by default. Touches without a value in one of the columns are left out, with a note. Raises
-    UserError for a sensor paired with itself, no covariate, no common touch, a gallery that is too large, or features
-    that are not finite.
+    UserError for a single sensor, no covariate, no common touch, a gallery that is too large, or features that are not
+    finite.
     """
     rows = np.asarray(rows)
     for name, values in features.items():
         if len(values) != len(rows):
-            raise UserError(f"features {name!r} have {len(values)} rows; they must have one for each of {len(rows)}")
+            raise UserError(f"Features {name!r} have {len(values)} rows. They must have one for each of {len(rows)}.")
     used, place, covariates, notes = _usable(manifest, rows, match)
-    sensors = text_column(manifest, "sensor")[used]
-    touch, unit = _touches(manifest, used), _joined(sensors, text_column(manifest, "unit")[used])
-    objects = text_column(manifest, "object")[used]
-    groups, keys = np.where(objects == "", touch, objects), _joined(touch, unit)
-    drawn = {}
-    for first, second in _pairs(sensors) if pairs is None else pairs:
-        query, gallery = _rows_of(sensors, first, second)
-        if pairs is None and not np.isin(touch[query], touch[gallery]).any():
+    sensors, units, objects, touch = (
+        text_column(manifest, name)[used] for name in ("sensor", "unit", "object", "touch")
+    )
+    if len(manifest.files) > 1:
+        touch = _joined(touch, manifest.source[used])  # equal names of joined manifests are not one touch
+    unit, groups = _joined(sensors, units), np.where(objects == "", touch, objects)
+    keys, drawn = _joined(touch, unit), {}
+    rows_of = {str(name): np.flatnonzero(sensors == name) for name in np.unique(sensors)}
+    if len(rows_of) < 2:
+        raise UserError(f"Cross-sensor retrieval needs touches by two sensors. These are by {', '.join(rows_of)}.")
+    for first, second in permutations(rows_of, 2):
+        query, gallery = rows_of[first], rows_of[second]
+        if not np.isin(touch[query], touch[gallery]).any():
             notes += (f"{first} to {second} left out: they share no touch",)
             continue
         near = None if match is None else numbers(manifest, covariates, used[gallery])
@@ -124,21 +119,20 @@ def cross_sensor_retrieval(
             gallery_unit=unit[gallery], seeds=seeds,
         )  # fmt: skip
     if not drawn:
-        raise UserError("two sensors share no touch; `touch` must be equal for the same place of the same object")
+        raise UserError("The two sensors share no touch. `touch` must be equal for the same place of the same object.")
     results = []
-    for name, centred in ((name, centred) for name in features for centred in centre):
+    for name, centred in product(features, centre):
         metric, values = (metrics or {}).get(name, "cosine"), np.asarray(features[name])[place]
         common = {"name": name, "metric": metric, "matched": covariates, "centred": centred, "notes": notes}
         tables = []
         for (first, second), galleries in drawn.items():
-            query, gallery = _rows_of(sensors, first, second)
+            query, gallery = rows_of[first], rows_of[second]
             tops = score_galleries(values[query], values[gallery], galleries, metric=metric, centre=centred)
             ids = query[galleries.queries]
             tables.append(QueryScores(_joined(keys[ids], [f"{first} to {second}"] * len(ids)), *tops, groups[ids]))
             names = {"query_sensor": first, "gallery_sensor": second}
             results.append(_summary(tables[-1], gallery_size, (galleries,), common | names))
-        columns = ([getattr(table, part.name) for table in tables] for part in dataclasses.fields(QueryScores))
-        pooled = QueryScores(*map(np.concatenate, columns))
+        pooled = QueryScores(*map(np.concatenate, zip(*(vars(table).values() for table in tables), strict=True)))
         results.append(_summary(pooled, gallery_size, tuple(drawn.values()), common))
     return results
 
@@ -150,7 +144,7 @@ def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None
     """
     a, b = first.per_query, second.per_query
     if a is None or b is None or not np.array_equal(a.keys, b.keys) or not np.array_equal(a.groups, b.groups):
-        raise UserError(f"{first.name!r} and {second.name!r} have different queries; give both the same rows")
+        raise UserError(f"{first.name!r} and {second.name!r} have different queries. Give both the same rows.")
     change = a.top1 - b.top1
     return float(change.mean()), *mean_interval(change, a.groups)
 
@@ -172,12 +166,6 @@ def _summary(scores: QueryScores, size: int, drawn: Sequence[Galleries], common:
     return Retrieval(**fields, per_query=scores)
 
 
-def _touches(manifest: Manifest, rows: Array) -> Array:
-    """Return the names of touches, which are distinct for each joined manifest."""
-    names = text_column(manifest, "touch")[rows]
-    return names if len(manifest.files) == 1 else _joined(names, manifest.source[rows])
-
-
 def _usable(
     manifest: Manifest, rows: Array, match: Sequence[str] | None
 ) -> tuple[Array, Array, tuple[str, ...], tuple[str, ...]]:
@@ -190,9 +178,7 @@ def _usable(
     covariates = () if match is None else tuple(name for name in match if name in manifest.table.column_names)
     if match is not None:
         if not covariates:
-            raise UserError(
-                f"the manifest has none of {', '.join(match)} to match the gallery in; add one, or draw --by-chance"
-            )
+            raise UserError(f"The manifest has none of {', '.join(match)} to match the gallery in. Use --by-chance.")
         whole = np.isfinite(numbers(manifest, covariates, used)).all(axis=1)
         if not whole.all():
             notes.append(f"{int(np.sum(~whole))} touches without {' or '.join(covariates)} left out")
@@ -201,27 +187,8 @@ def _usable(
     return used, order[np.searchsorted(rows, used, sorter=order)], covariates, tuple(notes)
 
 
-def _pairs(sensors: Array) -> list[tuple[str, str]]:
-    names = [str(name) for name in np.unique(sensors)]
-    if len(names) < 2:
-        raise UserError(f"cross-sensor retrieval needs touches by two sensors; these are by {names or 'no sensor'}")
-    return [(first, second) for first in names for second in names if first != second]
-
-
-def _rows_of(sensors: Array, first: str, second: str) -> tuple[Array, Array]:
-    if first == second:
-        raise UserError(f"query and gallery are both by {first!r}; name two sensors")
-    for name in (first, second):
-        if name not in sensors:
-            raise UserError(f"no touch is by the sensor {name!r}; name one of {', '.join(np.unique(sensors))}")
-    return np.flatnonzero(sensors == first), np.flatnonzero(sensors == second)
-
-
 def _joined(first: Any, second: Any) -> Array:
-    return np.array([f"{a}/{b}" for a, b in zip(_texts(first), _texts(second), strict=True)], dtype=str)
-
-
-# Galleries ----------------------------------------------------------------------------------------------------------
+    return np.array([f"{a}/{b}" for a, b in zip(first, second, strict=True)], dtype=str)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,33 +206,31 @@ class Galleries:
 
 
 def draw_galleries(
-    query_touch: Any,
-    gallery_touch: Any,
-    *,
-    gallery_size: int = GALLERY,
-    match: Array | None = None,
-    query_unit: Any = None,
-    gallery_unit: Any = None,
-    seeds: int = 5,
-) -> Galleries:
+    query_touch: Any, gallery_touch: Any, *, gallery_size: int = GALLERY, match: Array | None = None,
+    query_unit: Any = None, gallery_unit: Any = None, seeds: int = 5,
+) -> Galleries:  # fmt: skip
     """Return galleries that depend on names, covariates and seeds, not on the order of rows.
 
     Equal names are one touch. `match` (m, k) are covariates of the gallery: the distractors are the nearest to the true
     touch, each covariate scaled to unit spread. Without it `seeds` random galleries are drawn. Items of the query's
-    own unit are never in its gallery. Raises UserError for covariates that are not finite, too few touches, or no
-    common touch.
+    own unit are never in its gallery. Raises UserError for too few touches, or no common touch.
     """
     if seeds < 1:
-        raise UserError(f"seeds must be at least 1, not {seeds}")
+        raise UserError(f"seeds must be at least 1, not {seeds}.")
     if gallery_size < 2:
-        raise UserError(f"gallery_size {gallery_size} is too small: a gallery has the touch and at least one other")
-    query_order, query_touch, query_unit = _sorted(query_touch, query_unit, "query")
-    order, touch, unit = _sorted(gallery_touch, gallery_unit, "gallery")
+        raise UserError(f"gallery_size {gallery_size} is too small. A gallery has the touch and another.")
+    (query_order, query_touch, query_unit), (order, touch, unit) = (
+        _by_name(touches, [side] * len(touches) if units is None else units)
+        for side, touches, units in (("query", query_touch, query_unit), ("gallery", gallery_touch, gallery_unit))
+    )
     for one, two in pairwise(zip(touch, unit, strict=True)):
         if one == two:
-            raise UserError(f"the gallery has touch {str(one[0])!r} twice by one unit; keep one frame of each touch")
-    covariates = None if match is None else _unit_spread(match, len(order))[order]
-    draws = seeds if covariates is None else 1  # matched galleries have no randomness
+            raise UserError(f"The gallery has touch {str(one[0])!r} twice by one unit. Keep one frame of each touch.")
+    draws = seeds if match is None else 1  # matched galleries have no randomness
+    covariates = np.zeros((len(order), 0))
+    if match is not None:
+        spread = match.std(axis=0)
+        covariates = ((match - match.mean(axis=0)) / np.where(spread > 0, spread, 1.0))[order]
     ranks, items, sums = [], [], np.zeros(2)
     for rank in range(len(query_order)):
         allowed, same = unit != query_unit[rank], touch == query_touch[rank]
@@ -274,29 +239,34 @@ def draw_galleries(
             continue
         if len(rest) < gallery_size - 1:
             raise UserError(
-                f"a gallery of {gallery_size} needs {gallery_size - 1} other touches than "
-                f"{str(query_touch[rank])!r}, and there are {len(rest)}; give more touches or a smaller --gallery"
+                f"A gallery of {gallery_size} needs {gallery_size - 1} other touches than "
+                f"{str(query_touch[rank])!r}. There are {len(rest)}. Give more touches, or a smaller --gallery."
             )
         ranks.append(rank)
         several = [_draw(own, rest, covariates, gallery_size, np.random.default_rng([s, rank])) for s in range(draws)]
         items.append([order[chosen] for chosen, _ in several])
         sums += np.sum([distances for _, distances in several], axis=0)
     if not ranks:
-        raise UserError("no query touch is in the gallery: the two sensors share no touch")
+        raise UserError("No query touch is in the gallery. The two sensors share no touch.")
     rows = query_order[ranks]
     back = np.argsort(rows)
     nearness = float(sums[0] / sums[1]) if sums[1] > 0 else None
     return Galleries(rows[back], np.asarray(items).transpose(1, 0, 2)[:, back], nearness, len(query_order) - len(rows))
 
 
+def _by_name(touches: Any, units: Any) -> tuple[Array, Array, Array]:
+    """Return an order of rows that depends on their names alone, and touch and unit names in it."""
+    touch, unit = np.asarray(touches).astype(str), np.asarray(units).astype(str)
+    order = np.lexsort((unit, touch))
+    return order, touch[order], unit[order]
+
+
 def _draw(
-    own: Array, rest: Array, covariates: Array | None, size: int, rng: np.random.Generator
+    own: Array, rest: Array, covariates: Array, size: int, rng: np.random.Generator
 ) -> tuple[Array, tuple[float, float]]:
     """Return one gallery, the true touch first, and the mean distances of its distractors and of all candidates."""
     wanted, lot = own[rng.integers(len(own))], rng.random(len(rest))
-    distance = np.zeros(len(rest))
-    if covariates is not None:
-        distance = np.linalg.norm(covariates[rest] - covariates[[wanted]], axis=1)
+    distance = np.linalg.norm(covariates[rest] - covariates[[wanted]], axis=1)
     nearest = np.lexsort((lot, distance))[: size - 1]
     return np.concatenate([[wanted], rest[nearest]]), (float(distance[nearest].mean()), float(distance.mean()))
 
@@ -311,10 +281,14 @@ def score_galleries(
     """
     q, g = _finite(query, "query"), _finite(gallery, "gallery")
     if q.shape[1] != g.shape[1]:
-        raise UserError(f"query and gallery features have {q.shape[1]} and {g.shape[1]} values; they must be alike")
+        raise UserError(f"query and gallery features have {q.shape[1]} and {g.shape[1]} values. They must be alike.")
     q, g = _prepared(q, metric, centre)[drawn.queries], _prepared(g, metric, centre)
     if metric == "euclidean":
-        q, g = _comparable(q, g)
+        # Both sides are moved and scaled by the same amount, so that rounding does not reorder distances.
+        least, middle = _TIE * max(np.abs(side).max(initial=0.0) for side in (q, g)), g.mean(axis=0, keepdims=True)
+        q, g = (np.where(np.abs(side - middle) > least, side - middle, 0.0) for side in (q, g))
+        size = max(np.abs(side).max(initial=0.0) for side in (q, g)) or 1.0
+        q, g = q / size, g / size
     top1, top5 = np.zeros(len(q)), np.zeros(len(q))
     for start in range(0, len(q), _CHUNK):
         part = slice(start, start + _CHUNK)
@@ -338,53 +312,18 @@ def _prepared(values: Array, metric: Metric, centre: bool) -> Array:
         values = values - values.mean(axis=0, keepdims=True)
     if metric == "euclidean":
         return np.where(np.abs(values) > least, values, 0.0)
-    size = np.linalg.norm(values, axis=1, keepdims=True)
-    return np.where(size > least, values / np.maximum(size, 1e-300), 0.0)
-
-
-def _comparable(q: Array, g: Array) -> tuple[Array, Array]:
-    """Return both sides moved and scaled by the same amount, so that rounding does not reorder distances."""
-    least, middle = _TIE * max(np.abs(q).max(initial=0.0), np.abs(g).max(initial=0.0)), g.mean(axis=0, keepdims=True)
-    q, g = (np.where(np.abs(side - middle) > least, side - middle, 0.0) for side in (q, g))
-    size = max(np.abs(q).max(initial=0.0), np.abs(g).max(initial=0.0))
-    return (q / size, g / size) if size > 0 else (q, g)
-
-
-def _sorted(touch: Any, unit: Any, side: str) -> tuple[Array, Array, Array]:
-    """Return an order of rows that depends on their names alone, and touch and unit names in it."""
-    touch = _texts(touch)
-    unit = _texts([side] * len(touch) if unit is None else unit, len(touch))
-    order = np.lexsort((unit, touch))
-    return order, touch[order], unit[order]
-
-
-def _unit_spread(match: Array, count: int) -> Array:
-    """Return covariates (m, k) with unit spread; a constant one becomes 0."""
-    values = _finite(match, "covariate")
-    if len(values) != count:
-        raise UserError(f"match has {len(values)} rows; it must have one for each of the {count} gallery touches")
-    spread = values.std(axis=0, keepdims=True)
-    return (values - values.mean(axis=0, keepdims=True)) / np.where(spread > 0, spread, 1.0)
+    unit = unit_rows(values)
+    return np.where(np.abs(values).max(axis=1, keepdims=True, initial=0.0) > least, unit, 0.0)
 
 
 def _finite(values: Any, kind: str) -> Array:
     values = np.asarray(values, np.float64)
     if values.ndim != 2:
-        raise UserError(f"{kind} values must be (n, d), not {values.shape}")
+        raise UserError(f"The {kind} values must be (n, d), not {values.shape}.")
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise UserError(f"{kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others; repair or drop them")
+        raise UserError(f"The {kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others. Repair or drop them.")
     return values
-
-
-def _texts(values: Any, count: int | None = None) -> Array:
-    names = np.asarray(values).astype(str)
-    if names.ndim != 1 or count not in (None, len(names)):
-        raise UserError(f"retrieval needs one name for each touch, not {names.shape} names for {count}")
-    return names
-
-
-# Matching -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -468,19 +407,11 @@ def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
     return float((yes[0].mean() + 1 - yes[1].mean()) / 2)
 
 
-# Contacts of a manifest ---------------------------------------------------------------------------------------------
-
-
 def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
     """Return numeric columns as f64 (rows, columns), NaN for an empty cell. Raises UserError for text."""
-    columns = []
-    for name in names:
-        try:
-            column = manifest.column(name).cast(pa.float64())
-        except pa.ArrowException:
-            raise UserError(f"column {name!r} has text; it must have numbers") from None
-        columns.append(column.to_numpy().astype(np.float64))
-    return np.stack(columns, axis=1)[rows] if columns else np.zeros((len(rows), 0))
+    return np.array([number_column(manifest, name)[rows] for name in names], np.float64).T.reshape(
+        len(rows), len(names)
+    )
 
 
 def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:
@@ -500,9 +431,7 @@ def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = 
         raise UserError("no row has a touch; cross-sensor tasks need the column 'touch', equal for the same place")
     codes = np.stack([manifest.codes("touch", own=True), manifest.codes("sensor"), manifest.codes("unit", own=True)], 1)
     _, contact = np.unique(codes[rows], axis=0, return_inverse=True)
-    order = np.lexsort((rows, -_depth(manifest, rows, contact.ravel()), contact.ravel()))
-    first = np.unique(contact.ravel()[order], return_index=True)[1]
-    return np.sort(rows[order[first]])
+    return np.sort(best_rows(rows, contact.ravel(), _depth(manifest, rows, contact.ravel())))
 
 
 def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:

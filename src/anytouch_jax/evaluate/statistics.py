@@ -1,4 +1,4 @@
-"""Statistics of evaluations: bootstrap intervals over groups and seeds, verdicts, Markdown tables, plain JSON."""
+"""Statistics of evaluations: bootstrap intervals over groups and seeds, unit rows, Markdown tables, plain JSON."""
 
 from __future__ import annotations
 
@@ -16,14 +16,18 @@ Protocol = Literal["honest", "published"]
 DRAWS = 10_000  # bootstraps of an interval: its ends are 0.03 standard errors off, with a tenth of the draws 0.09
 
 
-def group_draws(count: int, stream: int = 0) -> Iterator[Array]:
-    """Yield how often each of `count` groups is drawn in a bootstrap, i64 (1000, count) at a time, DRAWS in all.
+def binary_scale(values: Array, axis: int | None = None) -> Array:
+    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, with the axes of `values`.
 
-    Streams are independent.
+    Float32 squares around 1e20 or 1e-25 are infinite or 0. Those of `np.ldexp(values, -e)` keep every digit.
     """
-    rng = np.random.default_rng(stream)
-    for _ in range(DRAWS // 1000):
-        yield rng.multinomial(count, np.full(count, 1 / count), size=1000)
+    return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
+
+
+def unit_rows(values: Array) -> Array:
+    """Return rows (n, d) divided by their Euclidean norms, of any magnitude; a row of zeros stays zero."""
+    values = np.ldexp(values, -binary_scale(values, 1))
+    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
 
 
 class GroupSums(NamedTuple):
@@ -72,17 +76,20 @@ def bootstrap_interval(runs: Sequence[GroupSums], value: Callable[[Array], Array
     totals = np.zeros((len(runs), len(names), runs[0].sums.shape[1]))
     for total, run in zip(totals, runs, strict=True):
         np.add.at(total, np.searchsorted(names, run.groups), run.sums)
-    shares = np.concatenate(list(group_draws(len(runs), stream=1))) / len(runs)
+    shares = np.concatenate(list(_draws(len(runs), stream=1))) / len(runs)
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.concatenate(
-            [np.stack([value(times @ total) for total in totals], 1) for times in group_draws(len(names))]
-        )
-    drawn = np.where(shares > 0, shares * values, 0).sum(1)
-    drawn = drawn[np.isfinite(drawn)]
-    if not drawn.size:
-        return None, None
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return float(low), float(high)
+        drawn = (np.stack([value(times @ total) for total in totals], 1) for times in _draws(len(names), stream=0))
+        values = np.concatenate(list(drawn))
+    means = np.where(shares > 0, shares * values, 0).sum(1)
+    means = means[np.isfinite(means)]
+    return tuple(np.percentile(means, [2.5, 97.5]).tolist()) if means.size else (None, None)
+
+
+def _draws(count: int, stream: int) -> Iterator[Array]:
+    """Yield how often each of `count` groups is drawn, i64 (1000, count) at a time, DRAWS in all; streams differ."""
+    rng = np.random.default_rng(stream)
+    for _ in range(DRAWS // 1000):
+        yield rng.multinomial(count, np.full(count, 1 / count), size=1000)
 
 
 def mean_interval(values: Array, groups: Array) -> tuple[float | None, float | None]:
@@ -90,34 +97,23 @@ def mean_interval(values: Array, groups: Array) -> tuple[float | None, float | N
     return bootstrap_interval([classification_sums(values, groups)], mean_of)
 
 
-def r2_interval(error: Array, truth: Array, groups: Array) -> tuple[float | None, float | None]:
-    """Return the 95 % percentile interval of R2 under a bootstrap over `groups`; `error`, `truth` (n,)."""
-    return bootstrap_interval([regression_sums(error, truth - truth.mean(), groups)], r2_of)
+def scores(runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: bool) -> dict[str, Any]:
+    """Return mean, interval, values and chance of accuracy (R2 and MAE if `measured`), a run for each seed."""
 
+    def values(of: Callable[[Array], Array], several: Sequence[GroupSums]) -> list[float]:
+        return [float(of(run.sums.sum(0))) for run in several]
 
-def seed_interval(several: Sequence[float]) -> tuple[float | None, float | None]:
-    """Return the 95 % interval of the mean over seeds, by Student's t; (None, None) below two seeds."""
-    if len(several) < 2:
-        return None, None
-    from scipy.stats import t
-
-    half = float(t.ppf(0.975, len(several) - 1) * np.std(several, ddof=1) / np.sqrt(len(several)))
-    return float(np.mean(several)) - half, float(np.mean(several)) + half
-
-
-CLAIM = 3  # seeds from which a sign is claimed
-
-
-def verdict(low: float | None, high: float | None, seeds: int, *, wanted: float = 1.0) -> str:
-    """Return whether the interval of a difference supports the claim that it has the sign of `wanted`.
-
-    "agrees" or "disagrees" if zero is outside of the interval, else "undecided". Below CLAIM seeds "1 seed, no claim".
-    """
-    if seeds < CLAIM:
-        return f"{seeds} seed{'s' if seeds > 1 else ''}, no claim"
-    if low is None or high is None or low <= 0 <= high:
-        return "undecided"
-    return "agrees" if (low > 0) == (wanted > 0) else "disagrees"
+    metric = r2_of if measured else mean_of
+    low, high = bootstrap_interval(runs, metric)
+    result: dict[str, Any] = {
+        "metric": "r2" if measured else "accuracy", "mean": float(np.mean(values(metric, runs))), "low": low,
+        "high": high, "values": values(metric, runs), "chance": float(np.mean(values(metric, baselines))),
+    }  # fmt: skip
+    if measured:
+        mae_low, mae_high = bootstrap_interval(runs, mae_of)
+        mae, chance = (float(np.mean(values(mae_of, several))) for several in (runs, baselines))
+        result |= {"mae": mae, "mae_low": mae_low, "mae_high": mae_high, "chance_mae": chance}
+    return result
 
 
 def plain(value: Any) -> Any:

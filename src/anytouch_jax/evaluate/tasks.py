@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS
@@ -21,8 +20,8 @@ from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.embed import Pooling, text_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import GradientRecipe
+from anytouch_jax.evaluate.statistics import Array
 
-Array = npt.NDArray[Any]
 T = TypeVar("T")
 Which = Literal["all", "press", "contact", "moving"]
 
@@ -135,15 +134,11 @@ class TaskRows(NamedTuple):
 
 def find_task(task: str | Task) -> Task:
     """Return the task with that name. Raises UserError."""
-    return task if isinstance(task, Task) else _choose(TASKS, task, "task")
+    return task if isinstance(task, Task) else find(TASKS, task, "task")
 
 
-def find_benchmark(name: str) -> Benchmark:
-    """Return the benchmark with that name. Raises UserError."""
-    return _choose(BENCHMARKS, name, "benchmark")
-
-
-def _choose(known: Mapping[str, T], name: str, kind: str) -> T:
+def find(known: Mapping[str, T], name: str, kind: str) -> T:
+    """Return the task or benchmark with that name. Raises UserError."""
     if name not in known:
         raise UserError(f"There is no {kind} {name!r}. Choose among {', '.join(known)}.")
     return known[name]
@@ -157,12 +152,7 @@ def available_tasks(table: Manifest) -> tuple[str, ...]:
 
 
 def label_task(
-    table: Manifest,
-    label: str,
-    *,
-    group: str = "",
-    where: tuple[str, float] | None = None,
-    sensor: str | None = None,
+    table: Manifest, label: str, *, group: str = "", where: tuple[str, float] | None = None, sensor: str | None = None
 ) -> Task:
     """Return the task of any label column, on all rows that pass the filters.
 
@@ -174,14 +164,10 @@ def label_task(
         if sensor not in (known := sorted(set(text_column(table, "sensor")))):
             raise UserError(f"No row is of sensor {sensor!r}. The manifest has {', '.join(known)}.")
         conditions.append(("sensor", sensor))
-    name, groups = label.removeprefix("label."), [group] if group else []
-    if not group:
-        groups = [
-            column for column in GROUPS
-            if column != name and (_has_values(table, column) or _has_values(table, f"label.{column}"))
-        ]  # fmt: skip
-    columns = tuple(find_column(table, column) for column in groups[:1])
-    return Task(name, find_column(table, label), groups=columns, which="all", where=tuple(conditions))
+    name = label.removeprefix("label.")
+    known = [one for one in GROUPS if one != name and (_has_values(table, one) or _has_values(table, f"label.{one}"))]
+    groups = tuple(find_column(table, column) for column in ([group] if group else known[:1]))
+    return Task(name, find_column(table, label), groups=groups, which="all", where=tuple(conditions))
 
 
 def find_column(table: Manifest, name: str) -> str:
@@ -226,7 +212,7 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
     used &= np.isin(split, ("train", "val", "test")) & ~np.isin(text_column(table, "sensor"), FIELD_SENSORS)
     for column, value in task.where:
-        used &= text_column(table, column) == value if isinstance(value, str) else _numbers(table, column) > value
+        used &= text_column(table, column) == value if isinstance(value, str) else number_column(table, column) > value
     length = max(task.frames, frames or 1)
     if length > 1:
         used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
@@ -239,11 +225,10 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
             "Check the filters and the splits."
         )
     if labels.dtype.kind == "U":
-        alike = [" and ".join(map(repr, group)) for group in spellings(labels[first].tolist())]
-        sentence = (
-            "Classes {} differ only by spaces, letter case or Unicode form. They are probed as different classes."
-        )
-        notes = (*notes, *(sentence.format(group) for group in alike))
+        notes += tuple(
+            f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or Unicode form. They are "
+            "probed as different classes." for alike in spellings(labels[first].tolist())
+        )  # fmt: skip
     sensors, units = (text_column(table, name)[first] for name in ("sensor", "unit"))
     return TaskRows(rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes)
 
@@ -273,7 +258,7 @@ def _label_column(table: Manifest, task: Task) -> str:
 
 def _labels(table: Manifest, task: Task) -> Array:
     if task.kind == "regression" or task.above is not None:
-        number = _numbers(table, task.label)
+        number = number_column(table, task.label)
         if task.above is None:
             return number
         return np.where(np.isfinite(number), np.where(number > task.above, "yes", "no"), "")
@@ -282,14 +267,14 @@ def _labels(table: Manifest, task: Task) -> Array:
     return np.where(np.isin(texts, task.classes), texts, "") if task.classes else texts
 
 
-def _numbers(table: Manifest, name: str) -> Array:
-    """Return a column as f64 (rows,), NaN where it is empty or missing."""
+def number_column(table: Manifest, name: str) -> Array:
+    """Return a column as f64 (rows,), NaN where it is empty or missing. Raises UserError for text."""
     if name not in table.table.column_names:
         return np.full(len(table), np.nan)
     try:
         return table.column(name).cast(pa.float64()).to_numpy().astype(np.float64)
     except pa.ArrowException:
-        raise UserError(f"Column {name!r} contains text. This task needs numbers.") from None
+        raise UserError(f"Column {name!r} contains text. It must have numbers.") from None
 
 
 def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
@@ -300,30 +285,27 @@ def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
         return rows
     sequence, frame = table.codes("sequence", own=True), np.asarray(table.column("frame_index"))
     if which == "press":
-        force = _numbers(table, "label.force")[rows]
+        force = number_column(table, "label.force")[rows]
         known = np.isfinite(force)
-        deepest = _best_of_sequence(rows[known], sequence[rows[known]], force[known], np.zeros(known.sum()))
+        deepest = best_rows(rows[known], sequence[rows[known]], force[known])
         return np.sort(np.concatenate([rows[~known], deepest]))
     last = np.zeros(sequence.max() + 1)
     np.maximum.at(last, sequence, frame)
     late = -np.abs(frame - 2 / 3 * last[sequence])[rows]  # motion lasts from a third to five sixths of a recording
-    slip = np.nan_to_num(_numbers(table, "label.slip")[rows], nan=0.0).round(2)
-    return np.sort(_best_of_sequence(rows, sequence[rows], slip, late))
+    slip = np.nan_to_num(number_column(table, "label.slip")[rows], nan=0.0).round(2)
+    return np.sort(best_rows(rows, sequence[rows], slip, late))
 
 
-def _best_of_sequence(rows: Array, sequence: Array, first: Array, second: Array) -> Array:
-    """Return the row of each sequence with the largest `first`, then the largest `second`, then the earliest."""
-    order = np.lexsort((rows, -second, -first, sequence))
-    return rows[order[np.unique(sequence[order], return_index=True)[1]]]
+def best_rows(rows: Array, groups: Array, *keys: Array) -> Array:
+    """Return the row of each group (n,) with the largest first key (n,), then the next key, then the earliest."""
+    order = np.lexsort((rows, *(-key for key in reversed(keys)), groups))
+    return rows[order[np.unique(groups[order], return_index=True)[1]]]
 
 
 def _touching(table: Manifest) -> Array:
-    """Return whether each frame is contact, bool (rows,), by force, contact flag or contact score.
-
-    All frames are, in a file without these. Force comes first: a flag or a score depends on the picture. It would leave
-    out soft objects, more for some sensors than for others.
-    """
-    force, contact_score = (_numbers(table, f"label.{name}") for name in ("force", "contact_score"))
+    """Return whether each frame is contact, bool (rows,), by force, flag or score; all are in a file without these."""
+    # Force comes first: a flag or a score depends on the picture, and would leave out soft objects for some sensors.
+    force, contact_score = (number_column(table, f"label.{name}") for name in ("force", "contact_score"))
     flag = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
@@ -336,10 +318,7 @@ def _touching(table: Manifest) -> Array:
 
 
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
-    """Return the group of each row: the first column with a value, else the sequence.
-
-    Keys are made different between joined manifests: equal names of recordings are not the same recording.
-    """
+    """Return the group of each row: the first column with a value, else the sequence; keys differ between manifests."""
     sequence = text_column(table, "sequence")
     file = np.array([f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str)
     groups = np.char.add(np.char.add("sequence ", sequence), file)

@@ -7,11 +7,11 @@ import pytest
 from PIL import Image
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import verdict
 from experiments.pouring import table as pouring_table
 from experiments.pouring.physics import Task
 from experiments.pouring.trials import Trials
 from experiments.records import write_record
+from experiments.verdicts import verdict
 
 TASK, RESULTS = Task(), "pouring.jsonl"
 

@@ -8,10 +8,10 @@ import pytest
 import synthetic
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import seed_interval as interval
 from experiments.tables import plan, questions, report, scores
 from experiments.tables.paper import TABLE6
 from experiments.tables.results import Column, change, comparable, read, spread, together, values
+from experiments.verdicts import seed_interval as interval
 
 LEAVES = plan.leaves(plan.FULL)
 NAME = "matrix.jsonl"

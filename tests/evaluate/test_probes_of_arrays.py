@@ -1,4 +1,4 @@
-"""Probes on data whose answer is known: separable, shuffled, leaking and measured labels; differences, tables, JSON."""
+"""Probes on data whose answer is known: separable, shuffled, leaking and measured labels; tables, JSON."""
 
 from __future__ import annotations
 
@@ -11,19 +11,17 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads
-from anytouch_jax.evaluate.array_probes import (
+from anytouch_jax.evaluate.heads import ProbeHead, linear_path
+from anytouch_jax.evaluate.probing import (
     Outcome,
     ProbeResult,
     SubsetResult,
-    accuracy_difference,
     leave_groups_out,
     majority_baseline,
     probe_features,
     probe_json,
     probe_table,
 )
-from anytouch_jax.evaluate.heads import ProbeHead, linear_path
-from anytouch_jax.evaluate.statistics import mean_interval
 
 Array = np.ndarray[Any, Any]
 
@@ -372,7 +370,7 @@ def test_an_unfinished_fit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any("limit of iterations" in note for note in linear_probe(features, labels, groups, split).notes)
 
 
-# ---- differences, tables and JSON ---------------------------------------------------------------------------
+# ---- tables and JSON ---------------------------------------------------------------------------
 
 ONE = ProbeResult(
     probe="linear",
@@ -412,30 +410,6 @@ TWO = ProbeResult(
 )
 
 
-def outcome(correct: Any, first: int = 0) -> ProbeResult:
-    rows = np.arange(first, first + len(correct))
-    return replace(ONE, outcome=Outcome(rows, np.asarray(correct, bool), rows // 5))
-
-
-def test_a_difference_is_paired() -> None:
-    rng = np.random.default_rng(0)
-    hard = rng.random(60)[np.arange(300) // 5] < 0.5  # whole recordings are hard for both
-    better, worse = ~hard, ~hard & (rng.random(300) < 0.9)
-    change, low, high = accuracy_difference(outcome(better), outcome(worse))
-    assert change == pytest.approx(better.mean() - worse.mean())
-    assert 0 < low < change < high
-    lock = mean_interval(better, np.arange(300) // 5)
-    assert high - low < (lock[1] - lock[0]) / 2
-    assert accuracy_difference(outcome(better), outcome(better)) == (0.0, 0.0, 0.0)
-
-
-def test_a_difference_needs_the_same_rows() -> None:
-    with pytest.raises(UserError, match="same rows"):
-        accuracy_difference(outcome([True] * 10), outcome([True] * 10, first=1))
-    with pytest.raises(UserError, match="same rows"):
-        accuracy_difference(ONE, outcome([True] * 10))
-
-
 def test_a_table_of_classes_and_numbers() -> None:
     lines = probe_table([ONE, TWO]).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
@@ -453,7 +427,7 @@ def test_a_table_of_classes_and_numbers() -> None:
 
 
 def test_json() -> None:
-    one, two = json.loads(probe_json([outcome([True]), TWO]))
+    one, two = json.loads(probe_json([replace(ONE, outcome=Outcome(np.zeros(1), np.ones(1, bool), np.zeros(1))), TWO]))
     assert one["accuracy"] == 0.5
     assert one["classes"] == ["ball", "cube"]
     assert one["parts"][1]["accuracy"] is None

@@ -138,7 +138,7 @@ def test_what_cannot_be_selected_is_refused():
     with pytest.raises(UserError, match="colour"):
         tasks.find_task("colour")
     with pytest.raises(UserError, match="mnist"):
-        tasks.find(BENCHMARKS, "mnist", "benchmark")
+        tasks.find_named(BENCHMARKS, "mnist", "benchmark")
     with pytest.raises(UserError, match="material"):
         select(table([row(label__material="x", label__contact=0)]), TASKS["material"])
 

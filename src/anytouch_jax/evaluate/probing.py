@@ -449,7 +449,7 @@ def probe_benchmark(models: Models, data: Paths | Manifest, benchmark: str, **op
 
     `options` are the others of `probe_tasks`, which returns the result. Raises UserError.
     """
-    setting = tasks.find(tasks.BENCHMARKS, benchmark, "benchmark")
+    setting = tasks.find_named(tasks.BENCHMARKS, benchmark, "benchmark")
     return probe_tasks(
         models, data, [setting.task], heads=("gradient",), protocol="published", pooling=setting.pooling,
         universal=setting.universal, recipe=setting.recipe, paper=setting.paper, **options,

@@ -134,10 +134,10 @@ class TaskRows(NamedTuple):
 
 def find_task(task: str | Task) -> Task:
     """Return the task with that name. Raises UserError."""
-    return task if isinstance(task, Task) else find(TASKS, task, "task")
+    return task if isinstance(task, Task) else find_named(TASKS, task, "task")
 
 
-def find(known: Mapping[str, T], name: str, kind: str) -> T:
+def find_named(known: Mapping[str, T], name: str, kind: str) -> T:
     """Return the task or benchmark with that name. Raises UserError."""
     if name not in known:
         raise UserError(f"There is no {kind} {name!r}. Choose among {', '.join(known)}.")

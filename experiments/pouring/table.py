@@ -81,39 +81,39 @@ def record(
     about: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the record of a row's trials with one seed; `about` adds seconds and the loss of learning."""
-    found = error(trials.poured, task.target)
+    result = error(trials.poured, task.target)
     values = {
         "row": name, "mode": mode, "seed": seed, "target": task.target, "source": source, "settings": dict(settings),
         "poured": [round(float(x), 3) for x in trials.poured], "steps": [int(x) for x in trials.steps],
-        "mean_error": round(found.mean, 3), "limit": task.limit,
+        "mean_error": round(result.mean, 3), "limit": task.limit,
     }  # fmt: skip
     return values | dict(about)
 
 
 def read_rows(path: Path) -> list[Row]:
     """Return the rows of a file of results. Raises UserError for a record that is no row, other settings, or no row."""
-    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    result: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for key, one in read_records(path).items():
         try:
-            found.setdefault((one["row"], one["mode"]), []).append(one)
+            result.setdefault((one["row"], one["mode"]), []).append(one)
         except KeyError as missing:
             raise UserError(f"{path}: the record {key} of a pouring row has no {missing}. Remove its line.") from None
-    if not found:
+    if not result:
         raise UserError(f"{path} has no result. Run python -m experiments.pouring.study.")
     for tuned in (False, True):
-        common = {json.dumps(one, sort_keys=True) for one in _settings(found, tuned)}
+        common = {json.dumps(one, sort_keys=True) for one in _settings(result, tuned)}
         if len(common) > 1:
             raise UserError(
                 f"rows of {path} were run with different settings ({'; '.join(sorted(common))}); remove the old"
             )
-    return [_row(name, mode, parts) for (name, mode), parts in found.items()]
+    return [_row(name, mode, parts) for (name, mode), parts in result.items()]
 
 
-def _settings(found: Mapping[tuple[str, str], Sequence[Mapping[str, Any]]], tuned: bool) -> list[dict[str, Any]]:
+def _settings(result: Mapping[tuple[str, str], Sequence[Mapping[str, Any]]], tuned: bool) -> list[dict[str, Any]]:
     """The settings that rows must share to be compared: all those of fine-tuned ones; of all rows those but of that."""
     return [
         {name: value for name, value in one["settings"].items() if tuned or not name.startswith("tune")}
-        for (_, mode), parts in found.items()
+        for (_, mode), parts in result.items()
         for one in parts
         if mode == "fine-tuned" or not tuned
     ]
@@ -171,11 +171,11 @@ def table(rows: Sequence[Row]) -> str:
         parts.append(f"Encoders: {used}.")
     claims = [_claim(by, mode, better, worse) for mode in MODES for better, worse in CLAIMS]
     claims += [_claim(by, mode, name, bound) for mode in MODES for name in PAPER for bound in BLIND]
-    found = [claim for claim in claims if claim]
-    if found:
+    result = [claim for claim in claims if claim]
+    if result:
         parts.append(
             markdown_table(
-                ("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), found
+                ("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), result
             )
         )
     return "\n\n".join(parts) + "\n"
@@ -198,10 +198,10 @@ def _cell(row: Row) -> str:
     return _words(row.error) + (f", {row.lost} never turned back" if row.lost else "")
 
 
-def _words(found: Error, form: str = ".1f") -> str:
-    if found.low is None or found.high is None:
-        return f"{found.mean:{form}}"
-    return f"{found.mean:{form}} ({found.low:{form}} to {found.high:{form}})"
+def _words(result: Error, form: str = ".1f") -> str:
+    if result.low is None or result.high is None:
+        return f"{result.mean:{form}}"
+    return f"{result.mean:{form}} ({result.low:{form}} to {result.high:{form}})"
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:

@@ -27,15 +27,15 @@ def probed(
 ) -> dict[str, Any]:
     """What linear probes of sets of features (principal components where they are `pixels`) get right of each object of
     the test split, by label; `commonest` is the commonest answer of train there."""
-    found = {}
+    result = {}
     for label, values in labels.items():
         results = {"commonest": probing.majority_baseline(values, groups, split)}
         for name, x in features.items():
             head = ProbeHead("linear", "common" if name == "pixels" else "column")
             results[name] = probing.probe_features(x, values, groups, split, head, name=name, seeds=0)
         outcomes = {name: one.outcome for name, one in results.items() if one.outcome is not None}
-        found[label] = by_object(outcomes["commonest"].groups, {name: one.correct for name, one in outcomes.items()})
-    return found
+        result[label] = by_object(outcomes["commonest"].groups, {name: one.correct for name, one in outcomes.items()})
+    return result
 
 
 def gathered(several: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, Right]:
@@ -66,14 +66,14 @@ def _percent(counts: np.ndarray, several: Sequence[np.ndarray]) -> str:
 
 
 def probe_table(
-    found: Sequence[Mapping[str, Any]], names: Sequence[str], rivals: Sequence[str], named: Sequence[str],
+    result: Sequence[Mapping[str, Any]], names: Sequence[str], rivals: Sequence[str], named: Sequence[str],
     unnamed: Sequence[str],
 ) -> str:  # fmt: skip
     """Accuracies by label, and of all that captions name together; and how far the first of `names` is ahead of the
     rivals, seed by seed too: the interval over objects is of these encoders, not of others trained alike."""
     rows, best = [], names[0]
     for title, labels in [*((x, (x,)) for x in named), ("these three", tuple(named)), *((x, (x,)) for x in unnamed)]:
-        each = [gathered([one[label] for one in found]) for label in labels]
+        each = [gathered([one[label] for one in result]) for label in labels]
         counts = each[0][0]
         right = {name: [np.mean(s, 0) for s in zip(*(r[name] for _, r in each), strict=True)] for name in names}
         changes = []

@@ -182,8 +182,8 @@ def taught(
     log = jax.jit(logits)
 
     def right(label: str, rows: np.ndarray) -> float:
-        told = [log(params, *some)[label].argmax(-1) for some in batched(data, rows)]
-        return float(np.mean(np.concatenate(told) == numbers[label][rows]))
+        predicted = [log(params, *some)[label].argmax(-1) for some in batched(data, rows)]
+        return float(np.mean(np.concatenate(predicted) == numbers[label][rows]))
 
     some = np.random.default_rng(seed).choice(train, min(2000, len(train)), replace=False)
     scores = {}
@@ -214,9 +214,9 @@ def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Wo
     params, scores = taught(of_encoder(fresh), data, seed, fresh.config.model.universal_row)
     named = (anytouch, Encoder(fresh.config, {"touch": params}, "trained with labels"), fresh)
     rows = contact_rows(table, cuts.SPLITS)
-    found = [embed_rows(one, table, rows, pooling="both", log=silent)[1] for one in named]
+    result = [embed_rows(one, table, rows, pooling="both", log=silent)[1] for one in named]
     pixels = background_difference(table, rows)
-    features = dict(zip(NAMES, found, strict=True))
+    features = dict(zip(NAMES, result, strict=True))
     features["pixels"] = principal_components(pixels, text_column(table, "split")[rows] == "train")
     return {
         "settings": SETTINGS,
@@ -232,18 +232,18 @@ def by_convolutions(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work
     """What a convolutional network trained with the labels tells."""
     pupil, rows = convolutional(seed), contact_rows(table, cuts.SPLITS)
     params, scores = taught(pupil, data, seed, fresh.config.model.universal_row)
-    read, seen = jax.jit(pupil.features), frames(work.manifest(LEFT_OUT.name), cuts.SPLITS, fresh)
-    features = np.concatenate([np.asarray(read(params, *some)) for some in batched(seen, np.arange(len(rows)))])
+    read, images = jax.jit(pupil.features), frames(work.manifest(LEFT_OUT.name), cuts.SPLITS, fresh)
+    features = np.concatenate([np.asarray(read(params, *some)) for some in batched(images, np.arange(len(rows)))])
     return {"scores": scores, "probes": probes({CONVOLUTIONAL: features}, table, rows)}
 
 
 def one_seed(seed: int) -> dict[str, Any]:
     """Return the record of a seed. What it lacks, or has of other settings, is measured first."""
-    found = read_records(RESULTS).get(str(seed), {})
-    if not TABLE and found.get("settings") != SETTINGS:
-        found = {}
-    if {"probes", CONVOLUTIONAL} <= set(found):
-        return found
+    result = read_records(RESULTS).get(str(seed), {})
+    if not TABLE and result.get("settings") != SETTINGS:
+        result = {}
+    if {"probes", CONVOLUTIONAL} <= set(result):
+        return result
     if TABLE:
         raise UserError(f"{RESULTS} has no whole record of seed {seed}. Run this page without TABLE=1.")
     work = Work(STUDY)
@@ -254,13 +254,13 @@ def one_seed(seed: int) -> dict[str, Any]:
         work.make(LEFT_OUT, SIZE)
     fresh = random_encoder(first.config, seed)
     about = seed, fresh, touches(work, fresh), work, manifests.read([work.manifest(LEFT_OUT.name)])
-    if "probes" not in found:
-        found = by_encoders(*about)
+    if "probes" not in result:
+        result = by_encoders(*about)
     there = read_records(OUT / f"{PLAIN}.jsonl").get(str(seed), {})  # the network depends on no encoder
-    same = all(there.get(kind) == found[kind] for kind in ("settings", "data"))
-    found[CONVOLUTIONAL] = there[CONVOLUTIONAL] if same and CONVOLUTIONAL in there else by_convolutions(*about)
-    write_record(RESULTS, str(seed), found)
-    return found
+    same = all(there.get(kind) == result[kind] for kind in ("settings", "data"))
+    result[CONVOLUTIONAL] = there[CONVOLUTIONAL] if same and CONVOLUTIONAL in there else by_convolutions(*about)
+    write_record(RESULTS, str(seed), result)
+    return result
 
 
 def percent(values: list[float]) -> str:

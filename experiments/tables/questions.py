@@ -80,14 +80,14 @@ def q1(runs: Sequence[Run]) -> Part:
 
 def _both(runs: Sequence[Run], table: Table, pairs: Sequence[Pair]) -> tuple[str, list[Statement]]:
     """A table of materials and, with the same signs expected, of forms: its text and statements."""
-    found = judge(runs, table.question, FOUR, pairs)
+    result = judge(runs, table.question, FOUR, pairs)
     form = judge(runs, table.question, FORM, [pair._replace(label=f"form: {pair.label}") for pair in pairs])
     text = (
-        f"The material, which captions name:\n\n{block(runs, table, found)}\n\n"
+        f"The material, which captions name:\n\n{block(runs, table, result)}\n\n"
         "The form of the indenter, which no caption names (the same signs are expected):\n\n"
         f"{block(runs, table._replace(columns=FORM, paper={}, paper_titles=()), form)}"
     )
-    return text, [*found, *form]
+    return text, [*result, *form]
 
 
 def q2(runs: Sequence[Run]) -> Part:
@@ -96,16 +96,16 @@ def q2(runs: Sequence[Run]) -> Part:
     # The paper in words: masked modelling draws the touches of a sensor together; alignment begins to blend the
     # sensors; matching mixes them and gathers the touches of an object. Signs are of what is better: to find the
     # touch, not to be ordered by sensor.
-    found = []
+    result = []
     for label, first, second, column, sign in (
         ("masked modelling gathers each sensor's touches", "masked", "untrained", 2, -1),
         ("alignment begins to blend the sensors", "aligned", "masked", 2, 1),
         ("matching mixes the sensors", "matched", "aligned", 2, 1),
         ("matching gathers the touches of an object", "matched", "aligned", 3, 1),
     ):
-        found += judge(runs, "q2", SPACE[column : column + 1], [Pair(label, first, second, (sign,))])
+        result += judge(runs, "q2", SPACE[column : column + 1], [Pair(label, first, second, (sign,))])
     finds = (1, 1)
-    found += judge(runs, "q2", SPACE[:2], [
+    result += judge(runs, "q2", SPACE[:2], [
         Pair("retrieval: alignment above masked modelling", "aligned", "masked", finds),
         Pair("retrieval: matching above alignment", "matched", "aligned", finds),
         Pair("retrieval: matching above no pre-training", "matched", "untrained", finds),
@@ -113,7 +113,7 @@ def q2(runs: Sequence[Run]) -> Part:
         Pair("our control: matching above area, place and force", "matched", "contact", finds),
     ])  # fmt: skip
     table = Table("q2", names, SPACE)
-    return Part("Q2: the space of touches (Figure 4)", f"{_chances(runs)}{block(runs, table, found)}", found)
+    return Part("Q2: the space of touches (Figure 4)", f"{_chances(runs)}{block(runs, table, result)}", result)
 
 
 def _chances(runs: Sequence[Run]) -> str:
@@ -167,10 +167,9 @@ def _read(runs: Sequence[Run]) -> str:
     for name in scores.READ:
         several = [run for run in runs if run.name == name and any(r["view"] in [*ways][1:] for r in run.about["rows"])]
         if several:
-            found = [replace(run, name=ways[run.name]) for run in by_view(several, "q3", name, [*ways])]
-            parts.append(
-                f"{title(name)}, by head and pooling:\n\n{block(found, Table('q3', [*ways.values()], columns), ())}\n\n"
-            )
+            result = [replace(run, name=ways[run.name]) for run in by_view(several, "q3", name, [*ways])]
+            text = block(result, Table("q3", [*ways.values()], columns), ())
+            parts.append(f"{title(name)}, by head and pooling:\n\n{text}\n\n")
     return "".join(parts)
 
 
@@ -196,12 +195,12 @@ def ablations(runs: Sequence[Run]) -> Part:
 def restricted(runs: Sequence[Run]) -> Part:
     """The control of Table 2: the rival's data for both."""
     table = Table("restricted", ("unitouch", "no_matching"), SIX, paper.RESTRICTED, SIX_PAPER)
-    found = judge(runs, "restricted", SIX, against(table, "no_matching", None))
+    result = judge(runs, "restricted", SIX, against(table, "no_matching", None))
     text = (
         f"Both see {' and '.join(plan.RESTRICTED)} alone, without touches felt twice (so AnyTouch has no matching).\n"
         "In the paper both had trained on Feel and on OF 2.0, so those two columns are not of unseen data there.\n\n"
     )
-    return Part("The same restricted data (control of Table 2)", text + block(runs, table, found), found)
+    return Part("The same restricted data (control of Table 2)", text + block(runs, table, result), result)
 
 
 def grasp(runs: Sequence[Run]) -> Part:
@@ -209,7 +208,7 @@ def grasp(runs: Sequence[Run]) -> Part:
     table = Table("grasp", ("anytouch",), GRASP, {"anytouch": paper.FEEL_AFTER}, ("Feel, during", "Feel, after"))
     pair = Pair("frames after the grasp are easier than frames during it", "after", "during", (1,))
     views = by_view(runs, "grasp", "anytouch", ("during", "after"))
-    found = judge(views, "grasp", (Column("held or slipped", ANY, "grasp"),), (pair,))
+    result = judge(views, "grasp", (Column("held or slipped", ANY, "grasp"),), (pair,))
     text = (
         "A simulated recording has no gripper: the press stands for the closing (the frame in which it is done), the\n"
         "end of the slide or twist for the lift, and a touch slipped when more than half of its contact slid half-way\n"
@@ -217,18 +216,18 @@ def grasp(runs: Sequence[Run]) -> Part:
     )
     if any("values" not in row for run in runs if run.question == "grasp" for row in run.about["rows"]):
         text += "Each number is of one fit on the data set's own split; other tables deal the objects five times.\n\n"
-    return Part("Feel: frames after the grasp beside frames during it", text + block(runs, table, found), found)
+    return Part("Feel: frames after the grasp beside frames during it", text + block(runs, table, result), result)
 
 
 def by_view(runs: Sequence[Run], question: str, name: str, views: Sequence[str]) -> list[Run]:
     """The views of one model as runs of their own, so that they can be set against each other."""
-    found = []
+    result = []
     for run in runs:
         if (run.question, run.name) == (question, name):
             for view in views:
                 rows = [row | {"view": ANY} for row in run.about["rows"] if row["view"] == view]
-                found.append(Run(question, view, run.seed, {"rows": rows}))
-    return found
+                result.append(Run(question, view, run.seed, {"rows": rows}))
+    return result
 
 
 def new_sensor(runs: Sequence[Run]) -> Part:
@@ -242,7 +241,7 @@ def new_sensor(runs: Sequence[Run]) -> Part:
     for name in (*views, "seen"):
         cells = [cell(several, "new_sensor", name, one) + _closed(several, name, one) for one in columns]
         lines.append((title(name), str(len({run.seed for run in several if run.name == name})), *cells))
-    said = published(several, Table("new_sensor", (*views, "seen"), columns))
+    on_test = published(several, Table("new_sensor", (*views, "seen"), columns))
     text = (
         f"{plan.UNSEEN} is left out of training. Its tokens are the universal ones, or they are fitted to the\n"
         "material of labelled frames, with all else frozen. The labelled frames also join the training rows of the\n"
@@ -256,9 +255,9 @@ def new_sensor(runs: Sequence[Run]) -> Part:
         Pair(f"{title(one)} against {title(scores.NOTHING)}", one, scores.NOTHING, (None,) * len(columns))
         for one in wide
     ]
-    found = judge(several, "new_sensor", columns, pairs)
-    parts = (f"{text}{table}", said.rstrip(), "\n".join(map(sentence, found)))
-    return Part("A new sensor", "\n\n".join(part for part in parts if part), found)
+    result = judge(several, "new_sensor", columns, pairs)
+    parts = (f"{text}{table}", on_test.rstrip(), "\n".join(map(sentence, result)))
+    return Part("A new sensor", "\n\n".join(part for part in parts if part), result)
 
 
 def _closed(runs: Sequence[Run], name: str, column: Column) -> str:
@@ -277,13 +276,13 @@ def dynamics(runs: Sequence[Run]) -> Part:
     views = by_view(runs, "dynamics", "anytouch", tuple(VIEWS))
     # The paper compares models, not views: differences of views are shown and no sign is expected of them.
     pairs = [Pair(f"AnyTouch, clips against {view}", "clips", view, (None,) * 4) for view in ("stills", "shuffled")]
-    found = judge(views, "dynamics", dynamic(ANY), pairs)
+    result = judge(views, "dynamics", dynamic(ANY), pairs)
     trained = Pair("dynamic training against stills only, on clips", "anytouch", "static_only", (1, 1, 1, 1), (0, 2, 3))
-    found += judge(runs, "dynamics", dynamic("clips"), (trained,))
+    result += judge(runs, "dynamics", dynamic("clips"), (trained,))
     for name in names[2:]:
         for columns, what in ((dynamic("clips"), "on clips"), (STATIC, "static tasks")):
             pair = Pair(f"{title(name)}, against AnyTouch, {what}", name, "anytouch", (None,) * len(columns))
-            found += judge(runs, "dynamics", columns, (pair,))
+            result += judge(runs, "dynamics", columns, (pair,))
     text = (
         "Twist and slide are directions of the picture as it is. Training flips touches, and the positive of a match\n"
         "apart from its anchor, which asks the encoder to overlook directions; a probe sees frames unflipped. The\n"
@@ -291,7 +290,7 @@ def dynamics(runs: Sequence[Run]) -> Part:
         "and the last frame repeated are one measurement. What the paper claims is that dynamic training is better\n"
         "(Table 4 compares models); what a clip shows beside a still is no claim of its.\n\n"
     )
-    return Part("Dynamics", text + "\n\n".join(parts) + "\n\n" + "\n".join(map(sentence, found)), found)
+    return Part("Dynamics", text + "\n\n".join(parts) + "\n\n" + "\n".join(map(sentence, result)), result)
 
 
 VIEWS = {
@@ -330,31 +329,31 @@ def real(runs: Sequence[Run]) -> Part:
     between = "95 % over test groups, by seed"
     head = ("task", "features", "accuracy, mean over seeds", between, "commonest", "test frames")
     table = markdown_table(head, lines)
-    said = "\n".join(f"- {one.label}: **{one.row.word}**{_by_seed(one)}." for one in statements)
-    return Part(REAL_TITLE, f"{text}{table}\n\n{said}", statements)
+    signs = "\n".join(f"- {one.label}: **{one.row.word}**{_by_seed(one)}." for one in statements)
+    return Part(REAL_TITLE, f"{text}{table}\n\n{signs}", statements)
 
 
 def ahead_of_control(runs: Sequence[Run], task: str, name: str) -> Statement:
     """Whether ours is above a control: in each seed the paired interval over test groups is above zero."""
-    found = [
+    result = [
         row for run in runs for row in run.about["rows"] if (row["task"], row["view"]) == (task, f"{OURS} - {name}")
     ]
-    means = [100 * row["mean"] for row in found]
+    means = [100 * row["mean"] for row in result]
     label = f"{task}: above {'raw pixels' if name == PIXELS else 'an untrained encoder'}"
     low, high = seed_interval(means)
-    if not found:
+    if not result:
         return Statement(label, Change("not run"), {})
-    words = {verdict(row["low"], row["high"], len(found)) for row in found}
+    words = {verdict(row["low"], row["high"], len(result)) for row in result}
     word = words.pop() if len(words) == 1 else "undecided"
     each = {f"seed {i}": Change("", *(None if row[k] is None else 100 * row[k] for k in ("mean", "low", "high")))
-            for i, row in enumerate(found)}  # fmt: skip
-    return Statement(label, Change(word, float(np.mean(means)), low, high, len(found)), each)
+            for i, row in enumerate(result)}  # fmt: skip
+    return Statement(label, Change(word, float(np.mean(means)), low, high, len(result)), each)
 
 
 def _by_seed(one: Statement) -> str:
-    found = [f"{c.mean:+.1f} ({c.low:+.1f} to {c.high:+.1f})" if c.low is not None and c.high is not None else "-"
+    result = [f"{c.mean:+.1f} ({c.low:+.1f} to {c.high:+.1f})" if c.low is not None and c.high is not None else "-"
              for c in one.columns.values()]  # fmt: skip
-    return f", by seed {'; '.join(found)}" if found else ""
+    return f", by seed {'; '.join(result)}" if result else ""
 
 
 def _over_seeds(runs: Sequence[Run], task: str, view: str) -> tuple[str, str, str, str]:

@@ -81,10 +81,10 @@ def read(path: Path) -> list[Run]:
 def noted(path: Path) -> dict[str, Any]:
     """Return the content of a file of notes, {} for a missing or broken one."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        result = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return result if isinstance(result, dict) else {}
 
 
 def simulated(about: Mapping[str, Any]) -> int:
@@ -99,30 +99,30 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
     seed. The data of another seed may be of another processor, where the same scenes gave another content hash. Records
     without settings are distinguished by the name of their size.
     """
-    found: dict[str, set[str]] = {}
+    result: dict[str, set[str]] = {}
     names = {name for about in records for name in about.get("settings") or {} if name not in LABELS}
     untold = any(not about.get("settings") for about in records)
     for about in records:
-        found.setdefault("simulator version", set()).add(str(simulated(about)))
-        found.setdefault("scoring version", set()).add(str(about.get("scoring", 1)))
+        result.setdefault("simulator version", set()).add(str(simulated(about)))
+        result.setdefault("scoring version", set()).add(str(about.get("scoring", 1)))
         for name in names if about.get("settings") else ():  # a setting that one does not know is another value
-            found.setdefault(name, set()).add(str(about["settings"].get(name, NOT_NOTED)))
+            result.setdefault(name, set()).add(str(about["settings"].get(name, NOT_NOTED)))
         for name, value in about.get("data", {}).items():
-            found.setdefault(f"data set {name} of seed {about.get('seed')}", set()).add(value[:8])
+            result.setdefault(f"data set {name} of seed {about.get('seed')}", set()).add(value[:8])
         if untold:
-            found.setdefault("size", set()).add(str(about.get("size")))
-    return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in found.items() if len(several) > 1)
+            result.setdefault("size", set()).add(str(about.get("size")))
+    return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in result.items() if len(several) > 1)
 
 
 def drawn(runs: Sequence[Run]) -> str:
     """Which data sets were made more than once, by content and seeds, in words; empty where none was."""
-    found: dict[str, dict[str, set[int]]] = {}
+    result: dict[str, dict[str, set[int]]] = {}
     for run in runs:
         for name, value in run.about.get("data", {}).items():
-            found.setdefault(name, {}).setdefault(value[:8], set()).add(run.seed)
+            result.setdefault(name, {}).setdefault(value[:8], set()).add(run.seed)
     return "; ".join(
         f"{name} " + ", ".join(f"{value} (seeds {', '.join(map(str, sorted(of)))})" for value, of in several.items())
-        for name, several in sorted(found.items())
+        for name, several in sorted(result.items())
         if len(several) > 1
     )
 
@@ -151,12 +151,12 @@ def spread(
     runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest"
 ) -> tuple[float, float | None, float | None] | None:
     """Mean of a cell and its interval: over seeds, with one seed that of the run itself (over test objects)."""
-    found = values(runs, question, name, column, protocol)
-    if not found:
+    result = values(runs, question, name, column, protocol)
+    if not result:
         return None
-    mean, (low, high) = float(np.mean(list(found.values()))), over_seeds(list(found.values()))
-    if len(found) == 1:
-        run = next(one for one in runs if (one.question, one.name, one.seed) == (question, name, *found))
+    mean, (low, high) = float(np.mean(list(result.values()))), over_seeds(list(result.values()))
+    if len(result) == 1:
+        run = next(one for one in runs if (one.question, one.name, one.seed) == (question, name, *result))
         row = run.row(column, protocol) or {}
         low, high = (None if row.get(side) is None else column.factor * row[side] for side in ("low", "high"))
     return mean, low, high

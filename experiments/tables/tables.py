@@ -115,7 +115,7 @@ def title(name: str) -> str:
 def block(runs: Sequence[Run], table: Table, statements: Sequence[Statement]) -> str:
     """Return the table, that of the published protocol, and the statements, as Markdown."""
     parts = [_ours(runs, table)]
-    parts += [logged] if (logged := published(runs, table)) else []
+    parts += [on_test] if (on_test := published(runs, table)) else []
     if statements:
         parts.append("\n".join(map(sentence, statements)))
     return "\n\n".join(parts)

@@ -47,8 +47,8 @@ def trainings(size: Size, seed: int) -> dict[str, Training]:
     whole, t3 = (plan.training(size, recipe, seed) for recipe in ("anytouch", "t3"))
     assert whole.init is not None
     kept = replace(whole.config, optim=replace(whole.config.optim, layer_decay=LAYER_DECAY))
-    found = {"anytouch": whole, "anytouch_layer_decay": Training(kept, whole.init), "stage1": whole.init, "t3": t3}
-    return {name: reduced(one) for name, one in found.items()}
+    result = {"anytouch": whole, "anytouch_layer_decay": Training(kept, whole.init), "stage1": whole.init, "t3": t3}
+    return {name: reduced(one) for name, one in result.items()}
 
 
 def reduced(one: Training) -> Training:
@@ -73,10 +73,10 @@ def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]
 
 def encoders(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Encoder]:
     """Return the encoders of `train`, and the weights half-way from AnyTouch's stage 1 to its stage 2."""
-    found = {name: load_encoder(run) for name, run in train(work, size, seed, taken).items()}
-    first, second = found["stage1"], found["anytouch"]
+    result = {name: load_encoder(run) for name, run in train(work, size, seed, taken).items()}
+    first, second = result["stage1"], result["anytouch"]
     params = interpolate(first.params, second.params, SHARE)
-    return found | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}
+    return result | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}
 
 
 RETRIEVAL = "found_"  # how keys of retrieval records begin

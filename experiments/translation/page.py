@@ -175,8 +175,8 @@ class Rows:
         if not change:
             return "-"
         low, high = seed_interval(change)
-        said = "" if low is None or high is None else f" ({low:+.4f} to {high:+.4f})"
-        return f"{np.mean(change):+.4f}{said}, {verdict(low, high, len(change), wanted=-1)}"
+        interval = "" if low is None or high is None else f" ({low:+.4f} to {high:+.4f})"
+        return f"{np.mean(change):+.4f}{interval}, {verdict(low, high, len(change), wanted=-1)}"
 
 
 def _row_name(about: dict[str, Any]) -> str:

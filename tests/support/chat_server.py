@@ -52,7 +52,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_response(status)
             headers = {"Retry-After-Ms": "1", "Content-Type": "application/json"} | headers
             for name, value in ({"Content-Length": str(len(data))} | headers).items():
-                self.send_header(name, value)
+                if value is not None:  # None takes a usual header away
+                    self.send_header(name, value)
             self.end_headers()
             self.wfile.write(data)
             if len(data) < int(headers.get("Content-Length", 0)):  # drip until the client leaves

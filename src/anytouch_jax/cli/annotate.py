@@ -128,7 +128,7 @@ def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
         raise _EstimateOnly
     if not estimate.questions:
         return True
-    _endpoint(options).check()  # raises for a missing key, before the question
+    _endpoint(options).read_key()  # raises for a missing key, before the question
     if options.yes:
         return True
     if not sys.stdin.isatty():

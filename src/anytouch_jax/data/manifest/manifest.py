@@ -394,6 +394,15 @@ def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
     return Manifest(manifest.table.take(pa.array(rows)), manifest.files, manifest.source[rows], manifest.number[rows])
 
 
+def group_rows(rows: np.ndarray, keys: np.ndarray, order: np.ndarray | None = None) -> list[np.ndarray]:
+    """Return `rows` (ids i64) by equal `keys` (rows,) or (rows, k), in the order of keys, then of `order` and row."""
+    if not len(rows):
+        return []
+    group = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    at = np.lexsort((rows, rows if order is None else order, group))
+    return np.split(rows[at], np.flatnonzero(np.diff(group[at])) + 1)
+
+
 def replace_column(manifest: Manifest, name: str, values: Any) -> Manifest:
     """Return the manifest with column `name` set to `values` (rows,), appended if it was absent."""
     column = pa.array(values, SCHEMA.get(name)) if not isinstance(values, pa.Array | pa.ChunkedArray) else values

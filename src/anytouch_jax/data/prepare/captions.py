@@ -7,6 +7,7 @@ therefore continues after an interruption, and no question is paid for twice.
 from __future__ import annotations
 
 import asyncio
+import base64
 import hashlib
 import html
 import json
@@ -14,7 +15,7 @@ import os
 import urllib.parse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.prepare.prompts import (
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 
 _BAD_ANSWER_TRIES = 3
 _MAX_STREAK = 25  # failures in a row after which the run stops instead of paying for more
-_LONGEST_WAIT = 120.0  # seconds; the client obeys a Retry-After up to this
+_LONGEST_WAIT = 120.0  # seconds between two tries; the client obeys no longer Retry-After
 _TILE = 512  # an image costs a base price and a price for each tile of 512 pixels
 _BASE_TOKENS, _TILE_TOKENS, _ANSWER_TOKENS = 85, 170, 80
 _LOCAL = ("localhost", "127.0.0.1", "::1")
@@ -105,10 +107,6 @@ class AnnotateError(UserError):
     """An annotation that did not start, or that stopped. Answers that arrived are stored."""
 
 
-class EndpointError(UserError):
-    """An endpoint that cannot be used, so that no further question makes sense."""
-
-
 class _QuestionError(Exception):
     """A question that got no answer after all tries. The message gives the reason."""
 
@@ -120,7 +118,7 @@ class Endpoint:
     `url` is the base address, such as https://api.openai.com/v1. The key is read from the environment variable
     `key_variable`. `timeout` is the seconds to wait for an answer, `tries` the attempts for each question. `json_mode`
     asks for a JSON object. `token_field` names the limit field (newer models want max_completion_tokens). A
-    `temperature` of None is not sent. Raises EndpointError for an address or a number that cannot be used.
+    `temperature` of None is not sent. Raises AnnotateError for an address or a number that cannot be used.
     """
 
     url: str
@@ -135,9 +133,9 @@ class Endpoint:
 
     def __post_init__(self) -> None:
         if not 0 < self.timeout <= 86_400:
-            raise EndpointError(f"timeout {self.timeout} must be above 0 seconds and at most 86,400")
+            raise AnnotateError(f"timeout {self.timeout} must be above 0 seconds and at most 86,400")
         if self.tries < 1 or self.max_tokens < 1:
-            raise EndpointError(f"tries {self.tries} and max-tokens {self.max_tokens} must be at least 1")
+            raise AnnotateError(f"tries {self.tries} and max-tokens {self.max_tokens} must be at least 1")
         try:
             parts = urllib.parse.urlsplit(self.url)
             valid = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and self.url.isascii()
@@ -145,9 +143,9 @@ class Endpoint:
         except ValueError:
             valid = False
         if not valid:
-            raise EndpointError(f"{self.url!r} is not an http or https address, such as https://api.openai.com/v1")
+            raise AnnotateError(f"{self.url!r} is not an http or https address, such as https://api.openai.com/v1")
         if parts.username or parts.password:
-            raise EndpointError(f"Set the environment variable {self.key_variable} to the key. Remove it from --url.")
+            raise AnnotateError(f"Set the environment variable {self.key_variable} to the key. Remove it from --url.")
 
     @property
     def is_local(self) -> bool:
@@ -160,50 +158,53 @@ class Endpoint:
         return self.url.startswith("http:") and not self.is_local and bool(os.environ.get(self.key_variable))
 
     def read_key(self) -> str:
-        """Return the key, or "" if it is missing and the endpoint is local. Raises EndpointError."""
+        """Return the key, or "" if it is missing and the endpoint is local.
+
+        Raises AnnotateError for a key that is missing or malformed, and if the openai client is not installed.
+        """
         key = os.environ.get(self.key_variable, "").strip()
         if not key and not self.is_local:
-            raise EndpointError(f"set the environment variable {self.key_variable} to the key of {self.url}")
+            raise AnnotateError(f"set the environment variable {self.key_variable} to the key of {self.url}")
         if key and not (key.isascii() and key.isprintable() and " " not in key):
-            raise EndpointError(f"the environment variable {self.key_variable} does not hold a key")
+            raise AnnotateError(f"the environment variable {self.key_variable} does not hold a key")
+        try:
+            import openai  # noqa: F401
+        except ImportError:
+            raise AnnotateError(
+                "captions need the package openai: install it with pip install 'anytouch_jax[annotate]'"
+            ) from None
         return key
-
-    def check(self) -> None:
-        """Raise EndpointError unless a question can be asked: the key is set and the client is installed."""
-        self.read_key()
-        _import_openai()
-
-
-def _import_openai() -> Any:
-    try:
-        import openai
-    except ImportError:
-        raise EndpointError(
-            "captions need the package openai: install it with pip install 'anytouch_jax[annotate]'"
-        ) from None
-    return openai
 
 
 class _Client:
     """The openai client for one endpoint. The key is read once and removed from every message."""
 
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.endpoint, self._key, self._openai = endpoint, endpoint.read_key(), _import_openai()
+    def __init__(self, endpoint: Endpoint, log: Callable[[str], None] | None = None) -> None:
+        self.endpoint, self._key, self._log = endpoint, endpoint.read_key(), log
 
     def connect(self) -> openai.AsyncOpenAI:
         """Return a client. It follows no redirect, which would take the key to another host."""
-        client: openai.AsyncOpenAI = self._openai.AsyncOpenAI(
+        import openai
+
+        return openai.AsyncOpenAI(
             api_key=self._key or "none", base_url=self.endpoint.url.rstrip("/").removesuffix("/chat/completions"),
             timeout=self.endpoint.timeout, max_retries=self.endpoint.tries - 1,
-            http_client=self._openai.DefaultAsyncHttpxClient(follow_redirects=False),
+            http_client=openai.DefaultAsyncHttpxClient(
+                follow_redirects=False, event_hooks={"response": [self._report_wait]}
+            ),
         )  # fmt: skip
-        return client
+
+    async def _report_wait(self, response: Any) -> None:
+        if self._log and response.status_code >= 400 and (wait := _asked_wait(response)):
+            self._log(f"the endpoint answers {response.status_code}{wait}")
 
     async def ask(self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]) -> tuple[str, str, int, int]:
         """Return an answer's text without the key, its finish reason, and the tokens in and out (0 if unknown).
 
-        Raises _QuestionError, BadAnswer, or EndpointError if no try can help.
+        Raises _QuestionError, BadAnswer, or AnnotateError if no try can help.
         """
+        import openai
+
         end = self.endpoint
         body: dict[str, Any] = {"model": end.model, "messages": messages, end.token_field: end.max_tokens}
         if end.temperature is not None:
@@ -214,11 +215,11 @@ class _Client:
             # The client's timeout is for one read: a server that sends a byte now and then would hold us for ever.
             async with asyncio.timeout(end.tries * end.timeout + (end.tries - 1) * _LONGEST_WAIT):
                 reply = await connection.post("/chat/completions", body=body, cast_to=object)
-        except (TimeoutError, self._openai.APITimeoutError):
+        except (TimeoutError, openai.APITimeoutError):
             reason = f"no answer within {end.timeout:g} seconds"
-        except self._openai.APIConnectionError as error:
+        except openai.APIConnectionError as error:
             reason = f"the endpoint cannot be reached: {error.__cause__ or error}"
-        except self._openai.APIStatusError as error:
+        except openai.APIStatusError as error:
             reason = self._judge(error)
         except (ValueError, RecursionError):
             raise BadAnswer("not JSON") from None
@@ -232,37 +233,46 @@ class _Client:
         return text.replace(self._key, "[key]") if self._key else text
 
     def _judge(self, error: openai.APIStatusError) -> str:
-        """Return the reason of an error status. Raises EndpointError for one that concerns every question."""
+        """Return the reason of an error status. Raises AnnotateError for one that concerns every question."""
         code = error.status_code
-        message = " ".join(self.redact(_error_message(error.response.text)).split())[:200]
+        try:
+            content = parse_json(error.response.content)["error"]
+            message = content["message"] if isinstance(content, dict) else content
+        except (ValueError, KeyError, TypeError):
+            message = error.response.text[:10_000]
+        message = _one_line(self.redact(str(message)))[:200]
         reason = f"the endpoint answers {code}{f': {message}' if message else ''}"
         if code in _REFUSED:
-            raise EndpointError(f"{self.endpoint.url}: {_REFUSED[code]}; {reason}")
+            raise AnnotateError(f"{self.endpoint.url}: {_REFUSED[code]}; {reason}")
         if 300 <= code < 400:
-            raise EndpointError(f"{self.endpoint.url} redirects to another address; give that address")
-        return reason
+            raise AnnotateError(f"{self.endpoint.url} redirects to another address; give that address")
+        return reason + _asked_wait(error.response)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.encode("utf-8", "replace").decode().split())
+
+
+def _asked_wait(response: Any) -> str:
+    wait = response.headers.get("retry-after")
+    return f" and asks to wait (Retry-After: {_one_line(wait)[:40]})" if wait else ""
 
 
 def _parse_reply(reply: Any) -> tuple[str, str, int, int]:
     try:
         choice = reply["choices"][0]
-        message, usage = choice["message"], reply.get("usage") or {}
+        message, usage = choice["message"], reply.get("usage")
         text, refusal = message.get("content"), message.get("refusal")
         if isinstance(text, list):  # some servers answer in parts
             text = "".join(str(part.get("text", "")) for part in text)
-        finish = "refusal" if refusal else str(choice.get("finish_reason") or "")
-        tokens_in, tokens_out = (int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens"))
-        return str(refusal or text or ""), finish, tokens_in, tokens_out
+        text, finish = str(refusal or text or ""), "refusal" if refusal else str(choice.get("finish_reason") or "")
+        text.encode()  # raises for half of a Unicode pair
     except (ValueError, KeyError, IndexError, TypeError, AttributeError):
         raise BadAnswer("not a chat completion") from None
-
-
-def _error_message(body: str) -> str:
-    try:
-        error = json.loads(body)["error"]
-        return str(error["message"] if isinstance(error, dict) else error)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return body[:10_000]
+    counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
+    # An answer with odd numbers is paid for too.
+    tokens_in, tokens_out = (n if isinstance(n, int) and 0 <= n < 1 << 40 else 0 for n in counts)
+    return text, finish, tokens_in, tokens_out
 
 
 def annotate(
@@ -287,19 +297,18 @@ def annotate(
     Each touch, or each sequence without a touch, is one question. `threads` questions are open at a time. Images are
     sent with no side longer than `side` pixels. Answers and failures are stored in `folder`. `confirm` is always
     called with the estimate, and prices are for a million tokens. `limit` asks only for the first captions. A phrase
-    that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False or too many
-    questions in a row fail, EndpointError if the endpoint cannot be used, and UserError if no caption is missing.
+    that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False or if the first
+    questions all fail, or if the endpoint cannot be used, and UserError if no caption is missing.
     """
     if threads < 1 or side < 16:
         raise AnnotateError(f"threads {threads} must be at least 1 and side {side} at least 16")
     if limit is not None and limit < 1:
         raise AnnotateError(f"limit {limit} must be at least 1; omit it for all captions")
-    store = _AnswerStore(Path(folder).expanduser().resolve())
     jobs, left_out = find_caption_jobs(
         manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
     )
+    jobs, store = jobs[:limit], _AnswerStore(Path(folder).expanduser().resolve())
     run = _Run(manifest, endpoint, store, side, log)
-    jobs = jobs[:limit]
     keys = run.keys(jobs, threads)
     missing: dict[str, CaptionJob] = {}  # equal questions about equal images are one
     for job, key in zip(jobs, keys, strict=True):
@@ -308,45 +317,25 @@ def annotate(
     if log and endpoint.exposes_key:
         log(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
-    if not confirm(_estimate(list(missing.values()), cached, side, price_in, price_out)):
+    image = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
+    tokens = [len(job.prompt.system + job.prompt.text) // 4 + image * len(job.images) + 20 for job in missing.values()]
+    tokens_in, tokens_out = sum(tokens), _ANSWER_TOKENS * len(missing)
+    cost = None if price_in is None or price_out is None else (tokens_in * price_in + tokens_out * price_out) / 1e6
+    if not confirm(CostEstimate(len(missing), cached, tokens_in, tokens_out, cost)):
         raise AnnotateError("not confirmed: nothing was asked")
-    if missing:
-        with store.exclusive():
-            questions = [(job, key) for key, job in missing.items() if key not in store.answers]
-            questions.sort(key=lambda question: question[1] in store.failed)  # earlier failures come last
-            try:
-                _run_async(run.ask(_Client(endpoint), questions, threads))
-            finally:
-                store.write_failures(run.failures, keys)
-    elif run.failures or store.failed:
-        store.write_failures(run.failures, keys)
-    captions = tuple(
-        Caption(job, store.answers[key]["caption"], store.answers[key]["object"])
-        for job, key in zip(jobs, keys, strict=True)
-        if key in store.answers
-    )
+    with store.exclusive() if missing else nullcontext():
+        try:
+            questions = [(key, job) for key, job in missing.items() if key not in store.answers]
+            questions.sort(key=lambda question: question[0] in store.failed)  # earlier failures come last
+            if questions:
+                with ThreadPoolExecutor(1) as pool:  # a notebook runs a loop in this thread
+                    pool.submit(asyncio.run, run.ask(_Client(endpoint, log), questions, threads)).result()
+        finally:
+            store.write_failures(run.failures, keys)
+    answers = ((job, store.answers.get(key)) for job, key in zip(jobs, keys, strict=True))
+    captions = tuple(Caption(job, answer["caption"], answer["object"]) for job, answer in answers if answer)
     annotated = _attach(manifest, captions)
     return CaptionResult(annotated, captions, tuple(run.failures), left_out, run.requests, *run.tokens)
-
-
-def _run_async(coroutine: Any) -> None:
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
-        asyncio.run(coroutine)
-        return
-    with ThreadPoolExecutor(1) as pool:  # a notebook runs a loop in this thread
-        pool.submit(asyncio.run, coroutine).result()
-
-
-def _estimate(
-    jobs: list[CaptionJob], cached: int, side: int, price_in: float | None, price_out: float | None
-) -> CostEstimate:
-    image = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
-    tokens_in = sum(len(job.prompt.system + job.prompt.text) // 4 + image * len(job.images) + 20 for job in jobs)
-    tokens_out = _ANSWER_TOKENS * len(jobs)
-    cost = None if price_in is None or price_out is None else (tokens_in * price_in + tokens_out * price_out) / 1e6
-    return CostEstimate(len(jobs), cached, tokens_in, tokens_out, cost)
 
 
 class _Run:
@@ -362,61 +351,67 @@ class _Run:
 
     def keys(self, jobs: list[CaptionJob], threads: int) -> list[str]:
         """Return the key of each job's answer. An unreadable image is a failure with the key ""."""
+
+        def key_of(job: CaptionJob) -> tuple[str, str]:
+            try:
+                return self._images(job)[0], ""
+            except UserError as error:
+                return "", str(error)
+
         keys = []
-        with closing(bounded_map(self._key, jobs, threads)) as results:
-            for job, key in zip(jobs, results, strict=True):
-                if isinstance(key, UserError):
-                    self._fail(job, "", str(key))
-                keys.append(key if isinstance(key, str) else "")
+        with closing(bounded_map(key_of, jobs, threads)) as results:
+            for job, (key, reason) in zip(jobs, results, strict=True):
+                keys.append(key)
+                if reason:
+                    self._fail(job, "", reason)
         return keys
 
-    def _key(self, job: CaptionJob) -> str | UserError:
-        end = self.endpoint
+    def _images(self, job: CaptionJob) -> tuple[str, list[bytes]]:
+        """Return the key of a job's answer, and its images as JPEG. Raises UserError for an unreadable image."""
+        end, jpegs = self.endpoint, []
         parts = [end.model, job.prompt.fingerprint(), self.side, end.max_tokens]
         digest = hashlib.sha256(json.dumps(parts).encode())
         for row, column in job.images:
             try:
                 data = image_bytes(self.manifest, row, column)
-                digest.update(hashlib.sha256(data).digest())
-                small_jpeg(data, f"{column} of row {row}", self.side)  # an image that does not decode costs nothing
-            except (UserError, OSError, ValueError) as error:
+                jpegs.append(small_jpeg(data, f"{column} of row {row}", self.side))
+            except (OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or error
-                return UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}")
-        return digest.hexdigest()[:32]
+                raise UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}") from None
+            digest.update(hashlib.sha256(data).digest())
+        return digest.hexdigest()[:32], jpegs
 
-    async def ask(self, client: _Client, questions: list[tuple[CaptionJob, str]], workers: int) -> None:
+    async def ask(self, client: _Client, questions: list[tuple[str, CaptionJob]], workers: int) -> None:
         """Ask all questions. The first error of a worker ends the others."""
         queue = iter(questions)
+
+        async def work() -> None:
+            for key, job in queue:
+                reason = await self._ask_one(client, connection, job, key)
+                self.done += 1
+                self.streak = self.streak + 1 if reason else 0
+                if reason:
+                    self._fail(job, key, reason)
+                if self.streak >= _MAX_STREAK:
+                    if not self.store.answers:
+                        raise AnnotateError(f"{self.streak} questions in a row failed, the last one: {reason}")
+                    for later_key, later_job in queue:
+                        self._fail(later_job, later_key, f"not asked: {_MAX_STREAK} before it failed")
+                if self.log and (self.done % 100 == 0 or self.done == len(questions)):
+                    self.log(f"{self.done} of {len(questions)} questions, {len(self.failures)} failed")
+
         try:
             async with client.connect() as connection, asyncio.TaskGroup() as group:
                 for _ in range(workers):
-                    group.create_task(self._work(client, connection, queue, len(questions)))
+                    group.create_task(work())
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
-
-    async def _work(
-        self, client: _Client, connection: openai.AsyncOpenAI, queue: Iterator[tuple[CaptionJob, str]], total: int
-    ) -> None:
-        for job, key in queue:
-            reason = await self._ask_one(client, connection, job, key)
-            self.done += 1
-            self.streak = self.streak + 1 if reason else 0
-            if reason:
-                self._fail(job, key, reason)
-            if self.streak >= _MAX_STREAK:
-                # A streak of questions that failed in an earlier run too does not condemn the endpoint.
-                if not (key in self.store.failed and self.store.answers):
-                    raise AnnotateError(f"{self.streak} questions in a row failed, the last one: {reason}")
-                for later_job, later_key in queue:
-                    self._fail(later_job, later_key, f"not asked again: {_MAX_STREAK} before it failed again")
-            if self.log and (self.done % 100 == 0 or self.done == total):
-                self.log(f"{self.done} of {total} questions, {len(self.failures)} failed")
 
     async def _ask_one(self, client: _Client, connection: openai.AsyncOpenAI, job: CaptionJob, key: str) -> str:
         """Get and store one answer. Returns the reason if there is none, else ""."""
         try:
-            jpegs = await asyncio.to_thread(self._jpegs, job)
-        except (UserError, OSError, ValueError) as error:
+            _, jpegs = await asyncio.to_thread(self._images, job)
+        except UserError as error:
             return str(error)
         reason = ""
         for _ in range(_BAD_ANSWER_TRIES):
@@ -438,12 +433,6 @@ class _Run:
             return ""
         return f"{reason} ({_BAD_ANSWER_TRIES} times)"
 
-    def _jpegs(self, job: CaptionJob) -> list[bytes]:
-        return [
-            small_jpeg(image_bytes(self.manifest, row, column), f"{column} of row {row}", self.side)
-            for row, column in job.images
-        ]
-
     def _fail(self, job: CaptionJob, key: str, reason: str) -> None:
         self.failures.append(CaptionFailure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key))
 
@@ -452,13 +441,10 @@ class _AnswerStore:
     """The answers of a folder, one JSON line each. A line that was cut off is asked for again."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self._path, self._line_break = folder, folder / "answers.jsonl", ""
         self.answers: dict[str, dict[str, Any]] = {}
-        self.failed: dict[str, str] = {}  # the line of each failed question by its key
-        self._path, self._line_break = folder / "answers.jsonl", ""
-        for line in _lines(folder / "failures.jsonl"):
-            with suppress(ValueError, KeyError, TypeError, RecursionError):
-                self.failed[str(json.loads(line)["key"])] = line.rstrip("\n")
+        # The line of each failed question by its key.
+        self.failed = {str(entry.get("key")): line for line, entry in _entries(folder / "failures.jsonl")}
         self._read_answers()
 
     @contextmanager
@@ -472,12 +458,10 @@ class _AnswerStore:
             yield
 
     def _read_answers(self) -> None:
-        for line in _lines(self._path):
+        for line, entry in _entries(self._path):
             self._line_break = "" if line.endswith("\n") else "\n"
-            with suppress(ValueError, KeyError, TypeError, RecursionError):
-                entry = json.loads(line)
-                if isinstance(entry["caption"], str) and isinstance(entry["object"], str):
-                    self.answers[str(entry["key"])] = entry
+            if isinstance(entry.get("caption"), str) and isinstance(entry.get("object"), str):
+                self.answers[str(entry.get("key"))] = entry
 
     def add(self, key: str, entry: dict[str, Any]) -> None:
         """Store an answer. It is on the disk when this returns."""
@@ -491,70 +475,73 @@ class _AnswerStore:
         """Write failures.jsonl: the new failures, and earlier ones among `keys` that are still open."""
         closed = {failure.key for failure in failures} | self.answers.keys() | {""}
         lines = [json.dumps(failure._asdict(), ensure_ascii=False) for failure in failures]
-        lines += [self.failed[key] for key in dict.fromkeys(keys) if key in self.failed and key not in closed]
-        atomic_write(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
+        lines += [self.failed[key].strip() for key in dict.fromkeys(keys) if key in self.failed and key not in closed]
+        if lines or self.failed:
+            atomic_write(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
 
 
-def _lines(path: Path) -> Iterator[str]:
-    if path.is_file():
-        with path.open(encoding="utf-8", errors="replace") as file:
-            yield from file
+def _entries(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the lines of a JSON-lines file and their objects, {} for a line that is damaged."""
+    if not path.is_file():
+        return
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            entry: Any = {}
+            with suppress(UserError):
+                entry = parse_json(line)
+            yield line, entry if isinstance(entry, dict) else {}
 
 
 def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
-    has_phrase = PHRASE in manifest.table.column_names
-    text = manifest.column("text").to_pylist()
-    phrase = manifest.column(PHRASE).to_pylist() if has_phrase else [None] * len(manifest)
+    columns: dict[str, list[str | None]] = {}
     for caption in captions:
-        for row in caption.job.rows:
-            text[row] = caption.text
-            phrase[row] = caption.job.phrase if caption.job.phrase is not None else phrase[row]
-    result = replace_column(manifest, "text", pa.array(text, pa.string()))
-    if any(caption.job.phrase is not None for caption in captions):
-        result = replace_column(result, PHRASE, pa.array(phrase, pa.string()))
-    return result
+        for name, cell in (("text", caption.text), (PHRASE, caption.job.phrase)):
+            if cell is not None:
+                if name not in columns:
+                    known = name in manifest.table.column_names
+                    columns[name] = manifest.column(name).to_pylist() if known else [None] * len(manifest)
+                for row in caption.job.rows:
+                    columns[name][row] = cell
+    for name, cells in columns.items():
+        manifest = replace_column(manifest, name, pa.array(cells, pa.string()))
+    return manifest
 
 
 def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40) -> Path:
     """Write an HTML page with a random sample of `count` captions and their images, to be checked by hand.
 
-    Images are in the folder `<name>_images` next to the page. Raises UserError if there are no captions.
+    The page holds its images. Raises UserError if there are no captions.
     """
     if not captions:
         raise UserError("there are no captions to look at")
-    target = Path(path).expanduser().resolve()
-    folder = target.with_name(f"{target.stem}_images")
-    chosen = np.random.default_rng(0).permutation(len(captions))[:count]
-    parts = [_article(manifest, captions[i], number, folder) for number, i in enumerate(np.sort(chosen))]
-    title = f"{len(parts)} of {len(captions)} captions"
+    chosen = np.sort(np.random.default_rng(0).permutation(len(captions))[:count])
+    title = f"{len(chosen)} of {len(captions)} captions"
     page = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_SHEET_STYLE}</style>'
-        f"<h1>{title}</h1><p>Tick what is wrong.</p>{''.join(parts)}</html>\n"
+        f"<h1>{title}</h1><p>Tick what is wrong.</p>"
     )
-    atomic_write(target, page)
+    page += "".join(_article(manifest, captions[i], number) for number, i in enumerate(chosen, 1))
+    atomic_write(target := Path(path).expanduser().resolve(), f"{page}</html>\n")
     return target
 
 
-def _article(manifest: Manifest, caption: Caption, number: int, folder: Path) -> str:
+def _article(manifest: Manifest, caption: Caption, number: int) -> str:
     job, row = caption.job, int(caption.job.rows[0])
     images = list(job.images)
     if not any(column == "path" for _, column in images):  # the model did not see the touch
         images.append((images[0][0] if images else row, "path"))
-    figures = []
-    for i, (image_row, column) in enumerate(images):
-        name = f"{number:04d}_{i}_{column.removesuffix('_path')}.jpg"
-        try:
-            data = image_bytes(manifest, image_row, column)
-            atomic_write(folder / name, small_jpeg(data, f"{column} of row {image_row}", _SHEET_SIDE))
-        except (UserError, OSError, ValueError) as error:
-            figures.append(f"<p>{html.escape(str(error))}</p>")
-            continue
+    parts = []
+    for image_row, column in images:
         word = "touch" if column == "path" else "photograph"
-        figures.append(f'<figure><img src="{folder.name}/{name}" alt="{word}"><figcaption>{word}</figcaption></figure>')
-    phrase = f"<p><small>phrase: {html.escape(job.phrase)}</small></p>" if job.phrase else ""
-    source = f"{manifest.value(row, 'dataset')}, row {manifest.number[row]}, {len(job.rows)} rows share it"
-    return (
-        f"<article>{''.join(figures)}<div><p><label><input type=checkbox> {number + 1}. "
-        f"<b>{html.escape(caption.object)}</b></label></p><p>{html.escape(caption.text)}</p>{phrase}"
-        f"<p><small>{html.escape(source)}</small></p></div></article>"
-    )
+        try:
+            jpeg = small_jpeg(image_bytes(manifest, image_row, column), f"{column} of row {image_row}", _SHEET_SIDE)
+        except (OSError, ValueError) as error:
+            parts.append(f"<p>{html.escape(str(error))}</p>")
+            continue
+        data = base64.b64encode(jpeg).decode()
+        parts.append(f'<figure><img src="data:image/jpeg;base64,{data}" alt="{word}"><figcaption>{word}</figure>')
+    notes = [f"phrase: {job.phrase}"] if job.phrase else []
+    notes += [f"{manifest.value(row, 'dataset')}, row {manifest.number[row]}, {len(job.rows)} rows share it"]
+    parts += [f"<div><p><label><input type=checkbox> {number}. <b>{html.escape(caption.object)}</b></label></p>"]
+    parts += [f"<p>{html.escape(caption.text)}</p>", *(f"<p><small>{html.escape(note)}</small></p>" for note in notes)]
+    return f"<article>{''.join(parts)}</div></article>"

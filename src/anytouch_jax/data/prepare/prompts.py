@@ -18,11 +18,12 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+import pyarrow.compute as pc
 
+from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.images import decode_bytes
 from anytouch_jax.data.manifest.files import read_file
-from anytouch_jax.data.manifest.manifest import Manifest, resolve_path
-from anytouch_jax.data.manifest.schema import SPLITS
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows, resolve_path
 from anytouch_jax.errors import UserError
 
 Family = Literal["photograph", "object", "phrase"]
@@ -132,14 +133,13 @@ def parse_caption(text: str, finish: str) -> tuple[str, str]:
         raise BadAnswer("cut off")
     bare = re.sub(r"\A\s*```(?:json)?\s*|\s*```\s*\Z", "", text)
     try:
-        answer = json.loads(bare)
-    except (ValueError, RecursionError):
-        raise BadAnswer("not JSON") from None
+        answer = parse_json(bare)
+    except UserError as error:
+        raise BadAnswer("not text" if "Unicode" in str(error) else "not JSON") from None
     caption = answer.get("caption") if isinstance(answer, dict) else None
     if not isinstance(caption, str):
         raise BadAnswer("JSON without a caption")
-    caption = " ".join(caption.split())
-    words = len(caption.split())
+    caption, words = " ".join(caption.split()), len(caption.split())
     if words < _MIN_WORDS or not re.search(r"[^\W\d_]{2}", caption):
         raise BadAnswer("too short")
     if words > _MAX_WORDS or len(caption) > 12 * _MAX_WORDS:
@@ -176,8 +176,12 @@ def find_caption_jobs(
     if second_image not in (SECOND_IMAGE, *names):
         raise UserError(f"The manifest has no column {second_image!r}. It has {', '.join(names)}.")
     rows_to_ask, family, left_out = _rows_to_ask(manifest, split, families, overwrite)
+    touch, sequence = manifest.codes("touch", own=True), manifest.codes("sequence", own=True)
+    text = np.where(family == "phrase", manifest.codes("text"), -1)
+    key = np.stack([touch, np.where(touch < 0, sequence, -1), text, manifest.codes("dataset")], 1)[rows_to_ask]
+    groups = group_rows(rows_to_ask, key, np.asarray(manifest.table["frame_index"])[rows_to_ask])
     jobs: list[CaptionJob] = []
-    for rows in _group_rows(manifest, rows_to_ask, family):
+    for rows in sorted(groups, key=np.min):
         job = _make_job(manifest, rows, family[rows[0]], second_image)
         if job is None:
             left_out["no photograph"] += len(rows)
@@ -194,30 +198,23 @@ def _rows_to_ask(
 ) -> tuple[np.ndarray, np.ndarray, Counter[str]]:
     """Return the row ids i64 to ask for, the family of every row, and the number of other rows by reason."""
     left_out: Counter[str] = Counter()
-    splits = np.asarray(manifest.table["split"].to_pylist())
-    selected = np.isin(splits, [name for name in SPLITS if name != "background"])
+    selected = np.asarray(pc.not_equal(manifest.table["split"], "background"))
     if split is not None:
-        selected = np.zeros(len(manifest), bool)
-        selected[manifest.rows_of(split)] = True
+        selected = np.isin(np.arange(len(manifest)), manifest.rows_of(split))
     left_out["background frame, or another split"] = int((~selected).sum())
     family = np.full(len(manifest), None, object)
-    dataset = manifest.codes("dataset")
-    for code in np.unique(dataset):
-        rows = np.flatnonzero(dataset == code)
+    for rows in group_rows(np.arange(len(manifest)), manifest.codes("dataset")):
         name = manifest.value(rows[0], "dataset")
-        family[rows] = chosen = family_of(name, families)
-        if chosen is None and selected[rows].any():
-            known, remedy = "", "the manifest has no column dataset that names it"
+        family[rows] = family_of(name, families)
+        if family[rows[0]] is None and selected[rows].any():
+            remedy = "the manifest has no column dataset that names it"
             if name is not None:
-                remedy = f"give it one, such as --family {shlex.quote(name)} photograph"
-            if not any("has no prompt" in reason for reason in left_out):
-                known = f"; known: {', '.join(FAMILIES)}"
-            left_out[f"dataset {name!r} has no prompt: {remedy}{known}"] = int(selected[rows].sum())
+                known = f"; known: {', '.join(FAMILIES)}" if len(left_out) == 1 else ""
+                remedy = f"give it one, such as --family {shlex.quote(name)} photograph{known}"
+            left_out[f"dataset {name!r} has no prompt: {remedy}"] = int(selected[rows].sum())
     selected &= family != None  # noqa: E711 - elementwise
-    has_text, expanded = manifest.present("text"), np.zeros(len(manifest), bool)
-    if PHRASE in manifest.table.column_names:
-        expanded = manifest.present(PHRASE)
-    is_phrase = family == "phrase"
+    has_text, is_phrase = manifest.present("text"), family == "phrase"
+    expanded = manifest.present(PHRASE) if PHRASE in manifest.table.column_names else np.zeros(len(manifest), bool)
     for reason, excluded in (
         ("no phrase to expand", is_phrase & ~has_text),
         ("expanded before", is_phrase & expanded & (not overwrite)),
@@ -228,27 +225,13 @@ def _rows_to_ask(
     return np.flatnonzero(selected), family, +left_out
 
 
-def _group_rows(manifest: Manifest, rows: np.ndarray, family: np.ndarray) -> list[np.ndarray]:
-    """Return the rows of every group in frame order. Groups are in the order of their first row."""
-    if not rows.size:
-        return []
-    touch, sequence = manifest.codes("touch", own=True)[rows], manifest.codes("sequence", own=True)[rows]
-    text = np.where(family[rows] == "phrase", manifest.codes("text")[rows], -1)
-    key = np.stack([touch, np.where(touch < 0, sequence, -1), text, manifest.codes("dataset")[rows]], 1)
-    _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    order = np.lexsort((rows, np.asarray(manifest.table["frame_index"])[rows], first[group.ravel()]))
-    cuts = np.flatnonzero(np.diff(group.ravel()[order])) + 1
-    return np.split(rows[order], cuts)
-
-
 def _make_job(manifest: Manifest, rows: np.ndarray, family: Family, second_image: str) -> CaptionJob | None:
     with_photograph = [int(row) for row in rows if manifest.value(row, "image_path") is not None]
     if not with_photograph and family != "phrase":
         return None
     phrase = None
     if family == "phrase":  # an expanded phrase is in its own column
-        before = manifest.value(rows[0], PHRASE) if PHRASE in manifest.table.column_names else None
-        phrase = str(before or manifest.value(rows[0], "text"))
+        phrase = str(manifest.value(rows[0], PHRASE) or manifest.value(rows[0], "text"))
     images: list[tuple[int, str]] = []
     if with_photograph:
         row = with_photograph[len(with_photograph) // 2]

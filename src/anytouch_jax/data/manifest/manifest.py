@@ -79,6 +79,10 @@ class Manifest:
         """Return which rows have a value in column `name`, bool (rows,)."""
         return np.asarray(pc.is_valid(self.column(name)))
 
+    def text_column(self, name: str) -> np.ndarray:
+        """Return a column as strings (rows,), "" for null."""
+        return np.array(["" if value is None else str(value) for value in self.column(name).to_pylist()])
+
     def codes(self, name: str, *, own: bool = False) -> np.ndarray:
         """Return a text column as i64 (rows,): equal numbers for equal values, -1 for null.
 

@@ -78,6 +78,18 @@ def load_table(path: Path) -> pa.Table:
     return typed(table, str(path))
 
 
+def shown(value: object) -> str:
+    """Return a value for a message: at most 200 characters of its form in Python."""
+    text = repr(value[:200] if isinstance(value, str | bytes) else value)
+    return text if len(text) <= 200 else f"{text[:197]}..."
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the first twenty names for a message, each with at most 50 characters, and the number of the others."""
+    more = f" and {len(names) - 20:,} more" if len(names) > 20 else ""
+    return ", ".join(name[:50] for name in names[:20]) + more
+
+
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Turn errors of reading a table into a ManifestError that names the file."""

@@ -26,7 +26,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.data.images import ImageError, decode
-from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column, select_rows
+from anytouch_jax.data.manifest.schema import shown
 from anytouch_jax.data.prepare.untouched_gel import (
     ALIKE,
     EDGE,
@@ -47,6 +48,7 @@ DEFAULT_THRESHOLD = 6.5
 THRESHOLDS: Mapping[str, float] = {"gelsight_mini": 6.5, "gelslim": 6.5, "gelsight": 6.5, "9dtact": 4.0}
 # Columns that report contact, in order of preference, and the value above which they do.
 REFERENCES: Mapping[str, float] = {"label.force": 0.0, "label.contact": 0.5, "label.contact_score": 7.0}
+_CONTACT_WORDS = {"true": 1.0, "false": 0.0, "none": np.nan, "": np.nan}
 TILE, PER_ROW = 120, 10  # of contact_sheet
 
 
@@ -70,42 +72,34 @@ class ContactScores:
 
 @dataclass(frozen=True)
 class ContactReport:
-    """Numbers of rows by result, of rows dropped, of rows labelled before, and of rows by source of the background.
+    """Numbers of rows by result, of rows dropped, and of rows labelled before, with the scores and thresholds."""
 
-    `recordings` and `decided` are those of ContactScores.
-    """
-
-    rows: int
+    scores: ContactScores
     contact: int
     free: int
     unknown: int
     dropped: int
     labelled: int
-    backgrounds: dict[str, int]
     thresholds: dict[str, float]
-    recordings: int = 0
-    decided: int = 0
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         limits = ", ".join(f"{sensor} {limit:g}" for sensor, limit in self.thresholds.items())
         labelled = f"; {self.labelled:,} rows keep the label.contact that they had" if self.labelled else ""
-        shares = []
-        if self.recordings:
-            share = self.decided / self.recordings
-            shares = [f"untouched gel estimated for {self.decided:,} of {self.recordings:,} recordings ({share:.0%})"]
-        if self.decided < self.recordings:
-            shares[0] += (
-                ". The labels of the others stay empty. To decide them, pass --background with a picture of the "
-                "untouched gel"
-            )
-        return [
-            f"{self.rows:,} rows: contact {self.contact:,}, no contact {self.free:,}, unknown {self.unknown:,}; "
-            f"dropped {self.dropped:,}",
-            "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.backgrounds.items()),
-            *shares,
-            f"contact is a score above: {limits}{labelled}",
+        lines = [
+            f"{len(self.scores.score):,} rows: contact {self.contact:,}, no contact {self.free:,}, "
+            f"unknown {self.unknown:,}; dropped {self.dropped:,}",
+            "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.scores.counts.items()),
         ]
+        if all_of := self.scores.recordings:
+            decided = self.scores.decided
+            lines += [f"untouched gel estimated for {decided:,} of {all_of:,} recordings ({decided / all_of:.0%})"]
+            if decided < all_of:
+                lines[-1] += (
+                    ". The labels of the others stay empty. To decide them, pass --background with a picture of the "
+                    "untouched gel"
+                )
+        return [*lines, f"contact is a score above: {limits}{labelled}"]
 
 
 @dataclass(frozen=True)
@@ -124,16 +118,10 @@ class ContactQuality:
     positives: int
     predicted: int
     hits: int
+    precision: float
+    recall: float
     correlation: float
     parts: dict[str, tuple[int, float, float]]
-
-    @property
-    def precision(self) -> float:
-        return self.hits / self.predicted if self.predicted else float("nan")
-
-    @property
-    def recall(self) -> float:
-        return self.hits / self.positives if self.positives else float("nan")
 
     def lines(self) -> list[str]:
         """Return the figures as lines of text."""
@@ -199,16 +187,15 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
     Raises UserError for a file that cannot be read, a unit without rows that need it, and a picture of another shape.
     """
     waiting = np.flatnonzero(~manifest.present("background_path"))
-    units, sensors = manifest.column("unit").to_pylist(), manifest.codes("sensor")
+    units, sensors = manifest.text_column("unit"), manifest.codes("sensor")
     gels: dict[str, UntouchedGel] = {}
     for word in words:
         is_file = "=" not in word or (len(words) == 1 and Path(word).exists())
         unit, _, file = ("", "", word) if is_file else word.partition("=")
         if unit in gels or (not unit and len(words) > 1):
             raise UserError(f"--background {word}: give one picture for all recordings, or one UNIT=FILE for each unit")
-        path = Path(file).expanduser()
-        gels[unit] = UntouchedGel(decode(path))
-        rows = waiting if not unit else waiting[[units[row] == unit for row in waiting]]
+        gel = gels[unit] = UntouchedGel(decode(Path(file).expanduser()))
+        rows = waiting[units[waiting] == unit] if unit else waiting
         if not len(rows):
             kind = f"of unit {unit} " if unit else ""
             raise UserError(f"--background {word}: the manifest has no row {kind}without a background picture")
@@ -216,10 +203,10 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
             picture = _load_or_none(manifest, row)
             try:
                 if picture is not None:
-                    gels[unit].score(picture)
+                    gel.score(picture)
             except ValueError:
                 raise UserError(
-                    f"--background {path} has other proportions than {manifest.where(int(row))}. "
+                    f"--background {file} has other proportions than {manifest.where(int(row))}. "
                     "Pass a picture of the same camera and cut, or name the unit as in UNIT=FILE."
                 ) from None
     return gels
@@ -235,22 +222,12 @@ def _score_row(manifest: Manifest, gel: UntouchedGel | Callable[[int], Untouched
         return row, np.nan, f"none: {error}"
 
 
-def _groups(manifest: Manifest, rows: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield `rows` by unit of one dataset and sensor if a unit is named, else by sequence, each in row order."""
+def _groups(manifest: Manifest, rows: np.ndarray) -> list[np.ndarray]:
+    """Return `rows` by unit of one dataset and sensor if a unit is named, else by sequence, each in row order."""
     unit, sequence = manifest.codes("unit", own=True), manifest.codes("sequence", own=True)
-    dataset, sensor = manifest.codes("dataset"), manifest.codes("sensor")
-    no_unit = unit < 0
-    yield from _split(rows, np.stack([no_unit, np.where(no_unit, sequence, unit), np.where(no_unit, 0, dataset),
-                                      sensor], 1)[rows])  # fmt: skip
-
-
-def _split(rows: np.ndarray, keys: np.ndarray) -> list[np.ndarray]:
-    """Return `rows` by equal rows of `keys`, each in row order."""
-    if not len(rows):
-        return []
-    _, groups = np.unique(keys, axis=0, return_inverse=True)
-    order = np.argsort(groups.ravel(), kind="stable")
-    return np.split(rows[order], np.flatnonzero(np.diff(groups.ravel()[order])) + 1)
+    no_unit, dataset = unit < 0, manifest.codes("dataset")
+    keys = [no_unit, np.where(no_unit, sequence, unit), np.where(no_unit, 0, dataset), manifest.codes("sensor")]
+    return group_rows(rows, np.stack(keys, 1)[rows])
 
 
 def _gel_of_group(
@@ -279,8 +256,8 @@ def _estimates(
 
     sequence = manifest.codes("sequence", own=True)[group]
     _, number, frames = np.unique(sequence, return_inverse=True, return_counts=True)
-    recordings = _split(group, np.where(frames[number] < 3, -2, sequence))
-    voters = np.unique(np.linspace(0, len(recordings) - 1, _MAX_RECORDINGS).astype(int)).tolist()
+    recordings = group_rows(group, np.where(frames[number] < 3, -2, sequence))
+    voters = spread(np.arange(len(recordings)), _MAX_RECORDINGS).tolist()
     estimates = {voter: estimate(recordings[voter]) for voter in voters}
     by_shape: dict[tuple[int, ...], list[UntouchedGel]] = {}
     for gel, _, shape in estimates.values():
@@ -300,8 +277,7 @@ def _estimates(
 
 def _pictures(manifest: Manifest, rows: np.ndarray, pool: ThreadPoolExecutor) -> list[np.ndarray]:
     """Return at most _MAX_FRAMES evenly spaced frames from `scale_picture`, those of the most common shape."""
-    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, _MAX_FRAMES).astype(int))] if len(rows) else rows
-    loaded = pool.map(partial(_load_or_none, manifest), chosen.tolist())
+    loaded = pool.map(partial(_load_or_none, manifest), spread(rows, _MAX_FRAMES).tolist())
     pictures = [picture for picture in loaded if picture is not None and min(picture.shape[:2]) > 2 * EDGE + 2]
     shapes = Counter(picture.shape for picture in pictures)
     return [picture for picture in pictures if picture.shape == shapes.most_common(1)[0][0]]
@@ -333,9 +309,11 @@ def mark_contact(
     nor frames of unknown contact. Raises UserError if nothing would be left.
     """
     limits, known = threshold_of_rows(manifest, thresholds, share), known_contact(manifest)
-    score = scores.score
-    contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * _highest(manifest, score)))
-    background = np.asarray(manifest.table["split"].to_pylist(), object) == "background"
+    score, sequence = scores.score, manifest.codes("sequence", own=True)
+    highest = np.zeros(sequence.max() + 1)
+    np.fmax.at(highest, sequence, score)
+    contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * highest[sequence]))
+    background = manifest.text_column("split") == "background"
     contact[background] = 0
     contact = np.where(np.isnan(known), contact, known > 0)
     free = contact == 0
@@ -350,10 +328,8 @@ def mark_contact(
     if not stays.any():
         raise UserError("every frame is without contact by these thresholds; nothing would be left")
     used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
-    unknown = int(np.isnan(contact).sum())
-    report = ContactReport(len(manifest), int((contact == 1).sum()), int(free.sum()), unknown, int((~stays).sum()),
-                           int(np.isfinite(known).sum()), scores.counts, used, scores.recordings,
-                           scores.decided)  # fmt: skip
+    counts = (int(flags.sum()) for flags in (contact == 1, free, np.isnan(contact), ~stays, np.isfinite(known)))
+    report = ContactReport(scores, *counts, used)
     return select_rows(marked, np.flatnonzero(stays)), report
 
 
@@ -371,28 +347,16 @@ def threshold_of_rows(manifest: Manifest, thresholds: Mapping[str, float] | None
     return np.array([table.get(name, DEFAULT_THRESHOLD) for name in sensors])
 
 
-def _highest(manifest: Manifest, score: np.ndarray) -> np.ndarray:
-    """Return the highest score in the sequence of every row, f64 (rows,)."""
-    codes = manifest.codes("sequence", own=True)
-    best = np.zeros(codes.max() + 1)
-    np.fmax.at(best, codes, score)
-    return np.asarray(best[codes])
-
-
 def known_contact(manifest: Manifest) -> np.ndarray:
     """Return `label.contact` of every row, f64 (rows,), NaN if unknown. Raises UserError for another word."""
-    words = {"true": 1.0, "false": 0.0}
     contact = np.full(len(manifest), np.nan)
-    if "label.contact" not in manifest.table.column_names:
-        return contact
-    for row, value in enumerate(manifest.table["label.contact"].to_pylist()):
-        word = "" if value is None else str(value).strip().lower()
-        if not word:  # an empty cell of a CSV
-            continue
+    cells = manifest.table["label.contact"].to_pylist() if "label.contact" in manifest.table.column_names else []
+    for row, value in enumerate(cells):
+        word = str(value).strip().lower()
         try:
-            contact[row] = words[word] if word in words else float(word)
+            contact[row] = _CONTACT_WORDS[word] if word in _CONTACT_WORDS else float(word)
         except ValueError:
-            message = f"column 'label.contact' must be a number, true or false, is {value!r}"
+            message = f"column 'label.contact' must be a number, true or false, is {shown(value)}"
             raise UserError(f"{manifest.where(row)}: {message}") from None
     return contact
 
@@ -414,9 +378,8 @@ def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple
     if name == "label.contact":
         return name, known_contact(manifest)
     try:
-        values = manifest.table[name].to_pylist()
-        return name, np.array([np.nan if value is None else float(value) for value in values])
-    except (TypeError, ValueError):
+        return name, np.asarray(pc.fill_null(manifest.table[name].cast(pa.float64()), np.nan))
+    except pa.ArrowException:
         raise UserError(f"column {name} holds something that is no number; contact must be a number") from None
 
 
@@ -435,28 +398,26 @@ def contact_quality(
     """
     name, truth = reference_contact(manifest, reference)
     limit = REFERENCES.get(name, 0.0) if above is None else above
-    relevant = np.asarray(manifest.table["split"].to_pylist(), object) != "background"
+    relevant = manifest.text_column("split") != "background"
     used = np.flatnonzero(relevant & ~np.isnan(truth) & ~np.isnan(scores.score))
     if not used.size:
         raise UserError(f"no row has both a value in {name} and a score")
-    score, sources = scores.score[used], scores.reasons[used]
-    sensors = np.asarray(manifest.table["sensor"].to_pylist(), object)[used]
+    score, sources, sensors = scores.score[used], scores.reasons[used], manifest.text_column("sensor")[used]
     predicted, positive = score > threshold_of_rows(manifest, thresholds, 0.0)[used], truth[used] > limit
-    hit = positive & predicted
-    groups = {f"sensor {sensor}": sensors == sensor for sensor in sorted(set(sensors))}
-    groups |= {f"background {source}": sources == source for source in sorted(set(sources))}
-    parts = {
-        group: (int(members.sum()), _share(hit[members], predicted[members]), _share(hit[members], positive[members]))
-        for group, members in groups.items()
-    }
-    counts = (len(used), int(relevant.sum()) - len(used), int(positive.sum()), int(predicted.sum()), int(hit.sum()))
+
+    def figures(members: np.ndarray) -> tuple[int, float, float]:
+        hits, found, real = (int(part[members].sum()) for part in (positive & predicted, predicted, positive))
+        return int(members.sum()), hits / found if found else np.nan, hits / real if real else np.nan
+
+    parts = {f"sensor {sensor}": figures(sensors == sensor) for sensor in sorted(set(sensors))}
+    parts |= {f"background {source}": figures(sources == source) for source in sorted(set(sources))}
     constant = len(used) < 2 or np.ptp(score) == 0 or np.ptp(truth[used]) == 0
-    correlation = float("nan") if constant else float(np.corrcoef(score, truth[used])[0, 1])
-    return ContactQuality(name, limit, *counts, correlation, parts)
-
-
-def _share(part: np.ndarray, whole: np.ndarray) -> float:
-    return int(part.sum()) / int(whole.sum()) if whole.any() else float("nan")
+    correlation = np.nan if constant else float(np.corrcoef(score, truth[used])[0, 1])
+    rows, precision, recall = figures(np.ones(len(used), bool))
+    return ContactQuality(
+        name, limit, rows, int(relevant.sum()) - rows, int(positive.sum()), int(predicted.sum()),
+        int((positive & predicted).sum()), precision, recall, correlation, parts,
+    )  # fmt: skip
 
 
 def contact_sheet(manifest: Manifest, scores: ContactScores, path: str | Path, *,
@@ -466,23 +427,18 @@ def contact_sheet(manifest: Manifest, scores: ContactScores, path: str | Path, *
     Frames are spread evenly over the scores of each side, so the doubtful ones are next to each other. Raises
     UserError if no row has a score.
     """
-    limits = threshold_of_rows(manifest, thresholds, 0.0)
-    splits = np.asarray(manifest.table["split"].to_pylist(), object)
-    scored = np.flatnonzero(~np.isnan(scores.score) & (splits != "background"))
-    if not scored.size:
+    is_scored = ~np.isnan(scores.score) & (manifest.text_column("split") != "background")
+    if not is_scored.any():
         raise UserError("no frame has a contact score, so there is nothing to show")
-    contact = scores.score[scored] > limits[scored]
+    contact = scores.score > threshold_of_rows(manifest, thresholds, 0.0)
     bands = []
-    for title, side, colour in (
-        ("no contact", scored[~contact], (60, 60, 230)), ("contact", scored[contact], (80, 180, 60)),
-    ):  # fmt: skip
-        order = side[np.argsort(scores.score[side], kind="stable")]
-        chosen = order[np.unique(np.linspace(0, len(order) - 1, rows * PER_ROW).astype(int))] if len(order) else order
+    for title, members, colour in (("no contact", ~contact, (60, 60, 230)), ("contact", contact, (80, 180, 60))):
+        side = np.flatnonzero(is_scored & members)
+        chosen = spread(side[np.argsort(scores.score[side], kind="stable")], rows * PER_ROW)
         tiles = [_tile(manifest, row, float(scores.score[row]), colour) for row in chosen]
         tiles += [np.full((TILE, TILE, 3), 255, np.uint8)] * (-len(tiles) % PER_ROW)
         head = np.full((28, TILE * PER_ROW, 3), 255, np.uint8)
-        cv2.putText(head, f"{title}: {len(side)} frames", (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1,
-                    cv2.LINE_AA)  # fmt: skip
+        _write(head, f"{title}: {len(side)} frames", (6, 20), 0.55, colour)
         bands += [head, *(np.hstack(tiles[start : start + PER_ROW]) for start in range(0, len(tiles), PER_ROW))]
     atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
     return Path(path)
@@ -495,10 +451,19 @@ def _tile(manifest: Manifest, row: int, score: float, colour: tuple[int, int, in
         image = decode(manifest.file(row))[..., ::-1]
     except ImageError:
         return tile
-    shrink = (TILE - 20) / max(image.shape[:2])
-    size = max(1, round(image.shape[1] * shrink)), max(1, round(image.shape[0] * shrink))
-    left = (TILE - size[0]) // 2
-    tile[2 : 2 + size[1], left : left + size[0]] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    cv2.rectangle(tile, (left - 1, 1), (left + size[0], 2 + size[1]), colour, 1)
-    cv2.putText(tile, f"{score:.1f}", (left, size[1] + 16), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+    image = scale_picture(image, TILE - 20)
+    height, width = image.shape[:2]
+    left = (TILE - width) // 2
+    tile[2 : 2 + height, left : left + width] = image
+    cv2.rectangle(tile, (left - 1, 1), (left + width, 2 + height), colour, 1)
+    _write(tile, f"{score:.1f}", (left, height + 16), 0.4, (0, 0, 0))
     return tile
+
+
+def _write(picture: np.ndarray, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+
+
+def spread(items: np.ndarray, most: int) -> np.ndarray:
+    """Return at most `most` evenly spread ones of `items` (n,)."""
+    return items[np.unique(np.linspace(0, len(items) - 1, most).astype(int))] if len(items) else items

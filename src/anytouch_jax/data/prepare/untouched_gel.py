@@ -22,10 +22,10 @@ ALIKE, DIFFERENT = 3.0, 6.5  # grey levels: frames of one state, and frames of t
 MARGIN = 0.1  # least excess of structure, as a share of the sum; measured on real and simulated recordings
 
 
-def scale_picture(picture: np.ndarray) -> np.ndarray:
-    """Scale a picture to LONG_SIDE pixels on its long side."""
+def scale_picture(picture: np.ndarray, long_side: int = LONG_SIDE) -> np.ndarray:
+    """Scale a picture to `long_side` pixels on its long side."""
     height, width = picture.shape[:2]
-    shrink = LONG_SIDE / max(height, width)
+    shrink = long_side / max(height, width)
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
 

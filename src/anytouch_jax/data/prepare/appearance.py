@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.prepare.scan import BORDER, BOTTOM, CHROMA, FIELDS, NOISE, OK, SPREAD, Scan
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows
+from anytouch_jax.data.prepare.scan import BORDER, BOTTOM, CHROMA, FIELDS, NOISE, SPREAD, Finding, Scan, finding
 
 _FEWEST = 5  # frames of a sequence that show what is usual in it
 _FROZEN = 3  # equal pictures in a row: cameras have noise
@@ -31,39 +31,29 @@ _IN_SEQUENCE = (
     ("channels", "with red and blue exchanged for their sequence"),
     ("turned", "rotated or mirrored for their sequence"),
 )
-Fault = tuple[str, str, np.ndarray, str]  # kind, sentence, row ids i64, column
 
 
-def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Fault]:
-    """Yield the kinds of pictures that cannot be right, with their rows and the column of the file."""
+def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
+    """Yield the kinds of pictures that cannot be right."""
     looks = scanned.looks
     flat = looks[:, SPREAD] < 1
     alone = {
         "flat": flat, "cut": ~flat & (looks[:, BOTTOM] > 0.1), "border": ~flat & (looks[:, BORDER] > 0.03),
         "noise": ~flat & (looks[:, NOISE] > 0.6),
     }  # fmt: skip
-    decoded = (scanned.state == OK) & (scanned.size[:, 0] > 0)
     for column, code in scanned.files.code.items():
         for kind, words in _ALONE:
-            rows = np.flatnonzero((code >= 0) & (decoded & alone[kind])[code])
-            if rows.size:
-                yield kind, f"{rows.size} rows whose {column} is {words}", rows, column
-    files = scanned.files.code["path"]
-    faults: dict[str, list[np.ndarray]] = {}
-    for rows in _sequences(manifest, np.flatnonzero((decoded & ~np.any([*alone.values()], axis=0))[files])):
-        for kind, wrong in _faults_of_sequence(scanned, files[rows]).items():
-            faults.setdefault(kind, []).append(rows[wrong])
+            rows = np.flatnonzero((code >= 0) & (scanned.decoded & alone[kind])[code])
+            yield from finding(manifest, kind, "warning", rows, f"rows whose {column} is {words}", column)
+    files, frame = scanned.files.code["path"], np.asarray(manifest.table["frame_index"])
+    faults: dict[str, list[np.ndarray]] = {kind: [] for kind, _ in _IN_SEQUENCE}
+    rows = np.flatnonzero((scanned.decoded & ~np.any([*alone.values()], axis=0))[files])
+    for members in group_rows(rows, manifest.codes("sequence", own=True)[rows], frame[rows]):
+        for kind, wrong in _faults_of_sequence(scanned, files[members]).items():
+            faults[kind].append(members[wrong])
     for kind, words in _IN_SEQUENCE:
-        rows = np.sort(np.concatenate(faults.get(kind, [np.empty(0, np.int64)])))
-        if rows.size:
-            yield kind, f"{rows.size} touch images {words}", rows, "path"
-
-
-def _sequences(manifest: Manifest, rows: np.ndarray) -> list[np.ndarray]:
-    """Return the row ids i64 of each sequence in the order of its frames."""
-    sequence, frame = manifest.codes("sequence", own=True)[rows], np.asarray(manifest.table["frame_index"])[rows]
-    order = np.lexsort((frame, sequence))
-    return np.split(rows[order], np.flatnonzero(np.diff(sequence[order])) + 1) if rows.size else []
+        rows = np.sort(np.concatenate([np.empty(0, np.int64), *faults[kind]]))
+        yield from finding(manifest, kind, "warning", rows, f"touch images {words}", "path")
 
 
 def _faults_of_sequence(scanned: Scan, files: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow.compute as pc
 
-from anytouch_jax.data.manifest.manifest import Manifest, select_rows
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows, select_rows
 from anytouch_jax.errors import UserError
 
 YES, NO, UNKNOWN = 1, 0, -1
@@ -73,11 +73,11 @@ def commercial_only(manifest: Manifest) -> Commercial:
 
 def licences(manifest: Manifest) -> tuple[Licence, ...]:
     """Return the rows under each licence, most rows first."""
-    use, name, dataset = commercial_use(manifest), manifest.codes("license"), manifest.codes("dataset")
+    use = commercial_use(manifest).astype(np.int64)
     result = []
-    for code, verdict in np.unique(np.stack([name, use.astype(np.int64)], 1), axis=0):
-        rows = np.flatnonzero((name == code) & (use == verdict))
-        _, first = np.unique(dataset[rows], return_index=True)
-        sets = sorted({str(value) for row in rows[first] if (value := manifest.value(row, "dataset")) is not None})
-        result.append(Licence(manifest.value(rows[0], "license"), int(verdict), tuple(sets), len(rows)))
+    for rows in group_rows(np.arange(len(manifest)), np.stack([manifest.codes("license"), use], 1)):
+        datasets = manifest.column("dataset").take(rows).unique().drop_null().to_pylist()
+        result.append(
+            Licence(manifest.value(rows[0], "license"), int(use[rows[0]]), tuple(sorted(datasets)), len(rows))
+        )
     return tuple(sorted(result, key=lambda licence: -licence.rows))

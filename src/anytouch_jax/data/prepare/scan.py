@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,10 +18,12 @@ from anytouch_jax.data.images import ImageError, decode_bytes
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.files import Files, distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.schema import shown
 from anytouch_jax.errors import UserError
 
 STATES = ("ok", "missing", "outside", "empty", "truncated", "unreadable")
 OK = STATES.index("ok")
+EXAMPLES = 5  # sentences of a finding
 FIELDS = 4  # colours are the means of 4 x 4 fields
 SPREAD, BOTTOM, BORDER, CHROMA, NOISE = range(5)  # columns of Scan.looks
 _CROP = 128  # side of the middle of a picture where noise is measured
@@ -50,6 +52,37 @@ class Scan(NamedTuple):
         code = self.files.code[column]
         return np.where(code < 0, OK, self.state[code])
 
+    @property
+    def decoded(self) -> np.ndarray:
+        """Whether each file is a whole picture that was decoded, bool (n,)."""
+        return (self.state == OK) & (self.size[:, 0] > 0)
+
+
+Level = Literal["error", "warning", "info"]
+
+
+class Finding(NamedTuple):
+    """One kind of fault: the row ids i64 that it concerns, and sentences about the first few."""
+
+    kind: str
+    level: Level
+    sentence: str
+    rows: np.ndarray
+    examples: tuple[str, ...] = ()
+    column: str | None = None
+
+
+def finding(
+    manifest: Manifest, kind: str, level: Level, rows: np.ndarray, words: str, *columns: str, column: str | None = None
+) -> Iterator[Finding]:
+    """Yield a finding of `rows` if there are any: their number and `words`, with their values in `columns`."""
+    if rows.size:
+        examples = (
+            f"{manifest.where(row)}: {', '.join(shown(manifest.value(row, name)) for name in columns)}"
+            for row in rows[:EXAMPLES]
+        )
+        yield Finding(kind, level, f"{rows.size} {words}", rows, tuple(examples), column or columns[0])
+
 
 class _FileState(NamedTuple):
     state: str
@@ -59,10 +92,6 @@ class _FileState(NamedTuple):
     looks: np.ndarray | None = None
     pixels: int = 0
     reason: str = ""
-
-
-_MISSING = _FileState("missing", reason="there is no such file")
-_EMPTY = _FileState("empty", reason="the file has no bytes")
 
 
 def scan(
@@ -82,14 +111,20 @@ def scan(
 
     def inspect(file: int) -> _FileState:
         row, column = int(files.row[file]), str(files.column[file])
+        is_field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
         try:
             path = manifest.file(row, column)
         except UserError as error:
             return _FileState("outside", reason=str(error))
-        is_field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
-        if decode or split_shard_path(path):
-            return _read(path, decode and not is_field)
-        return _stat(path)
+        try:
+            if not decode and not split_shard_path(path):
+                return _FileState("ok" if os.stat(path).st_size else "empty")
+            data = read_file(path)
+        except FileNotFoundError:
+            return _FileState("missing")
+        except (OSError, ValueError, MemoryError) as error:
+            return _FileState("unreadable", reason=str(getattr(error, "strerror", None) or error))
+        return _judge(data, path, decode and not is_field) if data else _FileState("empty")
 
     with closing(bounded_map(inspect, range(count), threads, 8 * max(threads, 1))) as states:
         for file, state in enumerate(states):
@@ -105,25 +140,7 @@ def scan(
     return result
 
 
-def _stat(path: Path) -> _FileState:
-    try:
-        size = os.stat(path).st_size
-    except FileNotFoundError:
-        return _MISSING
-    except OSError as error:
-        return _FileState("unreadable", reason=str(error.strerror))
-    return _FileState("ok") if size else _EMPTY
-
-
-def _read(path: Path, is_image: bool) -> _FileState:
-    try:
-        data = read_file(path)
-    except FileNotFoundError:
-        return _MISSING
-    except (OSError, ValueError, MemoryError) as error:
-        return _FileState("unreadable", reason=str(getattr(error, "strerror", None) or error))
-    if not data:
-        return _EMPTY
+def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
     digest = hashlib.sha256(data).hexdigest()[:32].encode()
     if not is_image:
         return _FileState("ok", digest=digest)
@@ -150,9 +167,8 @@ def _looks(pixels: np.ndarray) -> np.ndarray:
         _leading(side) for most in (rows, columns) for dark in [most.max(axis=1) <= 16] for side in (dark, dark[::-1])
     ]
     least = cv2.reduce(pixels, 1, cv2.REDUCE_MIN).reshape(-1, 3)
-    same = ((rows == pixels[-1, 0]) & (least == pixels[-1, 0])).all(
-        axis=1
-    )  # a cut JPEG is filled with exactly one grey
+    # A cut JPEG is filled with exactly one grey.
+    same = ((rows == pixels[-1, 0]) & (least == pixels[-1, 0])).all(axis=1)
     bottom = 0.0 if black[1] else _leading(same[::-1])
     height, width = pixels.shape[:2]
     top, left = max(0, (height - _CROP) // 2), max(0, (width - _CROP) // 2)

@@ -11,39 +11,25 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.data.manifest.manifest import Manifest, misspelt_sensors
-from anytouch_jax.data.manifest.schema import SPLITS, spellings
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows, misspelt_sensors
+from anytouch_jax.data.manifest.schema import SPLITS, listed, shown, spellings
 from anytouch_jax.data.prepare.appearance import picture_faults
 from anytouch_jax.data.prepare.licences import NO, YES, Licence, commercial_use, licences
-from anytouch_jax.data.prepare.scan import OK, STATES, Scan, scan
+from anytouch_jax.data.prepare.scan import EXAMPLES, OK, STATES, Finding, Level, Scan, finding, scan
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
 _JSON_ROWS = 1000  # row numbers of a finding that are written to JSON
-_EXAMPLES = 5
 _FRAME = ("dataset", "sensor", "unit", "sequence", "frame_index", "split")
-_LEARNING = ("train", "val", "test")  # the splits that must not share anything
+_LEARNING = SPLITS[:3]  # the splits that must not share anything: train, val, test
 _MIN_PAIRS = 8  # different pairs of images that are needed for an opinion on swapped folders
-_MAX_PAIRS = 4000  # pairs of a dataset that are compared
 _WIDER = 1.5  # touch images may spread this much more than photographs before they are suspect
 _CERTAIN = 0.95  # share of the rows that must resemble the background images to call a dataset swapped
-Level = Literal["error", "warning", "info"]
-
-
-class Finding(NamedTuple):
-    """One kind of fault: the row ids i64 that it concerns, and sentences about the first few."""
-
-    kind: str
-    level: Level
-    sentence: str
-    rows: np.ndarray
-    examples: tuple[str, ...] = ()
-    column: str | None = None
 
 
 @dataclass(frozen=True)
@@ -68,18 +54,12 @@ class VerifyReport:
 
     def to_json(self) -> str:
         """Return the report as JSON, with the first thousand row numbers of each finding."""
-        findings: list[dict[str, Any]] = [
-            {
-                "kind": f.kind, "level": f.level, "sentence": f.sentence, "column": f.column, "count": int(f.rows.size),
-                "rows": f.rows[:_JSON_ROWS].tolist(), "examples": list(f.examples),
-            }
-            for f in self.findings
-        ]  # fmt: skip
-        report = {
-            "rows": self.rows, "files": self.files, "decoded": self.decoded, "ok": self.ok,
-            "content_hash": self.content_hash, "split_hash": self.split_hash, "splits": self.splits,
-            "shares": self.shares, "licences": [licence._asdict() for licence in self.licences], "findings": findings,
-        }  # fmt: skip
+        names = ("rows", "files", "decoded", "ok", "content_hash", "split_hash", "splits", "shares")
+        report: dict[str, Any] = {name: getattr(self, name) for name in names}
+        report["licences"] = [licence._asdict() for licence in self.licences]
+        report["findings"] = [
+            one._asdict() | {"count": len(one.rows), "rows": one.rows[:_JSON_ROWS].tolist()} for one in self.findings
+        ]
         return json.dumps(report, indent=1, ensure_ascii=False) + "\n"
 
     def to_markdown(self) -> str:
@@ -94,19 +74,22 @@ class VerifyReport:
             lines.append(f"* **{finding.level}** `{finding.kind}`: {finding.sentence}")
             lines += [f"  * {example}" for example in finding.examples]
         lines += ["" if self.findings else "No fault was found.\n"]
-        lines += ["| dataset | " + " | ".join(_SHARES) + " |", "|---" * (len(_SHARES) + 1) + "|"]
-        lines += [
-            f"| {name} | " + " | ".join(f"{share[column]:.0%}" for column in _SHARES) + " |"
-            for name, share in self.shares.items()
-        ]
-        lines += ["", "| licence | commercial | rows | datasets |", "|---|---|---|---|"]
-        use = {YES: "yes", NO: "no"}
-        lines += [
-            f"| {licence.name or '-'} | {use.get(licence.commercial, 'unknown')} | {licence.rows} | "
-            f"{', '.join(licence.datasets[:8])}{' ...' if len(licence.datasets) > 8 else ''} |"
-            for licence in self.licences
-        ]
+        lines += _table("dataset", *_SHARES)
+        for name, share in self.shares.items():
+            lines += _row(name, *(f"{share[column]:.0%}" for column in _SHARES))
+        lines += ["", *_table("licence", "commercial", "rows", "datasets")]
+        for one in self.licences:
+            use = {YES: "yes", NO: "no"}.get(one.commercial, "unknown")
+            lines += _row(one.name or "-", use, one.rows, listed(one.datasets))
         return "\n".join(lines) + "\n"
+
+
+def _row(*cells: object) -> list[str]:
+    return [f"| {' | '.join(str(cell)[:200] for cell in cells)} |"]
+
+
+def _table(*names: str) -> list[str]:
+    return [*_row(*names), "|---" * len(names) + "|"]
 
 
 def verify(
@@ -124,14 +107,7 @@ def verify(
     """
     scanned = scan(manifest, decode=decode, threads=threads, log=log)
     findings = [
-        *_bad_files(manifest, scanned),
-        *_wrong_sizes(manifest, scanned),
-        *_duplicates(manifest, scanned),
-        *_swapped(manifest, scanned),
-        *(
-            Finding(kind, "warning", sentence, rows, _quoted(manifest, rows, column), column)
-            for kind, sentence, rows, column in picture_faults(manifest, scanned)
-        ),
+        *(fault for check in _FILE_CHECKS for fault in check(manifest, scanned)),
         *row_faults(manifest, objects=objects),
         *(Finding("unknown_sensor", *fault, (), "sensor") for fault in misspelt_sensors(manifest)),
     ]
@@ -152,22 +128,23 @@ def verify(
 
 
 def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding]:
-    """Yield the faults that need no file: leaks between splits, frame order, licence conflicts."""
+    """Yield the faults that need no file: leaks between splits, frame order, licence conflicts, spellings."""
     yield from _split_leaks(manifest, objects)
     yield from _frame_order(manifest)
-    yield from _licence_conflicts(manifest)
+    marked = np.asarray(pc.fill_null(manifest.column("commercial"), False))
+    rows, words = np.flatnonzero(marked & (commercial_use(manifest) == NO)), "marked commercial although their licence"
+    yield from finding(
+        manifest, "licence_conflict", "warning", rows, f"rows are {words} is not", "license", column="commercial"
+    )
     yield from _label_spellings(manifest)
 
 
 def _shares(manifest: Manifest) -> dict[str, dict[str, float]]:
-    dataset = manifest.codes("dataset")
     present = {name: manifest.present(name) for name in _SHARES}
-    shares = {}
-    for code in np.unique(dataset):
-        rows = np.flatnonzero(dataset == code)
-        name = str(manifest.value(rows[0], "dataset") or "-")
-        shares[name] = {column: float(has_value[rows].mean()) for column, has_value in present.items()}
-    return shares
+    return {
+        str(manifest.value(rows[0], "dataset") or "-"): {name: float(has[rows].mean()) for name, has in present.items()}
+        for rows in group_rows(np.arange(len(manifest)), manifest.codes("dataset"))
+    }
 
 
 def split_hash(manifest: Manifest) -> str:
@@ -186,68 +163,41 @@ def split_hash(manifest: Manifest) -> str:
     return digest.hexdigest()
 
 
-def _quoted(manifest: Manifest, rows: np.ndarray, *columns: str) -> tuple[str, ...]:
-    """Return a sentence for each of the first few rows: where it is, and its values in `columns`."""
-    return tuple(
-        f"{manifest.where(row)}: {', '.join(repr(manifest.value(row, column)) for column in columns)}"
-        for row in rows[:_EXAMPLES]
-    )
-
-
 def _bad_files(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield files that are missing, outside of the folder, empty, cut short, or unreadable."""
     for column, code in scanned.files.code.items():
         states = scanned.states(column)
         for number, state in enumerate(STATES):
-            rows = np.flatnonzero(states == number)
-            if number == OK or not rows.size:
-                continue
-            examples = tuple(
-                f"{example}: {scanned.reasons.get(int(code[row]), state)}"
-                for row, example in zip(rows, _quoted(manifest, rows, column), strict=False)
-            )
-            yield Finding(state, "error", f"{rows.size} rows whose {column} is {state}", rows, examples, column)
+            rows = np.flatnonzero(states == number) if number != OK else np.empty(0, np.int64)
+            for fault in finding(manifest, state, "error", rows, f"rows whose {column} is {state}", column):
+                reasons = [scanned.reasons.get(int(code[row]), state) for row in rows[:EXAMPLES]]
+                yield fault._replace(examples=tuple(map("{}: {}".format, fault.examples, reasons)))
 
 
 def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield touch images of another size than most of their dataset, sensor and unit, or than their sequence."""
-    size = scanned.size[scanned.files.code["path"]].astype(np.int64)
-    rows = np.flatnonzero(size[:, 0] > 0)
-    if not rows.size:
-        return
-    sizes, kind = np.unique(size[rows], axis=0, return_inverse=True)
-    kind = kind.ravel()
-    keys = np.stack([manifest.codes(name)[rows] for name in ("dataset", "sensor", "unit")], 1)
-    usual = _most_frequent(np.unique(keys, axis=0, return_inverse=True)[1].ravel(), kind)
-    in_sequence = _most_frequent(np.unique(manifest.codes("sequence", own=True)[rows], return_inverse=True)[1], kind)
-    usual = np.where(usual != kind, usual, in_sequence)
-    odd = rows[usual != kind]
-    if odd.size:
-        examples = tuple(
-            f"{manifest.where(row)}: {manifest.value(row, 'path')!r} is {size[row][0]} x {size[row][1]}, "
-            f"where most of its sensor or sequence are {sizes[main][0]} x {sizes[main][1]}"
-            for row, main in zip(odd[:_EXAMPLES], usual[usual != kind], strict=False)
-        )
-        sentence = f"{odd.size} touch images of another size than most of their dataset, sensor and unit, or sequence"
-        yield Finding("wrong_size", "warning", sentence, odd, examples, "path")
-
-
-def _most_frequent(group: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Return the most frequent kind i64 (rows,) in the group of each row."""
-    pairs, counts = np.unique(np.stack([group, kind], 1), axis=0, return_counts=True)
-    order = np.lexsort((-counts, pairs[:, 0]))
-    usual = np.full(pairs[:, 0].max() + 1, -1)
-    usual[pairs[order[::-1], 0]] = pairs[order[::-1], 1]  # the last one written is the most frequent
-    return usual[group]
+    size = scanned.size[scanned.files.code["path"]]
+    rows, usual = np.flatnonzero(size[:, 0] > 0), size.copy()
+    unit = np.stack([manifest.codes(name)[rows] for name in ("dataset", "sensor", "unit")], 1)
+    for keys in (manifest.codes("sequence", own=True)[rows], unit):  # the unit counts where both differ
+        for group in group_rows(rows, keys):
+            sizes, counts = np.unique(size[group], axis=0, return_counts=True)
+            main = sizes[counts.argmax()]
+            odd = group[(size[group] != main).any(axis=1)]
+            usual[odd] = main
+    rows = np.flatnonzero((usual != size).any(axis=1))
+    words = "touch images of another size than most of their dataset, sensor and unit, or sequence"
+    for fault in finding(manifest, "wrong_size", "warning", rows, words, "path"):
+        sizes = (f" is {w} x {h}, where most of its sensor or sequence are {u} x {v}"
+                 for (w, h), (u, v) in zip(size[rows], usual[rows], strict=True))  # fmt: skip
+        yield fault._replace(examples=tuple(map("".join, zip(fault.examples, sizes, strict=False))))
 
 
 def content_ids(scanned: Scan, column: str = "path") -> np.ndarray:
     """Return equal numbers i64 (rows,) for equal bytes, -1 for null. A file without a hash goes by its path."""
-    code = scanned.files.code[column]
-    numbers = np.char.mod("file %d", np.arange(len(scanned.digest))).astype("S32")
-    names = np.where(scanned.digest == b"", numbers, scanned.digest)
-    _, same = np.unique(names, return_inverse=True)
-    return np.where(code < 0, -1, same[code])
+    code, count = scanned.files.code[column], len(scanned.digest)
+    names = np.where(scanned.digest == b"", np.arange(count).astype("S32"), scanned.digest)
+    return np.where(code < 0, -1, np.unique(names, return_inverse=True)[1][code])
 
 
 def repeated_rows(manifest: Manifest, same: np.ndarray) -> np.ndarray:
@@ -273,46 +223,38 @@ def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield touch images that occur more than once, and touch images that are also the row's photograph."""
     same = content_ids(scanned)
     repeats = repeated_rows(manifest, same)
-    if repeats.size:
-        sentence = f"{repeats.size} rows repeat an earlier row, touch image and all"
-        examples = tuple(manifest.where(row) for row in repeats[:_EXAMPLES])
-        yield Finding("repeated_row", "warning", sentence, repeats, examples)
+    words = "rows repeat an earlier row, touch image and all"
+    yield from finding(manifest, "repeated_row", "warning", repeats, words, "path", column="")
     yield from _leak(manifest, same, "leak_file", "error", "touch image", "path")
     first = np.ones(len(same), bool)
     first[repeats] = False
-    _, inverse = np.unique(same, return_inverse=True)
-    rows = np.flatnonzero(first & (np.bincount(inverse, weights=first)[inverse] > 1))
-    if rows.size:
-        sentence = f"{rows.size} rows share the bytes of their touch image"
-        yield Finding("duplicate", "warning", sentence, rows, _quoted(manifest, rows, "path"))
+    rows = np.flatnonzero(first & (np.bincount(same, weights=first)[same] > 1))
+    yield from finding(manifest, "duplicate", "warning", rows, "rows share the bytes of their touch image", "path")
     if "image_path" in scanned.files.code:
-        image = content_ids(scanned, "image_path")
-        rows = np.flatnonzero((same == image) & (image >= 0))
-        if rows.size:
-            sentence = f"{rows.size} rows whose touch image and photograph are the same"
-            yield Finding("touch_is_picture", "error", sentence, rows, _quoted(manifest, rows, "path"), "image_path")
+        rows, words = (
+            np.flatnonzero(same == content_ids(scanned, "image_path")),
+            "rows whose touch image and photograph",
+        )
+        yield from finding(
+            manifest, "touch_is_picture", "error", rows, f"{words} are the same", "path", column="image_path"
+        )
 
 
 def _leak(manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: str, column: str) -> Iterator[Finding]:
     """Yield values (codes i64, -1 for null) that occur in two of the learning splits. Examples show `column`."""
-    split = manifest.codes("split")
-    names = [manifest.value(np.flatnonzero(split == code)[0], "split") for code in range(split.max() + 1)]
-    rows = np.flatnonzero((codes >= 0) & np.isin(split, [i for i, name in enumerate(names) if name in _LEARNING]))
+    split = np.asarray(pc.index_in(manifest.table["split"], value_set=pa.array(SPLITS)))
+    rows = np.flatnonzero((codes >= 0) & (split < len(_LEARNING)))
+    value = np.unique(codes[rows], return_inverse=True)[1]
+    pairs = np.unique(np.stack([value, split[rows]], 1), axis=0)
+    rows = rows[np.bincount(pairs[:, 0])[value] > 1]
     if not rows.size:
         return
-    _, value = np.unique(codes[rows], return_inverse=True)
-    pairs = np.unique(np.stack([value, split[rows]], 1), axis=0)
-    sides = np.bincount(pairs[:, 0])
-    leaks = int((sides > 1).sum())
-    if not leaks:
-        return
-    rows = rows[sides[value] > 1]
     _, first = np.unique(codes[rows], return_index=True)
     examples = []
-    for row in rows[np.sort(first)[:_EXAMPLES]]:
-        here = sorted({names[s] for s in split[rows[codes[rows] == codes[row]]]}, key=SPLITS.index)
-        examples.append(f"{what} {manifest.value(row, column)!r} is in {', '.join(here)}")
-    sentence = f"{leaks} values of {what} are in more than one of {', '.join(_LEARNING)} ({rows.size} rows)"
+    for row in rows[np.sort(first)[:EXAMPLES]]:
+        sides = ", ".join(SPLITS[side] for side in np.unique(split[rows[codes[rows] == codes[row]]]))
+        examples.append(f"{what} {shown(manifest.value(row, column))} is in {sides}")
+    sentence = f"{len(first)} values of {what} are in more than one of {', '.join(_LEARNING)} ({rows.size} rows)"
     yield Finding(kind, level, sentence, rows, tuple(examples))
 
 
@@ -328,32 +270,19 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
     """Yield sequences that repeat a frame, which allows no clips, or whose rows are not in frame order."""
     sequence = manifest.codes("sequence", own=True) * len(SPLITS) + manifest.codes("split")
     frame = np.asarray(manifest.table["frame_index"])
-
-    def finding(kind: str, level: Level, rows: np.ndarray, what: str) -> Iterator[Finding]:
-        if rows.size:
-            examples = tuple(
-                f"{manifest.where(row)}: frame {frame[row]} of sequence {manifest.value(row, 'sequence')!r}"
-                for row in rows[:_EXAMPLES]
-            )
-            yield Finding(kind, level, f"{rows.size} rows {what}", rows, examples, "frame_index")
-
-    order = np.lexsort((np.arange(len(frame)), frame, sequence))
-    twice = (np.diff(sequence[order]) == 0) & (np.diff(frame[order]) == 0)
-    rows = np.sort(order[1:][twice])
-    yield from finding("repeated_frame", "error", rows, "repeat a frame of their sequence: no clips can be cut from it")
-    order = np.argsort(sequence, kind="stable")
-    back = (np.diff(sequence[order]) == 0) & (frame[order][1:] < frame[order][:-1])
-    rows = np.sort(order[1:][back])
-    yield from finding("frame_order", "warning", rows, "stand after a later frame of their sequence")
-
-
-def _licence_conflicts(manifest: Manifest) -> Iterator[Finding]:
-    marked = np.asarray(pc.fill_null(manifest.column("commercial"), False))
-    rows = np.flatnonzero(marked & (commercial_use(manifest) == NO))
-    if rows.size:
-        sentence = f"{rows.size} rows are marked commercial although their licence is not"
-        examples = _quoted(manifest, rows, "license")
-        yield Finding("licence_conflict", "warning", sentence, rows, examples, "commercial")
+    by_frame, by_row = np.lexsort((frame, sequence)), np.argsort(sequence, kind="stable")
+    twice = (np.diff(sequence[by_frame]) == 0) & (np.diff(frame[by_frame]) == 0)
+    back = (np.diff(sequence[by_row]) == 0) & (frame[by_row][1:] < frame[by_row][:-1])
+    for kind, level, rows, words in (
+        (
+            "repeated_frame",
+            "error",
+            by_frame[1:][twice],
+            "repeat a frame of their sequence: no clips can be cut from it",
+        ),
+        ("frame_order", "warning", by_row[1:][back], "stand after a later frame of their sequence"),
+    ):
+        yield from finding(manifest, kind, level, np.sort(rows), f"rows {words}", "frame_index", "sequence")
 
 
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
@@ -364,10 +293,12 @@ def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
             continue
         for group in spellings(column.unique().drop_null().to_pylist()):
             rows = [np.flatnonzero(np.asarray(pc.fill_null(pc.equal(column, value), False))) for value in group]
-            several = " and ".join(f"{value!r} ({ids.size} rows)" for value, ids in zip(group, rows, strict=True))
+            several = " and ".join(f"{shown(value)} ({len(ids)} rows)" for value, ids in zip(group, rows, strict=True))
             sentence = f"{name} has {several}, which differ only by spaces, letter case or Unicode form"
-            examples = tuple(f"{manifest.where(ids[0])}: {value!r}" for value, ids in zip(group, rows, strict=True))
-            yield Finding("spelling", "warning", sentence, np.sort(np.concatenate(rows)), examples[:_EXAMPLES], name)
+            examples = tuple(
+                f"{manifest.where(ids[0])}: {shown(value)}" for value, ids in zip(group, rows, strict=True)
+            )
+            yield Finding("spelling", "warning", sentence, np.sort(np.concatenate(rows)), examples[:EXAMPLES], name)
 
 
 class SwapVerdict(NamedTuple):
@@ -386,22 +317,20 @@ def swap_verdicts(manifest: Manifest, scanned: Scan) -> list[SwapVerdict]:
     code = scanned.files.code
     if "image_path" not in code or not scanned.colours.any():
         return []
-    split, both = np.asarray(manifest.table["split"].cast("string")).astype(str), code["image_path"] >= 0
-    decoded = (scanned.state == OK) & (scanned.size[:, 0] > 0)
-    usable = both & decoded[code["path"]] & decoded[code["image_path"]] & (split != "background")
-    dataset, sensor = manifest.codes("dataset"), manifest.codes("sensor")
+    touch, vision = code["path"], code["image_path"]
+    background = np.asarray(pc.equal(manifest.table["split"], "background"))
+    usable = np.flatnonzero((vision >= 0) & scanned.decoded[touch] & scanned.decoded[vision] & ~background)
+    source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
     result = []
-    for data, kind in np.unique(np.stack([dataset[usable], sensor[usable]], 1), axis=0):
-        here = (dataset == data) & (sensor == kind)
-        rows = np.flatnonzero(usable & here)
-        pairs = np.unique(np.stack([code["path"][rows], code["image_path"][rows]], 1), axis=0)
-        if len(pairs) < _MIN_PAIRS:
+    for rows in group_rows(usable, source[usable]):
+        if len(np.unique(np.stack([touch[rows], vision[rows]], 1), axis=0)) < _MIN_PAIRS:
             continue
-        backgrounds = _background_colours(manifest, scanned, here, split, rows, decoded)
-        swapped, whole = _judge_swap(scanned, code, rows, pairs, backgrounds)
+        others = np.flatnonzero(background & (vision < 0) & (source == source[rows[0]]).all(axis=1))
+        backgrounds = _background_colours(manifest, scanned, others, rows)
+        swapped, whole = _judge_swap(scanned.colours, rows, touch[rows], vision[rows], backgrounds)
         if swapped.size:
-            verdict = SwapVerdict(manifest.value(rows[0], "dataset"), rows, swapped, whole, bool(len(backgrounds)))
-            result.append(verdict)
+            dataset = manifest.value(rows[0], "dataset")
+            result.append(SwapVerdict(dataset, rows, swapped, whole, bool(len(backgrounds))))
     return result
 
 
@@ -411,61 +340,54 @@ def in_touch_folder(manifest: Manifest, column: str) -> np.ndarray:
     return np.asarray(pc.fill_null(pc.equal(*folders), False))
 
 
-def _background_colours(
-    manifest: Manifest, scanned: Scan, here: np.ndarray, split: np.ndarray, rows: np.ndarray, decoded: np.ndarray
-) -> np.ndarray:
+def _background_colours(manifest: Manifest, scanned: Scan, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the colours f32 (k, 48) of the sensor's background images, k = 0 if it has none.
 
-    Images that may be swapped themselves are left out: a background row with its own photograph, and a
-    `background_path` in the folder of the touch images.
+    They are those of `others`, background rows without a photograph, which could be swapped too, and of `rows`, but for
+    a `background_path` in the folder of the touch images.
     """
     code = scanned.files.code
-    files = [code["path"][here & (split == "background") & (code["image_path"] < 0)]]
+    files = [code["path"][others]]
     if "background_path" in code:
         files.append(code["background_path"][rows[~in_touch_folder(manifest, "background_path")[rows]]])
     # A background that is also a photograph would confirm anything.
-    ids = np.setdiff1d(np.unique(np.concatenate(files)), [-1, *np.unique(code["image_path"])])
-    return scanned.colours[ids[decoded[ids]][:64]].astype(np.float32)
+    ids = np.setdiff1d(np.concatenate(files), [-1, *np.unique(code["image_path"])])
+    return scanned.colours[ids[scanned.decoded[ids]][:64]].astype(np.float32)
 
 
 def _judge_swap(
-    scanned: Scan, code: dict[str, np.ndarray], rows: np.ndarray, pairs: np.ndarray, backgrounds: np.ndarray
+    colours: np.ndarray, rows: np.ndarray, touch: np.ndarray, vision: np.ndarray, backgrounds: np.ndarray
 ) -> tuple[np.ndarray, bool]:
-    """Return the rows that look swapped, and whether the whole dataset does."""
-    touch = scanned.colours[code["path"][rows]].astype(np.float32)
-    vision = scanned.colours[code["image_path"][rows]].astype(np.float32)
+    """Return the rows that look swapped, and whether the whole dataset does; `touch` and `vision` are their files."""
     if len(backgrounds):
-        bad = _distance(vision, backgrounds) < _distance(touch, backgrounds)
+        bad = _distance(colours[vision], backgrounds) < _distance(colours[touch], backgrounds)
         whole = bool(bad.mean() >= _CERTAIN)
         return rows if whole else rows[bad], whole
-    centres, spreads = [], []
-    for side in (0, 1):
-        files = np.unique(pairs[:, side])  # each once: one photograph may serve many rows
-        files_used = files[np.linspace(0, len(files) - 1, min(len(files), _MAX_PAIRS)).astype(int)]
-        colours = scanned.colours[files_used].astype(np.float32)
-        centres.append(np.median(colours, axis=0))
-        spread = float(np.median(_distance(colours, centres[side][None])))
-        spreads.append(spread if len(files) >= _MIN_PAIRS else 0.0)
+    each = [colours[np.unique(files)] for files in (touch, vision)]  # one photograph may serve many rows
+    centre, other = (np.median(part, axis=0)[None] for part in each)
+    spreads = [
+        float(np.median(_distance(part, middle))) if len(part) >= _MIN_PAIRS else 0.0
+        for part, middle in zip(each, (centre, other), strict=True)
+    ]
     if spreads[1] and spreads[0] > _WIDER * spreads[1]:
         return rows, True
-    far, near = _distance(touch, centres[0][None]), _distance(vision, centres[0][None])
+    far, near = _distance(colours[touch], centre), _distance(colours[vision], centre)
     return rows[(far > 3 * max(spreads[0], 1.0)) & (near < far / 2)], False
 
 
 def _distance(colours: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference f32 (n,) of colours (n, 48) to the nearest of centres (k, 48)."""
-    best = np.full(len(colours), np.inf, np.float32)
-    for centre in centres:
-        np.minimum(best, np.abs(colours - centre[None]).mean(axis=1), out=best)
-    return best
+    """Return the mean absolute difference f32 (n,) of colours u8 (n, 48) to the nearest of centres (k, 48)."""
+    return np.min([np.abs(colours.astype(np.float32) - centre).mean(axis=1) for centre in centres], axis=0)
 
 
 def _swapped(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     for verdict in swap_verdicts(manifest, scanned):
-        name = f"dataset {verdict.dataset!r}" if verdict.dataset else "the rows without a dataset"
+        name = f"dataset {shown(verdict.dataset)}" if verdict.dataset else "the rows without a dataset"
         reason = "the background frames show it" if verdict.confirmed else "suspected from the colours; look at some"
         what = "all touch images and photographs are" if verdict.whole else f"{verdict.swapped.size} rows are"
-        examples = _quoted(manifest, verdict.swapped, "path", "image_path")
-        kind = "swapped" if verdict.whole else "swapped_rows"
-        level: Level = "error" if verdict.confirmed else "warning"
-        yield Finding(kind, level, f"{name}: {what} swapped ({reason})", verdict.swapped, examples, "image_path")
+        kind, level = "swapped" if verdict.whole else "swapped_rows", "error" if verdict.confirmed else "warning"
+        for fault in finding(manifest, kind, level, verdict.swapped, "", "path", "image_path", column="image_path"):
+            yield fault._replace(sentence=f"{name}: {what} swapped ({reason})")
+
+
+_FILE_CHECKS = (_bad_files, _wrong_sizes, _duplicates, _swapped, picture_faults)

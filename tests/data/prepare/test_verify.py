@@ -252,7 +252,7 @@ def test_frames_out_of_order_and_frames_twice(make):
     rows = [{"sequence": "s" if i < 5 else "r", "frame_index": frame} for i, frame in enumerate(frames)]
     report = verify(make(rows))
     assert finding_rows(report) == {"frame_order": [2], "repeated_frame": [4]}
-    assert "frame 1 of sequence 's'" in report.findings[1].examples[0]
+    assert ": 1, 's'" in report.findings[1].examples[0]
 
 
 def test_shares_of_missing_values_are_told_per_dataset(make):

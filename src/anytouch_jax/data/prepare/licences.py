@@ -77,7 +77,6 @@ def licences(manifest: Manifest) -> tuple[Licence, ...]:
     result = []
     for rows in group_rows(np.arange(len(manifest)), np.stack([manifest.codes("license"), use], 1)):
         datasets = manifest.column("dataset").take(rows).unique().drop_null().to_pylist()
-        result.append(
-            Licence(manifest.value(rows[0], "license"), int(use[rows[0]]), tuple(sorted(datasets)), len(rows))
-        )
+        name, verdict = manifest.value(rows[0], "license"), int(use[rows[0]])
+        result.append(Licence(name, verdict, tuple(sorted(datasets)), len(rows)))
     return tuple(sorted(result, key=lambda licence: -licence.rows))

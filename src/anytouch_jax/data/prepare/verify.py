@@ -70,9 +70,8 @@ class VerifyReport:
             f"{self.rows} rows, {self.files} files ({decoded})", "",
             f"content {self.content_hash[:16]}, splits {self.split_hash[:16]}: {splits}", "",
         ]  # fmt: skip
-        for finding in self.findings:
-            lines.append(f"* **{finding.level}** `{finding.kind}`: {finding.sentence}")
-            lines += [f"  * {example}" for example in finding.examples]
+        for one in self.findings:
+            lines += [f"* **{one.level}** `{one.kind}`: {one.sentence}", *(f"  * {text}" for text in one.examples)]
         lines += ["" if self.findings else "No fault was found.\n"]
         lines += _table("dataset", *_SHARES)
         for name, share in self.shares.items():
@@ -132,10 +131,8 @@ def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding
     yield from _split_leaks(manifest, objects)
     yield from _frame_order(manifest)
     marked = np.asarray(pc.fill_null(manifest.column("commercial"), False))
-    rows, words = np.flatnonzero(marked & (commercial_use(manifest) == NO)), "marked commercial although their licence"
-    yield from finding(
-        manifest, "licence_conflict", "warning", rows, f"rows are {words} is not", "license", column="commercial"
-    )
+    rows, words = np.flatnonzero(marked & (commercial_use(manifest) == NO)), "rows are commercial, their licence is not"
+    yield from finding(manifest, "licence_conflict", "warning", rows, words, "license", column="commercial")
     yield from _label_spellings(manifest)
 
 
@@ -231,13 +228,9 @@ def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     rows = np.flatnonzero(first & (np.bincount(same, weights=first)[same] > 1))
     yield from finding(manifest, "duplicate", "warning", rows, "rows share the bytes of their touch image", "path")
     if "image_path" in scanned.files.code:
-        rows, words = (
-            np.flatnonzero(same == content_ids(scanned, "image_path")),
-            "rows whose touch image and photograph",
-        )
-        yield from finding(
-            manifest, "touch_is_picture", "error", rows, f"{words} are the same", "path", column="image_path"
-        )
+        rows = np.flatnonzero(same == content_ids(scanned, "image_path"))
+        words = "rows whose touch image and photograph are the same"
+        yield from finding(manifest, "touch_is_picture", "error", rows, words, "path", column="image_path")
 
 
 def _leak(manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: str, column: str) -> Iterator[Finding]:
@@ -274,12 +267,7 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
     twice = (np.diff(sequence[by_frame]) == 0) & (np.diff(frame[by_frame]) == 0)
     back = (np.diff(sequence[by_row]) == 0) & (frame[by_row][1:] < frame[by_row][:-1])
     for kind, level, rows, words in (
-        (
-            "repeated_frame",
-            "error",
-            by_frame[1:][twice],
-            "repeat a frame of their sequence: no clips can be cut from it",
-        ),
+        ("repeated_frame", "error", by_frame[1:][twice], "repeat a frame of their sequence, which allows no clips"),
         ("frame_order", "warning", by_row[1:][back], "stand after a later frame of their sequence"),
     ):
         yield from finding(manifest, kind, level, np.sort(rows), f"rows {words}", "frame_index", "sequence")
@@ -295,10 +283,9 @@ def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
             rows = [np.flatnonzero(np.asarray(pc.fill_null(pc.equal(column, value), False))) for value in group]
             several = " and ".join(f"{shown(value)} ({len(ids)} rows)" for value, ids in zip(group, rows, strict=True))
             sentence = f"{name} has {several}, which differ only by spaces, letter case or Unicode form"
-            examples = tuple(
-                f"{manifest.where(ids[0])}: {shown(value)}" for value, ids in zip(group, rows, strict=True)
-            )
-            yield Finding("spelling", "warning", sentence, np.sort(np.concatenate(rows)), examples[:EXAMPLES], name)
+            places = [f"{manifest.where(ids[0])}: {shown(value)}" for value, ids in zip(group, rows, strict=True)]
+            every = np.sort(np.concatenate(rows))
+            yield Finding("spelling", "warning", sentence, every, tuple(places[:EXAMPLES]), name)
 
 
 class SwapVerdict(NamedTuple):

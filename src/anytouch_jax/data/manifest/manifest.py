@@ -29,15 +29,19 @@ from anytouch_jax.data.manifest.schema import (
     SPLITS,
     ManifestError,
     clean_text,
+    is_text,
+    listed,
     load_table,
     read_text_csv,
     reading,
+    shown,
     table_suffix,
     typed,
 )
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_path
 
+_LONGEST_PATH = 4000  # bytes, on Linux
 KEYS = ("sequence", "touch", "grasp_group")  # columns whose values belong to their file
 
 
@@ -68,7 +72,7 @@ class Manifest:
         if name in SCHEMA:
             fill = pa.scalar(1 if name == "stride" else None, SCHEMA[name])
             return pa.chunked_array([pa.repeat(fill, len(self))])
-        raise ManifestError(f"{self._name} has no column {name!r}; it has {', '.join(self.table.column_names)}")
+        raise ManifestError(f"{self._name} has no column {name!r}; it has {listed(self.table.column_names)}")
 
     def value(self, row: int, name: str) -> Any:
         """Return one cell as a Python value, None if it is null or the column is absent."""
@@ -93,6 +97,10 @@ class Manifest:
         if own and len(self.files) > 1:
             codes = np.where(codes < 0, -1, codes * len(self.files) + self.source)
         return codes
+
+    def groups(self, *names: str) -> list[np.ndarray]:
+        """Return the row ids i64 of each combination of values in text columns, in row order."""
+        return group_rows(np.arange(len(self)), np.stack([self.codes(name) for name in names], 1))
 
     def file(self, row: int, name: str = "path") -> Path:
         """Return the absolute file in a path column. Raises ManifestError if it is outside the manifest's folder."""
@@ -218,13 +226,12 @@ def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
 
 
 def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
-    is_text: dict[str, set[bool]] = {}
+    kinds: dict[str, set[bool]] = {}
     for field in (field for table in tables for field in table.schema if not pa.types.is_null(field.type)):
-        text = pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
-        is_text.setdefault(field.name, set()).add(text)
+        kinds.setdefault(field.name, set()).add(is_text(field.type))
     try:
         # A label that is a number in one manifest and text in another becomes text in all of them.
-        for name in (name for name, kinds in is_text.items() if len(kinds) > 1):
+        for name in (name for name, several in kinds.items() if len(several) > 1):
             tables = [_with_column(t, name, t[name].cast(pa.string())) if name in t.column_names else t for t in tables]
         table = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
@@ -316,14 +323,8 @@ def sensor_rows(
     Raises ManifestError, which names the first row.
     """
     ids = np.full(len(manifest), -1, np.int32)
-    codes = manifest.codes("sensor")
-    if rows is not None:
-        considered = np.zeros(len(manifest), bool)
-        considered[rows] = True
-        codes = np.where(considered, codes, -1)
-    notes = []
-    for code in np.flatnonzero(np.bincount(codes[codes >= 0])):
-        same = np.flatnonzero(codes == code)
+    rows, notes = np.arange(len(manifest)) if rows is None else np.unique(rows), []
+    for same in group_rows(rows, manifest.codes("sensor")[rows]):
         name = manifest.value(same[0], "sensor")
         try:
             ids[same] = model.sensor_row(name)
@@ -333,27 +334,26 @@ def sensor_rows(
             elif unknown == "error" or isinstance(error, SpellingError):
                 raise ManifestError(f"{manifest.where(same[0])}, column 'sensor': {error}") from None
             elif unknown == "skip":
-                notes.append(f"left out {len(same)} rows of the unknown sensor {name!r}")
+                notes.append(f"left out {len(same)} rows of the unknown sensor {shown(name)}")
             else:
                 ids[same] = model.universal_row
-                notes.append(f"sensor {name!r} is unknown: its {len(same)} rows use the universal sensor tokens")
+                notes.append(f"sensor {shown(name)} is unknown: its {len(same)} rows use the universal sensor tokens")
     return ids, notes
 
 
 def misspelt_sensors(manifest: Manifest) -> Iterator[tuple[Literal["error", "warning"], str, np.ndarray]]:
     """Yield (level, sentence, row ids i64) for sensor names that are nearly known names. New names are no fault."""
-    names = np.array(manifest.column("sensor").to_pylist(), str)
     known = (*(name for name in SENSORS if name != UNIVERSAL), *FIELD_SENSORS)
-    for name in sorted(set(names.tolist()) - set(known)):
-        rows = np.flatnonzero(names == name)
+    groups = {manifest.value(rows[0], "sensor"): rows for rows in manifest.groups("sensor")}
+    for name in sorted(groups.keys() - set(known)):
+        count = f"{groups[name].size} rows are of"
         try:
             check_spelling(name)
         except SpellingError as error:
-            yield "error", f"{rows.size} rows are of {error}", rows
+            yield "error", f"{count} {error}", groups[name]
             continue
-        if near := difflib.get_close_matches(name.lower(), known, 1, 0.8):
-            sentence = f"{rows.size} rows are of sensor {name!r}, which is not known: did you mean {near[0]}?"
-            yield "warning", sentence, rows
+        if near := difflib.get_close_matches(name[:50].lower(), known, 1, 0.8):
+            yield "warning", f"{count} sensor {shown(name)}, which is not known: did you mean {near[0]}?", groups[name]
 
 
 def resolve_path(root: str | Path, relative: str | None) -> Path:
@@ -363,9 +363,9 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
     """
     if not relative:
         raise ManifestError("the path is empty")
-    if "\0" in relative:
-        raise ManifestError(f"the path {relative!r} is not a file name")
-    root = str(root)
+    root, text = str(root), shown(relative)
+    if "\0" in relative or len(relative) > _LONGEST_PATH:
+        raise ManifestError(f"the path {text} is not a file name")
     head, _, name = relative.rpartition("/")
     # Folders are resolved once and cached, because that takes most of the time.
     path = f"{_real_folder(root, head)}/{name}"
@@ -373,16 +373,16 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
         path = os.path.realpath(path)
     if "\\" in relative and not os.path.lexists(path):
         raise ManifestError(
-            f"the path {relative!r} is written as on Windows; write it relative to the manifest's folder, with forward "
+            f"the path {text} is written as on Windows; write it relative to the manifest's folder, with forward "
             "slashes (touch/0.png)"
         )
     if relative[0] == "/":
-        raise ManifestError(f"the path {relative!r} is absolute; write it relative to the manifest's folder, {root}")
+        raise ManifestError(f"the path {text} is absolute; write it relative to the manifest's folder, {root}")
     if not path.startswith(root if root[-1] == "/" else f"{root}/"):
-        link = (
-            "" if ".." in relative.split("/") else ", by a link; put the files there, or move the manifest next to them"
+        link = ", by a link; put the files there, or move the manifest next to them"
+        raise ManifestError(
+            f"the path {text} leaves the folder of the manifest, {root}{'' if '..' in relative.split('/') else link}"
         )
-        raise ManifestError(f"the path {relative!r} leaves the folder of the manifest, {root}{link}")
     return Path(path)
 
 
@@ -424,52 +424,48 @@ def attach_text(
     """
     path = Path(captions).expanduser()
     caption_of, key = _read_captions(path, key, text)
-    try:
-        keys = manifest.column(key).cast(pa.string())
-    except pa.ArrowException:
-        raise UserError(f"column {key!r} of the manifest is no key: it is {manifest.column(key).type}") from None
-    at = pc.index_in(clean_text(keys), value_set=pa.array(list(caption_of), pa.string()))
-    new = pa.chunked_array([pa.array(list(caption_of.values()), pa.string())]).take(at.combine_chunks())
-    matched = pc.sum(pc.is_valid(new)).as_py()
+    keys = _text_of(manifest.column(key), f"{manifest.files[0]}: the key {key!r}")
+    at = pc.index_in(keys, value_set=pa.array(list(caption_of), pa.string())).combine_chunks()
+    new = pa.chunked_array([pa.array(list(caption_of.values()), pa.string()).take(at)])
+    old, matched = manifest.column("text"), len(at) - at.null_count
     if not matched:
-        first = next(iter(caption_of), None)
-        raise UserError(f"{path}: no key {key!r} of it is in the manifest; its first one is {first!r}")
-    old = manifest.column("text")
-    merged = pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)
-    unchanged = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
-    unused = len(caption_of) - len(pc.unique(at.drop_null()))
-    notes = [f"{matched - unchanged} rows got a caption by {key!r}"]
-    notes += [f"{unchanged} rows already had a caption"] if unchanged else []
+        raise UserError(
+            f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}"
+        )
+    kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
+    unused = len(caption_of) - len(at.drop_null().unique())
+    notes = [f"{matched - kept} rows got a caption by {key!r}"]
+    notes += [f"{kept} rows already had a caption"] if kept else []
     notes += [f"{unused} of {len(caption_of)} keys of {path.name} are not in the manifest"] if unused else []
-    return replace_column(manifest, "text", merged), notes
+    return replace_column(manifest, "text", pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)), notes
 
 
 def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, str], str]:
     """Return the captions of a table by key, and the name of its key column."""
     suffix = table_suffix(path, "a table of captions")
-    if not path.is_file():
-        raise UserError(f"there is no table {path}")
     with reading(path):
         table = read_text_csv(path) if suffix == ".csv" else pa.parquet.read_table(path, partitioning=None)
+        table.validate(full=True)
     names = table.column_names
-    if text not in names:
-        raise UserError(f"{path} has no column {text!r}; it has {', '.join(names)}")
     others = [name for name in names if name != text]
-    if key is None and len(others) != 1:
-        raise UserError(f"{path} has the columns {', '.join(names)}: name the key column")
-    key = key or others[0]
-    if key not in others:
-        raise UserError(f"{path} has no column {key!r}; it has {', '.join(names)}")
-    if repeated := [name for name in (key, text) if names.count(name) > 1]:
-        raise UserError(f"{path} has the column {repeated[0]!r} twice")
-    try:
-        keys, texts = (clean_text(table[key].cast(pa.string())).to_pylist(), table[text].cast(pa.string()).to_pylist())
-    except pa.ArrowException:
-        kinds = f"{table[key].type} and {table[text].type}"
-        raise UserError(f"{path}: {key!r} and {text!r} must be plain columns, are {kinds}") from None
+    if key is None and len(others) > 1 and text in names:
+        raise UserError(f"{path} has the columns {listed(names)}: name the key column")
+    key = key or next(iter(others), text)
+    for name in (text, key):
+        if names.count(name) != 1 or key == text:
+            fault = "twice the" if name in names else "no"
+            raise UserError(f"{path} has {fault} column {name!r}; it has {listed(names)}")
+    keys, texts = _text_of(table[key], f"{path}: {key!r}"), _text_of(table[text], f"{path}: {text!r}")
     captions: dict[str, str] = {}
-    for row, (name, caption) in enumerate(zip(keys, texts, strict=True)):
+    for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
         caption = " ".join((caption or "").split())
         if name is not None and caption and captions.setdefault(name, caption) != caption:
-            raise UserError(f"{path}, row {row}: {key} {name!r} has another caption in an earlier row")
+            raise UserError(f"{path}, row {row}: {key} {shown(name)} has another caption in an earlier row")
     return captions, key
+
+
+def _text_of(column: pa.ChunkedArray, name: str) -> pa.ChunkedArray:
+    try:
+        return clean_text(column.cast(pa.string()))
+    except pa.ArrowException:
+        raise UserError(f"{name} must be a plain column, is {column.type}") from None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import difflib
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv
@@ -23,8 +25,12 @@ PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 
 EMPTY = ("", "na", "n/a", "nan", "none", "null", "-", "?")  # spellings of an unknown value, in small letters
 
+MAX_ROWS = 20_000_000  # of a manifest file
+MAX_TEXT = 10_000  # bytes of a text cell in the columns that are used
 _SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"
-_READERS = 2  # columns of a Parquet file that are read at once: more need more memory
+_NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
+_READERS = 2  # parts of a Parquet file that are read at once: more need more memory
+_PART = 1 << 22  # cells of a part: a large table is read column by column, so that it is never in memory twice
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
 _TEXT_COLUMNS = (*REQUIRED, *PATHS, "dataset", "unit", "touch", "object", "text", "license")
 _NAMES = ("dataset", "unit", "object", "license")  # text columns with values that a hand-written table may misspell
@@ -34,6 +40,7 @@ SCHEMA: dict[str, pa.DataType] = {
     "stride": _WHOLE,
     "commercial": _FLAG,
 }
+
 Cast = Callable[[pa.ChunkedArray], pa.ChunkedArray]
 
 
@@ -68,14 +75,15 @@ def load_table(path: Path) -> pa.Table:
         with reading(path):
             return _load_parquet(path)
     table = read_text_csv(path)
-    for position, name in enumerate(table.column_names):
+    _check_names(table.column_names, table.num_rows, str(path))
+    columns = dict(zip(table.column_names, table.columns, strict=True))
+    for name, column in columns.items():
         if name.startswith("label."):
-            column = typed_label(table[name])
-            check_label(name, column, lambda row: f"{path}, row {row}")
-            table = table.set_column(position, name, column)
+            columns[name] = typed_label(column)
+            check_label(name, columns[name], lambda row: f"{path}, row {row}")
         elif name in (*_NAMES, "sensor", "split"):
-            table = table.set_column(position, name, clean_text(table[name]))
-    return typed(table, str(path))
+            columns[name] = clean_text(column)
+    return typed(pa.table(columns), str(path))
 
 
 def shown(value: object) -> str:
@@ -96,7 +104,7 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0][:500]
         kind = path.suffix.lower()[1:]
         raise ManifestError(f"{path} cannot be read as a {kind} table: {reason}") from None
 
@@ -116,27 +124,29 @@ def _csv_names(path: Path) -> list[str]:
 
 
 def _load_parquet(path: Path) -> pa.Table:
-    """Load column by column, so that a large table is never in memory twice."""
     with pa.parquet.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
     _check_names(names, rows, str(path))
+    size = max(1, _PART // rows)
 
-    def load(name: str) -> pa.ChunkedArray:
+    def load(start: int) -> list[pa.ChunkedArray]:
+        part = names[start : start + size]
         with pa.parquet.ParquetFile(path) as file:  # two threads cannot share a file
-            column = file.read([name], use_threads=False)[name]
-        return pa.table({"column": _checked(name, column, str(path))}).combine_chunks()["column"]
+            table = file.read(part, use_threads=False)
+        return pa.table({name: _checked(name, table[name], str(path)) for name in part}).combine_chunks().columns
 
     with ThreadPoolExecutor(_READERS) as pool:
-        columns = dict(zip(names, pool.map(load, names), strict=True))
+        columns = [column for part in pool.map(load, range(0, len(names), size)) for column in part]
     pa.default_memory_pool().release_unused()
-    return pa.table(columns)
+    return pa.table(columns, names)
 
 
 def typed(table: pa.Table, where: str) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
     Columns outside SCHEMA stay unchanged. `where` names the file in errors. Raises ManifestError for a missing column
-    or value, a wrong type, an unknown split, a stride below 1, and a table without rows.
+    or value, a wrong type, an unknown split, a stride below 1, text that is not UTF-8 or longer than MAX_TEXT, and a
+    table without rows or with more than MAX_ROWS.
     """
     _check_names(table.column_names, table.num_rows, where)
     return pa.table({name: _checked(name, table[name], where) for name in table.column_names}).combine_chunks()
@@ -177,69 +187,71 @@ def check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str])
     """
     if not pa.types.is_string(column.type):
         return
-    cells = column.to_pylist()
-    for first, other, *_ in spellings(cell for cell in cells if cell is not None):
+    for first, other, *_ in spellings(column.unique().drop_null().to_pylist()):
+        places = [where(pc.index(column, text).as_py()) for text in (other, first)]
         raise ManifestError(
-            f"{where(cells.index(other))}: column {name!r} has {other!r}, and {where(cells.index(first))} has "
-            f"{first!r}; write one class in one way"
+            f"{places[0]}: column {name!r} has {shown(other)}, and {places[1]} has {shown(first)}; write one class in "
+            "one way"
         )
-    numbers, words = 0, []
-    for row, cell in enumerate(cells):
-        if cell is not None and _is_number(cell):
-            numbers += 1
-        elif cell is not None:
-            words.append(row)
+    is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, _NUMBER), False))
+    words = np.flatnonzero(np.asarray(pc.is_valid(column)) & ~is_number)
     # 007 is a name, and names may have letters too.
-    if (
-        words
-        and numbers >= 9 * len(words)
-        and not any(cell and cell[0] == "0" and cell[1:2].isdigit() for cell in cells)
-    ):
-        raise ManifestError(
-            f"{where(words[0])}: column {name!r} has {cells[words[0]]!r} among numbers; write a number or nothing"
-        )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    is_name = pc.any(pc.match_substring_regex(column, r"^0\d")).as_py()
+    if words.size and is_number.sum() >= 9 * words.size and not is_name:
+        cell = shown(column[int(words[0])].as_py())
+        raise ManifestError(f"{where(words[0])}: column {name!r} has {cell} among numbers; write a number or nothing")
 
 
 def _check_names(names: Sequence[str], rows: int, where: str) -> None:
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise ManifestError(f"{where}: column {repeated[0]!r} is there twice")
+    repeated = [name for name, count in Counter(names).items() if count > 1]
     missing = [name for name in REQUIRED if name not in names]
+    if repeated:
+        raise ManifestError(f"{where}: column {shown(repeated[0])} is there twice")
     if len(names) == 1 and ";" in names[0]:
         raise ManifestError(f"{where} has semicolons between its columns; save it with commas")
     if missing:
-        raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {', '.join(names)}")
+        raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {listed(names)}")
     if not rows:
         raise ManifestError(f"{where} has no rows")
+    if rows > MAX_ROWS:
+        raise ManifestError(f"{where} has {rows:,} rows, more than {MAX_ROWS:,}; split it into several manifests")
+
+
+def is_text(kind: pa.DataType) -> bool:
+    """Return whether a column of this type holds text."""
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
 def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
-    """Return a column with its type, every value checked."""
+    """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the row."""
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()
         if row >= 0:
-            raise ManifestError(f"{where}, row {row}: column {name!r} {problem(row)}")
+            raise ManifestError(f"{where}, row {row}: column {shown(name)} {problem(row)}")
 
-    column = _converted(name, column, where)
+    for cast, kind in ((_plain, "UTF-8 text"), _CASTS[SCHEMA.get(name)]):
+        try:
+            column = cast(column)
+        except pa.ArrowInvalid:
+            row = _first_invalid(column, cast)
+            value = "" if cast is _plain else f", is {shown(column[row].as_py())}"
+            raise ManifestError(f"{where}, row {row}: column {shown(name)} must be {kind}{value}") from None
+        except pa.ArrowTypeError:
+            raise ManifestError(f"{where}: column {name!r} must be {kind}, is {column.type}") from None
     if name in REQUIRED:
         refuse(pc.is_null(column), lambda _: "is empty")
+    if pa.types.is_string(column.type) and (name in SCHEMA or name.startswith("label.")):
+        length = pc.binary_length(column)
+        refuse(pc.greater(length, MAX_TEXT), lambda row: f"has a text of {length[row]} bytes, more than {MAX_TEXT:,}")
     if name == "split":
         unknown, choices = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS))), ", ".join(SPLITS)
 
         def problem(row: int) -> str:
             value = column[row].as_py()
-            near = difflib.get_close_matches(value.strip().lower().replace("validation", "val"), SPLITS, 1)
+            near = difflib.get_close_matches(value[:50].strip().lower().replace("validation", "val"), SPLITS, 1)
             guess = f"; did you mean {near[0]}?" if near else ""
-            return f"must be one of {choices}, is the unknown split {value!r}{guess}"
+            return f"must be one of {choices}, is the unknown split {shown(value)}{guess}"
 
         refuse(unknown, problem)
     if name == "stride":
@@ -248,41 +260,24 @@ def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
     return column
 
 
-def _converted(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
-    if pa.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)
-    wanted = SCHEMA.get(name)
-    if wanted is None:
-        return column
-    is_text = any(kind(column.type) for kind in (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view))
-    if pa.types.is_null(column.type):
-        return column.cast(wanted)
-    if is_text:
-        column = column.cast(_TEXT)
-        if wanted != _TEXT:
-            column = pc.utf8_trim_whitespace(column)
-        blank = pc.or_(pc.equal(pc.binary_length(column), 0), pc.utf8_is_space(column))
-        if pc.any(blank).as_py():  # copying millions of strings takes longer than the check
-            column = pc.if_else(blank, pa.scalar(None, _TEXT), column)
-    if wanted == _TEXT:
-        if not is_text:
-            raise ManifestError(f"{where}: column {name!r} must be text, is {column.type}")
-        return column
-    kind = "whole number" if wanted == _WHOLE else "0 or 1"
-    if not is_text and not any(
-        is_kind(column.type) for is_kind in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
-    ):
-        raise ManifestError(f"{where}: column {name!r} must be a {kind}, is {column.type}")
-    cast = _cast_whole if wanted == _WHOLE else _cast_flag
-    try:
-        return cast(column)
-    except pa.ArrowInvalid:
-        row = _first_invalid(column, cast)
-        value = column[row].as_py()
-        raise ManifestError(f"{where}, row {row}: column {name!r} must be a {kind}, is {value!r}") from None
+def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    column.validate(full=True)
+    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+
+
+def _cast_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    if not is_text(column.type) and not pa.types.is_null(column.type):
+        raise pa.ArrowTypeError
+    column = column.cast(_TEXT)
+    blank = pc.or_(pc.equal(pc.binary_length(column), 0), pc.utf8_is_space(column))
+    # Copying millions of strings takes longer than the check.
+    return pc.if_else(blank, pa.scalar(None, _TEXT), column) if pc.any(blank).as_py() else column
 
 
 def _cast_whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    kind = column.type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+        column = pc.utf8_trim_whitespace(_cast_text(column))
     try:
         return column.cast(_WHOLE)
     except pa.ArrowInvalid:  # a column of whole numbers with gaps is often stored as floats ("130.0")
@@ -292,7 +287,15 @@ def _cast_whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
 def _cast_flag(column: pa.ChunkedArray) -> pa.ChunkedArray:
     if pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
         column = _cast_whole(column).cast(_TEXT)  # a number other than 0 and 1 is a mistake, not "true"
-    return column.cast(_FLAG)
+    return column if pa.types.is_boolean(column.type) else pc.utf8_trim_whitespace(_cast_text(column)).cast(_FLAG)
+
+
+_CASTS: dict[pa.DataType | None, tuple[Cast, str]] = {
+    None: (lambda column: column, ""),
+    _TEXT: (_cast_text, "text"),
+    _WHOLE: (_cast_whole, "a whole number"),
+    _FLAG: (_cast_flag, "a 0 or 1"),
+}
 
 
 def _first_invalid(column: pa.ChunkedArray, cast: Cast) -> int:

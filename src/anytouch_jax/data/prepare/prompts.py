@@ -203,7 +203,7 @@ def _rows_to_ask(
         selected = np.isin(np.arange(len(manifest)), manifest.rows_of(split))
     left_out["background frame, or another split"] = int((~selected).sum())
     family = np.full(len(manifest), None, object)
-    for rows in group_rows(np.arange(len(manifest)), manifest.codes("dataset")):
+    for rows in manifest.groups("dataset"):
         name = manifest.value(rows[0], "dataset")
         family[rows] = family_of(name, families)
         if family[rows[0]] is None and selected[rows].any():

@@ -140,7 +140,7 @@ def _shares(manifest: Manifest) -> dict[str, dict[str, float]]:
     present = {name: manifest.present(name) for name in _SHARES}
     return {
         str(manifest.value(rows[0], "dataset") or "-"): {name: float(has[rows].mean()) for name, has in present.items()}
-        for rows in group_rows(np.arange(len(manifest)), manifest.codes("dataset"))
+        for rows in manifest.groups("dataset")
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -163,14 +162,17 @@ def _weights(path: Path) -> list[str]:
 
 
 def _manifest(path: Path) -> list[str]:
+    import pyarrow.compute as pc
+
     from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.data.manifest.schema import listed
 
     table = manifests.read(path)
     columns = table.table.column_names
 
     def counts(name: str) -> str:
-        counter = Counter(table.column(name).to_pylist())
-        return ", ".join(f"{value} {count:,}" for value, count in sorted(counter.items()))
+        entries = pc.value_counts(table.column(name)).to_pylist()
+        return listed(sorted(f"{entry['values'][:40]} {entry['counts']:,}" for entry in entries))
 
     optional = ("image_path", "text", "background_path", "touch", "object", "field_path")
     filled = [f"{name} {int(table.present(name).sum()):,}" for name in optional if name in columns]
@@ -181,7 +183,7 @@ def _manifest(path: Path) -> list[str]:
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
         f"rows with {', '.join(filled) or 'no optional column'}",
-        f"labels: {', '.join(labels) or 'none'}",
+        f"labels: {listed(labels) or 'none'}",
         f"content {table.content_hash[:12]}",
     ]
 

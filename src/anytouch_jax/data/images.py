@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from PIL import BmpImagePlugin, ImageFile, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
-from anytouch_jax.data.manifest.files import NPY_HEADER_LOCK, read_file
+from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
 
@@ -46,7 +46,6 @@ _HEADERS: dict[bytes, type[ImageFile.ImageFile]] = {
 }
 _ORIENTATION = 274  # a tag of EXIF and of a TIFF
 _WIDTH, _HEIGHT, _BITS, _ALPHA = 256, 257, 258, 338  # tags of a TIFF; _ALPHA is 2 for unassociated alpha
-_NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 
 _MARKER = re.compile(rb"\xff([^\0\xff\xd0-\xd7])")  # of a JPEG, not inside its coded data
 _SCAN, _END = b"\xda", b"\xd9"
@@ -125,7 +124,7 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
 
 def _unpack(data: bytes) -> np.ndarray:
     if data[:6] == b"\x93NUMPY":
-        return _unpack_npy(data)
+        return unpack_npy(data)
     chunks = _decoded_chunks(data) if data.startswith(_PNG) else data
     orientation = _check_header(data)
     jpeg = data.startswith(_JPEG) and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
@@ -149,22 +148,6 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
     return pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
-
-
-def _unpack_npy(data: bytes) -> np.ndarray:
-    """Return a .npy as a view of its bytes, so that it cannot declare more than there is."""
-    stream = io.BytesIO(data)
-    try:
-        is_old = np.lib.format.read_magic(stream) == (1, 0)
-        with NPY_HEADER_LOCK:
-            shape, fortran, dtype = (_NPY_HEADER_1 if is_old else _NPY_HEADER_2)(stream)
-    except Exception:  # the header is Python text: a corrupt one fails in the tokenizer, the parser or in NumPy
-        raise ValueError("the file is cut short, or its header is corrupt") from None
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects")
-    if stream.tell() + math.prod(shape) * dtype.itemsize > len(data):
-        raise ValueError("the file is cut short")
-    return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 def _check_header(data: bytes) -> int:

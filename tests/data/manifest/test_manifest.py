@@ -8,6 +8,7 @@ import pytest
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import manifest as m
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest import schema
 from anytouch_jax.data.manifest.manifest import attach_text, replace_column
 from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.errors import UserError
@@ -431,3 +432,62 @@ def test_a_parquet_with_a_missing_or_mistyped_column_is_named(tmp_path, change, 
     with pytest.raises(manifests.ManifestError, match=words) as error:
         verify(manifests.read(tmp_path / "m.parquet"))
     assert "m.parquet" in str(error.value) and "\n" not in str(error.value)
+
+
+def _with_broken_text(columns, name):
+    """A table whose text column `name` has bytes that are not UTF-8 in row 1."""
+    table = pa.table(columns)
+    cells = [value.encode() for value in table[name].to_pylist()]
+    cells[1] = b"a\xff\xfeb"
+    buffers = pa.array(cells, pa.binary()).buffers()
+    return table.set_column(table.column_names.index(name), name, pa.StringArray.from_buffers(len(cells), *buffers[1:]))
+
+
+GOOD_COLUMNS = {"path": ["a", "b"], "sensor": ["x"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1]}
+GOOD_COLUMNS |= {"split": ["train"] * 2, "object": ["mug"] * 2, "label.x": ["u", "v"], "note": ["n"] * 2}
+
+
+@pytest.mark.parametrize("name", ["path", "split", "object", "label.x", "note"])
+def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
+    pa.parquet.write_table(_with_broken_text(GOOD_COLUMNS, name), tmp_path / "m.parquet")
+    with pytest.raises(m.ManifestError, match=f"row 1: column '{name}' must be UTF-8 text"):
+        m.read(tmp_path / "m.parquet")
+
+
+@pytest.mark.parametrize("name", ["path", "split", "object", "label.x"])
+def test_a_huge_cell_is_named_and_never_printed(tmp_path, name):
+    columns = GOOD_COLUMNS | {name: ["train", "Z" * 1_000_000]}
+    pa.parquet.write_table(pa.table(columns), tmp_path / "m.parquet")
+    with pytest.raises(m.ManifestError, match=f"row 1: column '{name}' has a text of 1000000 bytes") as error:
+        m.read(tmp_path / "m.parquet")
+    assert len(str(error.value)) < 400
+    columns[name] = ["train", "Z" * 9_000]  # is read, and shortened in messages
+    pa.parquet.write_table(pa.table(columns | {"frame_index": [0, 0]}), tmp_path / "m.parquet")
+    if name == "split":
+        with pytest.raises(m.ManifestError, match="unknown split 'ZZZ") as error:
+            m.read(tmp_path / "m.parquet")
+        assert len(str(error.value)) < 500
+    else:
+        report = verify(m.read(tmp_path / "m.parquet"))
+        assert not report.ok and max(map(len, report.to_markdown().splitlines())) < 1000
+
+
+def test_a_table_of_too_many_rows_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    pa.parquet.write_table(pa.table(GOOD_COLUMNS), tmp_path / "m.parquet")
+    monkeypatch.setattr(schema, "MAX_ROWS", 1)
+    with pytest.raises(m.ManifestError, match="has 2 rows, more than 1; split it"):
+        m.read(tmp_path / "m.parquet")
+
+
+def test_a_wide_table_is_read_in_few_parts_and_a_long_one_by_column(tmp_path, monkeypatch):
+    wide = GOOD_COLUMNS | {f"label.c{i}": [i, i + 1] for i in range(3000)}
+    pa.parquet.write_table(pa.table(wide), tmp_path / "m.parquet")
+    opened, real = [], pa.parquet.ParquetFile
+    monkeypatch.setattr(pa.parquet, "ParquetFile", lambda path: opened.append(path) or real(path))
+    assert m.read(tmp_path / "m.parquet").column("label.c2999").to_pylist() == [2999, 3000]
+    assert len(opened) == 2
+    monkeypatch.setattr(schema, "_PART", 2 * 1000)
+    assert m.read(tmp_path / "m.parquet").content_hash and len(opened) == 2 + 1 + 4
+    with pytest.raises(m.ManifestError, match=r"has no column 'gone'; it has path.* more") as error:
+        m.read(tmp_path / "m.parquet").column("gone")
+    assert len(str(error.value)) < 600

@@ -7,6 +7,8 @@ costs one read of its length. Shards of version 1 are Parquet files with their i
 from __future__ import annotations
 
 import hashlib
+import io
+import math
 import os
 import stat
 import threading
@@ -27,8 +29,9 @@ from anytouch_jax.data.manifest.schema import PATHS
 MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four channels of 16 bits
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
 _PARQUET_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
+_NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
 _OPEN = 64  # open shards at once
-NPY_HEADER_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 can fail in two threads
+_NPY_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 can fail in two threads
 
 
 class ShardError(ValueError):
@@ -136,16 +139,31 @@ def read_shard_index(path: Path) -> np.ndarray:
 def _parquet_index(path: Path) -> np.ndarray:
     """Return the index of a shard of version 1, a Parquet file with its index next to it."""
     try:
-        with NPY_HEADER_LOCK:
-            index = np.load(path, allow_pickle=False)
+        index = unpack_npy(_read_loose(path))
     except FileNotFoundError:
         raise ShardError(f"there is no {path}, the shard's index; copy it from where the data were packed") from None
-    except (ValueError, EOFError, SyntaxError) as error:
-        raise ShardError(f"{path}, the index of the shard, is damaged: {str(error).splitlines()[0]}") from None
+    except (OSError, ValueError) as error:
+        raise ShardError(f"{path}, the index of the shard, is damaged: {error}") from None
     is_index = index.dtype == _PARQUET_INDEX and index.ndim == 1
     if not is_index or (index["size"] > MAX_BYTES).any() or (index["offset"] < 0).any():
         raise ShardError(f"{path} is not the index of a shard")
     return index
+
+
+def unpack_npy(data: bytes) -> np.ndarray:
+    """Return a .npy as a view of its bytes, so that it cannot declare more than there is. Raises ValueError."""
+    stream = io.BytesIO(data)
+    try:
+        is_old = np.lib.format.read_magic(stream) == (1, 0)
+        with _NPY_LOCK:
+            shape, fortran, dtype = (_NPY_HEADER_1 if is_old else _NPY_HEADER_2)(stream)
+    except Exception:  # a corrupt header fails in the tokenizer, the parser or in NumPy
+        raise ValueError("the file is cut short, or its header is corrupt") from None
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    if stream.tell() + math.prod(shape) * dtype.itemsize > len(data):
+        raise ValueError("the file is cut short")
+    return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 _cached_index = lru_cache(None)(read_shard_index)  # 20 bytes a file; parsing takes about 5 us a file

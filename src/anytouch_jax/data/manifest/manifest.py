@@ -135,8 +135,8 @@ class Manifest:
     def content_hash(self) -> str:
         """SHA-256 over every column's name and values: equal tables in CSV and Parquet have equal hashes."""
         digest = hashlib.sha256()
-        for name in sorted(self.table.column_names):
-            column = self.table[name].combine_chunks()
+        for name, column in sorted(zip(self.table.column_names, self.table.columns, strict=True), key=lambda c: c[0]):
+            column = column.combine_chunks()
             try:
                 text = pc.fill_null(column.cast(pa.large_string()), "")
             except pa.ArrowException:  # nested or binary: as Python writes it

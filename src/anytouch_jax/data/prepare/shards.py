@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
+from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import (
@@ -35,7 +35,7 @@ from anytouch_jax.data.manifest.files import (
     read_shard_index,
     split_shard_path,
 )
-from anytouch_jax.data.manifest.manifest import Manifest, with_distinct_keys
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column, with_distinct_keys
 from anytouch_jax.data.manifest.schema import PATHS
 from anytouch_jax.data.prepare.licences import licences
 from anytouch_jax.errors import UserError
@@ -105,24 +105,25 @@ def _pack(
     manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, log: Callable[[str], None] | None
 ) -> None:
     """Write the shards, the manifest and, last, the README."""
-    shard_of, row_of = np.empty(len(files), np.int64), np.empty(len(files), np.int64)
-    names: list[str] = []
+    cells = np.empty(len(files), object)  # where each file lies, as the manifest names it
     sums: dict[str, str] = {}
     for group, ids in _group_files(manifest, files).items():
         done = 0
         for number, rows in enumerate(_write_shards(manifest, files, ids, folder / group, shard_bytes, threads)):
             name = f"{group}/{number:05d}.zip"
-            shard_of[ids[done : done + rows]], row_of[ids[done : done + rows]] = len(names), np.arange(rows)
+            cells[ids[done : done + rows]] = [f"{name}/{row}" for row in range(rows)]
             with (folder / name).open("rb") as file:
                 sums[name] = hashlib.file_digest(file, "sha256").hexdigest()
-            names.append(name)
             done += rows
             if log:
                 log(f"{name}: {done} of {len(ids)} files")
     close_shards()
     atomic_write(folder / "SHA256SUMS", "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
-    target = folder / "manifest.parquet"
-    packed = _point_into_shards(manifest, target, files, names, shard_of, row_of)
+    target, packed = folder / "manifest.parquet", manifest
+    for name, code in files.code.items():
+        packed = replace_column(packed, name, pa.array(cells, pa.string()).take(pa.array(code, mask=code < 0)))
+    table = with_distinct_keys(manifest, packed.table)
+    packed = Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
     manifests.write(packed, target)
     atomic_write(folder / "README.md", _readme(packed))
 
@@ -160,7 +161,7 @@ def _is_same_pack(folder: Path, plan: dict[str, object], fingerprint: str | None
     record = folder / "pack.json"
     if record.is_file():
         try:
-            old = dict(json.loads(record.read_text(encoding="utf-8")))
+            old = dict(parse_json(record.read_bytes()))
         except (ValueError, TypeError):
             raise PackError(f"{record} is not of a pack; choose another folder") from None
         files = old.pop("files", None)
@@ -182,12 +183,8 @@ def _group_files(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
     frame, sequence = np.asarray(manifest.table["frame_index"]), manifest.codes("sequence")
     rank = np.empty(len(manifest), np.int64)
     rank[np.lexsort((frame, sequence, manifest.source))] = np.arange(len(manifest))
-    groups = {}
-    for group, members in _GROUPS.items():
-        ids = np.flatnonzero(np.isin(files.column, members))
-        if ids.size:
-            groups[group] = ids[np.argsort(rank[files.row[ids]], kind="stable")]
-    return groups
+    by_group = {group: np.flatnonzero(np.isin(files.column, members)) for group, members in _GROUPS.items()}
+    return {group: ids[np.argsort(rank[files.row[ids]], kind="stable")] for group, ids in by_group.items() if ids.size}
 
 
 def _write_shards(
@@ -208,15 +205,13 @@ def _write_shards(
         try:
             data = read_file(manifest.file(row, column))
         except FileNotFoundError:
-            reason = "the file is missing"
-        except (UserError, OSError, ValueError) as error:
-            reason = str(error)
-        else:
-            if data:
-                suffix = re.search(r"\.[a-zA-Z0-9]{1,8}$", manifest.value(row, column))
-                return _Piece(suffix.group() if suffix else "", data)
-            reason = "the file is empty"
-        raise _cannot_pack(manifest, row, column, reason)
+            raise _cannot_pack(manifest, row, column, "the file is missing") from None
+        except (OSError, ValueError) as error:
+            raise _cannot_pack(manifest, row, column, str(error)) from None
+        if not data:
+            raise _cannot_pack(manifest, row, column, "the file is empty")
+        suffix = re.search(r"\.[a-zA-Z0-9]{1,8}$", manifest.value(row, column))
+        return _Piece(suffix.group() if suffix else "", data)
 
     with closing(bounded_map(fetch, ids[done:].tolist(), threads)) as pieces:
         piece = next(pieces, None)
@@ -230,20 +225,6 @@ def _write_shards(
                     piece = next(pieces, None)
             yield rows
             number += 1
-
-
-def _point_into_shards(
-    manifest: Manifest, target: Path, files: Files, names: list[str], shard_of: np.ndarray, row_of: np.ndarray
-) -> Manifest:
-    """Return the manifest at `target` with cells that point into the shards."""
-    shard = pa.array(names).take(pa.array(shard_of))
-    cell = pc.binary_join_element_wise(shard, pa.array(row_of).cast(pa.string()), "/")
-    table = manifest.table
-    for name, code in files.code.items():
-        place = table.column_names.index(name)
-        table = table.set_column(place, name, cell.take(pa.array(code, mask=code < 0)))
-    table = with_distinct_keys(manifest, table)
-    return Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
 
 
 def _readme(packed: Manifest) -> str:

@@ -16,7 +16,7 @@ from jax import Array
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.nn.functional import Net
-from anytouch_jax.ops import losses, masking, sensor_tokens, tokens
+from anytouch_jax.ops import losses, masking, tokens
 
 Params = dict[str, Any]
 Metrics = dict[str, Array]
@@ -244,9 +244,9 @@ def stage2_loss(
 def _draw_tokens(sensor: Array, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, Array]:
     """Return p_u at `progress`, and the sensor rows after one draw a sample (Eq. 7)."""
     objective = config.objective
-    p_u = sensor_tokens.universal_probability(progress, objective.universal_start, objective.universal_end)
+    p_u = tokens.universal_probability(progress, objective.universal_start, objective.universal_end)
     uniform = jax.random.uniform(key, sensor.shape)
-    return p_u, sensor_tokens.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
+    return p_u, tokens.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
 
 
 def _draw_match(batch: MatchBatch, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, MatchBatch]:

@@ -16,6 +16,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.weights import checkpoint, convert, safetensors
+from tests.support.release_keys import release_names
 
 RNG = np.random.default_rng(0)
 STILLS = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
@@ -55,7 +56,7 @@ def test_the_tower_of_clip_weights(tmp_path):
     model = replace(full_model(), match_head="linear")
     params = build(model).init(jax.random.key(9))
     full = convert.to_release(params, model)
-    keys = convert.release_names(model, "clip")
+    keys = release_names(model, "clip")
     file = tmp_path / "clip.safetensors"
     safetensors.write_safetensors(file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)})
     wanted = build(model).encode_image(params, normalise_touch(STILLS))

@@ -187,8 +187,27 @@ def test_normalise_is_exact_and_has_a_finite_gradient_at_zero():
     x = RNG.standard_normal((4, 6))
     np.testing.assert_allclose(normalise(jnp.asarray(x)), x / np.linalg.norm(x, axis=1, keepdims=True), rtol=1e-6)
     grad = jax.grad(lambda z: normalise(z).sum())(jnp.zeros((2, 6)))
-    assert np.isfinite(np.asarray(grad)).all()
+    assert 0 < float(jnp.abs(grad).max()) < 1e13  # a larger one would end in infinity further down
     assert not np.asarray(normalise(jnp.zeros((1, 6)))).any()
+
+
+@pytest.mark.parametrize("length", [1e-11, 1e-7, 1e-3, 1.0, 1e20, 3e38])
+def test_normalise_gives_length_one_to_every_length(length):
+    direction = unit(1, e=6, seed=3)
+    z, grad = jax.vjp(normalise, jnp.asarray(direction * length, jnp.float32))
+    np.testing.assert_allclose(z, direction, rtol=2e-6)
+    (pull,) = grad(jnp.asarray(unit(1, e=6, seed=4), jnp.float32))
+    assert np.isfinite(np.asarray(pull)).all()
+    along = np.asarray(pull, np.float64) @ direction.T * length  # only the direction matters
+    np.testing.assert_allclose(along, 0.0, atol=2e-6)
+
+
+def test_normalise_keeps_every_digit_of_the_plain_formula():
+    x = jnp.asarray(RNG.standard_normal((64, 96)) * 10.0 ** RNG.uniform(-3, 3, (64, 1)), jnp.float32)
+    plain = x * jax.lax.rsqrt(jnp.sum(x * x, axis=-1, keepdims=True))
+    np.testing.assert_array_equal(normalise(x), plain)
+    tiny = jnp.full((1, 4), 1e-13, jnp.float32)  # below eps as torch: divided by 1e-12
+    np.testing.assert_allclose(normalise(tiny), 0.1, rtol=1e-6)
 
 
 @pytest.mark.parametrize("size", [0.0, 3.0, 1e4])

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.ops.sensor_tokens import draw_tokens, universal_probability
+from anytouch_jax.ops.tokens import draw_tokens, universal_probability
 
 
 def test_probability_grows_linearly():

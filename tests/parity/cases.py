@@ -25,7 +25,7 @@ from anytouch_jax.config import Config
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, tokens
-from anytouch_jax.train.optim import learning_rate, moments, optimizer
+from anytouch_jax.train.optim import learning_rate, optimizer
 from anytouch_jax.train.step import TrainState, init_state, make_step, merge
 from anytouch_jax.weights import convert
 from tests.parity import weights
@@ -41,6 +41,7 @@ from tests.parity.golden_files import (
     read_cases,
 )
 from tests.parity.losses import align, align_edge, dead_keys, encode, match, setup, stage1, table_rows
+from tests.support.adam_moments import moments
 
 Params = dict[str, Any]
 

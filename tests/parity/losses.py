@@ -18,6 +18,7 @@ from anytouch_jax.ops import losses, masking
 from anytouch_jax.train.step import merge, split
 from anytouch_jax.weights import convert
 from tests.parity.golden_files import GRADIENT, KEY_BIAS, Case, channel_last, golden_config, golden_params, read_arrays
+from tests.support.release_keys import release_names, release_shapes
 from tests.support.used_parameters import used_parameters
 
 Params = dict[str, Any]
@@ -64,7 +65,7 @@ def _gradients(value: Value, params: Params, inputs: Any, exact: Any, net: Net, 
 
 def dead_keys(config: Config) -> set[str]:
     """Keys of the authors' files that nothing reads (golden Q2)."""
-    return set(convert.release_shapes(config.model)) - set(convert.release_names(config.model))
+    return set(release_shapes(config.model)) - set(release_names(config.model))
 
 
 def _compare_gradients(

@@ -15,6 +15,7 @@ from anytouch_jax.weights import convert, load
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten, nest
 from tests.parity.golden_files import Arrays, Case, read_arrays
+from tests.support.release_keys import release_names, release_shapes
 
 STAGE1 = preset("large", recipe="release")
 STAGE2 = preset("large", stage=2, recipe="release", towers="pretrained")
@@ -32,7 +33,7 @@ def manifest(case: Case) -> None:
     """Keys and shapes of the four full-size files against preset large; decay groups and freezing against our rules."""
     for kind, (layout, config) in _FULL_SIZE.items():
         rows = [row for row in case.info[kind]["state_dict"] if not row[0].startswith("head.")]
-        ours = convert.release_shapes(config.model, layout)
+        ours = release_shapes(config.model, layout)
         _same(case, f"{kind}/keys", ours, {key: tuple(shape) for key, shape, *_ in rows})
         if layout in ("stage1", "stage2"):
             shapes = {name: tuple(leaf.shape) for name, leaf in flatten(build(config.model).abstract()).items()}
@@ -42,7 +43,7 @@ def manifest(case: Case) -> None:
 
 def _groups(case: Case, kind: str, config: Config, rows: Iterable[Any]) -> None:
     """The decay group of every array that something reads; `text` runs without gradient there (golden Q10)."""
-    names, ours, theirs = convert.release_names(config.model), {}, {}
+    names, ours, theirs = release_names(config.model), {}, {}
     for key, _, _, group in rows:
         if key in names:
             name = names[key]
@@ -71,9 +72,9 @@ def loading_map(case: Case) -> None:
     """
     model1, model2 = _two_layers()
     files = {
-        "clip": _values(convert.release_shapes(model2, "clip"), 1),
-        "mae": _values(convert.release_shapes(model1), 2),
-        "stage2": _values(convert.release_shapes(model2), 3),
+        "clip": _values(release_shapes(model2, "clip"), 1),
+        "mae": _values(release_shapes(model1), 2),
+        "stage2": _values(release_shapes(model2), 3),
     }
     for name, sources in case.info.items():
         if isinstance(sources, dict) and "_from_" in name:
@@ -113,7 +114,7 @@ def _stage_map(
     stage1 = convert.to_params(files["mae"], _two_layers()[0]) if begun else None
     merged = load.first_params(fresh, model, stage1=stage1, clip=files["clip"])
     ours, before = convert.to_release(merged, model), convert.to_release(fresh, model)
-    used = convert.release_names(model)
+    used = release_names(model)
     for key in used:
         source = sources.get(key, "nowhere")
         expected = before[key] if source == _FRESH else _expected(key, source, files) if key in sources else None

@@ -11,10 +11,11 @@ import numpy as np
 
 from anytouch_jax.config import Config, ModelConfig, Stack, TextTower, to_json
 from anytouch_jax.weights.checkpoint import Checkpoints
-from anytouch_jax.weights.convert import release_names, release_shapes, to_release
+from anytouch_jax.weights.convert import to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.safetensors import write_safetensors
 from anytouch_jax.weights.tree import flatten, nest
+from tests.support.release_keys import release_names, release_shapes
 
 STAGE1 = ModelConfig(28, 14, 12, Stack(16, 2, 4, 24), Stack(8, 3, 2, 20))
 STAGE2 = replace(

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from adam_moments import moments
 from places import ROOT, SUPPORT
 from runs import TIMING
 from train_toy import ROWS, stopping_batches, toy_batch, toy_batches, toy_config, toy_loss, toy_params
@@ -22,7 +23,7 @@ from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
-from anytouch_jax.train.optim import moments
+from anytouch_jax.weights import checkpoint
 
 TOY = SUPPORT / "train_toy.py"
 SRC = ROOT / "src"
@@ -508,3 +509,19 @@ def test_a_failed_save_is_one_sentence_and_leaves_the_checkpoint_before(tmp_path
         patch.setattr(loop.Checkpoints, "save", full)
         run(tmp_path)
     assert run(tmp_path, stop_after=4).resumed == 3
+
+
+def test_a_full_disk_ends_a_run_before_its_first_step(tmp_path, monkeypatch):
+    def no_batches(start, stop):
+        raise AssertionError("no batch was needed")
+
+    run(tmp_path / "run", stop_after=2)
+    usage = checkpoint.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(free=400))
+    for folder in ("new", "run"):
+        with pytest.raises(UserError, match=r"the disk is full, [\d,]+ bytes are needed and 400 are free"):
+            run(tmp_path / folder, batches=no_batches)
+    monkeypatch.undo()
+    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["00000002"]
+    assert run(tmp_path / "run", stop_after=3).resumed == 2
+    assert run(tmp_path / "new", stop_after=1).resumed == 0

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from adam_moments import moments
 from jax.sharding import AxisType, PartitionSpec
 from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
@@ -20,7 +21,7 @@ from anytouch_jax.train.mesh import (
     replicated,
     state_sharding,
 )
-from anytouch_jax.train.optim import moments, optimizer
+from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step
 
 

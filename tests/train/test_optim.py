@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from adam_moments import moments
 from tiny_models import tiny_config
 from train_toy import toy_config, toy_params
 
 from anytouch_jax.config import preset
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, moments, optimizer, schedule
+from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, optimizer, schedule
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten
 

@@ -20,27 +20,27 @@ def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
     screen = sys.stderr
-    with progress(0, 3, to_stderr) as bar:
-        bar.log("saved at step 1")
+    with progress(0, 3, to_stderr) as advance:
+        to_stderr("saved at step 1")
         for step in range(3):
-            bar.advance(row(step))
+            advance(row(step))
     shown = screen.getvalue()
     assert "3/3" in shown and "loss 0.5000" in shown and "saved at step 1" in shown
 
 
 def test_elsewhere_some_twenty_lines_are_said():
     said = []
-    with progress(100, 1100, said.append) as bar:
+    with progress(100, 1100, said.append) as advance:
         for step in range(100, 1100):
-            bar.advance(row(step))
+            advance(row(step))
     assert len(said) == 21
     assert said[0] == "step 101/1100  loss 0.5000  30 samples/s" and said[-1].startswith("step 1100/1100")
 
 
 def test_a_silent_process_shows_no_bar_even_on_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
-    with progress(0, 1, silent) as bar:
-        bar.advance(row(0))
+    with progress(0, 1, silent) as advance:
+        advance(row(0))
     assert sys.stderr.getvalue() == ""
 
 

@@ -8,12 +8,13 @@ import jaxlib
 import numpy as np
 import optax
 import pytest
+from adam_moments import moments
 from train_toy import toy_batch, toy_config, toy_loss, toy_params, toy_trained
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
 from anytouch_jax.config import preset
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.optim import moments, optimizer, schedule
+from anytouch_jax.train.optim import optimizer, schedule
 from anytouch_jax.train.step import init_state, make_step, merge, micro_batches, split
 from anytouch_jax.weights.tree import flatten
 

@@ -23,15 +23,13 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.weights.compatible import match_sensors
 from anytouch_jax.weights.convert import (
     detect_layout,
-    detect_model,
-    release_names,
-    release_shapes,
     to_params,
     to_release,
 )
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten
+from tests.support.release_keys import detect_model, release_names, release_shapes
 
 MODELS = {"stage1": STAGE1, "stage2": STAGE2, "no lora": NO_LORA, "decoder tokens": DECODER_TOKENS}
 LAYER = "touch_model.encoder.layers.1."
@@ -226,9 +224,10 @@ def test_positions_of_another_image_size_are_resized():
 
 def test_sensor_rows_go_by_name():
     sensors = ("digit", "new_one", *SENSORS[3:])
-    model = replace(STAGE1, sensors=sensors)
     weights = weights_of(STAGE1)
-    tokens = to_params(weights, model)["touch"]["sensor_tokens"]
+    with pytest.raises(UserError, match="sensor_token has"):
+        to_params(weights, replace(STAGE1, sensors=sensors))
+    tokens = match_sensors(to_params(weights, STAGE1)["touch"]["sensor_tokens"], SENSORS, sensors)
     np.testing.assert_array_equal(tokens[0], weights["sensor_token"][1])
     np.testing.assert_array_equal(tokens[1], weights["sensor_token"][-1])  # unknown: starts as universal
     np.testing.assert_array_equal(tokens[2:], weights["sensor_token"][3:])

@@ -9,12 +9,13 @@ import pytest
 from places import SHARED
 
 from anytouch_jax.config import Stack
-from anytouch_jax.weights.convert import detect_form, detect_model, release_names, to_params, to_release
+from anytouch_jax.weights.convert import detect_form, to_params, to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.load import read_weights
 from anytouch_jax.weights.tree import flatten
 from tests.parity import weights as parity_weights
 from tests.parity.golden_files import Case
+from tests.support.release_keys import detect_model, release_names
 
 GOLDEN = SHARED / "golden"
 

@@ -27,7 +27,6 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.compatible import resize_position
 from anytouch_jax.weights.convert import to_params, to_release
 from anytouch_jax.weights.load import (
-    clip_to_touch,
     first_params,
     load_init,
     load_model,
@@ -263,7 +262,7 @@ def test_clip_starts_the_touch_encoder(layout, own):
     weights = clip if layout == "clip" else openclip_of(tower, STAGE2)
     model = replace(STAGE1, patch_encoder="sensor" if own else "shared")
     fresh = params_of(model, seed=1)
-    params = clip_to_touch(weights, model, fresh)
+    params = first_params(fresh, model, clip=weights)
     assert_same(params["decoder"], fresh["decoder"])  # kept, as the sensor tokens are
     np.testing.assert_array_equal(params["touch"]["sensor_tokens"], fresh["touch"]["sensor_tokens"])
     for part in ("class_token", "position", "pre_norm", "blocks", "post_norm", "projection"):

@@ -39,7 +39,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     before = path.read_bytes()
     with pytest.raises(UserError, match=r"w\.safetensors"):
         write_safetensors(path, {"x": np.array([object()])}, {})
-    with pytest.raises(UserError, match="must be text"):
+    with pytest.raises(UserError, match=r"could not write .*w\.safetensors"):
         write_safetensors(path, {"x": np.ones(2)}, {"step": 3})
     (tmp_path / "blocked").write_text("")
     with pytest.raises(UserError, match="blocked"):

@@ -21,10 +21,7 @@ Features = TypeVar("Features")  # an array, or a tuple of arrays
 
 
 def _matcher(model: ModelConfig) -> Mlp | Dense | None:
-    """Return the matching head of Eq. 5: an MLP (paper), one linear layer (release), or None (cosine).
-
-    Its logits are at least float32.
-    """
+    """Return the head of Eq. 5, float32 at least: an MLP (paper), one linear layer (release), or None (cosine)."""
     model = replace(model, dtype="float32") if model.dtype == "bfloat16" else model
     if model.match_head == "mlp":
         return Mlp(model.embed, model.embed, model, gelu, outputs=1)
@@ -50,22 +47,16 @@ class AnyTouch(nnx.Module):
         self.matcher = _matcher(model)
 
     def encode_touch(self, clip: Array, sensor: Array, join: str = "mean", keep_ids: Array | None = None) -> Array:
-        """Return touch embeddings (B, E) of stills (T = 1) or clips from the class token, not normalised.
-
-        With `keep_ids` (B, K) only these patches are encoded, of stills and of clips of `frames` frames. A longer clip
-        is cut into segments whose features are averaged (join="mean"), summed ("sum") or concatenated
-        ("concat": (B, segments * E)) (App. "Discussion on frame number").
-        """
+        """Return touch embeddings (B, E) from the class token, see `Net.encode_touch`."""
         if keep_ids is not None:
             return self.touch.features(clip, sensor, keep_ids)
         return self._over_segments(self.touch.features, clip, sensor, join)
 
     def encode_poolings(self, clip: Array, sensor: Array, join: str = "mean") -> tuple[Array, Array]:
         """Return in one pass `encode_touch`, and the mean over projected patch tokens (the release's "global")."""
-        special = 1 + self.touch.sensor_tokens[...].shape[1]
 
         def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
-            hidden = self.touch.hidden(clip, sensor)
+            hidden, special = self.touch.hidden(clip, sensor), self.decoder.special
             return self.touch.embedding(hidden[:, 0]), jnp.mean(self.touch.projection(hidden[:, special:]), axis=1)
 
         return self._over_segments(both, clip, sensor, join)
@@ -95,14 +86,6 @@ class AnyTouch(nnx.Module):
             own = rows_of(self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor)
         return self.decoder(latent, restore_ids, frames, own)
 
-    def encode_image(self, image: Array) -> Array:
-        """Return image embeddings (V, E), not normalised."""
-        return self.image(image)
-
-    def encode_text(self, ids: Array, mask: Array | None = None) -> Array:
-        """Return text embeddings (L, E), not normalised."""
-        return self.text(ids, mask)
-
     def match(self, z_first: Array, z_second: Array) -> Array:
         """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5), from their element-wise product."""
         if self.matcher is None:
@@ -111,7 +94,3 @@ class AnyTouch(nnx.Module):
         if isinstance(self.matcher, Mlp):
             product = product * self.embed  # entries of a product of unit vectors are about 1 / E: to order one
         return self.matcher(product)[:, 0]
-
-    def scale(self) -> Array:
-        """Return 1 / tau, the factor on cosine similarities."""
-        return jnp.exp(self.logit_scale[...])

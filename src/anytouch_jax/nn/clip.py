@@ -9,7 +9,7 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig, Stack, TextTower
-from anytouch_jax.nn.layers import Dense, LayerNorm, activation, rows_of, run_blocks, stacked_blocks, table
+from anytouch_jax.nn.layers import ACTIVATIONS, Dense, LayerNorm, rows_of, run_blocks, stacked_blocks, table
 from anytouch_jax.nn.matmul import stored
 from anytouch_jax.ops import tokens
 
@@ -24,7 +24,7 @@ class ImageTower(nnx.Module):
         self.class_token = table(stack.width)
         self.position = table(model.patches + 1, stack.width)
         self.pre_norm = LayerNorm(stack.width, model.norm_eps, model.dtype)
-        self.blocks = stacked_blocks(stack, model, model.norm_eps, activation(model.activation))
+        self.blocks = stacked_blocks(stack, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.post_norm = LayerNorm(stack.width, model.norm_eps, model.dtype)
         self.projection = Dense(stack.width, model.embed, model, bias=False)
         self.patch_size, self.remat = model.patch, model.remat
@@ -52,7 +52,7 @@ class TextEncoder(nnx.Module):
         width = tower.stack.width
         self.token = table(tower.vocab, width)
         self.position = table(tower.length, width)
-        self.blocks = stacked_blocks(tower.stack, model, model.norm_eps, activation(model.activation))
+        self.blocks = stacked_blocks(tower.stack, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.final_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
         self.end_token, self.dtype, self.remat = tower.end_token, stored(model.dtype), model.remat

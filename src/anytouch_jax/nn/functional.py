@@ -49,7 +49,9 @@ class Net:
     ) -> Array:
         """Return touch embeddings (B, E) of normalised clips (B, T, H, W, 3), from the class token; not unit-norm.
 
-        See `AnyTouch.encode_touch`.
+        With `keep_ids` (B, K) only these patches are encoded, of stills (T = 1) and of clips of `frames` frames. A
+        longer clip is cut into segments whose features are averaged (join="mean"), summed ("sum") or concatenated
+        ("concat": (B, segments * E)) (App. "Discussion on frame number").
         """
         return self.bind(params).encode_touch(clip, sensor, join, keep_ids)
 
@@ -70,11 +72,11 @@ class Net:
 
     def encode_image(self, params: Params, image: Array) -> Array:
         """Return image embeddings (V, E) of normalised photographs (V, H, W, 3); not unit-norm."""
-        return self.bind(params).encode_image(image)
+        return self.bind(params).image(image)
 
     def encode_text(self, params: Params, ids: Array, mask: Array | None = None) -> Array:
         """Return text embeddings (L, E) of token ids (L, S); not unit-norm."""
-        return self.bind(params).encode_text(ids, mask)
+        return self.bind(params).text(ids, mask)
 
     def match(self, params: Params, z_first: Array, z_second: Array) -> Array:
         """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5)."""
@@ -82,7 +84,7 @@ class Net:
 
     def scale(self, params: Params) -> Array:
         """Return 1 / tau, the learned factor on cosine similarities."""
-        return self.bind(params).scale()
+        return jnp.exp(self.bind(params).logit_scale[...])
 
 
 def build(model: ModelConfig) -> Net:

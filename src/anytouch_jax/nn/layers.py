@@ -52,10 +52,7 @@ def quick_gelu(x: Array) -> Array:
     return x * jax.nn.sigmoid(1.702 * x)
 
 
-def activation(name: str) -> Activation:
-    """Return the activation called `name`: "gelu" or "quick_gelu"."""
-    known: dict[str, Activation] = {"gelu": gelu, "quick_gelu": quick_gelu}
-    return known[name]
+ACTIVATIONS: dict[str, Activation] = {"gelu": gelu, "quick_gelu": quick_gelu}
 
 
 def table(*shape: int) -> nnx.Param:
@@ -104,16 +101,14 @@ class LayerNorm(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """Multi-head attention of (B, Q, D) over (B, S, D).
-
-    `project` gives q (B, Q, H, D / H) and k, v (B, S, H, D / H). Then follow `attend` and `out`.
-    """
+    """Multi-head attention of (B, Q, D) over (B, S, D): `project`, `attend` and `out`."""
 
     def __init__(self, stack: Stack, model: ModelConfig) -> None:
         self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
         self.heads, self.implementation = stack.heads, model.attention
 
     def project(self, asks: Array, x: Array) -> tuple[Array, Array, Array]:
+        """Return q (B, Q, H, D / H) and k, v (B, S, H, D / H)."""
         parts = (self.query(asks), self.key(x), self.value(x))
         q, k, v = (part.reshape(*part.shape[:2], self.heads, -1) for part in parts)
         return q, k, v
@@ -197,12 +192,9 @@ def read_blocks(blocks: Block, x: Array, *, remat: bool) -> Array:
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
-    """Send `x` through all blocks but the last one.
-
-    Each takes its values out of the stack where it runs: blocks cut off before a scan are copied, which costs more than
-    the last block does for a batch of one. Gradients are those of a scan over blocks cut off: those of a stack that is
-    closed over would be added up whole, block by block.
-    """
+    """Send `x` through all blocks but the last one."""
+    # Each takes its values out of the stack where it runs: blocks cut off before a scan are copied, which costs more
+    # than the last block does for a batch of one. A gradient through it would be added up whole, block by block.
 
     def body(x: Array, number: Array) -> tuple[Array, None]:
         block = jax.tree.map(lambda values: jax.lax.dynamic_index_in_dim(values, number, keepdims=False), blocks)

@@ -36,11 +36,8 @@ products_saveable = jax.checkpoint_policies.save_from_both_policies(
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _narrow(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
-    """Return a product of 16-bit operands summed in float32, and its gradients the same way.
-
-    XLA's CPU back end has one fast form of it: a float32 result, the first operand contracted over its last axis. All
-    others it widens, and is then slower than in float32.
-    """
+    """Return a product of 16-bit operands summed in float32, and its gradients the same way."""
+    # XLA's CPU back end has one fast form: a float32 result, the first operand contracted over its last axis.
     return _wide(x.astype(dtype), kernel.astype(dtype), 0)
 
 

@@ -10,9 +10,9 @@ from jax import Array
 
 from anytouch_jax.config import STEM, ModelConfig
 from anytouch_jax.nn.layers import (
+    ACTIVATIONS,
     Dense,
     LayerNorm,
-    activation,
     blocks_between,
     gelu,
     read_blocks,
@@ -65,7 +65,7 @@ class ConvolutionalPatch(nnx.Module):
         self.patch, self.dtype = model.patch, jnp.dtype(model.dtype)
 
     def __call__(self, patches: Array, sensor: Array) -> Array:
-        """Project (B, K, T, P*P*3) to (B, K, D). A still is a clip of equal frames (Sec. 3.1): kernels are summed."""
+        """Project (B, K, T, P*P*3) to (B, K, D), as `TouchPatch`."""
         b, k, frames, _ = patches.shape
         kernel = self.kernel[...]
         if frames == 1:
@@ -99,7 +99,7 @@ class TouchEncoder(nnx.Module):
         self.position = table(model.patches + 1, width)
         self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)
         self.pre_norm = LayerNorm(width, model.norm_eps, model.dtype)
-        self.blocks = stacked_blocks(model.touch, model, model.norm_eps, activation(model.activation))
+        self.blocks = stacked_blocks(model.touch, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
         self.patch_size, self.depth, self.remat = model.patch, model.touch.depth, model.remat
@@ -125,8 +125,7 @@ class TouchEncoder(nnx.Module):
     def states(self, clip: Array, sensor: Array, count: int) -> Array:
         """Return `count` hidden states, evenly spaced from the first block's input to the last block's output.
 
-        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state. Dense prediction needs
-        earlier states too (DPT, Ranftl et al. 2021), because the last block serves the training loss.
+        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT, Ranftl et al. 2021).
         """
         x = self.pre_norm(self.tokens(clip, sensor))
         states, before = [], 0
@@ -155,7 +154,7 @@ class TouchDecoder(nnx.Module):
         self.embed = Dense(model.embed, width, model)
         self.mask_token = table(width)
         self.position = table(model.patches + 1, width)
-        self.blocks = stacked_blocks(model.decoder, model, model.decoder_norm_eps, activation("gelu"))
+        self.blocks = stacked_blocks(model.decoder, model, model.decoder_norm_eps, gelu)
         self.norm = LayerNorm(width, model.decoder_norm_eps, model.dtype)
         self.still_head = Dense(width, pixels, model)
         self.clip_head = Dense(width, pixels * (model.frames + 1), model)

@@ -1,4 +1,4 @@
-"""Images and clips as token sequences: patches, position tables, segments (Sec. 3.1).
+"""Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1, 3.5).
 
 B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, D width.
 """
@@ -59,3 +59,16 @@ def segments(clip: Array, frames: int) -> Array:
         )
     starts = [min(start, total - frames) for start in range(0, total, frames)]
     return jnp.stack([clip[:, start : start + frames] for start in starts], axis=1)
+
+
+def universal_probability(progress: Array, start: float, end: float) -> Array:
+    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0 to 0.75)."""
+    return start + (end - start) * progress
+
+
+def draw_tokens(sensor: Array, uniform: Array, probability: Array, universal_row: int) -> Array:
+    """Replace a sensor's row by the universal one where `uniform` < p_u: i ~ Bernoulli(p_u) (Eq. 7).
+
+    `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
+    """
+    return jnp.where(uniform < probability, universal_row, sensor)

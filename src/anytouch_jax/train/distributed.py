@@ -8,9 +8,8 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +28,7 @@ _CONTINUE = "run the same command again to continue from the last complete check
 _COUNTS = ("JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
-@dataclass(frozen=True)
-class Process:
+class Process(NamedTuple):
     """This process among those of a run: number `index` of `count`."""
 
     count: int
@@ -49,10 +47,9 @@ def process_count(environ: Mapping[str, str] = os.environ) -> int:
 def joined(environ: Mapping[str, str] = os.environ) -> Iterator[Process | None]:
     """Join the other processes of a run while the block runs. A single process gets None.
 
-    The launcher is detected by `jax.distributed.initialize`. By hand and on Kubernetes, set JAX_COORDINATOR_ADDRESS
-    (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID. Enter it before anything asks jax for a device.
-    When the block fails, this process reports the error and exits at once, without waiting for the others.
-    The status is 2 after a UserError, 130 after Ctrl-C, else 1.
+    `jax.distributed.initialize` detects the launcher. By hand and on Kubernetes, set JAX_COORDINATOR_ADDRESS (host:port
+    of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID. Enter it before anything asks jax for a device. When the block
+    fails, this process reports the error and exits at once: with 2 after a UserError, 130 after Ctrl-C, else 1.
     """
     if process_count(environ) < 2:
         yield None
@@ -68,8 +65,9 @@ def joined(environ: Mapping[str, str] = os.environ) -> Iterator[Process | None]:
             sys.stdout.flush()
             sys.stderr.write(f"{process or 'this process'}: {message}\n")
             sys.stderr.flush()
-        if process and isinstance(error, UserError):
-            _shutdown_together()
+        if process and isinstance(error, UserError):  # wait for the others: jax aborts one whose coordinator leaves
+            (thread := threading.Thread(target=_shutdown, daemon=True)).start()
+            thread.join(PATIENCE)
         os._exit(status)  # jax's threads and exit handlers would wait for processes that have ended
 
 
@@ -103,23 +101,15 @@ def _exit_message(error: BaseException) -> tuple[str, int]:
     return "".join(traceback.format_exception(error)) + _CONTINUE, 1
 
 
-def _shutdown_together() -> None:
-    """Wait for processes that meet the same mistake: jax aborts a process whose coordinator leaves first."""
-
-    def shutdown() -> None:
-        with contextlib.suppress(Exception):
-            jax.distributed.shutdown()
-
-    thread = threading.Thread(target=shutdown, daemon=True)
-    thread.start()
-    thread.join(PATIENCE)
+def _shutdown() -> None:
+    with contextlib.suppress(Exception):
+        jax.distributed.shutdown()
 
 
 def _number(environ: Mapping[str, str], name: str) -> int:
-    value = environ[name]
-    if not value.isdigit():
-        raise ConfigError(f"the environment variable {name} must be a whole number, not {value!r}")
-    return int(value)
+    if not environ[name].isdigit():
+        raise ConfigError(f"the environment variable {name} must be a whole number, not {environ[name]!r}")
+    return int(environ[name])
 
 
 def _first_line(error: BaseException) -> str:

@@ -30,7 +30,7 @@ from anytouch_jax.train.mesh import (
 )
 from anytouch_jax.train.metrics import Record, alone_in, continues, open_run, writing
 from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.progress import Log, RunDisplay, progress, signals, silent, to_stderr
+from anytouch_jax.train.progress import Log, progress, signals, silent, to_stderr
 from anytouch_jax.train.step import LossFn, TrainedFn, TrainState, init_state, make_step, merge
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
@@ -44,18 +44,14 @@ Report = Callable[[int, Tree, Any], None]
 
 @dataclass(frozen=True)
 class FitResult:
-    """The result of a run or a part of one: the state after `step` steps and the last line of metrics.
-
-    `traces` counts how often the step was traced, which is once a batch structure. `resumed` is the step that the run
-    continued from, and `interrupted` the signal that ended it early.
-    """
+    """The result of a run or a part of one: the state after `step` steps and the last line of metrics."""
 
     state: TrainState
     step: int
     metrics: dict[str, Any] = field(default_factory=dict)
-    traces: int = 0
-    resumed: int = 0
-    interrupted: signal.Signals | None = None
+    traces: int = 0  # how often the step was traced: once a batch structure
+    resumed: int = 0  # the step that the run continued from
+    interrupted: signal.Signals | None = None  # the signal that ended it early
 
     @property
     def params(self) -> Tree:
@@ -80,15 +76,14 @@ def fit(
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
     `params` are the first parameters. When a run continues, only their shapes matter. `loss_fn` and `trained` are those
-    of `make_step`. `stop_after` ends the run after
-    that many steps in all, without changing the schedule. `on_report(step, params, batch)` draws figures and must not
-    keep the arrays. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal,
-    all stop a step later. Raises UserError for settings that changed since the start, too many skipped steps in a row,
-    a full disk, an unreadable checkpoint, and a folder that some process cannot see.
+    of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
+    `on_report(step, params, batch)` draws figures and must not keep the arrays. SIGTERM and Ctrl-C finish the step,
+    save and return. If one of several processes gets the signal, all stop a step later. Raises UserError for settings
+    that changed since the start, too many skipped steps in a row, a full disk, an unreadable checkpoint, and a folder
+    that some process cannot see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
-    log = log or to_stderr
-    lead = jax.process_index() == 0
+    log, lead = log or to_stderr, jax.process_index() == 0
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
         if lead:
@@ -98,12 +93,9 @@ def fit(
             continues(run_dir, config)  # each process reports a changed setting
             log = silent
         check_shared(run_dir / "figures")
-        with writing(run_dir / "checkpoints"):
+        with writing(folder := run_dir / "checkpoints"):
             checkpoints = Checkpoints(
-                run_dir / "checkpoints",
-                keep=config.run.keep,
-                config_json=to_json(config),
-                metadata=dict(metadata or {}),
+                folder, keep=config.run.keep, config_json=to_json(config), metadata=dict(metadata or {})
             )
         stack.push(checkpoints.leave)
         state, start = _first_state(config, params, checkpoints, mesh)
@@ -112,36 +104,36 @@ def fit(
         if start >= stop:
             log(f"nothing to do: {start} of {config.run.steps} steps are done")
             return FitResult(state, start, resumed=start)
-        record = stack.enter_context(
-            contextlib.closing(Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead))
-        )
-        bar = stack.enter_context(progress(start, stop, log))
-        loop = _Loop(config, mesh, checkpoints, record, bar, on_report)
+        checkpoints.check_space(state)
+        record = Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead)
+        stack.enter_context(contextlib.closing(record))
+        advance = stack.enter_context(progress(start, stop, log))
+        loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report)
         interrupt = stack.enter_context(signals())
         return loop.run(state, start, stop, batches, loss_fn, trained, interrupt)
 
 
+@dataclass
 class _Loop:
     """The loop, and its state between steps."""
 
-    def __init__(
-        self,
-        config: Config,
-        mesh: Mesh,
-        checkpoints: Checkpoints,
-        record: Record,
-        bar: RunDisplay,
-        on_report: Report | None,
-    ) -> None:
-        self.config, self.mesh, self.checkpoints = config, mesh, checkpoints
-        self.record, self.bar, self.on_report = record, bar, on_report
-        self.pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
-        self.row: dict[str, Any] = {}
-        self.losses: list[float] = []  # since the last checkpoint: their mean decides which checkpoint is the best
-        self.traces = 0
-        self.ballot = Ballot(mesh) if jax.process_count() > 1 else None
-        self.shared_signal: signal.Signals | None = None  # the signal that one of several processes received
-        self.clock, self.waited, self.last = time.perf_counter(), 0.0, LastStep()
+    config: Config
+    mesh: Mesh
+    checkpoints: Checkpoints
+    record: Record
+    log: Log
+    advance: Callable[[Mapping[str, Any]], None]
+    on_report: Report | None
+    pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
+    row: dict[str, Any] = field(default_factory=dict)
+    losses: list[float] = field(default_factory=list)  # since the last checkpoint: their mean decides which is the best
+    traces: int = 0
+    shared_signal: signal.Signals | None = None  # the signal that one of several processes received
+    waited: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.ballot = Ballot(self.mesh) if jax.process_count() > 1 else None
+        self.clock, self.last = time.perf_counter(), LastStep()
 
     def run(
         self,
@@ -159,8 +151,8 @@ class _Loop:
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
         done, saved, reported, placed = start, start, start, None
-        with contextlib.closing(_checked(batches, start, stop)) as feed:
-            for step, batch, info in self.awaited(feed):
+        with contextlib.closing(self.awaited(batches, start, stop)) as feed:
+            for step, batch, info in feed:
                 placed = put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key)
                 if self.ballot:
@@ -168,53 +160,52 @@ class _Loop:
                     metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), votes, strict=True))
                 self.log_metrics()  # of the step before, while this one runs
                 self.last.began(metrics)
-                self.pending = (step, metrics, {"samples": _rows(batch)} | dict(info))
+                samples = jax.tree.leaves(batch)[0].shape[0] * jax.process_count()
+                self.pending = (step, metrics, {"samples": samples} | dict(info))
                 done = step + 1
                 if every > 0 and done % every == 0:
                     saved = self.save(done, state, done - saved)
                 if figures > 0 and done % figures == 0:
                     reported = self.report(done, state, placed)
-                if self.signalled(interrupt):
+                if self.shared_signal if self.ballot else interrupt:
                     break
         if saved < done:
             self.save(done, state, done - saved)
-        with writing(self.record.path.parent / "checkpoints"):
-            self.checkpoints.wait()
-        signalled = self.signalled(interrupt)
+        self.checkpoints.wait()
+        signalled = self.shared_signal if self.ballot else next(iter(interrupt), None)
         if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
         if signalled:
-            self.bar.log(
-                f"stopped by {signalled.name} after step {done} and saved, the same command continues from here"
-            )
+            self.log(f"stopped by {signalled.name} after step {done} and saved, the same command continues from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
-    def awaited(self, feed: Iterator[Item]) -> Iterator[Item]:
-        """Yield from the feed, and count the time with neither a batch nor a running step."""
-        requested = time.perf_counter()
-        for item in feed:
-            ended = self.last.ended() if self.pending else requested
-            if ended is not None:
-                self.waited += time.perf_counter() - max(requested, ended)
-            yield item
-            requested = time.perf_counter()
+    def awaited(self, batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
+        """Yield the batches of steps `start` to `stop`, check their order, and close their source in the end.
 
-    def signalled(self, interrupt: list[signal.Signals]) -> signal.Signals | None:
-        """Return the signal that ends the run: of this process, or the shared one of several."""
-        return self.shared_signal if self.ballot else next(iter(interrupt), None)
+        Counts the time with neither a batch nor a running step.
+        """
+        source, expected, requested = batches(start, stop), start, time.perf_counter()
+        try:
+            for step, batch, info in source:
+                if step != expected:
+                    raise ValueError(f"the batches gave step {step} instead of step {expected}")
+                ended = self.last.ended() if self.pending else requested
+                if ended is not None:
+                    self.waited += time.perf_counter() - max(requested, ended)
+                yield step, batch, info
+                expected, requested = expected + 1, time.perf_counter()
+                if expected == stop:
+                    return
+            raise UserError(f"the data ended after {expected} of {stop} steps. Pass batches for every step.")
+        finally:
+            getattr(source, "close", lambda: None)()
 
     def compile(
         self, state: TrainState, loss_fn: LossFn, trained: TrainedFn | None
     ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
         """Return the jitted step, which keeps the sharding of the state and is traced once a batch structure."""
-        config = self.config
-        step = make_step(
-            gathering(loss_fn, self.mesh),
-            optimizer(config),
-            total_steps=config.run.steps,
-            accumulate=config.optim.accumulate,
-            trained=trained,
-        )
+        loss_fn, tx, options = gathering(loss_fn, self.mesh), optimizer(self.config), self.config.optim
+        step = make_step(loss_fn, tx, total_steps=self.config.run.steps, accumulate=options.accumulate, trained=trained)
 
         @functools.wraps(step)
         def counted(*args: Any) -> Any:
@@ -236,30 +227,23 @@ class _Loop:
             info[_SKIPPED] = int(numbers.pop(_SKIPPED))
         now = time.perf_counter()
         elapsed = max(now - self.clock, 1e-9)
-        rate = {
-            "samples_per_second": info["samples"] / elapsed,
-            "wait": self.waited,
-            "wait_share": self.waited / elapsed,
-        }
+        rate = {"samples_per_second": info["samples"] / elapsed}
+        rate |= {"wait": self.waited, "wait_share": self.waited / elapsed}
         self.clock, self.waited = now, 0.0
-        front = {"loss": numbers["loss"]}
-        self.row = self.record.write(step, front | numbers | info | rate)
-        if self.row["loss"] is not None:
-            self.losses.append(self.row["loss"])
-        self.bar.advance(self.row)
-        skipped = self.record.in_a_row
-        if skipped > self.config.run.max_skipped:
+        self.row = self.record.write(step, {"loss": numbers["loss"]} | numbers | info | rate)
+        self.losses += [] if self.row["loss"] is None else [self.row["loss"]]
+        self.advance(self.row)
+        if self.record.in_a_row > self.config.run.max_skipped:
             raise UserError(
-                f"{skipped} steps in a row, up to step {step}, had a loss or a gradient that is not finite and were "
-                "skipped. In another run folder, lower --optim.learning-rate, set --optim.grad-clip, or look for NaN "
-                "in the data."
+                f"{self.record.in_a_row} steps in a row, up to step {step}, had a loss or a gradient that is not "
+                "finite and were skipped. In another run folder, lower --optim.learning-rate, set --optim.grad-clip, "
+                "or look for NaN in the data."
             )
 
     def save(self, done: int, state: TrainState, since: int) -> int:
         """Write a checkpoint in the background, after the metrics of its `since` steps, and return `done`.
 
-        Its loss is the mean over these steps. A mean over fewer steps than usual is marked `partial`, because it could
-        be the best by chance.
+        Its loss is the mean over these steps, marked `partial` for few steps: it could be the best by chance.
         """
         self.log_metrics()
         self.record.sync()
@@ -268,7 +252,7 @@ class _Loop:
             metrics["loss"] = sum(self.losses) / len(self.losses)
         if since < self.config.run.save_every:
             metrics[PARTIAL] = 1
-        with writing(self.record.path.parent / "checkpoints"):
+        with writing(self.checkpoints.folder):
             self.checkpoints.save(done, state, metrics)
         self.losses = []
         return done
@@ -280,7 +264,7 @@ class _Loop:
             try:
                 self.on_report(done, gather(merge(state.trainable, state.frozen)), gather(batch))
             except Exception as error:
-                self.bar.log(f"no figures at step {done}: {type(error).__name__}: {error}")
+                self.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
 
 
@@ -289,32 +273,10 @@ def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: M
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
     places = state_sharding(shapes, mesh)
-    latest = broadcast(checkpoints.latest() or 0)
-    if latest:
-        shaped = [
-            jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)
-            for x, place in zip(jax.tree.leaves(shapes), jax.tree.leaves(places), strict=True)
-        ]
-        return checkpoints.restore(jax.tree.unflatten(jax.tree.structure(shapes), shaped), latest), latest
+    if latest := broadcast(checkpoints.latest() or 0):
+        wanted = jax.tree.map(lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at), shapes, places)
+        return checkpoints.restore(wanted, latest), latest
     return jax.jit(init, out_shardings=places)(put_state(params, state_sharding(params, mesh))), 0
-
-
-def _checked(batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
-    """Yield the batches of steps `start` to `stop`, check their order, and close their source in the end."""
-    source, expected = batches(start, stop), start
-    try:
-        for step, batch, info in source:
-            if step != expected:
-                raise ValueError(f"the batches gave step {step} instead of step {expected}")
-            yield step, batch, info
-            expected += 1
-            if expected == stop:
-                return
-        raise UserError(f"the data ended after {expected} of {stop} steps. Pass batches for every step.")
-    finally:
-        close = getattr(source, "close", None)
-        if close is not None:
-            close()
 
 
 class LastStep:
@@ -325,21 +287,16 @@ class LastStep:
 
     def began(self, metrics: Mapping[str, Any]) -> None:
         """Wait for the step that returns these metrics."""
-        self._end = []  # the thread of an older step has another list
+        end = self._end = []  # the thread of an older step has another list
+
+        def wait() -> None:
+            with contextlib.suppress(Exception):  # the loop raises the error when it reads the metrics
+                jax.block_until_ready(metrics)
+                end.append(time.perf_counter())
+
         # A daemon thread: a step never ends when a process is lost, but the run must.
-        threading.Thread(target=_wait_for, args=(metrics, self._end), name="last step", daemon=True).start()
+        threading.Thread(target=wait, name="last step", daemon=True).start()
 
     def ended(self) -> float | None:
         """Return when the step ended, or None if it still runs or failed."""
         return self._end[0] if self._end else None
-
-
-def _wait_for(metrics: Mapping[str, Any], end: list[float]) -> None:
-    with contextlib.suppress(Exception):  # the loop raises the error when it reads the metrics
-        jax.block_until_ready(metrics)
-        end.append(time.perf_counter())
-
-
-def _rows(batch: Any) -> int:
-    """Return the samples in a batch, over all processes."""
-    return jax.tree.leaves(batch)[0].shape[0] * jax.process_count()

@@ -15,7 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.pack import SMALL
+from anytouch_jax.train.optim import SMALL
 
 Tree = Any
 BATCH_AXES = ("data", "fsdp")
@@ -23,19 +23,15 @@ CACHE_DAYS = 60  # age at which a compiled program is removed
 
 
 def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """Return a mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError if there are too few.
-
-    The axes have type Auto, so that jit places the computation. The default of `jax.make_mesh` is explicit axes.
-    """
+    """Return a mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError if there are too few."""
     devices = list(jax.devices() if devices is None else devices)
     if fsdp < 1 or (data is None and len(devices) % fsdp):
         raise ConfigError(f"--run.fsdp {fsdp} must be a divisor of the {len(devices)} devices")
     data = len(devices) // fsdp if data is None else data
     if not 0 < data * fsdp <= len(devices):
         raise ConfigError(f"a mesh of {data} x {fsdp} needs {data * fsdp} devices, but there are {len(devices)}")
-    return jax.make_mesh(
-        (data, fsdp), BATCH_AXES, axis_types=(AxisType.Auto, AxisType.Auto), devices=devices[: data * fsdp]
-    )
+    auto = (AxisType.Auto, AxisType.Auto)  # jit places the computation: the default is explicit axes
+    return jax.make_mesh((data, fsdp), BATCH_AXES, axis_types=auto, devices=devices[: data * fsdp])
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
@@ -51,8 +47,8 @@ def replicated(mesh: Mesh) -> NamedSharding:
 def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> Tree:
     """Return a sharding for each array of a state: its largest divisible axis over "fsdp".
 
-    Arrays of fewer than `small` elements, or without a divisible axis, are copied to each device. Vectors are copied
-    too: a long one has many small arrays (`pack`), and each of them would have to be sent.
+    Vectors (a long one has many small arrays, see `optim.packing`), arrays of fewer than `small` elements, and those
+    without a divisible axis are copied to each device.
     """
     parts = mesh.shape["fsdp"]
 
@@ -60,8 +56,7 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
         divisible = [(size, axis) for axis, size in enumerate(leaf.shape) if size % parts == 0]
         if parts == 1 or not divisible or len(leaf.shape) < 2 or np.prod(leaf.shape) < small:
             return replicated(mesh)
-        _, axis = max(divisible)
-        return NamedSharding(mesh, PartitionSpec(*[None] * axis, "fsdp"))
+        return NamedSharding(mesh, PartitionSpec(*[None] * max(divisible)[1], "fsdp"))
 
     return jax.tree.map(place, abstract_state)
 
@@ -69,9 +64,9 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
 def put_state(tree: Tree, places: Tree) -> Tree:
     """Copy a host's tree to the devices, each array by its sharding. Every process passes the same tree.
 
-    Arrays are never shared with the caller, because the step donates its state. They are copied through the host:
-    `device_put` shares an array that is on one of several devices, whatever `may_alias` is.
+    Arrays are never shared with the caller, because the step donates its state.
     """
+    # Through the host: `device_put` shares an array that is on one of several devices, whatever `may_alias` is.
     host = jax.tree.map(np.asarray, tree)
     if jax.process_count() == 1:
         return jax.device_put(host, places, may_alias=False)
@@ -82,8 +77,8 @@ def put_state(tree: Tree, places: Tree) -> Tree:
 def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     """Return `loss_fn(params, ...)` that gathers sharded parameters just before their use.
 
-    Otherwise XLA's partitioner shards activations along the axis of a parameter, and sends twice the bytes. State and
-    optimiser stay sharded (ZeRO, Rajbhandari et al., 2020). Without an "fsdp" axis the loss is returned unchanged.
+    State and optimiser stay sharded (ZeRO, Rajbhandari et al., 2020). XLA alone would shard activations along the axis
+    of a parameter, and send twice the bytes.
     """
     if mesh.shape["fsdp"] == 1:
         return loss_fn
@@ -97,8 +92,7 @@ def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
 def donated() -> tuple[int, ...]:
     """Return the arguments of a step that are donated, for `jax.jit(donate_argnums=...)`: the state, on an accelerator.
 
-    On a CPU none is. XLA would copy every parameter and moment, because several kernels read them before they are
-    overwritten, and the step would be slower (`python -m experiments.benchmarks.run stage1` measures both).
+    On a CPU none is: XLA would copy every parameter and moment (`experiments.benchmarks.run stage1` measures it).
     """
     return () if jax.default_backend() == "cpu" else (0,)
 

@@ -17,21 +17,10 @@ from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.weights.checkpoint import read_record, steps
 
-# Settings that may change when a run continues. They decide where and how fast it runs, not its numbers.
-CHANGEABLE = {
-    "data.cache",
-    "data.manifests",  # `pretrain` compares their content, since a data set may have moved
-    "data.on_bad_sample",
-    "data.prefetch",
-    "data.threads",
-    "data.tokenizer",  # the run folder has a copy
-    "run.figure_every",
-    "run.fsdp",
-    "run.keep",
-    "run.max_skipped",
-    "run.save_every",
-    "run.tensorboard",
-}
+# Settings that may change when a run continues: they decide where and how fast it runs, not its numbers. `pretrain`
+# compares the content of the manifests, since a data set may have moved. The run folder has a copy of the tokenizer.
+CHANGEABLE = {f"data.{name}" for name in ("cache", "manifests", "on_bad_sample", "prefetch", "threads", "tokenizer")}
+CHANGEABLE |= {f"run.{n}" for n in ("figure_every", "fsdp", "keep", "max_skipped", "save_every", "tensorboard")}
 
 
 @contextlib.contextmanager
@@ -82,13 +71,12 @@ def begun_with(run_dir: Path) -> Config | None:
     if not done:
         return None
     try:
-        if not path.exists():
-            path = run_dir / "checkpoints" / f"{done[-1]:08d}"
-        text = read_record(path)["config"] if path.is_dir() else path.read_text(encoding="utf-8")
-        config: Config = from_json(text, allow_retired=False)
+        if path.exists():
+            return from_json(path.read_text(encoding="utf-8"), allow_retired=False)
+        path = run_dir / "checkpoints" / f"{done[-1]:08d}"
+        return from_json(read_record(path)["config"], allow_retired=False)
     except (ConfigError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read ({error}). Choose another run folder, or repair the file.") from None
-    return config
 
 
 def open_run(run_dir: Path, config: Config) -> None:
@@ -108,11 +96,9 @@ def continues(run_dir: Path, config: Config) -> bool:
 
     Raises UserError that names every changed setting with both values.
     """
-    begun = begun_with(run_dir)
-    if begun is None:
+    if (begun := begun_with(run_dir)) is None:
         return False
-    before = _flat(dataclasses.asdict(begun))
-    now = _flat(dataclasses.asdict(config))
+    before, now = _flat(dataclasses.asdict(begun)), _flat(dataclasses.asdict(config))
     changed = [
         f"{name} was {before.get(name)!r} and is now {now.get(name)!r}"
         for name in sorted(before.keys() | now.keys())
@@ -121,10 +107,8 @@ def continues(run_dir: Path, config: Config) -> bool:
     if changed:
         longer = f", or start from its weights by --init {run_dir} and another --run folder"
         raise UserError(
-            f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. "
-            "Use the same settings to continue it, or choose another run folder"
-            + (longer if before["run.steps"] != now["run.steps"] else "")
-            + "."
+            f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. Use the same settings to "
+            f"continue it, or choose another run folder{longer if before['run.steps'] != now['run.steps'] else ''}."
         )
     return True
 
@@ -133,10 +117,8 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a nested dict as {dotted name: value}, with lists as tuples."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = tuple(value) if isinstance(value, list) else value
+        value = tuple(value) if isinstance(value, list) else value
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
     return flat
 
 
@@ -155,17 +137,20 @@ class Record:
         with writing(self.path):
             for row in _cut(self.path, start, rewrite=lead):
                 self._count(row)
-            place = self.path if lead else Path(os.devnull)
-            self._file: TextIO = place.open("a", encoding="utf-8")
+            self._file: TextIO | None = self.path.open("a", encoding="utf-8") if lead else None
 
     def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Append the line of a step and return it. A number that is not finite becomes null, as JSON has no NaN."""
-        row = {"step": step} | {name: _plain(value) for name, value in numbers.items()}
+        row = {"step": step}
+        for name, value in numbers.items():
+            value = value.item() if hasattr(value, "item") else value
+            row[name] = None if isinstance(value, float) and not math.isfinite(value) else value
         self._count(row)
         row["skipped_batches"] = self.skipped
-        with writing(self.path):
-            self._file.write(json.dumps(row, allow_nan=False) + "\n")
-            self._file.flush()
+        if self._file:
+            with writing(self.path):
+                self._file.write(json.dumps(row, allow_nan=False) + "\n")
+                self._file.flush()
         if self._board is not None:
             for name, value in row.items():
                 if name != "step" and isinstance(value, int | float):
@@ -174,44 +159,34 @@ class Record:
 
     def sync(self) -> None:
         """Flush the lines to disk, so that a checkpoint never has steps that are missing here."""
-        if self._file.name == str(self.path):  # the null device cannot be synced
+        if self._file:
             with writing(self.path):
                 os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the files. `write` has reported what could not be written."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-        if self._board is not None:
-            self._board.close()
+        for file in (self._file, self._board):
+            with contextlib.suppress(OSError):
+                if file is not None:
+                    file.close()
 
     def _count(self, row: Mapping[str, Any]) -> None:
         self.in_a_row = self.in_a_row + 1 if row.get("skipped") else 0
         self.skipped += bool(row.get("skipped"))
 
 
-def _plain(value: Any) -> Any:
-    """Return a number that JSON can store."""
-    value = value.item() if hasattr(value, "item") else value
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
     """Remove the lines of step `start` and later, and incomplete ones, and return the rest."""
-    if not path.exists():
-        return []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-    rows: list[dict[str, Any]] = []
-    complete: list[str] = []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True) if path.exists() else []
+    rows: dict[str, dict[str, Any]] = {}
     for line in lines:
         with contextlib.suppress(ValueError):
             row = json.loads(line)
             if line.endswith("\n") and isinstance(row, dict) and row.get("step", start) < start:
-                rows.append(row)
-                complete.append(line)
-    if rewrite and len(complete) < len(lines):
-        atomic_write(path, "".join(complete))
-    return rows
+                rows[line] = row
+    if rewrite and len(rows) < len(lines):
+        atomic_write(path, "".join(rows))
+    return list(rows.values())
 
 
 def _tensorboard(run_dir: Path, start: int) -> Any:

@@ -2,11 +2,13 @@
 
 A step may not use a parameter, such as a clip's head on a batch of stills. That parameter is skipped: no decay, no
 moment and no count, as in PyTorch when a gradient is None. So each parameter needs its own count, and `optax.adamw`
-has one for all.
+has one for all. Small arrays are packed into one vector: a ViT has about twenty parameters a stack, most of them
+vectors, and updated one by one they take longer to compile than the whole backward pass.
 """
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -18,40 +20,71 @@ import optax
 
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.pack import Packing, global_norm, packing
 from anytouch_jax.weights.tree import flatten
 
 Array = jax.Array
 Tree = Any
 T = TypeVar("T")
+SMALL = 2**16  # elements; a larger array gets its own kernel and is sharded
+
+
+class Packing(NamedTuple):
+    """Which leaves of a tree are packed into one vector: `groups` of leaf numbers. A leaf alone is not changed."""
+
+    groups: tuple[tuple[int, ...], ...]
+    shapes: tuple[tuple[int, ...], ...]
+    treedef: Any
+
+    def pack(self, tree: Tree) -> tuple[Array, ...]:
+        """Return one array a group."""
+        leaves = self.treedef.flatten_up_to(tree)
+        return tuple(
+            leaves[group[0]] if len(group) == 1 else jnp.concatenate([leaves[i].reshape(-1) for i in group])
+            for group in self.groups
+        )
+
+    def unpack(self, arrays: Sequence[Array]) -> Tree:
+        """Return the tree that was packed."""
+        leaves: list[Any] = [None] * len(self.shapes)
+        for group, array in zip(self.groups, arrays, strict=True):
+            start = 0
+            for i in group:
+                size = int(np.prod(self.shapes[i]))
+                leaves[i] = array if len(group) == 1 else array[start : start + size].reshape(self.shapes[i])
+                start += size
+        return self.treedef.unflatten(leaves)
+
+    def spread(self, group: int, values: Any) -> Any:
+        """Repeat `values` (leaves,) over the elements of a group: (n,), or () for a group of one leaf."""
+        leaves = self.groups[group]
+        if len(leaves) == 1:
+            return values[leaves[0]]
+        # The index is known while tracing: jnp.repeat would leave XLA to fold a cumulative sum for seconds.
+        return values[np.repeat(np.asarray(leaves, np.int32), [int(np.prod(self.shapes[i])) for i in leaves])]
+
+
+def packing(tree: Tree, small: int = SMALL) -> Packing:
+    """Return how to pack a tree of arrays or shapes: leaves below `small` elements together, by data type."""
+    leaves, treedef = jax.tree.flatten(tree)
+    together: dict[Any, list[int]] = {}
+    for i, leaf in enumerate(leaves):
+        together.setdefault(leaf.dtype if leaf.size < small else i, []).append(i)
+    groups = tuple(tuple(group) for group in together.values())
+    return Packing(groups, tuple(leaf.shape for leaf in leaves), treedef)
+
+
+def global_norm(arrays: Sequence[Array]) -> Array:
+    """Return the Euclidean norm of all elements, f32 ()."""
+    return jnp.sqrt(sum(jnp.sum(jnp.square(x.astype(jnp.float32))) for x in arrays))
 
 
 class OptState(NamedTuple):
-    """The state of `optimizer`.
+    """The state of `optimizer`."""
 
-    `counts` i32 (parameters,) is how often each parameter was updated. `mu` and `nu` are the first and second moments,
-    packed by `pack.packing`. `learning_rate` f32 () is the last one.
-    """
-
-    counts: Array
-    mu: tuple[Array, ...]
-    nu: tuple[Array, ...]
-    learning_rate: Array
-
-
-class Moments(NamedTuple):
-    """The state of Adam for one parameter: the count `updates` i32 (), and `mu` and `nu` of its shape."""
-
-    updates: Array
-    mu: Array
-    nu: Array
-
-
-def moments(state: OptState, params: Tree) -> Tree:
-    """Return the `Moments` of every parameter, in a tree like `params`."""
-    layout = packing(params)
-    counts = layout.treedef.unflatten(list(state.counts))
-    return jax.tree.map(Moments, counts, layout.unpack(state.mu), layout.unpack(state.nu))
+    counts: Array  # i32 (parameters,): how often each was updated
+    mu: tuple[Array, ...]  # first moments, packed by `packing`
+    nu: tuple[Array, ...]  # second moments
+    learning_rate: Array  # f32 (): the last one
 
 
 def match_rules(rules: Sequence[tuple[str, T]], names: Iterable[str]) -> dict[str, T]:
@@ -83,26 +116,15 @@ def learning_rate(t: Array | float, *, peak: float, floor: float, warmup: float,
 def schedule(config: Config) -> Callable[[Array | float], Array]:
     """Return the schedule of a run: step -> learning rate. Step 0 has rate 0 (golden H)."""
     options = config.optim
-
-    def rate(step: Array | float) -> Array:
-        return learning_rate(
-            step,
-            peak=options.learning_rate,
-            floor=options.min_rate,
-            warmup=config.warmup,
-            total=config.run.steps,
-            decay=options.decay,
-        )
-
-    return rate
+    ends = {"peak": options.learning_rate, "floor": options.min_rate, "warmup": config.warmup}
+    return functools.partial(learning_rate, **ends, total=config.run.steps, decay=options.decay)
 
 
 def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | float:
     """Return the factor on a parameter's learning rate: a number, or one for each of stacked blocks (L, 1, ...).
 
-    Of L blocks of the touch encoder, block i of 1 to L has the factor layer_decay^(L - i). Parameters before the
-    blocks have layer_decay^L, and all others 1. BEiT's fine-tuning (Bao et al. 2022) is alike, but its last block has
-    the factor layer_decay.
+    Block i of 1 to L of the touch encoder has the factor layer_decay^(L - i), parameters before the blocks
+    layer_decay^L, and all others 1. In BEiT's fine-tuning (Bao et al. 2022) the last block has layer_decay.
     """
     depth, decay = config.model.touch.depth, config.optim.layer_decay
     if name.startswith("touch/blocks/"):

@@ -7,19 +7,10 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 Log = Callable[[str], None]
 _WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its time reports it
-
-
-@dataclass(frozen=True)
-class RunDisplay:
-    """The display of a run: `log` a sentence, or `advance` by one step with its line of metrics."""
-
-    log: Log
-    advance: Callable[[Mapping[str, Any]], None]
 
 
 def to_stderr(sentence: str) -> None:
@@ -33,8 +24,8 @@ def silent(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(start: int, stop: int, log: Log) -> Iterator[RunDisplay]:
-    """Show a bar from step `start` to `stop` on a terminal, else log about twenty lines."""
+def progress(start: int, stop: int, log: Log) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Give a function for the metrics of each step. It moves a bar on a terminal, else logs about twenty lines."""
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
 
@@ -43,7 +34,7 @@ def progress(start: int, stop: int, log: Log) -> Iterator[RunDisplay]:
             if done == start + 1 or done == stop or (done - start) % every == 0:
                 log(f"step {done}/{stop}  {summary(row)}")
 
-        yield RunDisplay(log, line)
+        yield line
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -51,10 +42,7 @@ def progress(start: int, stop: int, log: Log) -> Iterator[RunDisplay]:
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("compiling", total=stop, completed=start)
-        yield RunDisplay(
-            log,
-            lambda row: bar.update(task, completed=row["step"] + 1, description=summary(row)),
-        )
+        yield lambda row: bar.update(task, completed=row["step"] + 1, description=summary(row))
 
 
 def summary(row: Mapping[str, Any]) -> str:
@@ -68,29 +56,31 @@ def summary(row: Mapping[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def signals() -> Iterator[list[signal.Signals]]:
-    """Yield a list that collects SIGTERM and Ctrl-C, which then do not end the process. A second Ctrl-C does.
+def _handled(handler: Callable[[int, Any], None], *names: signal.Signals) -> Iterator[None]:
+    """Let signals call `handler` while the block runs. Outside the main thread Python has no handlers."""
+    before: dict[signal.Signals, Any] = {}
+    try:
+        for name in names if threading.current_thread() is threading.main_thread() else ():
+            before[name] = signal.signal(name, handler)
+        yield
+    finally:
+        for name, earlier in before.items():
+            signal.signal(name, earlier)
 
-    Outside the main thread Python has no handlers, and the list stays empty.
-    """
+
+@contextlib.contextmanager
+def signals() -> Iterator[list[signal.Signals]]:
+    """Yield a list that collects SIGTERM and Ctrl-C, which then do not end the process. A second Ctrl-C does."""
     received: list[signal.Signals] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield received
-        return
 
     def note(number: int, frame: Any) -> None:
         received.append(signal.Signals(number))
         if number == signal.SIGINT:
-            signal.signal(signal.SIGINT, before[signal.SIGINT])
+            signal.signal(signal.SIGINT, earlier)
 
-    before: dict[signal.Signals, Any] = {}
-    try:
-        for name in (signal.SIGTERM, signal.SIGINT):
-            before[name] = signal.signal(name, note)
+    earlier = signal.getsignal(signal.SIGINT)
+    with _handled(note, signal.SIGTERM, signal.SIGINT):
         yield received
-    finally:
-        for name, handler in before.items():
-            signal.signal(name, handler)
 
 
 class Terminated(BaseException):
@@ -99,19 +89,10 @@ class Terminated(BaseException):
 
 @contextlib.contextmanager
 def terminating() -> Iterator[None]:
-    """Let SIGTERM raise `Terminated` while the block runs, so that the block cleans up as after any error.
-
-    `signals` takes over inside it. Outside the main thread Python has no handlers, and nothing changes.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """Let SIGTERM raise `Terminated` while the block runs, so that it cleans up. `signals` takes over inside it."""
 
     def end(number: int, frame: Any) -> None:
         raise Terminated
 
-    before = signal.signal(signal.SIGTERM, end)
-    try:
+    with _handled(end, signal.SIGTERM):
         yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

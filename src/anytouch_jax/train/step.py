@@ -12,8 +12,7 @@ import optax
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.optim import match_rules, optimizer
-from anytouch_jax.train.pack import global_norm, packing
+from anytouch_jax.train.optim import global_norm, match_rules, optimizer, packing
 from anytouch_jax.weights.tree import flatten, nest
 
 Array = jax.Array
@@ -74,14 +73,13 @@ def make_step(
 
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
     differentiated. Those that a batch does not train by the rules of `trained` (`objectives.trained_by`) are skipped,
-    as in PyTorch (golden H_mixed). Without rules all are updated. If the loss or the gradient norm is not finite, the
-    update is not applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss,
-    grad_norm, param_norm (before the update), update_norm, learning_rate, skipped.
+    as in PyTorch (golden H_mixed). If the loss or the gradient norm is not finite, the update is not applied, `step`
+    advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm (before the
+    update), update_norm, learning_rate, skipped.
 
     `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses, gradients and metrics are
-    averaged. For a mean over rows this equals the large batch. InfoNCE compares rows of one micro-batch only. Raises
-    ConfigError for rows that do not divide, and for packed image or text slots. `optax.MultiSteps` would apply an
-    update and advance the schedule over several calls, and one step here is one call.
+    averaged: equal to the large batch for a mean over rows, not for InfoNCE. Raises ConfigError for rows that do not
+    divide, and for packed image or text slots. `optax.MultiSteps` would need several calls.
     """
     tx = optax.with_extra_args_support(tx)
 
@@ -95,9 +93,9 @@ def make_step(
 
         parts = batch if accumulate == 1 else micro_batches(batch, accumulate)
         used = nest(match_rules(trained(batch), flatten(state.trainable))) if trained else None
+        function = jax.value_and_grad(loss, has_aux=True)
 
         def gradients(part: Any, key: Array) -> tuple[Array, dict[str, Array], Tree]:
-            function = jax.value_and_grad(loss, has_aux=True)
             (value, metrics), grads = function(state.trainable, state.frozen, part, key, progress)
             return value, metrics, grads
 
@@ -111,11 +109,9 @@ def make_step(
 def _finish(
     state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
-    """Apply the update if loss and gradient are finite, and return the new state and its metrics.
-
-    The update is read only once. For a second reader XLA would keep a copy as large as the parameters. So
-    `update_norm` is the norm of the change of the parameters, and does not decide whether a step is skipped.
-    """
+    """Apply the update if loss and gradient are finite, and return the new state and its metrics."""
+    # The update is read only once: for a second reader XLA would keep a copy as large as the parameters. So
+    # `update_norm` is the norm of the change of the parameters, and does not decide whether a step is skipped.
     layout = packing(state.trainable)
     grad_norm = global_norm(layout.pack(grads))
     good = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
@@ -136,9 +132,9 @@ def _finish(
 
 
 def micro_batches(batch: Any, accumulate: int) -> Any:
-    """Split every leading axis B into (accumulate, B / accumulate): micro-batch m has the rows m, m + accumulate, ...
+    """Split every leading axis B into (accumulate, B / accumulate). Raises ConfigError.
 
-    With strided rows a batch that is sharded over devices needs no transfer. Raises ConfigError.
+    Micro-batch m has the rows m, m + accumulate, ...: with strided rows a sharded batch needs no transfer.
     """
     for part in jax.tree.leaves(batch, is_leaf=lambda x: isinstance(x, AlignBatch)):
         if isinstance(part, AlignBatch) and part.image.shape[0] + part.text.shape[0] > 0:

@@ -1,14 +1,13 @@
 """Checkpoints of a run: the one file that knows Orbax (its v1 API), and the record that each checkpoint has of itself.
 
-A checkpoint is a folder `<checkpoints>/<step>` that appears whole or not at all: everything is written under another
-name, then renamed. Its `checkpoint.json` stores the run's config, the caller's metadata, the metrics, and the size and
-checksum of every file. A folder is read only if its files match that record. Arrays are stored by name, so that
-parameters can be read without the optimiser, and on another number of devices.
+A checkpoint is a folder `<checkpoints>/<step>` that appears whole or not at all: it is written under another name, then
+renamed. Its `checkpoint.json` stores config, metadata, metrics, and the size and checksum of every file, and a folder
+is read only if its files match. Arrays are stored by name: parameters can be read without the optimiser.
 """
 
-# Orbax's `training.Checkpointer` has policies for what is kept, and renames a folder itself once the arrays are
-# written. Our record needs the checksums of the written files, and must be in the folder before that rename. With
-# Orbax's rename, a kill between the two left a checkpoint that could not be verified. So the rename is ours.
+# Orbax's `training.Checkpointer` renames a folder itself once the arrays are written. Our record needs the checksums of
+# the written files, and must be in the folder before that rename: a kill between the two left a checkpoint that could
+# not be verified. So the rename is ours.
 
 from __future__ import annotations
 
@@ -45,6 +44,7 @@ _STEP = re.compile(r"\d{8,}")
 _UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")  # being written or removed, by us or by Orbax
 _AVERAGE = "opt_state/ema/"  # runs of an older version may have an average of the parameters
 _LISTED = 5  # names in one error message
+_LINGER = 5.0  # seconds for threads of a failed save
 _TRIES = 3  # to read the latest checkpoint of a running run
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost
 _CHUNK = 1 << 22
@@ -56,10 +56,7 @@ class CheckpointError(UserError):
 
 
 def quiet_hook(hook: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an exception hook that drops what Tensorstore's threads raise after the first failed write.
-
-    The other writes of a checkpoint would each print a traceback on a full disk.
-    """
+    """Return an exception hook without what Tensorstore's threads raise for each write after the first failed one."""
 
     def quiet(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         if kind is not RuntimeError or str(error) != "Event loop is closed":
@@ -81,39 +78,45 @@ class Checkpoints:
     """
 
     def __init__(self, folder: str | Path, *, keep: int, config_json: str, metadata: dict[str, Any]) -> None:
-        if keep < 1:
-            raise CheckpointError(f"a run must keep at least one checkpoint, not {keep}")
         self.folder = Path(folder).absolute()
         self._keep = keep
-        try:
-            json.dumps(metadata, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise CheckpointError(f"the metadata of a checkpoint must be plain JSON values: {error}") from None
         self._described = {"config": config_json, "metadata": metadata}
         self._worker = ThreadPoolExecutor(1, "checkpoint")
         self._pending: tuple[Path, Future[None], Callable[[], None]] | None = None
-        self._saved: set[int] = set()
         with self._one_sentence(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._sweep()
 
+    def check_space(self, state: Tree) -> None:
+        """Raise CheckpointError if the disk has less space than a checkpoint of `state` (arrays or shapes) takes.
+
+        A save would find out too, but late, and its threads may take long to give up. Each of several processes writes
+        its own share, and disks that report no size are not checked.
+        """
+        needed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+        disk = shutil.disk_usage(self.folder)
+        if disk.total and disk.free < needed and jax.process_count() == 1:
+            raise CheckpointError(
+                f"cannot write a checkpoint in {self.folder}: the disk is full, {needed:,} bytes are needed and "
+                f"{disk.free:,} are free; free some space and run the same command again; older ones are untouched"
+            )
+
     def save(self, step: int, state: Tree, metrics: Mapping[str, Any]) -> None:
         """Start saving `state`, a pytree of arrays; it may be donated or changed as soon as this returns.
 
-        Waits for the previous save first, and raises its CheckpointError. A step that this object has saved already
-        is skipped. One that an earlier process saved is replaced when the new one is complete.
+        Waits for the previous save first, and raises its CheckpointError. A step that was saved before is replaced
+        when the new one is complete.
         """
         self.wait()
-        if step in self._saved:
-            return
+        self._sweep()  # threads of a failed save may have written on
         target = self.folder / f"{step:08d}"
         # A numpy array may be written to while the save runs.
         leaves = {n: x if isinstance(x, jax.Array) else np.array(x) for n, x in flatten(state).items()}
-        numbers = {name: float(value) for name, value in metrics.items()}
+        self.check_space(leaves)
         content = {
             **self._described,
             "step": int(step),
-            "metrics": {name: value if math.isfinite(value) else None for name, value in numbers.items()},
+            "metrics": {name: float(value) if math.isfinite(value) else None for name, value in metrics.items()},
             "arrays": {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in leaves.items()},
         }
         arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
@@ -141,7 +144,6 @@ class Checkpoints:
                     from jax.experimental import multihost_utils
 
                     multihost_utils.sync_global_devices(f"saved {target.name}")
-        self._saved.add(int(target.name))
 
     def latest(self) -> int | None:
         """Return the last complete step on disk, or None."""
@@ -156,15 +158,17 @@ class Checkpoints:
         self.wait()
         folder = resolve(self.folder, step)
         record = checked(folder)
-        wanted = {name: _abstract(leaf) for name, leaf in flatten(abstract_state).items()}
+        first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+        wanted = {
+            name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=getattr(leaf, "sharding", None) or first)
+            for name, leaf in flatten(abstract_state).items()
+        }
         _compare(folder, wanted, _forms(record))
-        _check_stored(folder, wanted)
-        arrays = _load(folder, {name: like for name, like in wanted.items() if math.prod(like.shape)})
-        leaves = [
-            arrays[name] if name in arrays else jax.device_put(np.zeros(like.shape, like.dtype), like.sharding)
-            for name, like in wanted.items()
-        ]
-        return jax.tree.unflatten(jax.tree.structure(abstract_state), leaves)
+        empty = {n: x for n, x in wanted.items() if not math.prod(x.shape)}
+        arrays = _load(folder, wanted) | {
+            n: jax.device_put(np.zeros(x.shape, x.dtype), x.sharding) for n, x in empty.items()
+        }
+        return jax.tree.unflatten(jax.tree.structure(abstract_state), [arrays[name] for name in wanted])
 
     def close(self) -> None:
         """Finish the running save and its housekeeping. Raises CheckpointError if the save failed."""
@@ -179,12 +183,11 @@ class Checkpoints:
         if error is None or jax.process_count() == 1:
             self.close()
             return
-        if self._pending is not None and not isinstance(error, jax.errors.JaxRuntimeError):
-            with suppress(Exception):
-                self._pending[1].result(timeout=_PATIENCE)
-        self._worker.shutdown(wait=False, cancel_futures=True)
         if self._pending is not None:
+            with suppress(Exception):
+                self._pending[1].result(0 if isinstance(error, jax.errors.JaxRuntimeError) else _PATIENCE)
             self._pending[2]()  # a save that never ends, or was cancelled, must not block a load
+        self._worker.shutdown(wait=False, cancel_futures=True)
 
     def _finish(self, target: Path, response: Any, content: dict[str, Any], release: Callable[[], None]) -> None:
         """Write the record once the arrays are on disk, rename, and remove old checkpoints (on the worker thread)."""
@@ -194,19 +197,19 @@ class Checkpoints:
             release()
         if jax.process_index() != 0:
             return
-        writing = _writing(target)
-        write_record(writing, content)
+        write_record(_writing(target), content)
         if target.exists():
             _discard(target)
-        writing.rename(target)
+        _writing(target).rename(target)
         present = steps(self.folder)
         for step in set(present) - {best_of(self.folder), *present[-self._keep :]}:
             _discard(self.folder / f"{step:08d}")
 
     def _sweep(self) -> None:
-        if jax.process_index() == 0 and self.folder.is_dir():
-            for entry in self.folder.iterdir():
-                if entry.is_dir() and _UNFINISHED.fullmatch(entry.name):
+        """Remove what is unfinished."""
+        if jax.process_index() == 0:
+            for entry in self.folder.glob("*.*"):
+                if _UNFINISHED.fullmatch(entry.name):
                     shutil.rmtree(entry, ignore_errors=True)
 
     @contextmanager
@@ -215,6 +218,9 @@ class Checkpoints:
         try:
             yield
         except Exception as error:  # Orbax and tensorstore wrap OSError in several types
+            for thread in threading.enumerate():
+                if thread.name == "serialize_shardings":  # Orbax's, which would write on into a removed folder
+                    thread.join(_LINGER)
             self._sweep()
             reason = " ".join(str(error).split())[:300]
             full = getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error)
@@ -240,32 +246,28 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
     for _ in range(_TRIES if step is None else 1):
         target = resolve(Path(folder), step)
         try:
-            return _params_of(target)
+            record = checked(target)
+            parts = ("trainable/", "frozen/", _AVERAGE)
+            forms = {name: like for name, like in _forms(record).items() if name.startswith(parts)}
+            if not forms:
+                raise CheckpointError(f"checkpoint {target} has no parameters (nothing under trainable/ or frozen/)")
+            wanted = {name: np.broadcast_to(np.zeros((), like.dtype), like.shape) for name, like in forms.items()}
+            arrays = wanted | _load(target, wanted)
         except (CheckpointError, OSError):
             if target.is_dir():
                 raise
+        else:
+            params = {n.split("/", 1)[1]: leaf for n, leaf in arrays.items() if not n.startswith(_AVERAGE)}
+            params |= {n.removeprefix(_AVERAGE): leaf for n, leaf in arrays.items() if n.startswith(_AVERAGE)}
+            return nest(params), record["config"], _description(record)
     raise CheckpointError(f"checkpoint {target} was removed while it was read; read the latest one, or another step")
-
-
-def _params_of(target: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    record = checked(target)
-    parts = ("trainable/", "frozen/", _AVERAGE)
-    forms = {name: like for name, like in _forms(record).items() if name.startswith(parts)}
-    if not forms:
-        raise CheckpointError(f"checkpoint {target} has no parameters (nothing under trainable/ or frozen/)")
-    _check_stored(target, forms)
-    wanted = {name: np.zeros(like.shape, like.dtype) for name, like in forms.items()}
-    arrays = wanted | _load(target, {name: like for name, like in wanted.items() if like.size})
-    trained = {name.split("/", 1)[1]: leaf for name, leaf in arrays.items() if not name.startswith(_AVERAGE)}
-    averaged = {name.removeprefix(_AVERAGE): leaf for name, leaf in arrays.items() if name.startswith(_AVERAGE)}
-    return nest(trained | averaged), record["config"], _description(record)
 
 
 def _acquire_orbax() -> Callable[[], None]:
     """Wait until no other operation of Orbax runs; return its release, which any thread may call, also twice."""
-    _ORBAX.acquire()
     stack = ExitStack()
     stack.callback(_ORBAX.release)
+    _ORBAX.acquire()
     return stack.close
 
 
@@ -281,33 +283,22 @@ def _discard(target: Path) -> None:
     shutil.rmtree(doomed, ignore_errors=True)
 
 
-def _load(folder: Path, abstract: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the named arrays, of the types of their abstract leaves; other arrays are not read."""
-    if not abstract:
-        return {}
+def _load(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the named arrays that are not empty, of the types of `wanted`. Raises CheckpointError for other shapes."""
     jax.local_devices()  # a wrong JAX_PLATFORMS is no fault of the checkpoint
     context = ocp.Context()
     context.pytree.loading.partial_load = True
+    wanted = {name: like for name, like in wanted.items() if math.prod(like.shape)}
     try:
         with _ORBAX, context:
-            return flatten(ocp.load(folder, nest(abstract)))
+            stored = flatten(ocp.metadata(folder).metadata)
+            for name, like in wanted.items():  # before memory is taken for them
+                if name not in stored or tuple(stored[name].shape) != like.shape:
+                    raise ValueError(f"{name} is not stored in shape {like.shape}")
+            return flatten(ocp.load(folder, nest(wanted))) if wanted else {}
     except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
         reason = " ".join(str(error).split())[:300]
         raise CheckpointError(f"could not read checkpoint {folder} ({type(error).__name__}: {reason})") from error
-
-
-def _check_stored(folder: Path, forms: Mapping[str, Any]) -> None:
-    """Raise CheckpointError if arrays on disk have other shapes than the record, before memory is taken for them."""
-    jax.local_devices()  # see `_load`
-    try:
-        with _ORBAX:
-            stored = flatten(ocp.metadata(folder).metadata)
-    except Exception as error:
-        reason = " ".join(str(error).split())[:300]
-        raise CheckpointError(f"could not read checkpoint {folder} ({type(error).__name__}: {reason})") from error
-    for name, like in forms.items():
-        if math.prod(like.shape) and (name not in stored or tuple(stored[name].shape) != like.shape):
-            raise CheckpointError(f"checkpoint {folder} is damaged: {name} is not stored in shape {like.shape}")
 
 
 def _forms(record: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
@@ -320,11 +311,8 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
     def form(like: Any) -> str:
         return "nothing" if like is None else f"{tuple(like.shape)} {np.dtype(like.dtype)}"
 
-    differing = [
-        f"{name}: {form(stored.get(name))} stored, {form(wanted.get(name))} wanted"
-        for name in sorted({*wanted, *stored})
-        if form(wanted.get(name)) != form(stored.get(name))
-    ]
+    pairs = {name: (form(stored.get(name)), form(wanted.get(name))) for name in sorted({*wanted, *stored})}
+    differing = [f"{name}: {theirs} stored, {ours} wanted" for name, (theirs, ours) in pairs.items() if theirs != ours]
     if differing:
         raise CheckpointError(
             f"checkpoint {folder} does not fit this configuration, use the preset and settings it was trained with; "
@@ -332,30 +320,22 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
         )
 
 
-def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
-    sharding = getattr(leaf, "sharding", None) or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    return jax.ShapeDtypeStruct(tuple(leaf.shape), leaf.dtype, sharding=sharding)
-
-
 def _description(record: Mapping[str, Any]) -> dict[str, Any]:
     return {**record["metadata"], "step": record["step"], "config": record["config"], "metrics": record["metrics"]}
 
 
-def _loss(folder: Path) -> float:
-    """Return the loss of a checkpoint; infinite if unknown or of few steps, so that it is never the best."""
-    try:
-        metrics = read_record(folder)["metrics"]
-    except CheckpointError:  # `restore` reports a damaged one
-        return math.inf
-    loss = metrics.get("loss")
-    return math.inf if loss is None or metrics.get(PARTIAL) else loss
-
-
 def best_of(folder: Path) -> int | None:
-    """Return the step of lowest loss in a folder of checkpoints, the latest of equals; None if no loss is known."""
-    losses = {step: _loss(folder / f"{step:08d}") for step in steps(folder)}
-    best = min(losses, key=lambda step: (losses[step], -step), default=None)
-    return best if best is not None and math.isfinite(losses[best]) else None
+    """Return the step of lowest loss in a folder of checkpoints, the latest of equals; None if no loss is known.
+
+    A loss of few steps does not count.
+    """
+    losses: dict[int, float] = {}
+    for step in steps(folder):
+        with suppress(CheckpointError):  # `restore` reports a damaged one
+            metrics = read_record(folder / f"{step:08d}")["metrics"]
+            if metrics.get("loss") is not None and not metrics.get(PARTIAL):
+                losses[step] = metrics["loss"]
+    return min(losses, key=lambda step: (losses[step], -step), default=None)
 
 
 def steps(folder: str | Path) -> list[int]:
@@ -377,15 +357,14 @@ def resolve(folder: Path, step: int | None) -> Path:
     if (folder / "checkpoints").is_dir():
         folder = folder / "checkpoints"
     elif _STEP.fullmatch(folder.name) and folder.is_dir() and not steps(folder):
-        if step is not None and step != int(folder.name):
-            raise CheckpointError(f"{folder} is the checkpoint of step {int(folder.name)}, not of step {step}")
-        return folder
+        if step in (None, int(folder.name)):
+            return folder
+        raise CheckpointError(f"{folder} is the checkpoint of step {int(folder.name)}, not of step {step}")
     if folder.is_file():
         raise CheckpointError(f"{folder} is a file; give the folder of a run, which has checkpoints")
-    present = steps(folder)
-    if not present:
+    if not (present := steps(folder)):
         raise CheckpointError(f"there is no complete checkpoint in {folder}; train first, or give another folder")
-    if step is not None and step not in present:
+    if step not in (None, *present):
         listed = ", ".join(map(str, present[-10:]))
         raise CheckpointError(f"there is no checkpoint of step {step} in {folder}; it has {listed}")
     return folder / f"{present[-1] if step is None else step:08d}"
@@ -417,13 +396,15 @@ def read_record(folder: Path) -> dict[str, Any]:
         whole = outer["checksum"] == zlib.crc32(json.dumps(record, sort_keys=True).encode())
     except (ValueError, KeyError, TypeError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} cannot be read") from None
-    if not whole:
+    if not whole or not isinstance(record, dict):
         raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} was altered")
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        stored = repr(record.get("format"))[:100] if isinstance(record, dict) else "none"
+    if record.get("format") != FORMAT:
+        stored = repr(record.get("format"))[:100]
         raise CheckpointError(f"checkpoint {folder} has format {stored}; this program reads {FORMAT!r}")
-    if wrong := [name for name, valid in _SCHEMA.items() if name not in record or not valid(record[name])]:
-        raise CheckpointError(f"checkpoint {folder} is damaged: {wrong[0]} in {RECORD} is missing or of another type")
+    for field, (kind, valid) in _FIELDS.items():
+        value = record.get(field)
+        if type(value) is not kind or not all(valid(*item) for item in (value.items() if kind is dict else ())):
+            raise CheckpointError(f"checkpoint {folder} is damaged: {field} in {RECORD} is missing or of another type")
     return record
 
 
@@ -431,21 +412,12 @@ def _is_size(value: Any) -> bool:
     return type(value) is int and 0 <= value < 1 << 48
 
 
-def _is_metric(value: Any) -> bool:
-    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
-
-
 def _is_form(value: Any) -> bool:
     """Return whether a value is the shape and type of an array, of less than 2^48 bytes."""
-    if not (isinstance(value, list) and len(value) == 2 and isinstance(value[0], list) and isinstance(value[1], str)):
-        return False
-    return (
-        len(value[0]) <= 16
-        and all(map(_is_size, value[0]))
-        and math.prod(value[0]) < 1 << 45
-        and re.fullmatch(r"bool|u?int(4|8|16|32|64)|b?float(16|32|64)|float[48]_e\dm\d\w*|complex(64|128)", value[1])
-        is not None
-    )
+    match value:
+        case [list(shape), str(kind)] if len(shape) <= 16 and all(map(_is_size, shape)):
+            return math.prod(shape) < 1 << 45 and _TYPES.fullmatch(kind) is not None
+    return False
 
 
 def _is_file(name: str, value: Any) -> bool:
@@ -454,18 +426,15 @@ def _is_file(name: str, value: Any) -> bool:
     return inside and isinstance(value, list) and len(value) == 2 and all(map(_is_size, value))
 
 
-def _has_values(valid: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, dict) and all(map(valid, value.values()))
-
-
-# The fields of a record, and the check of each.
-_SCHEMA: dict[str, Callable[[Any], bool]] = {
-    "config": lambda value: isinstance(value, str),
-    "metadata": lambda value: isinstance(value, dict),
-    "step": _is_size,
-    "metrics": _has_values(_is_metric),
-    "arrays": _has_values(_is_form),
-    "files": lambda value: isinstance(value, dict) and bool(value) and all(_is_file(*item) for item in value.items()),
+# The fields of a record: the type of each, and the check of its values by name.
+_TYPES = re.compile(r"bool|u?int(4|8|16|32|64)|b?float(16|32|64)|float[48]_e\dm\d\w*|complex(64|128)")
+_FIELDS: dict[str, tuple[type, Callable[[str, Any], bool]]] = {
+    "config": (str, lambda name, value: True),
+    "metadata": (dict, lambda name, value: True),
+    "step": (int, lambda name, value: True),
+    "metrics": (dict, lambda name, value: value is None or type(value) in (int, float)),
+    "arrays": (dict, lambda name, value: _is_form(value)),
+    "files": (dict, _is_file),
 }
 
 
@@ -474,13 +443,11 @@ def checked(folder: Path) -> dict[str, Any]:
     try:
         return _verified(folder)
     except CheckpointError as error:
-        older = [step for step in reversed(steps(folder.parent)) if step < int(folder.name)]
-        intact = next((step for step in older if _is_intact(folder.parent / f"{step:08d}")), None)
-        advice = (
-            "no older checkpoint is intact"
-            if intact is None
-            else f"step {intact} is intact, remove {folder.name} to go on from there"
-        )
+        advice = "no older checkpoint is intact"
+        for step in steps(folder.parent):
+            with suppress(CheckpointError):
+                if step < int(folder.name) and _verified(folder.parent / f"{step:08d}"):
+                    advice = f"step {step} is intact, remove {folder.name} to go on from there"
         raise CheckpointError(f"{error}; {advice}") from None
 
 
@@ -488,23 +455,16 @@ def _verified(folder: Path) -> dict[str, Any]:
     """Return the record after comparing every file with it. Raises CheckpointError that names the first bad file."""
     record = read_record(folder)
     for name, (size, checksum) in record["files"].items():
-        path = folder / name
+        path, problem = folder / name, None
         if not path.is_file():
             problem = "is missing"
         elif path.stat().st_size != size:
             problem = f"has {path.stat().st_size} bytes instead of {size}"
         elif _checksum(path) != checksum:
             problem = "was altered"
-        else:
-            continue
-        raise CheckpointError(f"checkpoint {folder} is damaged: its file {name} {problem}")
+        if problem:
+            raise CheckpointError(f"checkpoint {folder} is damaged: its file {name} {problem}")
     return record
-
-
-def _is_intact(folder: Path) -> bool:
-    with suppress(CheckpointError):
-        return bool(_verified(folder))
-    return False
 
 
 def _checksum(path: Path) -> int:

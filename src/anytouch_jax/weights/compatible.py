@@ -15,10 +15,10 @@ from anytouch_jax.errors import UserError
 
 Params = dict[str, Any]
 
-# Settings that shapes depend on, and settings that leave no trace in shapes.
-SHAPED: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
-SHAPED += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
-SHAPELESS = ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")
+# Settings that must be equal: some leave no trace in shapes.
+_FORM: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
+_FORM += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
+_FORM += ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")
 
 
 def check_activation(path: Path, trained: str | None, config: Config) -> None:
@@ -30,25 +30,18 @@ def check_activation(path: Path, trained: str | None, config: Config) -> None:
         )
 
 
-def check_preset(path: Path, before: Config, config: Config) -> None:
-    """Raise UserError if a run has another preset than this run, and a touch encoder of another size."""
-    theirs, ours = ((model.touch.width, model.touch.depth) for model in (before.model, config.model))
-    if theirs != ours and before.preset not in (config.preset, "custom"):
-        raise UserError(
-            f"{path} has preset {before.preset}, this run would have preset {config.preset}: add --preset "
-            f"{before.preset}"
-        )
-
-
-def check_form(path: Path, before: ModelConfig, config: Config, names: Sequence[str] = (*SHAPED, *SHAPELESS)) -> None:
-    """Raise UserError with all the missing options if weights belong to another network than the run's."""
-    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in names}
-    differing = {name: (theirs, ours) for name, (theirs, ours) in pairs.items() if theirs != ours}
-    if differing:
-        trained = ", ".join(f"{name} {theirs}" for name, (theirs, _) in differing.items())
-        used = ", ".join(str(ours) for _, ours in differing.values())
-        options = " ".join(f"--model.{name.replace('_', '-')} {theirs}" for name, (theirs, _) in differing.items())
-        raise UserError(f"{path} was trained with {trained}, this run would use {used}: add {options}")
+def check_form(path: Path, before: ModelConfig, config: Config, preset: str = "custom") -> None:
+    """Raise UserError with the missing options if weights, of this preset, belong to another network than the run's."""
+    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in _FORM}
+    differing = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    if not differing:
+        return
+    trained = ", ".join(f"{name} {theirs}" for name, (theirs, _) in differing.items())
+    used = ", ".join(str(ours) for _, ours in differing.values())
+    options = " ".join(f"--model.{name.replace('_', '-')} {theirs}" for name, (theirs, _) in differing.items())
+    if differing.keys() & {"touch.width", "touch.depth"} and preset not in (config.preset, "custom"):
+        trained, used, options = f"preset {preset}", f"preset {config.preset}", f"--preset {preset}"
+    raise UserError(f"{path} was trained with {trained}, this run would use {used}: add {options}")
 
 
 def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:

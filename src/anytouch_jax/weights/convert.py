@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
-from anytouch_jax.weights.compatible import match_sensors, resize_position
-from anytouch_jax.weights.keymaps import SAME, Entry, Heads, KeyMap, Shape, UnknownHeads, Weights, param_shapes
+from anytouch_jax.config import UNIVERSAL, ModelConfig
+from anytouch_jax.weights.compatible import resize_position
+from anytouch_jax.weights.keymaps import Entry, Heads, KeyMap, Shape, Weights, param_shapes
 from anytouch_jax.weights.keymaps.anytouch import PROBE, STAGE1, STAGE2
-from anytouch_jax.weights.keymaps.hf_clip import HF_CLIP
-from anytouch_jax.weights.keymaps.openclip import OPENCLIP
-from anytouch_jax.weights.safetensors import WeightsError, as_float32
+from anytouch_jax.weights.keymaps.clip import HF_CLIP, OPENCLIP
+from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten, nest
 
 Params = dict[str, Any]
@@ -25,20 +24,10 @@ Params = dict[str, Any]
 # Parts that some model of ours has, and the classifier that came with a probe file.
 _OWN_PARTS = ("touch", "decoder", "image", "lora", "text", "logit_scale", "matcher", "force", "head")
 _LISTED = 6  # names in one error message
-_HEAD = frozenset(("head.weight", "head.bias"))
+_HEAD = {"head.weight": "head/kernel", "head.bias": "head/bias"}
 
 
-def _no_model(weights: Weights, heads: Heads) -> ModelConfig:
-    raise WeightsError("a file in our names does not store its model; use the configuration it was saved with")
-
-
-OWN = KeyMap(
-    "own",
-    lambda weights: any(key.startswith(("touch/", "image/")) for key in weights),
-    lambda model: [Entry(name, name, SAME) for name in param_shapes(model)],
-    _no_model,
-    towers={part: rf"{part}(/.*)?" for part in _OWN_PARTS},
-)
+OWN = KeyMap("own", r"(touch|image)/.*", towers={part: rf"{part}(/.*)?" for part in _OWN_PARTS})
 KEYMAPS = {keymap.name: keymap for keymap in (STAGE2, STAGE1, PROBE, OPENCLIP, HF_CLIP, OWN)}
 
 
@@ -48,7 +37,7 @@ def detect_layout(weights: Weights) -> str:
     Raises WeightsError if none matches.
     """
     for keymap in KEYMAPS.values():
-        if keymap.matches(weights):
+        if any(re.fullmatch(keymap.mark, key) for key in weights):
             return keymap.name
     names = ", ".join(list(weights)[:5]) or "no arrays"
     raise WeightsError(f"these are not weights of AnyTouch, HF CLIP or OpenCLIP: the file has {names}")
@@ -60,36 +49,26 @@ def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, 
     Head counts leave no trace: those that neither `heads` nor a published width gives are 1 in the model, and the
     second value has the widths of these stacks. A CLIP file gets the authors' decoder sizes. Raises WeightsError.
     """
-    layout, unknown = detect_layout(weights), dict[str, int]()
-    while True:
-        try:
-            return KEYMAPS[layout].detect(weights, {**heads, **dict.fromkeys(unknown, 1)}), unknown
-        except UnknownHeads as error:
-            unknown[error.stack] = error.width
-        except WeightsError:
-            raise
-        except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
-            raise WeightsError(
-                f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
-            ) from None
+    layout = detect_layout(weights)
+    if layout == "own":
+        raise WeightsError("a file in our names does not store its model; use the configuration it was saved with")
+    try:
+        return KEYMAPS[layout].detect(weights, heads)
+    except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
+        raise WeightsError(
+            f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
+        ) from None
 
 
-def detect_model(weights: Weights, heads: Heads | None = None) -> ModelConfig:
-    """Return the model that a file was made for, see `detect_form`. Raises WeightsError for unknown head counts."""
-    model, unknown = detect_form(weights, heads or {})
-    refuse_unknown(unknown)
-    return model
-
-
-def refuse_unknown(stacks: Mapping[str, int]) -> None:
-    """Raise WeightsError that names stacks of unknown head counts, by their widths."""
+def refuse_unknown(stacks: Mapping[str, int], start: str = "") -> None:
+    """Raise WeightsError that names stacks of unknown head counts, by their widths, after `start`."""
     if stacks:
         names = " and ".join(f"{name} (width {width})" for name, width in stacks.items())
         example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
-            f"the weights do not store the number of attention heads of {names}; write it to a config.json beside the "
-            f'file, as {{"model": {{{example}}}}}, or write the file by `anytouch export --to safetensors`, which '
-            "stores it"
+            f"{start}the weights do not store the number of attention heads of {names}; write it to a config.json "
+            f'beside the file, as {{"model": {{{example}}}}}, or write the file by `anytouch export --to safetensors`, '
+            "which stores it"
         )
 
 
@@ -103,29 +82,31 @@ def to_params(
     classifier as `head`. A file may lack the parameters named in `optional`. Raises WeightsError.
     """
     layout, shapes = detect_layout(weights), param_shapes(model)
-    entries = KEYMAPS[layout].entries(model)
+    keymap, entries = KEYMAPS[layout], KEYMAPS[layout].entries(model)
     if layout == "own":  # a file of stage 1 has no towers
         parts = {key.split("/")[0] for key in weights}
         entries = [entry for entry in entries if entry.name.split("/")[0] in parts]
     entries = [entry for entry in entries if entry.key in weights or entry.name not in optional]
-    head = _HEAD if layout == "probe" and weights.keys() >= _HEAD else frozenset()
-    first = {entry.key: entry for entry in entries}
+    head = _HEAD if layout == "probe" and weights.keys() >= _HEAD.keys() else {}
+    first, parts = {entry.key: entry for entry in entries}, {name.split("/")[0] for name in shapes}
+    left_out = [pattern for part, pattern in keymap.towers.items() if part not in parts]
+    left_out += [] if layout == "own" else [r"(.*\.)?(position_ids|attn_mask)"]  # buffers
+    unread = {*ignore, *head, *keymap.unused}
     arrays = {
         key: _fit(array, first[key], model) if key in first else array
         for key, array in weights.items()
-        if not (key in ignore or key in head or _is_left_out(key, layout, model))
+        if key not in unread and not any(re.fullmatch(pattern, key) for pattern in left_out)
     }
-    check_arrays(f"{layout} weights", arrays, _file_shapes(entries, shapes))
-    flat: dict[str, Any] = {}
-    for entry in entries:
-        array = entry.conversion.read(_third(arrays[entry.key], entry.part))
-        if entry.layer is None:
-            flat[entry.name] = array
-        else:
-            flat.setdefault(entry.name, {})[entry.layer] = array
-    if head:
-        flat |= {"head/kernel": weights["head.weight"].T, "head/bias": weights["head.bias"]}
-    return nest({name: _assemble(value) for name, value in flat.items()})
+    check_arrays(f"{layout} weights", arrays, file_shapes(entries, shapes))
+    flat: dict[str, Any] = {
+        name: np.empty(shapes[name], np.float32) for name in dict.fromkeys(entry.name for entry in entries)
+    }
+    for entry in entries:  # each number is copied once
+        array = arrays[entry.key] if entry.part is None else np.split(arrays[entry.key], 3)[entry.part]
+        flat[entry.name][... if entry.layer is None else entry.layer] = entry.read(array)
+    for key, name in head.items():
+        flat[name] = np.array(weights[key].T, np.float32, order="C")
+    return nest(flat)
 
 
 def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False) -> dict[str, np.ndarray]:
@@ -134,7 +115,7 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
     Arrays that the authors' loader expects and never reads are filled in. The matching MLP of the paper has no place
     in those files: it is refused, or stored as `cross_sensor_mlp.*` with `allow_extra`. Raises WeightsError.
     """
-    flat = {name: as_float32(array) for name, array in flatten(params).items()}
+    flat = {name: np.asarray(array, np.float32) for name, array in flatten(params).items()}
     keymap = STAGE2 if "image" in params or "text" in params else STAGE1
     if model.match_head == "mlp" and keymap is STAGE2 and not allow_extra:
         raise WeightsError(
@@ -149,33 +130,11 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
         )
     shapes, entries = param_shapes(model), keymap.entries(model)
     check_arrays("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
-    arrays = {e.key: e.conversion.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
+    arrays = {e.key: e.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
     for key, source in keymap.unused.items():
         theirs = arrays[source]
         arrays[key] = theirs.mean(axis=1, dtype=np.float64) if theirs.ndim == 5 else theirs
     return {key: np.array(array, np.float32, order="C") for key, array in arrays.items()}
-
-
-def _keymap(model: ModelConfig, layout: str | None) -> KeyMap:
-    return KEYMAPS[layout or ("stage2" if model.image or model.text else "stage1")]
-
-
-def release_shapes(model: ModelConfig, layout: str | None = None) -> dict[str, Shape]:
-    """Return key -> shape of a file of `model`: stage 2 if it has a tower, else stage 1, or the layout given.
-
-    The classifier of a probe file is not included: its size depends on the task.
-    """
-    keymap = _keymap(model, layout)
-    shapes = _file_shapes(keymap.entries(model), param_shapes(model))
-    for key, source in keymap.unused.items():
-        theirs = shapes[source]
-        shapes[key] = (theirs[0], *theirs[2:]) if len(theirs) == 5 else theirs
-    return shapes
-
-
-def release_names(model: ModelConfig, layout: str | None = None) -> dict[str, str]:
-    """Return key -> our parameter name, for the keys of `release_shapes` that are used."""
-    return {entry.key: entry.name for entry in _keymap(model, layout).entries(model)}
 
 
 def check_arrays(title: str, arrays: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
@@ -189,62 +148,36 @@ def check_arrays(title: str, arrays: Mapping[str, Any], wanted: Mapping[str, Sha
             if key in arrays and tuple(arrays[key].shape) != shape
         ],
     }
-    problems = [f"{name} ({len(rows)}): {_first(rows)}" for name, rows in lists.items() if rows]
+    problems = [
+        f"{name} ({len(rows)}): {', '.join(rows[:_LISTED])}"
+        + (f" and {len(rows) - _LISTED} more" if rows[_LISTED:] else "")
+        for name, rows in lists.items()
+        if rows
+    ]
     if problems:
         hint = _hint((*lists["unknown keys"], *lists["missing keys"]))
         raise WeightsError(f"the {title} do not fit this model; {'; '.join(problems)}{hint}")
 
 
-def _is_left_out(key: str, layout: str, model: ModelConfig) -> bool:
-    """Return whether a key is known and not needed: an unused array, a buffer, a part that `model` lacks."""
-    keymap, parts = KEYMAPS[layout], {name.split("/")[0] for name in param_shapes(model)}
-    absent = (pattern for part, pattern in keymap.towers.items() if part not in parts)
-    buffer = layout != "own" and re.fullmatch(r"(.*\.)?(position_ids|attn_mask)", key) is not None
-    return buffer or key in keymap.unused or any(re.fullmatch(pattern, key) for pattern in absent)
-
-
 def _fit(array: np.ndarray, entry: Entry, model: ModelConfig) -> np.ndarray:
-    """Return the array in float32, its grid of positions and its sensor rows fitted to the model."""
-    array = as_float32(array)
+    """Return the array in float32, its grid of positions resized to that of the model."""
+    array = np.asarray(array, np.float32)
     if entry.name in ("touch/position", "image/position", "decoder/position"):
         table = array[0] if array.ndim == 3 and len(array) == 1 else array
         square = table.ndim == 2 and round((len(table) - 1) ** 0.5) ** 2 == len(table) - 1 > 0
         if square and len(table) != model.patches + 1:
             return resize_position(table, model.patches + 1).reshape(*array.shape[:-2], model.patches + 1, -1)
-    if entry.name == "touch/sensor_tokens" and array.ndim == 3 and len(array) == len(SENSORS) != len(model.sensors):
-        return match_sensors(array, SENSORS, model.sensors)
     return array
 
 
-def _third(array: np.ndarray, part: int | None) -> np.ndarray:
-    """Return query, key or value from a kernel that stacks all three on axis 0."""
-    return array if part is None else array[part * len(array) // 3 : (part + 1) * len(array) // 3]
-
-
-def _assemble(value: Any) -> np.ndarray:
-    """Return one parameter, its layers stacked on axis 0. Each number is copied once."""
-    if not isinstance(value, dict):
-        return np.array(value, np.float32, order="C")
-    stacked = np.empty((len(value), *value[0].shape), np.float32)
-    for layer, array in value.items():
-        stacked[layer] = array
-    return stacked
-
-
-def _file_shapes(entries: Sequence[Entry], shapes: Mapping[str, Shape]) -> dict[str, Shape]:
+def file_shapes(entries: Sequence[Entry], shapes: Mapping[str, Shape]) -> dict[str, Shape]:
     """Return key -> shape in the file, by writing an array of zeros that takes no memory."""
     theirs: dict[str, Shape] = {}
     for entry in entries:
         shape = shapes[entry.name][entry.layer is not None :]
-        written = entry.conversion.write(np.broadcast_to(np.float32(0), shape)).shape
+        written = entry.write(np.broadcast_to(np.float32(0), shape)).shape
         theirs[entry.key] = written if entry.part is None else (3 * written[0], *written[1:])
     return theirs
-
-
-def _first(rows: Sequence[str]) -> str:
-    """Return the first rows, and the number of the others."""
-    more = len(rows) - _LISTED
-    return ", ".join(rows) if more <= 0 else f"{', '.join(rows[:_LISTED])} and {more} more"
 
 
 def _hint(keys: Sequence[str]) -> str:
@@ -256,5 +189,4 @@ def _hint(keys: Sequence[str]) -> str:
         r".*\.(layers|resblocks|touch_decoder_blocks)\.\d+\..*": "the depths of the model (or another preset)",
     }
     matching = (setting for pattern, setting in hints.items() if any(re.fullmatch(pattern, key) for key in keys))
-    setting = next(matching, None)
-    return f"; look at {setting}" if setting else ""
+    return next((f"; look at {setting}" for setting in matching), "")

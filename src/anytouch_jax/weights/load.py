@@ -12,6 +12,7 @@ import numpy as np
 
 from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json, to_json
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 from anytouch_jax.weights import checkpoint, compatible, registry
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
 from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
@@ -21,13 +22,10 @@ from anytouch_jax.weights.safetensors import (
     MODEL_KEY,
     SEEN_KEY,
     WeightsError,
-    as_float32,
     existing_file,
     read_file_metadata,
-    read_npz,
     read_safetensors,
 )
-from anytouch_jax.weights.state_dict import strip_prefixes
 from anytouch_jax.weights.torch_file import read_torch
 from anytouch_jax.weights.tree import flatten
 
@@ -38,6 +36,8 @@ _TORCH = (".pth", ".pt", ".ckpt", ".bin")
 _INDEX = ".index.json"  # of weights in several files
 _PATTERNS = ("*.safetensors", f"*.safetensors{_INDEX}", "*.bin", f"*.bin{_INDEX}", "*.pth", "*.pt", "*.ckpt")
 _SHARD = re.compile(r"(.+)-\d{5}-of-(\d{5})(\.\w+)")
+_PREFIX = re.compile(r"(module|_orig_mod|model)\.")  # DistributedDataParallel, torch.compile, Lightning
+_INNER = re.compile(r"(^|\.)(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
 
 
 @dataclass(frozen=True)
@@ -135,25 +135,32 @@ def load_init(
     elif config.stage == 2:
         notes.append("stage 2 starts without --init: its touch encoder has not been trained on touch yet")
     if clip is not None:
-        file = find_weights_file(Path(clip))
-        compatible.check_activation(file, clip_activation(file), config)
+        file = find_weights_file(clip)
+        trained_by = clip_activation(file)
+        compatible.check_activation(file, trained_by, config)
         towers = read_weights(file)
         check_finite(file, towers)
         if detect_layout(towers) in ("clip", "openclip"):
             compatible.check_clip(file, model_of_file(file, towers), config, touch=init is None)
-            notes += _clip_notes(file, towers, config, touch=init is None)
+            if trained_by is None:
+                ours, other = sorted(("gelu", "quick_gelu"), key=config.model.activation.__ne__)
+                notes.append(
+                    f"the activation of {file} is not stored, this run uses {ours}: OpenAI's CLIP wants quick_gelu, "
+                    "most others gelu; put the config.json of the weights beside the file, or add "
+                    f"--model.activation {other}"
+                )
+            if init is None and not towers.keys() & {"visual_projection.weight", "visual.proj"}:
+                notes.append(f"{file} has no projection: that of the touch encoder starts untrained")
     return Start(first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained)
 
 
 def _check_init(loaded: Loaded, config: Config) -> None:
     """Raise UserError if a run or a file cannot start this run."""
     path, model = loaded.path, loaded.config.model
-    if loaded.from_run:
-        compatible.check_preset(path, loaded.config, config)
     compatible.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
     if "touch" not in loaded.params or "decoder" not in loaded.params:
         raise UserError(f"{path} has no touch encoder and decoder; give a stage-1 run or the authors' weights")
-    compatible.check_form(path, model, config)
+    compatible.check_form(path, model, config, preset=loaded.config.preset if loaded.from_run else "custom")
 
 
 def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[str]:
@@ -167,28 +174,12 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     ours = config.model.sensors
     lost = [name for name in loaded.config.model.sensors if name in (loaded.trained_sensors or ()) and name not in ours]
     if lost:
-        notes.append(
-            f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {' '.join((*ours, *lost))} "
-            "keeps them"
-        )
+        option = " ".join((*ours, *lost))
+        notes.append(f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {option} keeps them")
     if dropped := sorted((fresh_parts & set(loaded.params)) - {"touch", "decoder"}):
         notes.append(f"{path} gives the touch encoder and the decoder; {', '.join(dropped)} start untrained")
     if loaded.config.model.patches != config.model.patches:
         notes.append(f"the positions of {path} are resized for images of {config.model.image_size} pixels")
-    return notes
-
-
-def _clip_notes(path: Path, weights: Weights, config: Config, *, touch: bool) -> list[str]:
-    """Return sentences on an unknown activation and a missing projection of CLIP weights."""
-    notes, activation = [], config.model.activation
-    if clip_activation(path) is None:
-        other = "quick_gelu" if activation == "gelu" else "gelu"
-        notes.append(
-            f"the activation of {path} is not stored, this run uses {activation}: OpenAI's CLIP wants quick_gelu, most "
-            f"others gelu; put the config.json of the weights beside the file, or add --model.activation {other}"
-        )
-    if touch and not weights.keys() & {"visual_projection.weight", "visual.proj"}:
-        notes.append(f"{path} has no projection: that of the touch encoder starts untrained")
     return notes
 
 
@@ -218,29 +209,22 @@ def first_params(
 ) -> Params:
     """Return fresh `params` with touch and decoder from `stage1`, and the towers and the temperature from CLIP.
 
-    Without `stage1` the touch encoder starts from CLIP's vision tower, see `clip_to_touch`. LoRA and the matching
-    head stay fresh. Raises WeightsError.
+    Without `stage1` the touch encoder starts from CLIP's vision tower. The 2-D patch kernel is repeated over the
+    frames, as the authors do, and not divided by their number (golden Q1): the response to a still is three times
+    CLIP's. A tower without a projection leaves that of `params`. LoRA and the matching head stay fresh. Raises
+    WeightsError.
     """
     merged = dict(params)
-    if clip is not None:
-        merged = merged if stage1 is not None else clip_to_touch(clip, model, merged)
-        towers = to_params(clip, model) if model.image or model.text else {}
+    if clip is not None and stage1 is None:
+        tower = replace(model, image=model.touch, text=None, match_head="none", lora_rank=0)
+        image = to_params(clip, tower, optional=("image/projection/kernel", "logit_scale"))["image"]
+        merged = inflate(merged, {"projection": params["touch"]["projection"], **image})
+    if clip is not None and (model.image or model.text):
+        towers = to_params(clip, model)
         merged = _replace(merged, {part: towers[part] for part in ("image", "text", "logit_scale") if part in towers})
     if stage1 is not None:
         merged = _replace(merged, {part: stage1[part] for part in ("touch", "decoder")})
     return merged
-
-
-def clip_to_touch(weights: Weights, model: ModelConfig, params: Params) -> Params:
-    """Return `params` with the touch encoder from CLIP's vision tower.
-
-    The 2-D patch kernel is repeated over the frames, as the authors do, and not divided by their number (golden Q1).
-    The response to a still is then three times CLIP's. A tower without a projection leaves that of `params`. Raises
-    WeightsError.
-    """
-    tower = replace(model, image=model.touch, text=None, match_head="none", lora_rank=0)
-    image = to_params(weights, tower, optional=("image/projection/kernel", "logit_scale"))["image"]
-    return inflate(params, {"projection": params["touch"]["projection"], **image})
 
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
@@ -272,16 +256,14 @@ def find_weights_file(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_dir():
         return path
-    files = _weights_files(path)
-    if not files:
-        raise UserError(f"there are no weights (*.safetensors, *.bin, *.pth, *.ckpt) in {path}; give another path")
-    return files[0]
+    if files := _weights_files(path):
+        return files[0]
+    raise UserError(f"there are no weights (*.safetensors, *.bin, *.pth, *.ckpt) in {path}; give another path")
 
 
 def _weights_files(folder: Path) -> list[Path]:
     files = [file for pattern in _PATTERNS for file in sorted(folder.glob(pattern))]
-    whole = [file for file in files if not _SHARD.fullmatch(file.name)]
-    return whole or files
+    return [file for file in files if not _SHARD.fullmatch(file.name)] or files
 
 
 def read_weights(path: str | Path) -> dict[str, np.ndarray]:
@@ -297,30 +279,40 @@ def read_weights(path: str | Path) -> dict[str, np.ndarray]:
         if not index.is_file():
             raise WeightsError(f"{path} is one of {int(shard[2])} parts; put them and {index.name} into one folder")
         path = index
-    arrays = strip_prefixes(_read_parts(path) if path.name.endswith(_INDEX) else _read_file(path))
-    # numpy calls bfloat16 and float8 a "V" too, as it does records.
-    kinds = {name: array.dtype for name, array in arrays.items()}
-    if words := [name for name, dtype in kinds.items() if dtype.kind in "USOMmc" or dtype.type is np.void]:
-        raise WeightsError(f"{path} has no weights: {words[0]} is {kinds[words[0]]}, not real numbers")
-    return {name: array if array.dtype.kind in "iub" else as_float32(array) for name, array in arrays.items()}
+    arrays = _strip_prefixes(_read_parts(path) if path.name.endswith(_INDEX) else _read_file(path))
+    for name, array in arrays.items():
+        # numpy calls bfloat16 and float8 a "V" too, as it does records.
+        if array.dtype.kind in "USOMmc" or array.dtype.type is np.void:
+            raise WeightsError(f"{path} has no weights: {name} is {array.dtype}, not real numbers")
+    return {name: array if array.dtype.kind in "iub" else array.astype(np.float32) for name, array in arrays.items()}
 
 
 def _read_file(path: Path) -> dict[str, np.ndarray]:
     suffix = path.suffix.lower()
     if suffix == ".safetensors":
         return read_safetensors(path)[0]
-    if suffix == ".npz":
-        return read_npz(path)
     if suffix in _TORCH:
         return read_torch(path)
-    raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt, .ckpt or .bin file")
+    if suffix != ".npz":
+        raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt, .ckpt or .bin file")
+    try:
+        return read_arrays(existing_file(path))
+    except (OSError, ValueError) as error:
+        raise WeightsError(f"{path} is not a whole npz file of plain arrays: {error}") from error
+
+
+def _strip_prefixes(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays without prefixes that all names share, nor wrappers inside a name, if names stay different."""
+    names = {name: _INNER.sub(r"\1", name) for name in weights}
+    while len(shared := {(_PREFIX.match(name) or [""])[0] for name in names.values()}) == 1 and "" not in shared:
+        names = {old: _INNER.sub(r"\1", new.removeprefix(*shared)) for old, new in names.items()}
+    return {names[old]: value for old, value in weights.items()} if len(set(names.values())) == len(names) else weights
 
 
 def _read_parts(index: Path) -> dict[str, np.ndarray]:
     """Return the arrays of all files that an index names. Raises WeightsError for missing files and arrays."""
-    homes = _read_json(index).get("weight_map")
-    plain = isinstance(homes, dict) and all(isinstance(x, str) and Path(x).name == x for x in homes.values())
-    if not isinstance(homes, dict) or not homes or not plain:
+    homes = _object(_read_json(index), "weight_map")
+    if not homes or not all(isinstance(part, str) and Path(part).name == part for part in homes.values()):
         raise WeightsError(f"{index} is no index of weights: it needs weight_map, the file of each array")
     arrays: dict[str, np.ndarray] = {}
     for part in sorted(set(homes.values())):
@@ -336,10 +328,7 @@ def _read_parts(index: Path) -> dict[str, np.ndarray]:
 def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
     """Return the model of a weights file, see `form_of_file`. Raises WeightsError for unknown head counts."""
     model, unknown = form_of_file(path, weights)
-    try:
-        refuse_unknown(unknown)
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from None
+    refuse_unknown(unknown, f"{path}: ")
     return model
 
 
@@ -351,41 +340,39 @@ def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[
     """
     if text := read_file_metadata(path).get(MODEL_KEY):
         return from_json(text, ModelConfig), {}
-    model, unknown = detect_form(weights, stored_heads(path))
-    activation: Any = _object(_read_json(Path(path).with_name("config.json")), "model").get("activation")
+    config, openclip = _folder_config(path)
+    model, unknown = detect_form(weights, _stored_heads(path, config, openclip))
+    activation: Any = _object(config, "model").get("activation")
     if detect_layout(weights) in ("clip", "openclip"):  # CLIP's configuration says nothing of the authors' weights
         activation = clip_activation(path)
     return (model if activation is None else replace(model, activation=activation)), unknown
 
 
-def stored_heads(path: str | Path) -> dict[str, int]:
-    """Return the head counts of the stacks of weights, from the configuration in their folder.
+def _folder_config(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the config.json in the folder of weights, of a run or of HF, and the model of OpenCLIP's file."""
+    config = _read_json(Path(path).with_name("config.json"))
+    if config.get("model_type") == "clip_vision_model":  # of the vision tower alone
+        config = {"vision_config": config} | config
+    return config, _object(_read_json(Path(path).with_name("open_clip_config.json")), "model_cfg")
 
-    A config.json is that of a run (`model.touch.heads`) or HF's. open_clip_config.json is OpenCLIP's. Raises
-    WeightsError for a count that is no positive integer.
-    """
-    path = Path(path)
-    config, heads = _read_json(path.with_name("config.json")), dict[str, Any]()
-    openclip = _object(_read_json(path.with_name("open_clip_config.json")), "model_cfg")
-    tower = _object(openclip, "vision_cfg")
+
+def _stored_heads(path: str | Path, config: dict[str, Any], openclip: dict[str, Any]) -> dict[str, int]:
+    """Return the head counts of stacks. Raises WeightsError for a count that is no positive integer."""
+    tower, ours, heads = _object(openclip, "vision_cfg"), _object(config, "model"), dict[str, Any]()
     if isinstance(tower.get("width"), int) and isinstance(size := tower.get("head_width", 64), int) and size > 0:
         heads["image"] = tower["width"] // size
     heads["text"] = _object(openclip, "text_cfg").get("heads")
-    theirs = _vision_config(config) or {}
-    heads["image"] = theirs.get("num_attention_heads", heads.get("image"))
-    heads["text"] = _object(config, "text_config").get("num_attention_heads", heads["text"])
-    ours = _object(config, "model")
-    stacks = {name: _object(ours, name) for name in ("touch", "decoder", "image")}
-    stacks["text"] = _object(_object(ours, "text"), "stack")
-    stacks["text"] = stacks["text"] or _object(ours, "text")
+    for name, theirs in (("image", "vision_config"), ("text", "text_config")):
+        heads[name] = _object(config, theirs).get("num_attention_heads", heads.get(name))
+    stacks = {name: _object(ours, name) for name in ("touch", "decoder", "image", "text")}
+    stacks["text"] = _object(stacks["text"], "stack") or stacks["text"]
     heads |= {name: stack["heads"] for name, stack in stacks.items() if "heads" in stack}
-    heads = {name: count for name, count in heads.items() if count is not None}
-    wrong = [name for name, count in heads.items() if type(count) is not int or not 0 < count <= 1024]
-    if wrong:
-        raise WeightsError(
-            f"the configuration in the folder of {path} gives {wrong[0]} {str(heads[wrong[0]])[:40]} heads; correct it"
-        )
-    return heads
+    for name, count in heads.items():
+        if count is not None and (type(count) is not int or not 0 < count <= 1024):
+            raise WeightsError(
+                f"the configuration in the folder of {path} gives {name} {str(count)[:40]} heads; correct it"
+            )
+    return {name: count for name, count in heads.items() if count is not None}
 
 
 def _object(value: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -394,35 +381,24 @@ def _object(value: Mapping[str, Any], name: str) -> dict[str, Any]:
     return inner if isinstance(inner, dict) else {}
 
 
-def _vision_config(config: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the settings of the vision tower in HF's config.json, which may be of that tower alone."""
-    if isinstance(config.get("vision_config"), dict):
-        return _object(config, "vision_config")
-    return config if config.get("model_type") == "clip_vision_model" else None
-
-
 def clip_activation(path: str | Path) -> str | None:
     """Return the activation of weights, which leaves no trace in the arrays; None if it is not stored.
 
     It stands in the metadata of our files, in HF's config.json, or in OpenCLIP's open_clip_config.json. Raises
     WeightsError for a file that is not JSON, and for an activation that this network does not have.
     """
-    path, names = Path(path), set()
     if text := read_file_metadata(path).get(MODEL_KEY):
         return str(from_json(text, ModelConfig).activation)
-    config = _read_json(path.with_name("config.json"))
-    for tower in (config.get("text_config"), _vision_config(config)):
-        if isinstance(tower, dict):
-            names.add(str(tower.get("hidden_act", "quick_gelu")))  # HF's default
-    if "activation" in (ours := _object(config, "model")):
-        names.add(str(ours["activation"]))
-    model = _read_json(path.with_name("open_clip_config.json")).get("model_cfg")
-    if not names and isinstance(model, dict):
-        names.add("quick_gelu" if model.get("quick_gelu") else "gelu")
+    config, openclip = _folder_config(path)
+    towers = [tower for name in ("text_config", "vision_config") if isinstance(tower := config.get(name), dict)]
+    names = {str(tower.get("hidden_act", "quick_gelu")) for tower in towers}  # HF's default
+    names |= {str(name) for key, name in _object(config, "model").items() if key == "activation"}
+    if not names and openclip:
+        names.add("quick_gelu" if openclip.get("quick_gelu") else "gelu")
     if len(names) > 1 or not names <= {"gelu", "quick_gelu"}:
         raise WeightsError(
-            f"the configuration in the folder of {path} names the activation {' and '.join(sorted(map(str, names)))}; "
-            "give CLIP weights of which both towers use gelu, or both quick_gelu"
+            f"the configuration in the folder of {path} names the activation {' and '.join(sorted(names))}; give CLIP "
+            "weights of which both towers use gelu, or both quick_gelu"
         )
     return next(iter(names), None)
 

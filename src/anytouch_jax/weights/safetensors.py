@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path, placeholder, read_arrays
+from anytouch_jax.files import atomic_path, placeholder
 from anytouch_jax.weights.tree import flatten
 
 # Metadata of our files: heads, activation and training data leave no trace in shapes.
@@ -29,9 +29,6 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
     from safetensors.numpy import save_file
 
     path = Path(path)
-    wrong = [name for name, value in metadata.items() if not isinstance(value, str)]
-    if wrong:
-        raise WeightsError(f"metadata of {path} must be text; {', '.join(wrong)} is not")
     try:
         with atomic_path(path) as part:
             # the library ignores strides: a transposed view would be written in the wrong order
@@ -76,15 +73,6 @@ def _opened(path: str | Path) -> Iterator[Any]:
         raise WeightsError(f"{path} is not a whole safetensors file: {error}") from error
 
 
-def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an npz file; pickled objects are refused. Raises WeightsError."""
-    path = existing_file(path)
-    try:
-        return read_arrays(path)
-    except (OSError, ValueError) as error:
-        raise WeightsError(f"{path} is not a whole npz file of plain arrays: {error}") from error
-
-
 def existing_file(path: str | Path) -> Path:
     """Return `path` if it is a file. Raises WeightsError."""
     path = Path(path)
@@ -96,8 +84,3 @@ def existing_file(path: str | Path) -> Path:
         advice = "run `git lfs pull`" if "LFS" in kind else "download the file itself"
         raise WeightsError(f"{path} is {kind}, not the data that its name promises; {advice}")
     return path
-
-
-def as_float32(array: Any) -> np.ndarray:
-    """Return the array in float32; exact for float32, float16 and bfloat16."""
-    return np.asarray(array, dtype=np.float32)

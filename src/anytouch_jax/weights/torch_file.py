@@ -13,25 +13,28 @@ import pickle
 import pickletools
 import reprlib
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any
 
+import ml_dtypes
 import numpy as np
 
 from anytouch_jax.weights.safetensors import WeightsError, existing_file
-from anytouch_jax.weights.state_dict import unwrap
 
-# Storages of torch, as the numpy type of their bytes; bfloat16 is widened by `_Tensor.read`.
 _STORAGES = {
-    "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "BFloat16Storage": "u2", "LongStorage": "i8",
-    "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
+    "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "BFloat16Storage": "bfloat16", "BoolStorage": "?",
+    "LongStorage": "i8", "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
 }  # fmt: skip
 _REPEATS = 1 << 20  # a tensor larger than its storage (stride 0) may have this many elements
 _GROWTH, _SPARE = 3, 1 << 26  # the tensors of a file may take 3 times its bytes, and 64 MiB more
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
+_WRAPPERS = ("model", "state_dict", "model_state_dict", "module", "student")
+_AVERAGES = ("state_dict_ema", "model_ema", "ema", "teacher")  # read only where no plain weights are
+_DEPTH = 4  # of wrappings in each other
 
 
 def read_torch(path: str | Path) -> dict[str, np.ndarray]:
@@ -46,21 +49,18 @@ def read_torch(path: str | Path) -> dict[str, np.ndarray]:
             zipped, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
             file.seek(0)
             reader = _Zip(file, size) if zipped else _Legacy(file)
-            tensors = _state(unwrap(reader.content, path))
-            if sum(tensor.nbytes for tensor in tensors.values()) > _GROWTH * size + _SPARE:
+            tensors = _state(_unwrap(reader.content, path))
+            if sum(math.prod(t.shape) * t.storage.dtype.itemsize for t in tensors.values()) > _GROWTH * size + _SPARE:
                 raise ValueError("its tensors are many times larger than the file")
-            return {name: tensor.read(reader.load, reader.byteorder) for name, tensor in tensors.items()}
+            return {name: tensor.read(reader.load(tensor.storage), big=reader.big) for name, tensor in tensors.items()}
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
     except Exception as error:  # damaged bytes raise any type of error
         raise WeightsError(f"{path} is damaged or not a torch file ({type(error).__name__}: {error})") from error
 
 
-@dataclass(frozen=True)
-class _Name:
+class _Name(str):
     """A class or function that a pickle mentions."""
-
-    name: str
 
 
 class _Other:
@@ -69,16 +69,11 @@ class _Other:
 
 @dataclass(frozen=True)
 class _Storage:
-    """A block of numbers elsewhere in the file: its key there, its kind in `_STORAGES`, its length."""
+    """A block of numbers elsewhere in the file: its key there, the type of one number, its length."""
 
     key: str
-    kind: str
+    dtype: np.dtype
     length: int
-
-    @property
-    def dtype(self) -> np.dtype:
-        """The type of one element in the file."""
-        return np.dtype(_STORAGES[self.kind])
 
 
 @dataclass(frozen=True)
@@ -90,29 +85,20 @@ class _Tensor:
     shape: tuple[int, ...]
     stride: tuple[int, ...]
 
-    @property
-    def nbytes(self) -> int:
-        """The bytes of the values, bfloat16 as float32."""
-        return math.prod(self.shape) * (4 if self.storage.kind == "BFloat16Storage" else self.storage.dtype.itemsize)
-
-    def read(self, load: Callable[[_Storage], bytes], byteorder: Literal["<", ">"] = "<") -> np.ndarray:
+    def read(self, data: bytes, *, big: bool) -> np.ndarray:
         """Return the values, given the bytes of the storage. Raises ValueError if the view leaves its storage."""
-        data = load(self.storage)
-        if len(data) != self.storage.length * self.storage.dtype.itemsize:
+        flat = np.frombuffer(data, self.storage.dtype)
+        if len(flat) != self.storage.length:
             raise ValueError(f"storage {self.storage.key} has {len(data)} bytes, not those it announces")
-        flat = np.frombuffer(data, self.storage.dtype.newbyteorder(byteorder))
         if 0 in self.shape:
-            values = np.empty(self.shape, flat.dtype)
-        else:
-            last = self.offset + sum((size - 1) * step for size, step in zip(self.shape, self.stride, strict=True))
-            if last >= len(flat):
-                raise ValueError(f"a tensor of shape {self.shape} reaches beyond its storage of {len(flat)} elements")
-            steps = tuple(step * flat.itemsize for step in self.stride)
-            values = np.lib.stride_tricks.as_strided(flat[self.offset :], self.shape, steps, writeable=False)
-        values = values.astype(flat.dtype.newbyteorder("="), order="C")
-        if self.storage.kind == "BFloat16Storage":  # the upper half of a float32
-            return (values.astype(np.uint32) << 16).view(np.float32)
-        return values
+            return np.empty(self.shape, flat.dtype)
+        last = self.offset + sum((size - 1) * step for size, step in zip(self.shape, self.stride, strict=True))
+        if last >= len(flat):
+            raise ValueError(f"a tensor of shape {self.shape} reaches beyond its storage of {len(flat)} elements")
+        steps = tuple(step * flat.itemsize for step in self.stride)
+        values = np.lib.stride_tricks.as_strided(flat[self.offset :], self.shape, steps, writeable=False)
+        values = values.byteswap() if big else np.array(values, order="C")
+        return values.astype(np.float32) if values.dtype == ml_dtypes.bfloat16 else values
 
 
 class _Zip:
@@ -128,8 +114,7 @@ class _Zip:
         self.root = pickles[0].removesuffix("data.pkl")
         if f"{self.root}constants.pkl" in names:
             raise WeightsError("a TorchScript program, not plain weights; save its state_dict() instead")
-        order = self._read("byteorder") if f"{self.root}byteorder" in names else b"little"
-        self.byteorder: Literal["<", ">"] = ">" if order.strip() == b"big" else "<"
+        self.big = f"{self.root}byteorder" in names and self._read("byteorder").strip() == b"big"
         self.content = _Unpickler(io.BytesIO(self._read("data.pkl"))).load()
 
     def load(self, storage: _Storage) -> bytes:
@@ -145,7 +130,7 @@ class _Zip:
 class _Legacy:
     """torch.save before 1.6: five pickles, then the storages one after the other, each with its length."""
 
-    byteorder: Literal["<", ">"] = "<"
+    big = False
 
     def __init__(self, file: IO[bytes]) -> None:
         if _Unpickler(file).load() != _LEGACY_MAGIC:
@@ -166,16 +151,26 @@ class _Legacy:
         return self.data[storage.key]
 
 
+def _unwrap(content: Any, path: Path) -> Any:
+    """Return the state dict inside the usual wrappings, plain weights before averaged ones, which give a warning."""
+    for _ in range(_DEPTH):
+        inner = content if isinstance(content, dict) else {}
+        name = next((name for name in _WRAPPERS + _AVERAGES if isinstance(inner.get(name), dict)), None)
+        if name is None:
+            break
+        if name in _AVERAGES:
+            warnings.warn(f"{path} has no plain weights; the averaged ones in {name!r} are read", stacklevel=4)
+        content = inner[name]
+    return content
+
+
 def _state(content: Any) -> dict[str, _Tensor]:
     """Return the tensors by name. Raises WeightsError for an object that is no state_dict."""
     if not isinstance(content, dict) or not content:
         raise WeightsError(f"it has no state_dict, but {type(content).__name__}")
-    others = [
-        str(name) for name, value in content.items() if not (isinstance(name, str) and isinstance(value, _Tensor))
-    ]
+    others = [str(name) for name, value in content.items() if not (type(name) is str and isinstance(value, _Tensor))]
     if others:
-        verb = "is" if len(others) == 1 else "are"
-        raise WeightsError(f"it has no state_dict: {', '.join(others[:5])} {verb} no tensor")
+        raise WeightsError(f"it has no state_dict: {', '.join(others[:5])} {'are' if others[1:] else 'is'} no tensor")
     return content
 
 
@@ -200,7 +195,7 @@ def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> _Ten
 
 
 def _key(key: Any) -> Any:
-    if not isinstance(key, str | bytes | int | float | None):
+    if isinstance(key, _Name) or not isinstance(key, str | bytes | int | float | None):
         raise ValueError(f"{type(key).__name__} as the key of a dictionary or set")
     return key
 
@@ -273,12 +268,11 @@ class _Unpickler(pickle._Unpickler):
 
     def persistent_load(self, pid: Any) -> _Storage:
         match pid:
-            case ("storage", _Name(name), str(key), str(), int(length), *rest) if rest in ([], [None]):
-                kind = name.removeprefix("torch.")
-                if kind not in _STORAGES:
+            case ("storage", _Name() as name, str(key), str(), int(length), *rest) if rest in ([], [None]):
+                kind = _STORAGES.get(name.removeprefix("torch."))
+                if kind is None:
                     raise ValueError(f"a storage of kind {name}")
-                self.storages[key] = _Storage(key, kind, _size(length))
-                return self.storages[key]
+                return self.storages.setdefault(key, _Storage(key, np.dtype(kind), _size(length)))
         raise ValueError(f"the pickle refers to {reprlib.repr(pid)}")
 
     def load_inst(self) -> None:
@@ -286,9 +280,9 @@ class _Unpickler(pickle._Unpickler):
 
     def load_reduce(self) -> None:
         args, function = self.stack.pop(), self.stack.pop()
-        if not isinstance(function, _Name) or function.name not in _BUILDERS or not isinstance(args, tuple):
+        if not isinstance(function, _Name) or function not in _BUILDERS or not isinstance(args, tuple):
             raise ValueError(f"the pickle calls {reprlib.repr(function)}")
-        self.stack.append(_BUILDERS[function.name](*args))
+        self.stack.append(_BUILDERS[function](*args))
 
     load_newobj = load_reduce
 

@@ -13,6 +13,7 @@ from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import compilation, speed, workloads
 from experiments.benchmarks import run as bench
 from experiments.benchmarks.pytorch import run as pytorch
+from tests.support.release_keys import release_names
 
 RESULTS = EXPERIMENTS / "results"
 
@@ -137,7 +138,7 @@ def test_the_rival_gets_the_same_numbers_under_the_authors_names(tmp_path):
     assert found["clip"].dtype == np.uint8 and found["text_row"].dtype == np.int64
     spec = json.loads(json.dumps(pytorch.spec(work)))
     assert spec["kind"] == "align" and spec["kept"] == 4 and spec["weights"] == [0.5, 1.0, 0.1]
-    named = convert.release_names(work.config.model)
+    named = release_names(work.config.model)
     assert set(named) == set(
         convert.to_release(build(work.config.model).init(pytorch.jax.random.key(0)), work.config.model)
     ) - pytorch.UNUSED | ({k for k in named if k in pytorch.UNUSED})

@@ -1,75 +1,45 @@
 """Key maps: which array of a weights file is which parameter of the model.
 
-A family of weights is one module of this folder. It lists the keys of its files, and detects its files by their keys.
-Our names are those of `Net.abstract()`: paths joined with "/", blocks stacked on axis 0, kernels as (in, out).
+A family of weights is a table in a module of this folder: which key of a file is which of our parameters. A row takes
+part where the model has its parameter, and the sizes of a model are read from the arrays by the same rows. Our names
+are those of `Net.abstract()`: paths joined with "/", blocks stacked on axis 0, kernels as (in, out).
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import ModelConfig, Stack, TextTower
+from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig, Stack, TextTower
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.tree import flatten
 
 Weights = Mapping[str, np.ndarray]
 Shape = tuple[int, ...]
 Heads = Mapping[str, int]  # head counts of "touch", "decoder", "image" and "text"
-PROJECTIONS = ("query", "key", "value", "out")
-
-
-@dataclass(frozen=True)
-class Conversion:
-    """Exact conversions of an array: from the file's layout to ours (`read`), and back (`write`)."""
-
-    read: Callable[[np.ndarray], np.ndarray]
-    write: Callable[[np.ndarray], np.ndarray]
+Conversion = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One array of a file: its `key`, our parameter `name`, its `layer` in a stack, its third (`part`) of a kernel."""
+    """One array of a file: its `key`, our parameter `name`, and the exact conversions to our layout and back.
+
+    In a row of a table "{}" in the key stands for the `layer` of a stack. `part` is a third of a kernel.
+    """
 
     key: str
     name: str
-    conversion: Conversion
+    read: Conversion
+    write: Conversion
     layer: int | None = None
     part: int | None = None
-
-
-@dataclass(frozen=True)
-class KeyMap:
-    """A kind of weights file.
-
-    `matches` detects it. `entries` lists the arrays that fill a model. `detect` returns the model that made the file;
-    its last argument has the known head counts, which leave no trace in shapes.
-    `unused` maps a key that no code reads to the key it is made from: a copy, or the mean over frames if it has fewer
-    axes (golden Q2). `towers` matches the keys of each part that a model may lack.
-    """
-
-    name: str
-    matches: Callable[[Weights], bool]
-    entries: Callable[[ModelConfig], list[Entry]]
-    detect: Callable[[Weights, Heads], ModelConfig]
-    unused: Mapping[str, str] = field(default_factory=dict)
-    towers: Mapping[str, str] = field(default_factory=dict)
-
-
-@lru_cache(maxsize=8)
-def _shapes(model: ModelConfig) -> dict[str, Shape]:
-    return {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
-
-
-def param_shapes(model: ModelConfig) -> dict[str, Shape]:
-    """Return name -> shape of every parameter of a model."""
-    return dict(_shapes(model))
 
 
 def _write_patch(kernel: np.ndarray) -> np.ndarray:  # (..., P*P*3, D) -> (D, ..., colour, row, col)
@@ -81,74 +51,127 @@ def _read_patch(weight: np.ndarray) -> np.ndarray:  # golden Q1: (D, frame, colo
     return np.moveaxis(weight, (0, -3), (-1, -2)).reshape(*weight.shape[1:-3], -1, len(weight))
 
 
-SAME = Conversion(lambda x: x, lambda x: x)
-LINEAR = Conversion(lambda x: x.T, lambda x: x.T)
-ROW = Conversion(lambda x: x[0], lambda x: x[None])
-TOKEN = Conversion(lambda x: x[0, 0], lambda x: x[None, None])
-PATCH = Conversion(_read_patch, _write_patch)
+SAME: tuple[Conversion, Conversion] = (lambda x: x, lambda x: x)
+_TURNED: tuple[Conversion, Conversion] = (lambda x: x.T, lambda x: x.T)
+# kind of a row -> the arrays of such a layer: what is added to its key and to our name, the conversions, the third
+_KINDS: dict[str, list[tuple[Any, ...]]] = {
+    "same": [("", "", *SAME)],
+    "row": [("", "", lambda x: x[0], lambda x: x[None])],
+    "token": [("", "", lambda x: x[0, 0], lambda x: x[None, None])],
+    "patch": [(".weight", "/kernel", _read_patch, _write_patch)],
+    "kernel": [(".weight", "/kernel", *_TURNED)],
+    "linear": [(".weight", "/kernel", *_TURNED), (".bias", "/bias", *SAME)],
+    "norm": [(".weight", "/scale", *SAME), (".bias", "/bias", *SAME)],
+    "lora": [(".lora_A.default.weight", "/a", *_TURNED), (".lora_B.default.weight", "/b", *_TURNED)],
+    "qkv": [
+        (theirs, f"/{name}/{ours}", *conversions, None, part)
+        for part, name in enumerate(("query", "key", "value"))
+        for theirs, ours, conversions in (("_weight", "kernel", _TURNED), ("_bias", "bias", SAME))
+    ],
+}
 
 
-def linear(theirs: str, ours: str) -> list[Entry]:
-    """Return the entries of a torch Linear layer."""
-    return [Entry(f"{theirs}.weight", f"{ours}/kernel", LINEAR), Entry(f"{theirs}.bias", f"{ours}/bias", SAME)]
+def rows(table: str, theirs: str = "", ours: str = "") -> tuple[Entry, ...]:
+    """Return the rows of a table. A line has the kind of a layer in `_KINDS`, its key and our name."""
+    return tuple(
+        Entry(f"{theirs}{key}{key_end}", f"{ours}{name}{name_end}", *rest)
+        for kind, key, name in (line.split() for line in table.strip().splitlines())
+        for key_end, name_end, *rest in _KINDS[kind]
+    )
 
 
-def layer_norm(theirs: str, ours: str) -> list[Entry]:
-    """Return the entries of a LayerNorm."""
-    return [Entry(f"{theirs}.weight", f"{ours}/scale", SAME), Entry(f"{theirs}.bias", f"{ours}/bias", SAME)]
-
-
-def stacked(theirs: str, ours: str, depth: int, block: Iterable[Entry]) -> Iterator[Entry]:
-    """Yield the entries of `depth` blocks, each with the entries of `block`."""
-    block = list(block)
-    for layer in range(depth):
-        for entry in block:
-            yield Entry(f"{theirs}.{layer}.{entry.key}", f"{ours}/{entry.name}", entry.conversion, layer, entry.part)
+@lru_cache(maxsize=8)
+def param_shapes(model: ModelConfig) -> Mapping[str, Shape]:
+    """Return name -> shape of every parameter of a model."""
+    return MappingProxyType({name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()})
 
 
 # Heads of the published towers by width: OpenAI's CLIP and the authors (width / 64), OpenCLIP's larger towers (16).
-VISION_HEADS = {384: 6, 512: 8, 768: 12, 896: 14, 1024: 16, 1280: 16, 1408: 16, 1664: 16}
-TEXT_HEADS = {384: 6, 512: 8, 640: 10, 768: 12, 1024: 16, 1280: 20}
-DECODER_HEADS = {512: 16}  # the authors'
+_VISION_HEADS = {384: 6, 512: 8, 768: 12, 896: 14, 1024: 16, 1280: 16, 1408: 16, 1664: 16}
+_TEXT_HEADS = {384: 6, 512: 8, 640: 10, 768: 12, 1024: 16, 1280: 20}
+_HEADS = {"touch": _VISION_HEADS, "image": _VISION_HEADS, "text": _TEXT_HEADS, "decoder": {512: 16}}
+_DECODER = Stack(512, 8, 16, 2048)  # the authors', for files without a decoder
 
 
-class UnknownHeads(Exception):
-    """The head count of a stack, which leaves no trace in its arrays: `stack` is its name, `width` its width."""
+@dataclass(frozen=True)
+class KeyMap:
+    """A family of weights files.
 
-    def __init__(self, stack: str, width: int) -> None:
-        super().__init__(stack, width)
-        self.stack, self.width = stack, width
-
-
-def detect_stack(weights: Weights, prefix: str, name: str, heads: Heads, published: Mapping[int, int]) -> Stack:
-    """Return the sizes of the blocks under `prefix`, from the kernels of their feed-forward layers.
-
-    The head count is `heads[name]`, else that of a published tower of this width. Raises KeyError if there are no
-    blocks, and UnknownHeads.
+    `mark` is a regex that only its files have a key for. `table` lists the arrays, and `lora` those that replace them
+    in a model with LoRA. A table without rows stands for our own names.
+    `unused` maps a key that no code reads to the key it is made from: a copy, or the mean over frames if it has fewer
+    axes (golden Q2). `towers` matches the keys of each part that a model may lack.
     """
-    pattern = re.compile(
-        re.escape(prefix) + r"\.(?:encoder\.|base_model\.model\.|layers\.|transformer\.|resblocks\.)*(\d+)\."
-        r"(?:mlp\.fc1|mlp\.c_fc|intermediate\.dense)\.weight"
-    )
-    shapes = {int(match[1]): array.shape for key, array in weights.items() if (match := pattern.fullmatch(key))}
-    if not shapes:
-        raise KeyError(f"{prefix} blocks")
-    mlp, width = shapes[0]
-    count = heads.get(name) or published.get(width)
-    if count is None:
-        raise UnknownHeads(name, width)
-    return Stack(width, max(shapes) + 1, count, mlp)
 
+    name: str
+    mark: str
+    table: tuple[Entry, ...] = ()
+    lora: tuple[Entry, ...] = ()
+    unused: Mapping[str, str] = field(default_factory=dict)
+    towers: Mapping[str, str] = field(default_factory=dict)
 
-def detect_text(weights: Weights, blocks: str, token: str, position: str, heads: Heads) -> TextTower | None:
-    """Return the sizes of a text tower from the keys of its tables; None if the file has no such tower."""
-    if token not in weights:
-        return None
-    stack = detect_stack(weights, blocks, "text", heads, TEXT_HEADS)
-    return TextTower(stack, vocab=len(weights[token]), length=len(weights[position]))
+    def entries(self, model: ModelConfig) -> list[Entry]:
+        """Return the arrays that fill a model, a layer of a stack each."""
+        shapes = param_shapes(model)
+        if not self.table:
+            return [Entry(name, name, *SAME) for name in shapes]
+        table = [row for name, row in self._rows(bool(model.lora_rank)).items() if name in shapes]
+        layers = [range(shapes[row.name][0]) if "{}" in row.key else (None,) for row in table]
+        return [
+            replace(row, key=row.key.format(layer), layer=layer)
+            for row, numbers in zip(table, layers, strict=True)
+            for layer in numbers
+        ]
 
+    def _rows(self, lora: bool) -> dict[str, Entry]:
+        return {row.name: row for row in (*self.table, *(self.lora if lora else ()))}
 
-def image_sizes(weights: Weights, patch: str, position: str) -> dict[str, Any]:
-    """Return the image and patch sizes in pixels, from the keys of a patch kernel and a position table."""
-    side = int(weights[patch].shape[-1])
-    return {"image_size": round((len(weights[position]) - 1) ** 0.5) * side, "patch": side}
+    def detect(self, weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, int]]:
+        """Return the model that made a file, and the widths of its stacks of unknown head counts, which are 1 in it.
+
+        A head count leaves no trace in shapes. It is that of `heads`, else that of a published tower of this width.
+        A missing array or an odd shape raises KeyError, IndexError, ValueError or TypeError.
+        """
+        table, unknown = self._rows(any(".lora_A." in key for key in weights)), dict[str, int]()
+
+        def has(name: str) -> bool:
+            return name in table and table[name].key.format(0) in weights
+
+        def shape(name: str) -> Shape:
+            return table[name].read(weights[table[name].key.format(0)]).shape
+
+        def stack(part: str) -> Stack:
+            row = table[f"{part}/blocks/mlp/up/kernel"]
+            width, mlp = shape(row.name)
+            pattern = re.compile(re.escape(row.key).replace(r"\{\}", r"(\d+)"))
+            depth = max(int(match[1]) for key in weights if (match := pattern.fullmatch(key))) + 1
+            count = heads.get(part) or _HEADS[part].get(width)
+            if count is None:
+                unknown[part] = width
+            return Stack(width, depth, count or 1, mlp)
+
+        main = "touch" if "touch/patch/kernel" in table else "image"
+        kernel, tower = shape(f"{main}/patch/kernel"), stack(main)
+        patch, projection = math.isqrt(kernel[-2] // 3), f"{main}/projection/kernel"
+        sizes: dict[str, Any] = {"touch": tower, "decoder": _DECODER, "match_head": "none"}
+        if main == "touch":
+            count, each, _ = shape("touch/sensor_tokens")
+            numbered = (*(f"sensor{row}" for row in range(count - 1)), UNIVERSAL)
+            sizes |= {"sensors": SENSORS if count == len(SENSORS) else numbered, "sensor_tokens": each}
+            sizes |= {"frames": kernel[0], "decoder_sensor_tokens": has("decoder/sensor_projection/kernel")}
+        if "decoder/mask_token" in table:
+            sizes["decoder"] = stack("decoder")
+        if has("image/patch/kernel"):
+            sizes["image"] = stack("image")
+        if has("text/token"):
+            sizes["text"] = TextTower(stack("text"), vocab=shape("text/token")[0], length=shape("text/position")[0])
+        if has("lora/query/a"):
+            sizes["lora_rank"] = shape("lora/query/a")[-1]
+        if has("matcher/kernel") or has("matcher/up/kernel"):
+            sizes["match_head"] = "linear" if has("matcher/kernel") else "mlp"
+        return ModelConfig(
+            image_size=round((shape(f"{main}/position")[0] - 1) ** 0.5) * patch,
+            patch=patch,
+            embed=shape(projection)[-1] if has(projection) else tower.width,  # a vision tower alone has none
+            **sizes,
+        ), unknown

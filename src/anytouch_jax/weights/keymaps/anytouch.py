@@ -2,129 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
-from typing import Any
+from anytouch_jax.weights.keymaps import Entry, KeyMap, rows
+from anytouch_jax.weights.keymaps.clip import BLOCKS, TABLE, TOWERS, VISION
 
-from anytouch_jax.config import SENSORS, UNIVERSAL, ModelConfig
-from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.keymaps import (
-    DECODER_HEADS,
-    LINEAR,
-    SAME,
-    VISION_HEADS,
-    Entry,
-    Heads,
-    KeyMap,
-    Weights,
-    detect_stack,
-    hf_clip,
-    layer_norm,
-    linear,
-)
-
-_STAGE2 = "touch_mae_model."
-_CLIP_PATCH = "video_patch_embedding.weight"
-_PROBE_PATCH = "touch_model.embeddings.patch_embedding.weight"
-_MATCH_HEADS = {"mlp": "cross_sensor_mlp.up.weight", "linear": "cross_sensor_head.weight"}
-_DECODER_BLOCK = [
-    *linear("attention.attention.query", "attention/query"),
-    *linear("attention.attention.key", "attention/key"),
-    *linear("attention.attention.value", "attention/value"),
-    *linear("attention.output.dense", "attention/out"),
-    *linear("intermediate.dense", "mlp/up"),
-    *linear("output.dense", "mlp/down"),
-    *layer_norm("layernorm_before", "norm1"),
-    *layer_norm("layernorm_after", "norm2"),
-]
+_DECODER = """
+    token   mask_token                                         mask_token
+    row     decoder_pos_embed                                  position
+    kernel  sensor_token_proj                                  sensor_projection
+    linear  touch_decoder_blocks.{}.attention.attention.query  blocks/attention/query
+    linear  touch_decoder_blocks.{}.attention.attention.key    blocks/attention/key
+    linear  touch_decoder_blocks.{}.attention.attention.value  blocks/attention/value
+    linear  touch_decoder_blocks.{}.attention.output.dense     blocks/attention/out
+    linear  touch_decoder_blocks.{}.intermediate.dense         blocks/mlp/up
+    linear  touch_decoder_blocks.{}.output.dense               blocks/mlp/down
+    norm    touch_decoder_blocks.{}.layernorm_before           blocks/norm1
+    norm    touch_decoder_blocks.{}.layernorm_after            blocks/norm2
+    linear  decoder_embed                                      embed
+    norm    decoder_norm                                       norm
+    linear  decoder_pred                                       still_head
+    linear  decoder_pred_video                                 clip_head
+"""
+_MATCHER = """
+    linear  cross_sensor_head      matcher
+    linear  cross_sensor_mlp.up    matcher/up
+    linear  cross_sensor_mlp.down  matcher/down
+"""  # the MLP only in our files: the authors' head is linear
+_LORA = """
+    lora    layers.{}.self_attn.q_proj    query
+    lora    layers.{}.self_attn.k_proj    key
+    lora    layers.{}.self_attn.v_proj    value
+    lora    layers.{}.self_attn.out_proj  out
+"""
+_CLIP_PATCH, _PROBE_PATCH = "video_patch_embedding", "touch_model.embeddings.patch_embedding"
+_PEFT = "vision_model.encoder.base_model.model."  # the library of LoRA puts the tower into a wrapper
 
 
-def _touch(model: ModelConfig, prefix: str = "", patch: str = _CLIP_PATCH) -> Iterator[Entry]:
-    yield Entry(f"{prefix}sensor_token", "touch/sensor_tokens", SAME)
-    yield Entry(f"{prefix}{patch}", "touch/patch/kernel", keymaps.PATCH)
-    yield from hf_clip.vision(f"{prefix}touch_model", "touch", model.touch.depth)
-    yield Entry(f"{prefix}touch_projection.weight", "touch/projection/kernel", LINEAR)
-
-
-def _decoder(model: ModelConfig, prefix: str = "") -> Iterator[Entry]:
-    yield Entry(f"{prefix}mask_token", "decoder/mask_token", keymaps.TOKEN)
-    yield Entry(f"{prefix}decoder_pos_embed", "decoder/position", keymaps.ROW)
-    if model.decoder_sensor_tokens:
-        yield Entry(f"{prefix}sensor_token_proj.weight", "decoder/sensor_projection/kernel", LINEAR)
-    yield from keymaps.stacked(f"{prefix}touch_decoder_blocks", "decoder/blocks", model.decoder.depth, _DECODER_BLOCK)
-    yield from linear(f"{prefix}decoder_embed", "decoder/embed")
-    yield from layer_norm(f"{prefix}decoder_norm", "decoder/norm")
-    yield from linear(f"{prefix}decoder_pred", "decoder/still_head")
-    yield from linear(f"{prefix}decoder_pred_video", "decoder/clip_head")
-
-
-def _stage2(model: ModelConfig) -> list[Entry]:
-    entries = [*_touch(model, _STAGE2), *_decoder(model, _STAGE2), *hf_clip.towers(model, lora=bool(model.lora_rank))]
-    if model.match_head == "linear":
-        entries += linear("cross_sensor_head", "matcher")
-    elif model.match_head == "mlp":  # only in our files: the authors' head is linear
-        entries += [*linear("cross_sensor_mlp.up", "matcher/up"), *linear("cross_sensor_mlp.down", "matcher/down")]
-    return entries
-
-
-def _detect(weights: Weights, heads: Heads, *, prefix: str = "", patch: str = _CLIP_PATCH) -> ModelConfig:
-    position = f"{prefix}touch_model.embeddings.position_embedding.weight"
-    tokens, blocks = weights[f"{prefix}sensor_token"], f"{prefix}touch_decoder_blocks"
-    numbered = (*(f"sensor{row}" for row in range(len(tokens) - 1)), UNIVERSAL)
-    sizes: dict[str, Any] = keymaps.image_sizes(weights, f"{prefix}{patch}", position)
-    if prefix:  # stage 2
-        ranks = [array.shape[0] for key, array in weights.items() if "lora_A" in key]
-        heads_of_match = [name for name, key in _MATCH_HEADS.items() if key in weights]
-        sizes |= {
-            "image": detect_stack(weights, "vision_model", "image", heads, VISION_HEADS),
-            "text": hf_clip.detect_text_tower(weights, heads),
-            "match_head": heads_of_match[0] if heads_of_match else "none",
-            "lora_rank": ranks[0] if ranks else 0,
-        }
-    decoder = hf_clip.DECODER
-    if patch != _PROBE_PATCH:
-        decoder = detect_stack(weights, blocks, "decoder", heads, DECODER_HEADS)
-    return ModelConfig(
-        **sizes,
-        embed=weights[f"{prefix}touch_projection.weight"].shape[0],
-        touch=detect_stack(weights, f"{prefix}touch_model", "touch", heads, VISION_HEADS),
-        decoder=decoder,
-        frames=weights[f"{prefix}{patch}"].shape[1],
-        sensors=SENSORS if len(tokens) == len(SENSORS) else numbered,
-        sensor_tokens=tokens.shape[1],
-        decoder_sensor_tokens=f"{prefix}sensor_token_proj.weight" in weights,
-    )
+def _touch(prefix: str = "", patch: str = _CLIP_PATCH) -> tuple[Entry, ...]:
+    own = f"same sensor_token sensor_tokens\npatch {patch} patch\nkernel touch_projection projection"
+    return (*rows(own, prefix, "touch/"), *rows(VISION, f"{prefix}touch_model.", "touch/"))
 
 
 def _unused(prefix: str = "") -> dict[str, str]:
     inner = f"{prefix}touch_model.embeddings."
     return {
-        f"{inner}patch_embedding.weight": f"{prefix}{_CLIP_PATCH}",
+        f"{inner}patch_embedding.weight": f"{prefix}{_CLIP_PATCH}.weight",
         f"{prefix}video_position_embedding.weight": f"{inner}position_embedding.weight",
     }
 
 
-_TOWERS = hf_clip.TOWERS | {"matcher": r"cross_sensor_.*"}
+_STAGE2 = "touch_mae_model."
+_TOWERS = TOWERS | {"matcher": r"cross_sensor_.*"}
 STAGE1 = KeyMap(
     "stage1",
-    lambda weights: _CLIP_PATCH in weights,
-    lambda model: [*_touch(model), *_decoder(model)],
-    _detect,
-    _unused(),
-    _TOWERS,
+    r"video_patch_embedding\.weight",
+    (*_touch(), *rows(_DECODER, "", "decoder/")),
+    unused=_unused(),
+    towers=_TOWERS,
 )
 STAGE2 = KeyMap(
     "stage2",
-    lambda weights: any(key.startswith(_STAGE2) for key in weights),
-    _stage2,
-    partial(_detect, prefix=_STAGE2),
-    _unused(_STAGE2),
-    _TOWERS,
-)
-PROBE = KeyMap(
-    "probe",
-    lambda weights: _PROBE_PATCH in weights,
-    lambda model: list(_touch(model, patch=_PROBE_PATCH)),
-    partial(_detect, patch=_PROBE_PATCH),
+    r"touch_mae_model\..*",
+    (*_touch(_STAGE2), *rows(_DECODER, _STAGE2, "decoder/"), *TABLE, *rows(_MATCHER)),
+    lora=(
+        *rows(BLOCKS.replace("encoder.", "").replace("_proj", "_proj.base_layer"), _PEFT, "image/"),
+        *rows(_LORA, _PEFT, "lora/"),
+    ),
+    unused=_unused(_STAGE2),
     towers=_TOWERS,
 )
+PROBE = KeyMap("probe", r"touch_model\.embeddings\.patch_embedding\.weight", _touch(patch=_PROBE_PATCH), towers=_TOWERS)

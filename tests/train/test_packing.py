@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from anytouch_jax.train.pack import global_norm, packing
+from anytouch_jax.train.optim import global_norm, packing
 
 TREE = {
     "b": jnp.arange(6.0).reshape(2, 3),

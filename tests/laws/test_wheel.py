@@ -36,7 +36,8 @@ def test_the_wheel_works_in_an_empty_folder(tmp_path):
     with zipfile.ZipFile(wheel) as file:
         packed = {name for name in file.namelist() if ".dist-info/" not in name}
     assert packed == {p.relative_to(ROOT / "src").as_posix() for p in (ROOT / "src").rglob("*.py")} | {
-        "anytouch_jax/py.typed"
+        "anytouch_jax/py.typed",
+        "anytouch_jax/sim/sensing/looks.npz",
     }
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"

@@ -30,12 +30,12 @@ class SimulateOptions:
     out: Path  # Folder for images and manifest.parquet.
     touches: int = 400  # Number of places to touch. Every sensor feels each place once.
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
-    """Sensors: gelsight, gelsight_mini, gelslim, digit, duragel, tac3d (a force field)."""
+    """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field)."""
     seed: int = 0  # Random seed.
     grade: Literal["fine", "coarse"] = "fine"
     """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
     fidelity: Literal["fast", "exact"] = "fast"  # Solve contact in a few rounds, or to convergence.
-    frames: int = 10  # Frames of a recording. One gesture fills them; 10 are a third of a second at 30 Hz.
+    frames: int = 10  # Frames of a recording. They show a part of one gesture, with pauses and regrasps.
     objects: int = 200  # Number of objects.
     depth: tuple[float, float] = (0.3, 1.0)  # Range of the deepest press, mm.
     vision: float = 0.7  # Share of the recordings with a photograph.

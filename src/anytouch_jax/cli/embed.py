@@ -78,8 +78,9 @@ def run(options: EmbedOptions) -> int:
             refuse_unused(options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame")
     check_folder(options.out, read=(options.model, *options.data), suffix=".npz")
     encoder, pooling, head = load_inputs(options)
+    about: dict[str, str] = {}
     if is_manifest:
-        features, about = _embed_manifest(encoder, options, pooling), {}
+        features = _embed_manifest(encoder, options, pooling)
     else:
         row, preprocess, about = frames_input(encoder, options, data)
         features = _embed_frames(encoder, options, pooling, row, preprocess)

@@ -24,7 +24,8 @@ class ExampleTouch(NamedTuple):
 def example_touches() -> list[ExampleTouch]:
     """Return simulated touches: each of a few presses by several sensors. They are in the public domain (CC0)."""
     files = sorted(file for file in FOLDER.glob("*.jpg") if not file.stem.endswith("-background"))
-    return [
-        ExampleTouch(*file.stem.split("-"), decode(file), decode(file.with_stem(f"{file.stem}-background")))
-        for file in files
-    ]
+    touches = []
+    for file in files:
+        press, sensor = file.stem.split("-")
+        touches.append(ExampleTouch(press, sensor, decode(file), decode(file.with_stem(f"{file.stem}-background"))))
+    return touches

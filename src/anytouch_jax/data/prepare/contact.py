@@ -328,8 +328,9 @@ def mark_contact(
     if not stays.any():
         raise UserError("every frame is without contact by these thresholds; nothing would be left")
     used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
-    counts = (int(flags.sum()) for flags in (contact == 1, free, np.isnan(contact), ~stays, np.isfinite(known)))
-    report = ContactReport(scores, *counts, used)
+    masks = {"contact": contact == 1, "free": free, "unknown": np.isnan(contact), "dropped": ~stays,
+             "labelled": np.isfinite(known)}  # fmt: skip
+    report = ContactReport(scores, thresholds=used, **{name: int(mask.sum()) for name, mask in masks.items()})
     return select_rows(marked, np.flatnonzero(stays)), report
 
 

@@ -77,9 +77,9 @@ class VerifyReport:
         for name, share in self.shares.items():
             lines += _row(name, *(f"{share[column]:.0%}" for column in _SHARES))
         lines += ["", *_table("licence", "commercial", "rows", "datasets")]
-        for one in self.licences:
-            use = {YES: "yes", NO: "no"}.get(one.commercial, "unknown")
-            lines += _row(one.name or "-", use, one.rows, listed(one.datasets))
+        for licence in self.licences:
+            use = {YES: "yes", NO: "no"}.get(licence.commercial, "unknown")
+            lines += _row(licence.name or "-", use, licence.rows, listed(licence.datasets))
         return "\n".join(lines) + "\n"
 
 
@@ -185,9 +185,9 @@ def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     rows = np.flatnonzero((usual != size).any(axis=1))
     words = "touch images of another size than most of their dataset, sensor and unit, or sequence"
     for fault in finding(manifest, "wrong_size", "warning", rows, words, "path"):
-        sizes = (f" is {w} x {h}, where most of its sensor or sequence are {u} x {v}"
+        reasons = (f" is {w} x {h}, where most of its sensor or sequence are {u} x {v}"
                  for (w, h), (u, v) in zip(size[rows], usual[rows], strict=True))  # fmt: skip
-        yield fault._replace(examples=tuple(map("".join, zip(fault.examples, sizes, strict=False))))
+        yield fault._replace(examples=tuple(map("".join, zip(fault.examples, reasons, strict=False))))
 
 
 def content_ids(scanned: Scan, column: str = "path") -> np.ndarray:
@@ -266,10 +266,11 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
     by_frame, by_row = np.lexsort((frame, sequence)), np.argsort(sequence, kind="stable")
     twice = (np.diff(sequence[by_frame]) == 0) & (np.diff(frame[by_frame]) == 0)
     back = (np.diff(sequence[by_row]) == 0) & (frame[by_row][1:] < frame[by_row][:-1])
-    for kind, level, rows, words in (
+    faults: tuple[tuple[str, Level, np.ndarray, str], ...] = (
         ("repeated_frame", "error", by_frame[1:][twice], "repeat a frame of their sequence, which allows no clips"),
         ("frame_order", "warning", by_row[1:][back], "stand after a later frame of their sequence"),
-    ):
+    )
+    for kind, level, rows, words in faults:
         yield from finding(manifest, kind, level, np.sort(rows), f"rows {words}", "frame_index", "sequence")
 
 
@@ -372,7 +373,8 @@ def _swapped(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
         name = f"dataset {shown(verdict.dataset)}" if verdict.dataset else "the rows without a dataset"
         reason = "the background frames show it" if verdict.confirmed else "suspected from the colours; look at some"
         what = "all touch images and photographs are" if verdict.whole else f"{verdict.swapped.size} rows are"
-        kind, level = "swapped" if verdict.whole else "swapped_rows", "error" if verdict.confirmed else "warning"
+        kind = "swapped" if verdict.whole else "swapped_rows"
+        level: Level = "error" if verdict.confirmed else "warning"
         for fault in finding(manifest, kind, level, verdict.swapped, "", "path", "image_path", column="image_path"):
             yield fault._replace(sentence=f"{name}: {what} swapped ({reason})")
 

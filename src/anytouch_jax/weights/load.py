@@ -158,8 +158,11 @@ def _check_init(loaded: Loaded, config: Config) -> None:
     """Raise UserError if a run or a file cannot start this run."""
     path, model = loaded.path, loaded.config.model
     compatible.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
-    if "touch" not in loaded.params or "decoder" not in loaded.params:
-        raise UserError(f"{path} has no touch encoder and decoder; give a stage-1 run or the authors' weights")
+    if "touch" not in loaded.params:
+        raise UserError(f"{path} has no touch encoder; give a run, an encoder by name, or the authors' weights")
+    if "decoder" not in loaded.params:  # an encoder of the package: the decoder starts untrained
+        ours = config.model
+        model = replace(model, decoder=ours.decoder, decoder_norm_eps=ours.decoder_norm_eps)
     compatible.check_form(path, model, config, preset=loaded.config.preset if loaded.from_run else "custom")
 
 
@@ -176,6 +179,8 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     if lost:
         option = " ".join((*ours, *lost))
         notes.append(f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {option} keeps them")
+    if "decoder" not in loaded.params:
+        notes.append(f"{path} has no decoder, so the decoder starts untrained")
     if dropped := sorted((fresh_parts & set(loaded.params)) - {"touch", "decoder"}):
         notes.append(f"{path} gives the touch encoder and the decoder; {', '.join(dropped)} start untrained")
     if loaded.config.model.patches != config.model.patches:
@@ -196,7 +201,8 @@ def check_finite(path: str | Path, arrays: Mapping[str, Any]) -> None:
 
 def _fit(loaded: Loaded, config: Config) -> Params:
     """Return the touch encoder and decoder with this run's positions and sensor rows."""
-    parts, rows = {name: loaded.params[name] for name in ("touch", "decoder")}, config.model.patches + 1
+    parts = {name: loaded.params[name] for name in ("touch", "decoder") if name in loaded.params}
+    rows = config.model.patches + 1
     if loaded.config.model.patches + 1 != rows:
         parts = {n: p | {"position": resize_position(np.asarray(p["position"]), rows)} for n, p in parts.items()}
     stored, wanted = loaded.config.model.sensors, config.model.sensors
@@ -223,7 +229,7 @@ def first_params(
         towers = to_params(clip, model)
         merged = _replace(merged, {part: towers[part] for part in ("image", "text", "logit_scale") if part in towers})
     if stage1 is not None:
-        merged = _replace(merged, {part: stage1[part] for part in ("touch", "decoder")})
+        merged = _replace(merged, {part: stage1[part] for part in ("touch", "decoder") if part in stage1})
     return merged
 
 

@@ -21,8 +21,8 @@ class TouchBatch(NamedTuple):
 class AlignBatch(NamedTuple):
     """Stage 2, alignment. Images and texts are packed into V and L slots; an unused slot has row B.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `image` u8 (V, H, W, 3), `image_row` i32 (V,) the row of the
-    batch each image belongs to, `text` i32 (L, S), `text_mask` bool (L, S), `text_row` i32 (L,).
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `image` u8 (V, H, W, 3), `text` i32 (L, S). `text_mask` bool (L, S) is
+    True for tokens. `image_row` i32 (V,) and `text_row` i32 (L,) are the rows of the batch that the slots belong to.
     """
 
     clip: Array

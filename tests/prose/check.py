@@ -29,7 +29,7 @@ PHRASES = (
     "where there is none", "where there are none", "so far as", "by heart",
 )  # fmt: skip
 _FORBIDDEN = re.compile(r"\b(" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
-_SENTENCE_END = re.compile(r"(?<=[.!?:])[\"')\]*]*\s+(?=[\"'(\[*`]*[A-Z0-9`*])")
+_SENTENCE_END = re.compile(r"(?<=[.!?:])[\"')\]*]*\s+(?=[\"'(\[*`]*(?:[A-Z0-9`*]|code\b))")
 _ABBREVIATION = re.compile(r"\b(e\.g|i\.e|Eq|Sec|Fig|App|No|vs|cf|al)\.\s")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,.]*%?(?!\w)")
 
@@ -143,8 +143,8 @@ def docstring_faults(file: Path, text: str) -> Iterator[Fault]:
             continue
         line = node.body[0].lineno
         for block in re.split(r"\n\s*\n|\n(?=\s*[-*>]\s)", docstring):
-            if block.lstrip().startswith(">>>"):
-                continue
+            if block.startswith("    ") or block.lstrip().startswith(">>>"):
+                continue  # code
             prose = plain(" ".join(block.split()))
             if found := _FORBIDDEN.search(prose):
                 yield Fault(file, line, f"the phrase {found[0]!r}")

@@ -41,6 +41,7 @@ def test_a_fault_is_found_with_its_line(text, reason):
         "```\n" + LONG + "; 1 2 3 4 5\n```",
         "    " + LONG,
         "See `a; b; c` and [a page](x;y).",
+        "`a` is " + LONG[:120] + ". `b` is " + LONG[:120] + ".",
         "By e.g. Eq. 3 of the paper, Sec. 4 holds. " + " ".join(["word"] * 25),
         "| 1 | 2 | 3 | 4 | 5 |",
         "---\ntitle: a; b\n---\nFine.",
@@ -56,7 +57,8 @@ def test_a_long_readme_is_a_fault_and_a_long_page_is_not():
 
 
 def test_docstrings_are_checked_and_code_is_not():
-    text = f'"""{LONG}"""\n\n\ndef f():\n    """It tells.\n\n    >>> {LONG}\n    """\n    return "{LONG} told"\n'
+    code = f"    >>> {LONG}\n\n        {LONG}\n"
+    text = f'"""{LONG}"""\n\n\ndef f():\n    """It tells.\n\n{code}    """\n    return "{LONG} told"\n'
     found = [(fault.line, fault.reason) for fault in check.docstring_faults(Path("a.py"), text)]
     assert [line for line, _ in found] == [1, 5] and "31 words" in found[0][1] and "'tells'" in found[1][1]
 

@@ -73,7 +73,7 @@ COMMANDS = {
 
 
 def console() -> int:
-    """Run the `anytouch` command in a process of its own.
+    """Run the `anytouch` command.
 
     This silences XLA's C++ log: jaxlib 0.10.1 logs a spurious error for each program that it reads from the cache.
     Set TF_CPP_MIN_LOG_LEVEL to see it.

@@ -73,7 +73,7 @@ def expand_home(arg: str) -> str:
 
 
 def option_of(arg: str) -> str:
-    """Return the name of an option as it is documented: --save-every for --save_every=5."""
+    """Return the name of an option as documented: --save-every for --save_every=5."""
     return arg.partition("=")[0].replace("_", "-")
 
 

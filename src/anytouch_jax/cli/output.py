@@ -89,8 +89,8 @@ def check_folder(
 ) -> None:
     """Make the folder of a file that will be written after long work, if there is one; `option` named it.
 
-    Raises UserError for a folder that cannot be made, for a `path` that is a folder, a device or one of the files
-    that are `read`, and for another ending than `suffix`.
+    Raises UserError for a folder that cannot be made, and for a name that does not end in `suffix`. So it does for a
+    `path` that is a folder, a device or one of the files that are `read`.
     """
     if path is None:
         return

@@ -142,7 +142,7 @@ def _unpack(data: bytes) -> np.ndarray:
 
 
 def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return stored pixels (h, w) or (h, w, c) as they are to be shown; EXIF's orientations are 1 to 8."""
+    """Return stored pixels (h, w) or (h, w, c) turned upright; EXIF's orientations are 1 to 8."""
     if orientation > 4:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -389,8 +389,8 @@ def split_series(names: Sequence[str]) -> dict[str, list[str]]:
 def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
     """Return the series of each name, and its numbers that count frames.
 
-    The series is the words of the name with their serial numbers: numbers right behind a word (D20012, cam0), unless
-    the word announces a count (frame0001) or the name has no other number that differs.
+    The series is the words of the name with their serial numbers, which stand right behind a word (D20012, cam0). A
+    number counts frames if its word says so (frame0001), or if it is the only one that differs.
     """
     forms: dict[str, list[list[str]]] = {}
     pieces = [re.split(r"(\d+)", Path(name).stem) for name in names]

@@ -111,9 +111,9 @@ def colour_jitter(
 ) -> np.ndarray:
     """Jitter brightness, contrast, saturation and hue in a random order, the same for all frames u8 (T, h, w, 3).
 
-    This is torchvision's ColorJitter on floats: factors in 1 +- jitter (at least 0), hue rotated by up to +-jitter of
-    a circle, each step clipped. float32 with one rounding at the end keeps the error at half a grey level. The result
-    is written into `out` (`frames` is allowed) or a new array.
+    This is torchvision's ColorJitter on floats. Factors are in 1 +- jitter (at least 0), the hue turns by up to
+    +-jitter of a circle, and each step is clipped. One rounding of float32 at the end keeps the error at half a grey
+    level. The result is written into `out` (`frames` is allowed) or a new array.
     """
     spread = np.asarray(jitter)
     low, high = np.maximum(0.0, 1.0 - spread), 1.0 + spread

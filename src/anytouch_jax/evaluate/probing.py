@@ -395,11 +395,12 @@ def probe_tasks(
 ) -> dict[str, Any]:  # fmt: skip
     """Probe named tasks with features of every model, of features files, and of the controls.
 
-    The "results" have a JSON-ready dict for each source of features, task, head and protocol. Keys: features, task,
-    head, protocol; metric, "accuracy" in 0..1 or "r2"; mean over seeds, low, high (95 % over seeds and test groups),
-    values (one a seed); train, test (rows); groups (tested); classes; chance, the score of the most frequent class or
-    the mean of train; chosen options; frames; order; notes. A regression also has mae, mae_low, mae_high and chance_mae
-    in `unit`. Print them with `probe_table`. Tasks that cannot be probed are left out with their reason.
+    The "results" have a JSON-ready dict for each source of features, task, head and protocol. These four are keys.
+    Among the others, `metric` is "accuracy" in 0..1 or "r2". `mean`, `low` and `high` (95 %) are over seeds and test
+    groups. `values` has one a seed. `train` and `test` count rows, `groups` the tested groups. `chance` is the score of
+    the most frequent class or the mean of train. Classes, chosen options, frames, order and notes are there too. A
+    regression also has mae, mae_low, mae_high and chance_mae in `unit`. Print them with `probe_table`. Tasks that
+    cannot be probed are left out with their reason.
 
     `protocol` "published" reports both protocols. `frames` replaces that of each task. `order` shuffles the frames of
     clips, or repeats the last. `universal`: the universal tokens for all sensors. `paper`: the accuracy that the report

@@ -28,10 +28,10 @@ _GREY, _GAP, _TITLE = np.uint8(128), 4, 16
 def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config) -> dict[str, float]:
     """Return the mean squared errors of normalised pixels (Eq. 1, 2) of the clips that end at rows `ends`.
 
-    "reconstruction" (masked patches) and "next_frame" are those of stage 1. "plain ..." are those of
-    `plain_reconstruction` on the same masks, and "untouched ..." those of an untouched gel if the background is
-    subtracted. A clip has the model's frames and, if it predicts one, the next frame. Sensors outside the table get the
-    universal tokens. Raises ValueError without rows, and for `norm_pix_loss`, whose errors are relative to each patch.
+    "reconstruction" (masked patches) and "next_frame" are those of stage 1. Those that begin with "plain" are of
+    `plain_reconstruction` on the same masks. Those that begin with "untouched" are of an untouched gel, if the
+    background is subtracted. A clip has the model's frames and, if it predicts one, the next frame. Sensors outside the
+    table get the universal tokens. Raises ValueError without rows, and for `norm_pix_loss`.
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")

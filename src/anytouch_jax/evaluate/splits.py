@@ -1,7 +1,7 @@
 """Train/validation/test splits that keep whole groups together, and the selection of an option of a head.
 
-Two protocols, always named in the result. honest: the penalty (k, epoch) is selected on val, or by cross-validation
-over groups of train, and test is read once. published: it is selected on test, as the authors' released code does.
+Every result names its protocol. By "honest" the penalty (k, epoch) is selected on val, or by cross-validation over
+groups of train, and test is read once. By "published" it is selected on test, as the authors' released code does.
 """
 
 from __future__ import annotations
@@ -151,8 +151,8 @@ def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str
 def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]:
     """Return the splits of one seed: one by the manifest's split, or FOLDS that test every row once.
 
-    honest: a fifth of the groups of train selects, the rest is fitted on. published: the manifest's split even if it
-    shares groups, all of train is fitted on, and test selects. Raises UserError for too few groups.
+    By "honest" a fifth of the groups of train selects, and the rest is fitted on. By "published" the manifest's split
+    is used even if it shares groups. All of train is fitted on, and test selects. Raises UserError for too few groups.
     """
     _check_protocol(protocol)
     rng = np.random.default_rng([11, seed])

@@ -44,7 +44,7 @@ def usable(model: ModelConfig) -> ModelConfig:
 def mapped(q: Array, k: Array, v: Array) -> Array:
     """Return attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from its saved log-sum.
 
-    All B * H tables of S x S logits at once are written to memory and read back a dozen times; a few at a time never
+    All B * H tables of S x S logits at once are written to memory and read back a dozen times. A few at a time never
     leave the cache (Rabe and Staats, 2021; Dao et al., 2022). On two CPU cores 2 to 4 times as fast.
     """
     return _forward(q, k, v)[0]

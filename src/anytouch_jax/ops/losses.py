@@ -59,8 +59,8 @@ def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 
     """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
     `scale` is 1 / tau. Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair
-    gives 0. With `groups` > 1 the batch is cut in that many shares, negatives come from a row's share, and the mean
-    is over all shares, as over the devices of the release. Rows of one `place` i32 (B,) are no negatives of each other.
+    gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices of the release. Negatives come
+    from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,) are no negatives of each other.
     """
     e = a.shape[-1]
     present = present.reshape(groups, -1)

@@ -14,8 +14,8 @@ def count_visible(positions: int, ratio: float) -> int:
 def random_mask(noise: Array, keep: int) -> tuple[Array, Array, Array]:
     """Keep the `keep` positions of smallest noise, each sample by its own row of `noise` (B, N).
 
-    Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N) such that position n is element
-    restore_ids[n] of [visible, hidden], and hidden (B, N), True where a position was removed (Omega_M of Eq. 1).
+    Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N), and hidden (B, N). Position n is element
+    restore_ids[n] of [visible, hidden]. `hidden` is True where a position was removed (Omega_M of Eq. 1).
     """
     order = jnp.argsort(noise, axis=1)
     restore_ids = jnp.argsort(order, axis=1)

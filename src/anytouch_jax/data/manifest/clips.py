@@ -64,8 +64,8 @@ def _windows_ending_at(last: np.ndarray, key: np.ndarray, spread: int, stride: n
 
 
 def _sorted_keys(sequence: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
-    """Return (order, key, spread): row ids i64 sorted by sequence and frame (None: they are sorted already), and in
-    that order one i64 for each row, sequence * spread + frame, where frames count from 0 and are below `spread`."""
+    """Return (order, key, spread): row ids i64 sorted by sequence and frame (None if sorted), and their keys. A key i64
+    is sequence * spread + frame. Frames count from 0 and are below `spread`."""
     if not len(frame):
         return None, np.arange(0), 1
     low, high, sequences = int(frame.min()), int(frame.max()), int(sequence.max()) + 1

@@ -145,8 +145,8 @@ def typed(table: pa.Table, where: str) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
     Columns outside SCHEMA stay unchanged. `where` names the file in errors. Raises ManifestError for a missing column
-    or value, a wrong type, an unknown split, a stride below 1, text that is not UTF-8 or longer than MAX_TEXT, and a
-    table without rows or with more than MAX_ROWS.
+    or value, a wrong type, an unknown split, and a stride below 1. So it does for text that is not UTF-8 or longer than
+    MAX_TEXT, and for a table without rows or with more than MAX_ROWS.
     """
     _check_names(table.column_names, table.num_rows, where)
     return pa.table({name: _checked(name, table[name], where) for name in table.column_names}).combine_chunks()

@@ -157,9 +157,9 @@ def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
 def _looks(pixels: np.ndarray) -> np.ndarray:
     """Return measures of RGB u8 (h, w, 3) as f32 (5,).
 
-    They are the standard deviation, the share of rows at the bottom that are of one colour but black, the share of the
-    largest black border, the mean range of a pixel's channels, and how much of the variance is noise from pixel to
-    pixel (1: all of it).
+    In order: the standard deviation, and the share of rows at the bottom of one colour other than black. The share of
+    the largest black border. The mean range of a pixel's channels. The share of the variance that is noise from pixel
+    to pixel.
     """
     # OpenCV needs a tenth of NumPy's time for these.
     rows, columns = (cv2.reduce(pixels, dim, cv2.REDUCE_MAX).reshape(-1, 3) for dim in (1, 0))

@@ -1,11 +1,11 @@
 """Shards: millions of small files as a few uncompressed ZIP files, and a manifest that points into them.
 
-OUT/manifest.parquet   the manifest with paths such as `touch/00000.zip/17` (entry 17)
-OUT/touch/00000.zip    touch images by sequence and frame
-OUT/shared/            photographs and backgrounds, each stored once
-OUT/field/             field files
-OUT/SHA256SUMS         checksums for `sha256sum -c`
-OUT/README.md          the licences
+* OUT/manifest.parquet: the manifest with paths such as `touch/00000.zip/17` (entry 17)
+* OUT/touch/00000.zip: touch images by sequence and frame
+* OUT/shared/: photographs and backgrounds, each stored once
+* OUT/field/: field files
+* OUT/SHA256SUMS: checksums for `sha256sum -c`
+* OUT/README.md: the licences
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ def _real_touch(index: DatasetIndex) -> None:
 def _taxim_presses(index: DatasetIndex) -> None:
     """Ball presses on a GelSight and a GelSight Mini, in the package `taxim` (1.4.1), which is read and not imported.
 
-    `calib/{gelsight,gelsight_mini}/dataPack.npz` has `f0` (the untouched gel), `imgs` (48 and 24 presses of a steel
-    ball, BGR u8 480 x 640), `touch_center` and `touch_radius` (of the contact disc in the picture, pixels). They are
+    `calib/{gelsight,gelsight_mini}/dataPack.npz` has `f0`, the untouched gel, and `imgs`, 48 and 24 presses of a steel
+    ball, BGR u8 480 x 640. `touch_center` and `touch_radius` are those of the contact disc, in pixels. Pictures are
     written as PNG into ROOT/taxim_presses, where an existing file stays. `lists` may name another `calib` folder.
     Every press is a sequence, split by hash. Raises DatasetError if the package is not installed.
     """

@@ -86,8 +86,8 @@ def press(
     "exact", conjugate gradients on the contact set (Polonsky and Keer 1999) reach `tolerance` in at most `iterations`
     (300). With "fast", `iterations` (2) projected gradients on this grid follow twice and four times as many on coarser
     grids. Where the gel still cuts the object, it takes the object's surface, as in Taxim (Si and Yuan 2022). Use
-    `jax.vmap` for a batch. Raises UserError for untraced values that make no sense: a negative depth, a surface of NaN,
-    moduli of 0 or less, a gel thinner than a pixel (with "fast": than one and a half pixels of the coarsest grid).
+    `jax.vmap` for a batch. Raises UserError for untraced values that make no sense, such as a negative depth or a
+    modulus of 0, and for a gel thinner than a pixel ("fast": 1.5 pixels of the coarsest grid).
     """
     _check(surface, depth, pitch, fidelity)
     _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)

@@ -1,9 +1,9 @@
 """Renderer of tactile images from the deformation of the skin, and the field that Tac3D measures.
 
-Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into one pass over the
-pixels, so a batch under `vmap` costs little more than its pixels. The steps are: resample and differentiate the
-displacement at the pixels, colour change by normal and place (`shading`), soft shadow and light bleed from the blurred
-dent, background, markers, noise.
+Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into one pass. So a batch
+under `vmap` costs little more than its pixels. The steps are: resample and differentiate the displacement at the
+pixels, colour change by normal and place (`shading`), soft shadow and light bleed from the blurred dent, background,
+markers, noise.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ _ALIASES = {  # public names that say more outside their module
 _HOME = {name: (module, name) for module, names in _HOMES.items() for name in names.split()} | _ALIASES
 
 __all__ = sorted(_HOME)
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:

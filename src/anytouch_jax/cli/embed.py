@@ -71,7 +71,7 @@ def run(options: EmbedOptions) -> int:
     elif len(options.data) != 1:
         raise UserError(f"--data takes several manifests, or one folder or video, not {len(options.data)} paths")
     elif not data.exists():
-        raise UserError(f"there is no manifest, folder or video at {data}")
+        raise UserError(f"there is no manifest, folder or video at {data}. Give another path with --data.")
     else:
         refuse_unused(options, ("split",), "with a folder or a video, which has no splits")
         if data.is_file():

@@ -45,7 +45,7 @@ def _lines(path: Path) -> list[str]:
     if str(path) in registry.list_encoders():
         return [_named(str(path)), *_weights(registry.locate(path))]
     if not path.exists():
-        raise UserError(f"there is no {path}")
+        raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
     if path.is_dir():
         return _folder(path)
@@ -197,7 +197,7 @@ def _arrays(path: Path) -> list[str]:
     try:
         arrays = read_arrays(path, only=lambda name: name.startswith("about/") or (is_small and name == "features"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}") from None
+        raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}. Write it again.") from None
     if {"format", "mark", "classes"} <= arrays.keys():
         from anytouch_jax.evaluate.heads import load_head
 

@@ -54,7 +54,10 @@ def run(options: StreamOptions) -> int:
         raise result.error
     if not live and not result.interrupted:
         if not len(result.numbers):
-            raise UserError(f"{data} has too few frames for a clip of {options.frames} at stride {options.stride}")
+            raise UserError(
+                f"{data} has too few frames for a clip of {options.frames} at stride {options.stride}. "
+                "Lower one of them."
+            )
         embed.log_if_cut(data, int(result.numbers[-1]) + 1)
     if not lines:
         about |= {"stride": str(options.stride), "pooling": pooling, "input": str(data)}

@@ -270,7 +270,7 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     """Yield (time stamp in seconds, RGB u8 (h, w, 3)) of the frames of a video. Raises ImageError as above."""
     path = Path(path)
     if not path.is_file():
-        raise ImageError(f"there is no video {path}")
+        raise ImageError(f"there is no video {path}; give another path")
     video = open_video(path)
     number, last = 0, -1.0
     try:
@@ -325,7 +325,7 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ImageError(f"there is no folder {folder}")
+        raise ImageError(f"there is no folder {folder}; give another path")
     files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
     named = {file.stem.lower(): file for file in files if file.stem.lower() in (BACKGROUND, PHOTO)}
     files = [file for file in files if file.stem.lower() not in named]

@@ -133,7 +133,7 @@ def embed_frames(
 
     values = run_in_batches(encode, clips(), batch)
     if not ends:
-        raise UserError(f"{len(names)} frames are too few for clips of {length} readable frames")
+        raise UserError(f"{len(names)} frames are too few for clips of {length} readable frames; ask for fewer")
     index = np.array(ends)
     keys = {"frame_index": index} | ({"path": np.array(names)[index]} if any(names) else {})
     return Features(values, index, keys, max(0, len(names) - length + 1) - len(index))

@@ -83,7 +83,8 @@ def load(path: str | Path) -> Exported:
     data, about = read_checked(path)
     if _here() not in about["platforms"]:
         raise UserError(
-            f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}"
+            f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}; "
+            "export it again for this machine"
         )
     try:
         module = jax_export.deserialize(bytearray(data))

@@ -138,7 +138,11 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
         raise UserError(f"there is no video {name}; give a video file, or the number of a camera, such as 0")
     source = cv2.VideoCapture(int(str(name))) if live else open_video(name)
     if not source.isOpened():
-        raise UserError(f"camera {name} cannot be opened" if live else f"{name} is not a video that can be read")
+        raise UserError(
+            f"camera {name} cannot be opened; check its number and its cable"
+            if live
+            else f"{name} is not a video that can be read; convert it first"
+        )
     if live:
         source.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the driver's own queue would hold old frames
     return source, live

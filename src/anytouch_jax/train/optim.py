@@ -1,9 +1,9 @@
 """AdamW, the learning-rate schedule, and rules over parameter names.
 
 A step may not use a parameter, such as a clip's head on a batch of stills. That parameter is skipped: no decay, no
-moment and no count, as in PyTorch when a gradient is None. So each parameter needs its own count, and `optax.adamw`
-has one for all. Small arrays are packed into one vector: a ViT has about twenty parameters a stack, most of them
-vectors, and updated one by one they take longer to compile than the whole backward pass.
+moment and no count, as in PyTorch when a gradient is None. So each parameter needs its own count, and `optax.adamw` has
+one for all. Small arrays are packed into one vector. A ViT has about twenty parameters a stack, most of them vectors.
+One by one, their updates take longer to compile than the whole backward pass.
 """
 
 from __future__ import annotations

@@ -52,6 +52,9 @@ def interpolate(first: Mapping[str, Any], second: Mapping[str, Any], share: floa
     start, end = flatten(first), flatten(second)
     for name in start.keys() & end.keys():
         if np.shape(start[name]) != np.shape(end[name]):
-            raise UserError(f"{name} has shape {np.shape(start[name])} in one and {np.shape(end[name])} in the other")
+            raise UserError(
+                f"{name} has shape {np.shape(start[name])} in one and {np.shape(end[name])} in the other; "
+                "give two models of one configuration"
+            )
         end[name] = (1 - share) * np.asarray(start[name]) + share * np.asarray(end[name])
     return nest(end)

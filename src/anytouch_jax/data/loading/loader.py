@@ -58,7 +58,9 @@ class Loader:
         contrasted = [size, self._match_size] if self._in_batch_negatives else [size]
         for rows in contrasted if config.stage == 2 else ():
             if rows % groups:
-                raise UserError(f"a batch of {rows} touches does not divide by --objective.groups {groups}")
+                raise UserError(
+                    f"a batch of {rows} touches does not divide by --objective.groups {groups}; change one of them"
+                )
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
         self._reader = SampleReader(manifest, config)

@@ -185,7 +185,10 @@ def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]
     rows = rows[sensor[rows] >= 0]
     if not rows.size:
         files = ", ".join(map(str, manifest.files))
-        raise ManifestError(f"{files}: split {split!r} has no row of a known sensor with images")
+        raise ManifestError(
+            f"{files}: split {split!r} has no row of a known sensor with images; "
+            "add some, or the sensor by --model.sensors"
+        )
     if config.data.background == "subtract":
         missing = rows[~manifest.present("background_path")[rows]]
         if len(missing) == len(rows) or (len(missing) and on_bad == "error"):
@@ -226,7 +229,9 @@ def _required(
     count, words = int(allowed[rows].sum()), " and ".join(wanted)
     option = "data.contact_only" if wanted == ["contact"] else "data.require"
     if not count:
-        raise UserError(f"{option}: no row of split {config.data.split!r} has {words}")
+        raise UserError(
+            f"{option}: no row of split {config.data.split!r} has {words}; add some, or leave the option out"
+        )
     return allowed, [f"{count} of {len(rows)} rows have {words}; only they are drawn ({option})"]
 
 
@@ -245,14 +250,14 @@ def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.n
         if not 0 <= weight < 1e6:
             raise UserError(f"--data.weights of {name!r} is the number of draws per epoch, not {weight}")
     if len(set(dict(wanted))) < len(wanted):
-        raise UserError("--data.weights names a dataset twice")
+        raise UserError("--data.weights names a dataset twice; name it once")
     if not wanted:
         return None, []
     weights = np.ones(len(manifest))
     for name, weight in wanted:
         weights[np.asarray(pc.fill_null(pc.equal(column, name), False))] = weight
     if not weights[rows].any():
-        raise UserError(f"--data.weights leaves out every row of split {split!r}")
+        raise UserError(f"--data.weights leaves out every row of split {split!r}; name a dataset that has some")
     counts = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
     return weights, [f"an epoch draws {counts}, other datasets once"]
 

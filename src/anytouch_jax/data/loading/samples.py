@@ -132,4 +132,7 @@ def fill_slot(
             last = error
         rng = np.random.default_rng([config.run.seed % 2**63, _REPLACE, step, slot, attempt])
         index = int(rng.integers(size))
-    raise SampleError(f"{TRIES} samples in a row cannot be read at step {step}; the last one is {last}")
+    raise SampleError(
+        f"{TRIES} samples in a row cannot be read at step {step}; the last one is {last}; "
+        "check the data with `anytouch data verify`"
+    )

@@ -283,7 +283,8 @@ def _placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
         file = os.path.normpath(manifest.files[manifest.source[row]].parent / cell)
         if not Path(file).is_relative_to(folder):
             raise ManifestError(
-                f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to be written"
+                f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to be written; "
+                "write it above its files"
             )
         return Path(file).relative_to(folder).as_posix()
 
@@ -430,7 +431,8 @@ def attach_text(
     old, matched = manifest.column("text"), len(at) - at.null_count
     if not matched:
         raise UserError(
-            f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}"
+            f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}; "
+            "name the right column with --key"
         )
     kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
     unused = len(caption_of) - len(at.drop_null().unique())
@@ -460,7 +462,7 @@ def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, st
     for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
         caption = " ".join((caption or "").split())
         if name is not None and caption and captions.setdefault(name, caption) != caption:
-            raise UserError(f"{path}, row {row}: {key} {shown(name)} has another caption in an earlier row")
+            raise UserError(f"{path}, row {row}: {key} {shown(name)} has another caption in an earlier row; keep one")
     return captions, key
 
 

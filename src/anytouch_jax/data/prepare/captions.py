@@ -513,7 +513,7 @@ def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Pa
     The page holds its images. Raises UserError if there are no captions.
     """
     if not captions:
-        raise UserError("there are no captions to look at")
+        raise UserError("there are no captions to look at; leave out --sheet, or ask for some")
     chosen = np.sort(np.random.default_rng(0).permutation(len(captions))[:count])
     title = f"{len(chosen)} of {len(captions)} captions"
     page = (

@@ -326,7 +326,10 @@ def mark_contact(
     marked = replace_column(marked, "label.contact", column)
     stays = ~free | background if drop else np.ones(len(manifest), bool)
     if not stays.any():
-        raise UserError("every frame is without contact by these thresholds; nothing would be left")
+        raise UserError(
+            "every frame is without contact by these thresholds; nothing would be left. "
+            "Lower --threshold or --share, or leave out --drop"
+        )
     used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
     masks = {"contact": contact == 1, "free": free, "unknown": np.isnan(contact), "dropped": ~stays,
              "labelled": np.isfinite(known)}  # fmt: skip
@@ -342,7 +345,9 @@ def threshold_of_rows(manifest: Manifest, thresholds: Mapping[str, float] | None
     sensors = manifest.table["sensor"].to_pylist()
     for name in thresholds or {}:
         if name not in sensors:
-            raise UserError(f"a threshold is given for the sensor {name!r}, which the manifest does not have")
+            raise UserError(
+                f"a threshold is given for the sensor {name!r}, which the manifest does not have; leave it out"
+            )
         if not np.isfinite(table[name]):
             raise UserError(f"the threshold of {name} must be a number, not {table[name]}")
     return np.array([table.get(name, DEFAULT_THRESHOLD) for name in sensors])
@@ -374,7 +379,8 @@ def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple
     name = reference or next((column for column in REFERENCES if column in columns), None)
     if name is None or name not in columns:
         raise UserError(
-            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with"
+            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with; "
+            "name one with --reference"
         )
     if name == "label.contact":
         return name, known_contact(manifest)
@@ -402,7 +408,7 @@ def contact_quality(
     relevant = manifest.text_column("split") != "background"
     used = np.flatnonzero(relevant & ~np.isnan(truth) & ~np.isnan(scores.score))
     if not used.size:
-        raise UserError(f"no row has both a value in {name} and a score")
+        raise UserError(f"no row has both a value in {name} and a score; name another column with --reference")
     score, sources, sensors = scores.score[used], scores.reasons[used], manifest.text_column("sensor")[used]
     predicted, positive = score > threshold_of_rows(manifest, thresholds, 0.0)[used], truth[used] > limit
 
@@ -430,7 +436,7 @@ def contact_sheet(manifest: Manifest, scores: ContactScores, path: str | Path, *
     """
     is_scored = ~np.isnan(scores.score) & (manifest.text_column("split") != "background")
     if not is_scored.any():
-        raise UserError("no frame has a contact score, so there is nothing to show")
+        raise UserError("no frame has a contact score, so there is nothing to show; leave out --picture")
     contact = scores.score > threshold_of_rows(manifest, thresholds, 0.0)
     bands = []
     for title, members, colour in (("no contact", ~contact, (60, 60, 230)), ("contact", contact, (80, 180, 60))):

@@ -164,7 +164,9 @@ def _export_videos(index: DatasetIndex) -> None:
             except images.ImageError:
                 index.skip("video that cannot be read", str(video))
             except OSError as error:
-                raise UserError(f"the frames of {video} cannot be written next to it: {error.strerror}") from None
+                raise UserError(
+                    f"the frames of {video} cannot be written next to it: {error.strerror}; make its folder writable"
+                ) from None
             else:
                 if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
                     index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
@@ -218,9 +220,11 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
         cells = dict(zip(names, row, strict=False))
         key = (_plain(cells.pop("object", None)), _plain((cells.pop("sequence", "") or "").replace("\\", "/")))
         if not any(key):
-            raise DatasetError(f"{path}, line {line}: there is neither an object nor a sequence")
+            raise DatasetError(f"{path}, line {line}: there is neither an object nor a sequence; fill in one")
         if key in lines:
-            raise DatasetError(f"{path}, line {line}: {', '.join(part for part in key if part)} is there twice")
+            raise DatasetError(
+                f"{path}, line {line}: {', '.join(part for part in key if part)} is there twice; keep one"
+            )
         lines[key] = {name: cell for name, cell in cells.items() if name}
     for name in (name for name in names if name not in (*LABEL_KEYS, *PLAIN_COLUMNS, "")):
         column = typed_label(pa.chunked_array([pa.array([cells.get(name) for cells in lines.values()], pa.string())]))

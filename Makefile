@@ -42,7 +42,7 @@ export-onnx: FRAMES ?= 1
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --data.background subtract --data.contact-only --data.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps $(DEMO_STEPS1) --batch 48
-# A longer demo lies beside the plain one, on the same scenes: stage1-3000, stage2-3000-600, report-3000-600.
+# A longer demo lies next to the plain one, on the same scenes: stage1-3000, stage2-3000-600, report-3000-600.
 DEMO_LONGER1 := $(if $(filter-out 400,$(DEMO_STEPS1)),-$(DEMO_STEPS1))
 DEMO_LONGER := $(DEMO_LONGER1)$(if $(DEMO_LONGER1)$(filter-out 200,$(DEMO_STEPS)),-$(DEMO_STEPS))
 DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --data.negatives same_sensor
@@ -116,7 +116,7 @@ bench: $(STAMP) ## speed against error: [PRESET= BATCH= OUT= WHAT="stage1 embed 
 	$(PY) -m experiments.benchmarks.run $(WHAT) --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-torch: $(TORCH)/.made
-bench-torch: $(STAMP) ## beside PyTorch, in a venv of its own: [PRESET= BATCH= OUT= WHAT=]
+bench-torch: $(STAMP) ## next to PyTorch, in a separate venv: [PRESET= BATCH= OUT= WHAT=]
 	$(PY) -m experiments.benchmarks.pytorch.run $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
@@ -129,11 +129,11 @@ translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's 
 	RUNS="$(RUNS)" STUDY="$(STUDY)" STEPS1="$(STEPS1)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.translation.study
 
 long-clips: RUN ?= runs/stage2
-long-clips: $(STAMP) $(scenes) ## longer clips, what they see beside what they cost: [RUN= DATA= QUICK=1 OUT=]
+long-clips: $(STAMP) $(scenes) ## longer clips, what they add and what they cost: [RUN= DATA= QUICK=1 OUT=]
 	RUN="$(RUN)" DATA="$(DATA)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.tables.long_clips
 
 export-onnx: $(ONNX)/.made
-export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a venv of its own: RUN= OUT= [FRAMES=1]
+export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a separate venv: RUN= OUT= [FRAMES=1]
 	$(PY) -m experiments.onnx_export.run --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
 
 experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
@@ -153,7 +153,7 @@ weights: $(STAMP) ## train the shipped encoder again: [CORPUS= REAL="a.csv b.csv
 	$(PY) -m experiments.encoders.train --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
 
 docs: $(DOCS)/.made
-docs: $(STAMP) ## the documentation site, in build/site, in a venv of its own
+docs: $(STAMP) ## the documentation site, in build/site, in a separate venv
 	$(PY) -m docs.generate
 	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 

@@ -146,7 +146,7 @@ def load_init(
                 ours, other = sorted(("gelu", "quick_gelu"), key=config.model.activation.__ne__)
                 notes.append(
                     f"the activation of {file} is not stored, this run uses {ours}: OpenAI's CLIP wants quick_gelu, "
-                    "most others gelu; put the config.json of the weights beside the file, or add "
+                    "most others gelu; put the config.json of the weights next to the file, or add "
                     f"--model.activation {other}"
                 )
             if init is None and not towers.keys() & {"visual_projection.weight", "visual.proj"}:

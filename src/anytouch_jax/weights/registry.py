@@ -137,7 +137,7 @@ def _page(card: Mapping[str, Any], notes: str) -> str:
     count, sensors = sum(card["parameters"].values()), card["trained_sensors"]
     subtracted = {
         "subtract": "It needs the picture of the untouched gel, which is subtracted.",
-        "either": "A picture of the untouched gel is subtracted where there is one. It works without.",
+        "either": "A picture of the untouched gel is subtracted if you give one. It also works without.",
         "keep": "The picture of the untouched gel is not used.",
     }[card["background"]]
     return f"""---

@@ -67,7 +67,7 @@ def refuse_unknown(stacks: Mapping[str, int], start: str = "") -> None:
         example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
             f"{start}the weights do not store the number of attention heads of {names}; write it to a config.json "
-            f'next to it, as {{"model": {{{example}}}}}, or write the file by `anytouch export --to safetensors`, '
+            f'in its folder, as {{"model": {{{example}}}}}, or write the file by `anytouch export --to safetensors`, '
             "which stores it"
         )
 

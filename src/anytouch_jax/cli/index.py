@@ -30,7 +30,7 @@ class DatasetOptions:
     lists: Path | None = None  # Folder of the dataset's list files, if they are not in ROOT.
     task: Literal["material", "rough"] = "material"  # touch_and_go: the task whose lists decide the split.
     fold: int = 0  # feel: the fold k whose split_<k>.npy decides the split.
-    export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or films.
+    export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
     sensor: str | None = None  # recordings: the sensor, by its name in the configuration or a new name.
     split_by: Literal["object", "recording"] = "object"
     """recordings: hold out whole objects, or recordings of each object."""

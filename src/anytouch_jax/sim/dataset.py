@@ -165,10 +165,11 @@ def _write_recording(
     photograph = caption = None
     if recording.has_photo:
         photograph = folder / "photo.jpg"
-        image = photo.photograph(thing, touch.place, scene.photo_rng(scenes, recording), scenes.size or 224)
+        rng = np.random.default_rng([scenes.seed, scene.PHOTO, recording.seed])
+        image = photo.photograph(thing, touch.place, rng, scenes.size or 224)
         _write_image(out / photograph, image)
     if recording.has_text:
-        caption = captions.caption(thing, scene.caption_rng(scenes, recording))
+        caption = captions.caption(thing, np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed]))
     background = None if kind == "field" else folder / "background.jpg"
     common |= {
         "image_path": photograph and photograph.as_posix(),
@@ -182,7 +183,9 @@ def _write_recording(
         if kind != "field":
             _write_image(out / path, take.image[t], int(recording.unit.quality))
         if field is not None:
-            _write_array(out / field, take.field[t])
+            data = io.BytesIO()
+            np.save(data, take.field[t], allow_pickle=False)
+            _write_bytes(out / field, data.getvalue())
         rows.append(
             common
             | {"path": path.as_posix(), "frame_index": t, "field_path": field and field.as_posix()}
@@ -246,12 +249,6 @@ def _write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     if not good:
         raise RuntimeError(f"OpenCV could not encode {path}")
     _write_bytes(path, data.tobytes())
-
-
-def _write_array(path: Path, array: np.ndarray) -> None:
-    data = io.BytesIO()
-    np.save(data, array, allow_pickle=False)
-    _write_bytes(path, data.getvalue())
 
 
 def _write_bytes(path: Path, data: bytes) -> None:

@@ -115,9 +115,8 @@ def simulate_clip(
         del labels["converged"]  # a few iterations do not converge
     keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
     if sensor.kind == "field":
-        measure = partial(
-            optics.measure_field, pitch=pitch, points=sensor.resolution[0], noise=clip.unit.noise, gel=gel
-        )
+        points, noise = sensor.resolution[0], clip.unit.noise
+        measure = partial(optics.measure_field, pitch=pitch, points=points, noise=noise, gel=gel)
         measured = jax.vmap(lambda *maps: measure(*maps[:-1], key=maps[-1]))(
             contact.displacement, sheared.displacement, contact.pressure, sheared.traction, keys[1:]
         )
@@ -139,22 +138,15 @@ def _sheared(
 ) -> shear.Shear:
     """Return the tangential state of every frame, computed from the previous one."""
 
+    slide = partial(shear.shear_step, gel=gel, pitch=pitch, friction=clip.friction, fidelity=fidelity,
+                    modulus_object=clip.modulus, centre=clip.unit.offset)  # fmt: skip
+
     def step(state: shear.Shear, frame: tuple[PressResult, Array, Array]) -> tuple[shear.Shear, shear.Shear]:
-        state = shear.shear_step(
-            state,
-            frame[0],
-            frame[1],
-            gel,
-            pitch,
-            clip.friction,
-            fidelity=fidelity,
-            modulus_object=clip.modulus,
-            centre=clip.unit.offset,
-            squeezed=frame[2],
-        )
+        state = slide(state, frame[0], frame[1], squeezed=frame[2])
         return state, state
 
-    start = shear.at_rest((contact.pressure.shape[1], contact.pressure.shape[2]), contact.pressure.dtype)
+    _, rows, columns = contact.pressure.shape
+    start = shear.at_rest((rows, columns), contact.pressure.dtype)
     change = jnp.diff(squeezed, axis=0, prepend=jnp.zeros_like(squeezed[:1]))
     return jax.lax.scan(step, start, (contact, gel_motion(clip), change))[1]
 

@@ -27,7 +27,7 @@ Motion = Literal["hold", "slide", "twist"]
 FIELDS = ("displacement", "pressure", "shear")
 _MAX_SIZE = 4096  # pixels of a side
 # Tags that separate the random streams of a seed.
-_OBJECTS, _TOUCH, _RECORDING, _PHOTO, _CAPTION, _UNIT = 1, 2, 3, 4, 5, 6
+_OBJECTS, _TOUCH, _RECORDING, PHOTO, CAPTION, _UNIT = 1, 2, 3, 4, 5, 6
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,7 @@ def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
 def _draw_gesture(scenes: Scenes, rng: np.random.Generator, like: Gesture | None = None) -> Gesture:
     """Return a gesture. With `like`, its depth is similar and its speed and motion are drawn."""
     low, high = scenes.depth
-    depth = (
-        float(rng.uniform(low, high)) if like is None else float(np.clip(like.depth * rng.uniform(0.7, 1.3), low, high))
-    )
+    depth = float(rng.uniform(low, high) if like is None else np.clip(like.depth * rng.uniform(0.7, 1.3), low, high))
     motion: Motion = ("hold", "slide", "slide", "twist", "twist")[int(rng.integers(5))]
     angle, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.4, 2.5)
     turn = rng.choice([-1, 1]) * rng.uniform(math.radians(4), math.radians(20))
@@ -190,8 +188,7 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     if scenes.units == "one":
         unit = shared_unit(scenes, sensor)
     if SENSORS[sensor].kind == "field":  # it has no camera
-        plain = {"mirror": np.ones(2, np.float32), "window": np.zeros(2, np.float32), "zoom": np.float32(1)}
-        unit = unit._replace(**plain)
+        unit = unit._replace(mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1))
     gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
     if scenes.grade == "coarse":
         gesture = _draw_gesture(scenes, rng, gesture)
@@ -208,8 +205,8 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
 def shared_unit(scenes: Scenes, sensor: str) -> Unit:
     """Return the unit of `sensor` for units "one": not mirrored, not rotated, not moved."""
     rng = np.random.default_rng([scenes.seed, _UNIT, list(SENSORS).index(sensor)])
-    straight = {"mirror": np.ones(2, np.float32), "rotation": np.float32(0), "offset": np.zeros(2, np.float32)}
-    return draw_unit(SENSORS[sensor], rng)._replace(**straight)
+    unit, none = draw_unit(SENSORS[sensor], rng), np.zeros(2, np.float32)
+    return unit._replace(mirror=none + 1, rotation=none[0], offset=none)
 
 
 def trajectory(frames: int, gesture: Gesture) -> tuple[Array, Array]:
@@ -245,25 +242,12 @@ def directions(recording: Recording) -> dict[str, str]:
     steps = np.diff(trajectory(len(touching), recording.gesture._replace(lift=-1.0))[0], axis=0)
     *slid, turn = steps[touching[1:] & touching[:-1]].sum(0)
     turn *= float(unit.mirror[0] * unit.mirror[1])
-    motion = "hold"
+    motion, twist, slide = "hold", "none", "none"
     if recording.gesture.motion == "twist" and abs(turn) > MOVES[1]:
-        motion = "twist"
+        motion, twist = "twist", "clockwise" if turn > 0 else "counterclockwise"
     elif recording.gesture.motion == "slide" and math.hypot(*slid) > MOVES[0]:
         motion = "slide"
-    twist = "none" if motion != "twist" else "clockwise" if turn > 0 else "counterclockwise"
-    slide = "none"
-    if motion == "slide":
         c, s = math.cos(float(unit.rotation)), math.sin(float(unit.rotation))
         x, y = np.array([[c, -s], [s, c]]) @ np.asarray(slid) * np.asarray(unit.mirror)
         slide = ("right", "down", "left", "up")[round(math.atan2(y, x) / (math.pi / 2)) % 4]
     return {"label.motion": motion, "label.twist": twist, "label.slide": slide}
-
-
-def photo_rng(scenes: Scenes, recording: Recording) -> np.random.Generator:
-    """Return the random generator of a recording's photograph."""
-    return np.random.default_rng([scenes.seed, _PHOTO, recording.seed])
-
-
-def caption_rng(scenes: Scenes, recording: Recording) -> np.random.Generator:
-    """Return the random generator of a recording's caption."""
-    return np.random.default_rng([scenes.seed, _CAPTION, recording.seed])

@@ -260,7 +260,7 @@ def test_the_vignette_darkens_a_dent_as_it_darkens_the_untouched_gel():
 
 def test_dirt_and_the_fixed_pattern_lie_on_every_picture_of_a_unit():
     specks = PLAIN.specks.copy()
-    specks[0] = [0.5, 0, 0.8, 0.5, 0.5, 0.5, 1]
+    specks[0] = [0.5, 0, 0.8, 0.5, 0.5, 0.5]
     dirty = PLAIN._replace(specks=specks, grain=np.array([2, 7], np.float32))
     dirt = levels(draw(FLAT, STILL, dirty, KEY)) - levels(draw(FLAT, STILL, PLAIN, KEY))
     assert dirt[23:25, 47:49].mean() < -20 and abs(dirt[:, :24].mean()) < 1 and 1.5 < dirt[:, :24].std() < 2.6

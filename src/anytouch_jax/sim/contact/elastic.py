@@ -60,14 +60,14 @@ class Plan:
 
     def even(self, transform: Array, spectrum: Array) -> Array:
         """Return the transform of a field's convolution with a kernel that is even in x and in y."""
-        return transform * (_lifted(spectrum) if self.matmul else _unfold(spectrum, self.padded[0], 1, jnp))
+        return transform * (spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1, jnp))
 
     def odd(self, transform: Array, spectrum: Array) -> Array:
         """Return the transform of a field's convolution with a kernel that is odd in x and in y."""
         if not self.matmul:
             return transform * _unfold(spectrum, self.padded[0], -1, jnp)
         sign = jnp.array([[-1, 1], [1, -1]], transform.dtype)[:, :, None, None]  # sin(a - b), twice, and i squared
-        return sign * transform[::-1, ::-1] * _lifted(spectrum)
+        return sign * transform[::-1, ::-1] * spectrum[None, None]
 
     def spectrum(self, quadrant: Any, parity: int = 1, xp: ModuleType = np) -> Any:
         """Return the spectrum of a kernel from its (rows, columns) coefficients at offsets >= 0."""
@@ -121,10 +121,6 @@ def _join(parts: Array, axis: int) -> Array:
     """Invert `_split` up to a factor of two: parts (2, ...) -> ..., concatenated along `axis`."""
     even, odd = parts[0], parts[1]
     return jnp.concatenate([jnp.flip(even - odd, axis), even + odd], axis)
-
-
-def _lifted(spectrum: Array) -> Array:
-    return spectrum[None, None]
 
 
 def _unfold(half: Any, size: int, parity: int, xp: ModuleType) -> Any:

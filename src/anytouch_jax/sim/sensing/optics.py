@@ -71,7 +71,7 @@ def backdrop(sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = No
     image = jnp.einsum("ih,hwc,jw->cij", rows, unit.base, columns)
     bits = jax.random.bits(jax.random.key(unit.grain[1].astype(jnp.uint32)), resolution, jnp.uint32)
     grain = unit.grain[0] / 255 * _noise(bits)
-    u0, v0, radius, *absorbed, _ = jnp.split(unit.specks, 7, 1)  # dirt and wear
+    u0, v0, radius, *absorbed = jnp.split(unit.specks, 6, 1)  # dirt and wear
     across = jnp.exp(-0.5 * ((place.x[None] - u0 * sensor.field[1] / 2) / radius) ** 2)
     along = jnp.exp(-0.5 * ((place.y[None] - v0 * sensor.field[0] / 2) / radius) ** 2)
     left = 1 - jnp.einsum("ki,kc,kj->cij", along, jnp.concatenate(absorbed, 1), across)
@@ -111,11 +111,13 @@ def render(
     model, place = look(sensor), picture_view(sensor, unit, resolution)
     photometry = model.photometry if shadow else model.plain
     matrices = _resample(displacement.shape, pitch, place)
-    nx, ny = shading.tilt(*_slopes(displacement, matrices, pitch, sensor, unit), photometry.steepest)
+    skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
+    nx, ny = shading.tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
     glow: tuple[Array, ...] | None = None
     if shadow and np.any(np.asarray(photometry.halo)):
-        halo = _halo(displacement, matrices, pitch, sensor)
-        lit = (*rotated(halo[0], halo[1], unit.light_angle), halo[2])
+        soft = _blurred(displacement, sensor.halo / pitch)
+        depth = matrices[0] @ soft @ matrices[2].T
+        lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
         glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
     ink = None
     if sensor.markers is not None:
@@ -186,22 +188,15 @@ def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrice
     return *rows, *interpolation.spline(place.x / pitch + (shape[1] - 1) / 2, shape[1])
 
 
-def _slopes(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor, unit: Unit) -> tuple[Array, Array]:
-    """Return slopes (H, W) along x and y at the pixels, smoothed by the skin and rotated with the unit's lights."""
+def _slopes(field: Array, matrices: Matrices, pitch: Any) -> tuple[Array, Array]:
+    """Return slopes (H, W) along x and y at the pixels."""
     ay, dy, ax, dx = matrices
-    blur = jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05)
-    by, bx = (interpolation.blur(n, blur) for n in displacement.shape)
-    displacement = by @ displacement @ bx.T
-    return rotated(ay @ displacement @ dx.T / pitch, dy @ displacement @ ax.T / pitch, unit.light_angle)
+    return ay @ field @ dx.T / pitch, dy @ field @ ax.T / pitch
 
 
-def _halo(displacement: Array, matrices: Matrices, pitch: Any, sensor: Sensor) -> tuple[Array, ...]:
-    """Return slopes and depth of the dent blurred over the sensor's `halo` mm, at the pixels."""
-    ay, dy, ax, dx = matrices
-    by, bx = (interpolation.blur(n, sensor.halo / pitch) for n in displacement.shape)
-    soft = by @ displacement @ bx.T
-    rows = ay @ soft
-    return rows @ dx.T / pitch, dy @ soft @ ax.T / pitch, rows @ ax.T
+def _blurred(field: Array, sigma: Any) -> Array:
+    rows, columns = (interpolation.blur(n, sigma) for n in field.shape)
+    return rows @ field @ columns.T
 
 
 def _ink(

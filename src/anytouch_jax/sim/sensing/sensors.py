@@ -121,13 +121,6 @@ SENSORS: dict[str, Sensor] = {
 }  # fmt: skip
 
 
-def find_sensor(name: str) -> Sensor:
-    """Return the sensor with this name. Raises UserError that lists the known ones."""
-    if name not in SENSORS:
-        raise UserError(f"there is no simulated sensor {name!r}; known are {', '.join(SENSORS)}")
-    return SENSORS[name]
-
-
 def _stored() -> dict[str, Array]:
     with (files("anytouch_jax.sim.sensing") / "looks.npz").open("rb") as file, np.load(file) as pack:
         return {name: np.asarray(pack[name]) for name in pack.files}

@@ -32,7 +32,7 @@ class Unit(NamedTuple):
     lights: Leaf  # (4,) shift and stretch along u and v of the place that the lights see
     uneven: Leaf  # (5, 3) relative brightness on u, v, u^2, uv, v^2
     focus: Leaf  # mm, blur of the lens
-    specks: Leaf  # (SPECKS, 7): place (u, v), radius mm, share of each colour that dirt or wear absorbs, sharpness
+    specks: Leaf  # (SPECKS, 6): place (u, v), radius mm, share of each colour that dirt or wear absorbs
     grain: Leaf  # (2,) standard deviation (0 to 255) and seed of the fixed pattern of a camera and a gel
     thickness: Leaf  # factor on the gel's thickness
     modulus: Leaf  # factor on the gel's modulus
@@ -57,7 +57,7 @@ def identity_unit(sensor: Sensor) -> Unit:
     """Return the nominal unit of a sensor: no markers, no noise, the whole field, nothing moved."""
     return _unit(
         base=bases(sensor)[0], tint=np.ones(3), gain=np.ones(3), light_angle=0, lights=[0, 0, 1, 1],
-        uneven=np.zeros((5, 3)), focus=0, specks=np.zeros((SPECKS, 7)) + np.eye(7)[2], grain=np.zeros(2),
+        uneven=np.zeros((5, 3)), focus=0, specks=np.zeros((SPECKS, 6)) + np.eye(6)[2], grain=np.zeros(2),
         thickness=1, modulus=1, marked=0, marker_pitch=1, marker_phase=np.zeros(2), marker_size=1, zoom=1,
         window=np.zeros(2), mirror=np.ones(2), rotation=0, offset=np.zeros(2), noise=0, quality=95,
     )  # fmt: skip
@@ -90,8 +90,7 @@ def draw_unit(sensor: Sensor, rng: np.random.Generator) -> Unit:
         focus=rng.uniform(0.02, 0.15),
         specks=np.concatenate([
             rng.uniform(-1, 1, (SPECKS, 2)), np.exp(rng.uniform(math.log(0.06), math.log(0.9), (SPECKS, 1))),
-            dirt[:, None] * (rng.normal(0.06, 0.12, (SPECKS, 1)) + rng.normal(0, 0.03, (SPECKS, 3))),
-            np.ones((SPECKS, 1))], 1),
+            dirt[:, None] * (rng.normal(0.06, 0.12, (SPECKS, 1)) + rng.normal(0, 0.03, (SPECKS, 3)))], 1),
         # Measured: 0.5 to 2.5 levels of fine structure in an untouched picture.
         grain=[np.exp(rng.uniform(math.log(0.3), math.log(2))), rng.integers(2**24)],
         thickness=np.exp(rng.normal(0, 0.08)),

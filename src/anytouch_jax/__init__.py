@@ -28,6 +28,7 @@ _HOMES = {
     "weights.registry": "list_encoders",
     "weights.tree": "interpolate",
     "encoder.encoder": "Encoder load_encoder random_encoder",
+    "encoder.family": "FamilyEncoder",
     "encoder.examples": "example_touches",
     "encoder.preprocess": "Preprocess",
 }

@@ -28,7 +28,7 @@ from anytouch_jax.ops import losses, tokens
 from anytouch_jax.train.optim import learning_rate, optimizer
 from anytouch_jax.train.step import TrainState, init_state, make_step, merge
 from anytouch_jax.weights import convert
-from tests.parity import weights
+from tests.parity import families, weights
 from tests.parity.golden_files import (
     GRADIENT,
     PARAMETER,
@@ -48,14 +48,17 @@ Params = dict[str, Any]
 
 def run(folder: Path) -> list[Row]:
     """Compare every case of `folder`; a case or an array that is not understood is a failing row."""
-    rows = [row for case in read_cases(folder) for row in run_case(case)]
-    paths = sorted(folder.glob("*.pth"))
+    found = read_cases(folder)
+    rows = [row for case in found for row in run_case(case)]
+    others = {name for case in found for name in case.info.get("files", ())}
+    paths = sorted(path for path in folder.glob("*.pth") if path.name not in others)
     return rows + [row for path in paths for row in _tried(weights.checkpoint, Case(path.name, folder, {}))]
 
 
 def run_case(case: Case) -> list[Row]:
     """Compare one case; what this version cannot follow is a failing row that says why."""
     runner = next((fn for pattern, fn in _RUNNERS.items() if re.match(pattern, case.name)), None)
+    runner = families.compare if "architecture" in case.info else runner
     if runner is None:
         case.fail("-", "not a case this version understands")
         return case.rows
@@ -280,4 +283,6 @@ _RUNNERS: dict[str, Callable[[Case], None]] = {
     r"K_weight_loading_map": weights.loading_map,
     r"K_manifest": weights.manifest,
     r"stage[12]_params": weights.parameters,
+    r"preprocess_full_size": families.preprocess,
+    r"manifest_full_size": families.full_size,
 }

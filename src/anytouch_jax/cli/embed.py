@@ -155,7 +155,7 @@ def frames_input(encoder: Encoder, options: FrameOptions, data: Path) -> tuple[i
 
 def log_universal(encoder: Encoder, options: FrameOptions) -> None:
     """Warn about a missing --sensor, after the work: a mistake gets one sentence only."""
-    if options.sensor is None:
+    if options.sensor is None and len(encoder.config.model.sensors) > 1:
         names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
         log(f"no --sensor was given, so the universal tokens were used. Known sensors: {names}.")
 

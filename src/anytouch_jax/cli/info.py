@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, from_json
 from anytouch_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from anytouch_jax.weights.keymaps import Weights
 
 _TABLES = (".csv", ".parquet")
 _SPREAD_BYTES = 1 << 28  # the features of larger files are not read
@@ -47,6 +51,16 @@ def _lines(path: Path) -> list[str]:
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
+    weights = None
+    if path.is_dir() or (suffix in _WEIGHTS and not description.is_file()):
+        from anytouch_jax.weights.families import load_family
+
+        model, weights = load_family(path)
+        if model is not None:
+            from anytouch_jax.encoder.family import describe_family, family_encoder
+
+            lines = describe_family(family_encoder(model, str(path), path))
+            return [f"{path}: {lines[0]}", *lines[1:]]
     if path.is_dir():
         return _folder(path)
     if description.is_file():
@@ -59,7 +73,7 @@ def _lines(path: Path) -> list[str]:
     if suffix == ".npz" and (lines := _arrays(path)):
         return lines
     if suffix in _WEIGHTS or path.name.endswith(".index.json"):
-        return _weights(path)
+        return _weights(path, weights)
     known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
     raise UserError(f"{path} has no known format. Known are {known}.")
 
@@ -133,13 +147,14 @@ def _sensors(model: ModelConfig, trained: Sequence[str] | None) -> str:
     return f"trained sensors: {', '.join(trained) or 'none'}. All others get the universal tokens."
 
 
-def _weights(path: Path) -> list[str]:
+def _weights(path: Path, weights: Weights | None = None) -> list[str]:
     import numpy as np
 
     from anytouch_jax.weights import load, safetensors
     from anytouch_jax.weights.convert import detect_layout
 
-    weights, metadata = load.read_weights(path), safetensors.read_file_metadata(path)
+    weights = load.read_weights(path) if weights is None else weights
+    metadata = safetensors.read_file_metadata(path)
     layout = detect_layout(weights)
     names = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}.get(
         layout, f"the authors' ({layout})"

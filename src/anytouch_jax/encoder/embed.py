@@ -85,7 +85,16 @@ def embed_rows(
 
     def touches() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
-        for row_ids, part in evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"):
+        for row_ids, part in evaluation(
+            manifest,
+            rows,
+            config,
+            kind,
+            frames=frames,
+            unknown="universal",
+            prepare=encoder.prepare,
+            like=encoder.blank,
+        ):
             ids.append(row_ids)
             clips = part.clip[: len(row_ids)]
             clips = clips if edit is None else edit(clips, row_ids)

@@ -41,7 +41,7 @@ _CHECKED = (1, 5)  # batch sizes
 _EXAMPLE = """import pathlib
 import jax
 run = jax.export.deserialize(bytearray(pathlib.Path({name!r}).read_bytes()))
-features = jax.jit(run.call)(frames, sensor)  # uint8 (B, {frames}, {size}, {size}, 3), int32 (B,)"""
+features = jax.jit(run.call)(frames, sensor)  # {shape}, int32 (B,)"""
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,17 @@ class Exported:
     _run: Any = field(repr=False)
 
     def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
-        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3).
+        """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family prepares them.
 
         `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape or type, and for a sensor
         that the model does not know.
         """
         frames = np.asarray(frames)
-        wanted = (self.about["frames"], self.about["image_size"], self.about["image_size"], 3)
-        if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
+        side, kind = self.about["image_size"], self.about.get("frame_dtype", "uint8")
+        wanted = (self.about["frames"], *self.about.get("frame_shape", (side, side, 3)))
+        if frames.dtype != kind or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
             shape = ", ".join(str(size) for size in wanted)
-            raise UserError(f"touches must be uint8 RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
+            raise UserError(f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
         rows = rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
         return np.asarray(self._run(frames, rows))
 
@@ -130,28 +131,29 @@ def export(
         "platforms": list(platforms),
         **call_of(encoder, frames=frames, width=width, pooling=pooling, join=join),
         "worst_difference": differs,
-        "example": _EXAMPLE.format(name=path.name, frames=frames, size=model.image_size),
+        "example": _EXAMPLE.format(name=path.name, shape=_shape(encoder, frames)),
     }
     atomic_write(path, data)
     atomic_write(describes(path), json.dumps(about, indent=2) + "\n")
     return about
 
 
+def _shape(encoder: Encoder, frames: int) -> str:
+    """Return type and shape of the input, as text."""
+    return f"{encoder.blank.dtype} (B, {frames}, {', '.join(map(str, encoder.blank.shape))})"
+
+
 def call_of(
     encoder: Encoder, *, frames: int, width: int, pooling: Pooling = "class", join: Join = "mean"
 ) -> dict[str, Any]:
     """Return how an exported encoder is called: its inputs, its outputs, the row of each sensor."""
-    model, side = encoder.config.model, encoder.config.model.image_size
-    subtracted = ", background-subtracted: clip(frame - gel + 128, 0, 255)" if encoder.subtracts else ""
+    model = encoder.config.model
     return {
         "source": encoder.source,
-        "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){subtracted}; sensor: int32 (B,)",
         "output": f"features: float32 (B, {width}), not normalised",
-        "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the shorter "
-        f"side is above {side} pixels, else INTER_LINEAR"
-        + ("; the background is subtracted before" if encoder.subtracts else ""),
+        **encoder.input_form(frames),
         "frames": frames,
-        "image_size": side,
+        "image_size": model.image_size,
         "features": width,
         "background": encoder.config.data.background,
         "pooling": pooling,
@@ -168,11 +170,9 @@ def _here() -> str:
 
 
 def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: Pooling, join: Join) -> bytes:
-    from anytouch_jax.encoder.encoder import touch_features
-
-    side, (batch,) = encoder.config.model.image_size, jax_export.symbolic_shape("b")
-    run = partial(touch_features, encoder.params, net=encoder.net, pooling=pooling, join=join)
-    touches = jax.ShapeDtypeStruct((batch, frames, side, side, 3), np.uint8)
+    (batch,), blank = jax_export.symbolic_shape("b"), encoder.blank
+    run = partial(encoder.traceable(pooling, join), encoder.params)
+    touches = jax.ShapeDtypeStruct((batch, frames, *blank.shape), blank.dtype)
     rows = jax.ShapeDtypeStruct((batch,), np.int32)
     return bytes(jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize())
 
@@ -180,9 +180,10 @@ def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: 
 def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: Join) -> tuple[float, int]:
     """Return the largest difference from the live model, as a share of the largest feature, and the feature count."""
     run = jax.jit(jax_export.deserialize(bytearray(data)).call)
-    model, rng, worst, width = encoder.config.model, np.random.default_rng(0), 0.0, 0
+    model, rng, worst, width, blank = encoder.config.model, np.random.default_rng(0), 0.0, 0, encoder.blank
     for count in _CHECKED:
-        clips = rng.integers(0, 256, (count, frames, model.image_size, model.image_size, 3), np.uint8)
+        clips = rng.integers(0, 256, (count, frames, *blank.shape), np.uint8)
+        clips = clips if blank.dtype == np.uint8 else clips.astype(blank.dtype) / 255
         rows = rng.integers(0, len(model.sensors), count).astype(np.int32)
         live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
         exported = np.asarray(run(clips, rows))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.data.images import to_rgb
-from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation
+from anytouch_jax.data.transforms import Flip, orient_frame
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -29,7 +29,7 @@ class Preprocess:
     def __init__(
         self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
     ) -> None:
-        self._size = encoder.config.model.image_size
+        self._prepare = encoder.prepare
         self._subtracts = encoder.needs_background or (encoder.subtracts and background is not None)
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
         self._background = None
@@ -37,12 +37,12 @@ class Preprocess:
             self._background = self._orient(to_rgb(np.asarray(background), "the background"))
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
-        """Return a frame as RGB u8 (size, size, 3).
+        """Return a frame as RGB u8 (size, size, 3), or as an encoder of another family reads it.
 
         `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
         """
         frame = np.ascontiguousarray(self._orient(to_rgb(np.asarray(frame), "the frame")))
         if self._subtracts:
             self._background = frame if self._background is None else self._background
-            frame = subtract_background([frame], self._background)[0]
-        return touch_evaluation([frame], self._size)[0]
+            return self._prepare(frame, self._background)
+        return self._prepare(frame)

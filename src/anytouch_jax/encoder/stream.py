@@ -14,7 +14,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ import numpy as np
 
 from anytouch_jax.data.images import frame_time, open_video, to_rgb
 from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
-from anytouch_jax.encoder.encoder import Encoder, check_frames, touch_features
+from anytouch_jax.encoder.encoder import Encoder, check_frames
 from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 
@@ -197,9 +196,9 @@ def compile_for_one(
     encoder: Encoder, sensor: int, frames: int, pooling: Pooling = "class", join: Join = "mean"
 ) -> Callable[[jax.Array], jax.Array]:
     """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device."""
-    side = encoder.config.model.image_size
-    run = jax.jit(partial(touch_features, net=encoder.net, pooling=pooling, join=join))
-    given = jax.device_put((encoder.params, np.zeros((1, frames, side, side, 3), np.uint8), np.full(1, sensor, "i4")))
+    run = jax.jit(encoder.traceable(pooling, join))
+    touch = np.tile(encoder.blank, (1, frames, 1, 1, 1))
+    given = jax.device_put((encoder.params, touch, np.full(1, sensor, "i4")))
     compiled = run.lower(*given).compile()
     compiled(*given).block_until_ready()
     params, _, row = given

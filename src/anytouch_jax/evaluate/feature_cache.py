@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -187,7 +186,7 @@ def _content(table: Manifest, parameters: str, order: Order) -> dict[str, Any]:
 
 def encoder_digest(encoder: Encoder) -> str:
     """Return SHA-256 over the parameters and the model config."""
-    digest = hashlib.sha256(json.dumps(asdict(encoder.config.model), sort_keys=True).encode())
+    digest = hashlib.sha256(encoder.contract.encode())
     leaves = jax.tree_util.tree_leaves_with_path(encoder.params)
     for name, leaf in sorted((jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves):
         array = np.ascontiguousarray(leaf)
@@ -325,7 +324,7 @@ def sources(
     encoders = {str(model): load_encoder(model) for model in models if not isinstance(model, FeatureSource)}
     if controls:
         first = next((one for one in (*encoders.values(), *(source.encoder for source in several)) if one), None)
-        encoders[RANDOM] = random_encoder(first.config if first else preset("tiny"))
+        encoders[RANDOM] = first.untrained() if first else random_encoder(preset("tiny"))
     for name, encoder in encoders.items():
         check_frames(encoder.config.model, least)
         store = encoder_features(encoder, table, order=order, folder=cache, **encoding)

@@ -101,7 +101,11 @@ class Part:
 
     def init(self, key: Array) -> Params:
         """Return fresh float32 parameters, by the rules of `Net.init`."""
-        return _drawn(nnx.to_pure_dict(_skeleton(self.kind, self.options)[1]), self.options.model, key)
+        return _drawn(self.abstract(), self.options.model, key)
+
+    def abstract(self) -> Params:
+        """Return the tree of jax.ShapeDtypeStruct of `init`, without allocating."""
+        return nnx.to_pure_dict(_skeleton(self.kind, self.options)[1])
 
     def apply(self, params: Params, *args: Any) -> Any:
         """Call the module."""

@@ -165,9 +165,11 @@ class Block(nnx.Module):
         return x + self.mlp(self.norm2(x))
 
 
-def stacked_blocks(stack: Stack, model: ModelConfig, eps: float, act: Activation) -> Block:
+def stacked_blocks(
+    stack: Stack, model: ModelConfig, eps: float, act: Activation, kind: type[Block] = Block
+) -> Block:  # fmt: skip
     """Return `stack.depth` blocks as one, every parameter with a leading axis of that length."""
-    return nnx.vmap(lambda: Block(stack, model, eps, act), axis_size=stack.depth)()
+    return nnx.vmap(lambda: kind(stack, model, eps, act), axis_size=stack.depth)()
 
 
 def run_blocks(blocks: Block, x: Array, *, remat: bool, causal: bool = False, mask: Array | None = None) -> Array:

@@ -98,15 +98,19 @@ def to_params(
         if key not in unread and not any(re.fullmatch(pattern, key) for pattern in left_out)
     }
     check_arrays(f"{layout} weights", arrays, file_shapes(entries, shapes))
-    flat: dict[str, Any] = {
-        name: np.empty(shapes[name], np.float32) for name in dict.fromkeys(entry.name for entry in entries)
-    }
-    for entry in entries:  # each number is copied once
-        array = arrays[entry.key] if entry.part is None else np.split(arrays[entry.key], 3)[entry.part]
-        flat[entry.name][... if entry.layer is None else entry.layer] = entry.read(array)
+    flat = fill(entries, arrays, shapes)
     for key, name in head.items():
         flat[name] = np.array(weights[key].T, np.float32, order="C")
     return nest(flat)
+
+
+def fill(entries: Sequence[Entry], arrays: Weights, shapes: Mapping[str, Shape]) -> dict[str, np.ndarray]:
+    """Return our parameters by name, in float32, from the arrays of a file. Each number is copied once."""
+    flat = {name: np.empty(shapes[name], np.float32) for name in dict.fromkeys(entry.name for entry in entries)}
+    for entry in entries:
+        array = arrays[entry.key] if entry.part is None else np.split(arrays[entry.key], 3)[entry.part]
+        flat[entry.name][... if entry.layer is None else entry.layer] = entry.read(array)
+    return flat
 
 
 def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False) -> dict[str, np.ndarray]:

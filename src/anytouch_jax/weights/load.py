@@ -74,11 +74,14 @@ class Start(NamedTuple):
     trained_sensors: tuple[str, ...]
 
 
-def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool = False) -> Loaded:
+def load_model(
+    path: str | Path, *, step: int | None = None, stored_rows: bool = False, weights: Weights | None = None
+) -> Loaded:
     """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
 
     `step` chooses a checkpoint of a run, the latest by default. With `stored_rows` the rows of a file for sensors
-    outside its training are unchanged, as a conversion needs them. Raises UserError.
+    outside its training are unchanged, as a conversion needs them. `weights` are those of the file, if they are read
+    already. Raises UserError.
     """
     path = registry.locate(path)
     if not path.exists():
@@ -87,14 +90,14 @@ def load_model(path: str | Path, *, step: int | None = None, stored_rows: bool =
             f"{', '.join(registry.list_encoders())}"
         )
     trained: Any
-    if path.is_dir() and not any(path.glob("*.pth")) and (checkpoint.is_run(path) or not _weights_files(path)):
+    if is_run_folder(path):
         params, text, metadata = checkpoint.load_params(path, step)
         config: Config = from_json(text)
         trained = metadata.get("seen")
         drawn, from_run = config.objective.universal_start + config.objective.universal_end > 0, True
     else:
         path = find_weights_file(path)
-        weights = read_weights(path)
+        weights = read_weights(path) if weights is None else weights
         model, file_metadata = model_of_file(path, weights), read_file_metadata(path)
         background: Any = file_metadata.get(BACKGROUND_KEY, "keep")
         params, config = to_params(weights, model), Config(model, data=DataConfig(background=background))
@@ -257,6 +260,11 @@ def _replace(params: Params, parts: Params) -> Params:
     return {**params, **parts}
 
 
+def is_run_folder(path: Path) -> bool:
+    """Return whether a folder is that of a run or of a checkpoint, and not of weights files."""
+    return path.is_dir() and not any(path.glob("*.pth")) and (checkpoint.is_run(path) or not _weights_files(path))
+
+
 def find_weights_file(path: str | Path) -> Path:
     """Return the weights file in a downloaded folder, or the file itself. Raises UserError if there is none."""
     path = Path(path)
@@ -317,7 +325,7 @@ def _strip_prefixes(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _read_parts(index: Path) -> dict[str, np.ndarray]:
     """Return the arrays of all files that an index names. Raises WeightsError for missing files and arrays."""
-    homes = _object(_read_json(index), "weight_map")
+    homes = _object(read_settings(index), "weight_map")
     if not homes or not all(isinstance(part, str) and Path(part).name == part for part in homes.values()):
         raise WeightsError(f"{index} is no index of weights: it needs weight_map, the file of each array")
     arrays: dict[str, np.ndarray] = {}
@@ -356,10 +364,10 @@ def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[
 
 def _folder_config(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the config.json in the folder of weights, of a run or of HF, and the model of OpenCLIP's file."""
-    config = _read_json(Path(path).with_name("config.json"))
+    config = read_settings(Path(path).with_name("config.json"))
     if config.get("model_type") == "clip_vision_model":  # of the vision tower alone
         config = {"vision_config": config} | config
-    return config, _object(_read_json(Path(path).with_name("open_clip_config.json")), "model_cfg")
+    return config, _object(read_settings(Path(path).with_name("open_clip_config.json")), "model_cfg")
 
 
 def _stored_heads(path: str | Path, config: dict[str, Any], openclip: dict[str, Any]) -> dict[str, int]:
@@ -409,7 +417,7 @@ def clip_activation(path: str | Path) -> str | None:
     return next(iter(names), None)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_settings(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file, {} if there is no file. Raises WeightsError."""
     if not path.is_file():
         return {}

@@ -207,10 +207,13 @@ _BUILDERS: dict[str, Callable[..., Any]] = {
     "torch.Size": lambda values=(): tuple(values),
     "torch.device": lambda *_: _Other(),
     "collections.OrderedDict": lambda pairs=(): {_key(key): value for key, value in pairs},
+    "collections.defaultdict": lambda *_: {},
     "argparse.Namespace": _Other,
 }
+_STATES = ("torch.optim.", "tactile_ssl.model.custom_scheduler.")  # classes of a training state, which is not read
 _INERT = {f"torch.{kind}" for kind in _STORAGES}
 _INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")}
+_INERT |= {"builtins.dict", "__builtin__.dict"}
 # Operations that only make data. BYTEARRAY8 is left out: it allocates whatever size it is given.
 _DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4
     FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING BINBYTES
@@ -262,7 +265,7 @@ class _Unpickler(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module}.{name}"
-        if full not in _BUILDERS and full not in _INERT:
+        if full not in _BUILDERS and full not in _INERT and not full.startswith(_STATES):
             raise _refused(full)
         return _Name(full)
 
@@ -280,9 +283,10 @@ class _Unpickler(pickle._Unpickler):
 
     def load_reduce(self) -> None:
         args, function = self.stack.pop(), self.stack.pop()
-        if not isinstance(function, _Name) or function not in _BUILDERS or not isinstance(args, tuple):
+        is_state = isinstance(function, _Name) and function.startswith(_STATES)
+        if not isinstance(function, _Name) or not (is_state or function in _BUILDERS) or not isinstance(args, tuple):
             raise ValueError(f"the pickle calls {reprlib.repr(function)}")
-        self.stack.append(_BUILDERS[function](*args))
+        self.stack.append(_Other() if is_state else _BUILDERS[function](*args))
 
     load_newobj = load_reduce
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
-from anytouch_jax.data.loading.samples import SampleError, SampleReader
+from anytouch_jax.data.loading.samples import Prepare, SampleError, SampleReader
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
 from anytouch_jax.errors import UserError
@@ -24,14 +24,17 @@ def evaluation(
     *,
     frames: int | None = None,
     unknown: Literal["error", "universal"] = "error",
+    prepare: Prepare | None = None,
+    like: np.ndarray | None = None,
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     """Yield (row ids i64 (n,), TouchBatch of B rows) over `rows` in order, with the same bytes every time.
 
     Stills have T = 1; clips are the `frames` (default `model.frames`) frames that end at each row. B is
     `data.batch_size`. The last batch is filled up with its last row, so only the first n rows of a batch are valid.
     With `data.on_bad_sample` "skip" bad rows are left out, which the row ids show. `unknown` "universal" gives unknown
-    sensors the universal tokens. Raises UserError: ManifestError for an unknown sensor, SampleError for a bad sample,
-    and for a row that ends no clip.
+    sensors the universal tokens. `prepare` makes an array of the form of `like` from a frame u8 (h, w, 3) and its
+    background or None, in place of the resizing and the subtraction. Raises UserError: ManifestError for an unknown
+    sensor, SampleError for a bad sample, and for a row that ends no clip.
     """
     rows = np.asarray(rows, np.int64)
     windows = rows[:, None] if kind == "still" else _clips_ending_at(manifest, rows, frames or config.model.frames)
@@ -42,17 +45,24 @@ def evaluation(
         raise UserError(
             f"{manifest.where(row)}: sensor {name!r} measures a force field and has no images; leave it out"
         )
-    return _batches(SampleReader(manifest, config), rows, windows, sensor)
+    side = config.model.image_size
+    blank = np.zeros((side, side, 3), np.uint8) if like is None else like
+    return _batches(SampleReader(manifest, config), rows, windows, sensor, prepare, blank)
 
 
 def _batches(
-    reader: SampleReader, rows: np.ndarray, windows: np.ndarray, sensor: np.ndarray
+    reader: SampleReader,
+    rows: np.ndarray,
+    windows: np.ndarray,
+    sensor: np.ndarray,
+    prepare: Prepare | None,
+    blank: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
-    data, size = reader.config.data, reader.config.model.image_size
+    data = reader.config.data
 
     def write(clip: np.ndarray, is_good: np.ndarray, start: int, slot: int) -> int:
         try:
-            clip[slot] = reader.touch(windows[start + slot], None)
+            clip[slot] = reader.touch(windows[start + slot], None, prepare=prepare)
         except SampleError:
             if data.on_bad_sample == "error":
                 raise
@@ -61,7 +71,7 @@ def _batches(
 
     def plan(start: int) -> BatchJobs[tuple[TouchBatch, np.ndarray]]:
         chosen = windows[start : start + data.batch_size]
-        clip = np.zeros((data.batch_size, chosen.shape[1], size, size, 3), np.uint8)
+        clip = np.zeros((data.batch_size, chosen.shape[1], *blank.shape), blank.dtype)
         batch, is_good = TouchBatch(clip, np.zeros(data.batch_size, np.int32)), np.ones(len(chosen), bool)
         batch.sensor[: len(chosen)] = sensor[chosen[:, -1]]
         return BatchJobs((batch, is_good), [partial(write, clip, is_good, start, slot) for slot in range(len(chosen))])

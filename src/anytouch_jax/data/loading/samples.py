@@ -19,6 +19,9 @@ TRIES = 20  # bad samples in a row before a slot gives up
 _REPLACE, _SUBTRACT = 51, 52  # tags of the random streams of replacements and of subtracted backgrounds
 
 
+Prepare = Callable[[np.ndarray, np.ndarray | None], np.ndarray]  # a frame, and its background or None
+
+
 class SampleError(UserError):
     """A sample that cannot be used; the message names the row, its manifest, the file and the reason."""
 
@@ -35,12 +38,15 @@ class SampleReader:
     config: Config
     _cache: dict[Path, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
-    def touch(self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None) -> np.ndarray:
+    def touch(
+        self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None, prepare: Prepare | None = None
+    ) -> np.ndarray:
         """Return the frames of a window of rows, u8 (T, size, size, 3); `epoch` None means no augmentation.
 
         They are written into `out` once all frames could be read, else into a new array. The last row seeds the
         augmentation of the whole clip. A background that is subtracted is augmented too: otherwise the change of
-        brightness would be stronger than the contact. Raises SampleError.
+        brightness would be stronger than the contact. `prepare` (without augmentation) replaces both resizing and
+        subtraction. Raises SampleError.
         """
         size, data = self.config.model.image_size, self.config.data
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
@@ -56,6 +62,8 @@ class SampleReader:
                     "requires; add one, or pass --data.background keep"
                 )
             background = read_image(self.manifest, rows[-1], "background_path", load or self._decode_background)
+        if prepare is not None:
+            return np.stack([prepare(frame, background) for frame in frames])
         if epoch is None or plain:
             return transforms.touch_evaluation(
                 frames if background is None else transforms.subtract_background(frames, background), size, out

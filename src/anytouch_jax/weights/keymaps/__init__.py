@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import MappingProxyType
@@ -51,6 +51,10 @@ def _read_patch(weight: np.ndarray) -> np.ndarray:  # golden Q1: (D, frame, colo
     return np.moveaxis(weight, (0, -3), (-1, -2)).reshape(*weight.shape[1:-3], -1, len(weight))
 
 
+def _frames(weight: np.ndarray) -> np.ndarray:  # (D, frame * colour, row, col) -> (D, frame, colour, row, col)
+    return weight.reshape(len(weight), -1, 3, *weight.shape[2:])
+
+
 SAME: tuple[Conversion, Conversion] = (lambda x: x, lambda x: x)
 _TURNED: tuple[Conversion, Conversion] = (lambda x: x.T, lambda x: x.T)
 # kind of a row -> the arrays of such a layer: what is added to its key and to our name, the conversions, the third
@@ -59,16 +63,31 @@ _KINDS: dict[str, list[tuple[Any, ...]]] = {
     "row": [("", "", lambda x: x[0], lambda x: x[None])],
     "token": [("", "", lambda x: x[0, 0], lambda x: x[None, None])],
     "patch": [(".weight", "/kernel", _read_patch, _write_patch)],
+    "frames": [
+        (".weight", "/kernel", lambda x: _read_patch(_frames(x)), lambda x: _joined(_write_patch(x))),
+        (".bias", "/bias", *SAME),
+    ],
+    "video": [  # (D, colour, frame, row, col)
+        (".weight", "/kernel", lambda x: _read_patch(x.swapaxes(1, 2)), lambda x: _write_patch(x).swapaxes(1, 2)),
+        (".bias", "/bias", *SAME),
+    ],
     "kernel": [(".weight", "/kernel", *_TURNED)],
     "linear": [(".weight", "/kernel", *_TURNED), (".bias", "/bias", *SAME)],
     "norm": [(".weight", "/scale", *SAME), (".bias", "/bias", *SAME)],
     "lora": [(".lora_A.default.weight", "/a", *_TURNED), (".lora_B.default.weight", "/b", *_TURNED)],
-    "qkv": [
-        (theirs, f"/{name}/{ours}", *conversions, None, part)
-        for part, name in enumerate(("query", "key", "value"))
-        for theirs, ours, conversions in (("_weight", "kernel", _TURNED), ("_bias", "bias", SAME))
-    ],
+    **{
+        kind: [
+            (f"{dot}{theirs}", f"/{name}/{ours}", *conversions, None, part)
+            for part, name in enumerate(("query", "key", "value"))
+            for theirs, ours, conversions in (("weight", "kernel", _TURNED), ("bias", "bias", SAME))
+        ]
+        for kind, dot in (("qkv", "_"), ("fused", "."))
+    },
 }
+
+
+def _joined(weight: np.ndarray) -> np.ndarray:  # the inverse of _frames
+    return weight.reshape(len(weight), -1, *weight.shape[3:])
 
 
 def rows(table: str, theirs: str = "", ours: str = "") -> tuple[Entry, ...]:
@@ -80,6 +99,23 @@ def rows(table: str, theirs: str = "", ours: str = "") -> tuple[Entry, ...]:
     )
 
 
+def each_layer(table: Iterable[Entry], shapes: Mapping[str, Shape]) -> list[Entry]:
+    """Return the rows of a table whose parameters are in `shapes`, one for each layer of a stack."""
+    table = [row for row in table if row.name in shapes]
+    layers = [range(shapes[row.name][0]) if "{}" in row.key else (None,) for row in table]
+    return [
+        replace(row, key=row.key.format(layer), layer=layer)
+        for row, numbers in zip(table, layers, strict=True)
+        for layer in numbers
+    ]
+
+
+def find_depth(key: str, keys: Iterable[str]) -> int:
+    """Return the number of layers in a file, from the key of an array of each with "{}" for the layer."""
+    pattern = re.compile(re.escape(key).replace(r"\{\}", r"(\d+)"))
+    return max(int(match[1]) for key in keys if (match := pattern.fullmatch(key))) + 1
+
+
 @lru_cache(maxsize=8)
 def param_shapes(model: ModelConfig) -> Mapping[str, Shape]:
     """Return name -> shape of every parameter of a model."""
@@ -87,9 +123,9 @@ def param_shapes(model: ModelConfig) -> Mapping[str, Shape]:
 
 
 # Heads of the published towers by width: OpenAI's CLIP and the authors (width / 64), OpenCLIP's larger towers (16).
-_VISION_HEADS = {384: 6, 512: 8, 768: 12, 896: 14, 1024: 16, 1280: 16, 1408: 16, 1664: 16}
+VISION_HEADS = {384: 6, 512: 8, 768: 12, 896: 14, 1024: 16, 1280: 16, 1408: 16, 1664: 16}
 _TEXT_HEADS = {384: 6, 512: 8, 640: 10, 768: 12, 1024: 16, 1280: 20}
-_HEADS = {"touch": _VISION_HEADS, "image": _VISION_HEADS, "text": _TEXT_HEADS, "decoder": {512: 16}}
+_HEADS = {"touch": VISION_HEADS, "image": VISION_HEADS, "text": _TEXT_HEADS, "decoder": {512: 16}}
 _DECODER = Stack(512, 8, 16, 2048)  # the authors', for files without a decoder
 
 
@@ -115,13 +151,7 @@ class KeyMap:
         shapes = param_shapes(model)
         if not self.table:
             return [Entry(name, name, *SAME) for name in shapes]
-        table = [row for name, row in self._rows(bool(model.lora_rank)).items() if name in shapes]
-        layers = [range(shapes[row.name][0]) if "{}" in row.key else (None,) for row in table]
-        return [
-            replace(row, key=row.key.format(layer), layer=layer)
-            for row, numbers in zip(table, layers, strict=True)
-            for layer in numbers
-        ]
+        return each_layer(self._rows(bool(model.lora_rank)).values(), shapes)
 
     def _rows(self, lora: bool) -> dict[str, Entry]:
         return {row.name: row for row in (*self.table, *(self.lora if lora else ()))}
@@ -143,8 +173,7 @@ class KeyMap:
         def stack(part: str) -> Stack:
             row = table[f"{part}/blocks/mlp/up/kernel"]
             width, mlp = shape(row.name)
-            pattern = re.compile(re.escape(row.key).replace(r"\{\}", r"(\d+)"))
-            depth = max(int(match[1]) for key in weights if (match := pattern.fullmatch(key))) + 1
+            depth = find_depth(row.key, weights)
             count = heads.get(part) or _HEADS[part].get(width)
             if count is None:
                 unknown[part] = width

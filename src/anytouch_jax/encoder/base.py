@@ -1,0 +1,317 @@
+"""The touch encoder with its image and text towers: features, similarity, matching, preprocessing."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
+from anytouch_jax.data.images import to_rgb
+from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
+from anytouch_jax.data.transforms import subtract_background, touch_evaluation, vision_evaluation
+from anytouch_jax.encoder.arrays import rows_of_sensors
+from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
+from anytouch_jax.encoder.preprocess import Preprocess
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.attention import usable
+from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.objectives import normalise_image, normalise_touch
+from anytouch_jax.ops import losses
+
+Params = dict[str, Any]
+_PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matching head", "logit_scale": "temperature"}
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A touch encoder with its parameters, and the image and text towers if the weights have them.
+
+    `config` and `params` are those of the touch encoder alone, `source` is the path of the weights. `trained_sensors`
+    is None if the weights do not store them. If training never drew the universal tokens (`universal_drawn`), the mean
+    of the trained sensors' tokens is used instead. `others` are the parameters of towers, decoder and heads of the
+    `whole` model: they stay on the host until they are used. `tokenizer_file` is None without a tokenizer.json.
+    """
+
+    config: Config
+    params: Params = field(repr=False)
+    source: str
+    trained_sensors: tuple[str, ...] | None = None
+    universal_drawn: bool = True
+    whole: ModelConfig | None = field(default=None, repr=False)
+    others: Params = field(default_factory=dict, repr=False)
+    tokenizer_file: Path | None = field(default=None, repr=False)
+    metadata: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def net(self) -> Net:
+        """The network of the touch encoder."""
+        return build(self.config.model)
+
+    def sensor_row(self, name: str, log: Log = warn) -> int:
+        """Return the row of a sensor's tokens, that of the universal tokens for a sensor outside training.
+
+        The universal tokens (Sec. 3.5) are logged. Raises SpellingError for a misspelled name.
+        """
+        model, name = self.config.model, str(name)
+        drawn, known = self.universal_drawn or not self.trained_sensors, name in model.sensors
+        if known and (drawn if name == UNIVERSAL else self.trained_sensors is None or name in self.trained_sensors):
+            return model.sensors.index(name)
+        check_spelling(name, model.sensors)
+        why = f"is not in this model's table ({', '.join(model.sensors)})"
+        if known:
+            why = f"was not in training, which had {', '.join(self.trained_sensors or ())}"
+        used = "the universal tokens" if drawn else "the mean of the trained sensors' tokens (no universal ones)"
+        log(f"sensor {name!r} {why}: using {used}")
+        return model.sensors.index(name) if known else model.universal_row
+
+    def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
+        """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its training."""
+        if dtype == "trained":
+            return self
+        whole = self.whole and replace(self.whole, dtype=dtype)
+        return replace(self, config=self.config.with_settings({"model.dtype": dtype}), whole=whole)
+
+    @property
+    def subtracts(self) -> bool:
+        """Whether it subtracts the background of a touch that has one (`data.background`)."""
+        return self.config.data.background != "keep"
+
+    @property
+    def needs_background(self) -> bool:
+        """Whether it was trained on background-subtracted touches only."""
+        return self.config.data.background == "subtract"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """CRC-32 of the touch encoder's parameters, in hexadecimal."""
+        return f"{zlib.crc32(b''.join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(self.params))):08x}"
+
+    @property
+    def blank(self) -> np.ndarray:
+        """A prepared frame of zeros: its shape and type are those of the input."""
+        return np.zeros((self.config.model.image_size, self.config.model.image_size, 3), np.uint8)
+
+    def input_form(self, frames: int) -> dict[str, Any]:
+        """Return what an exported encoder says about its input, and how a picture becomes a frame of it."""
+        side, subtracts = self.config.model.image_size, self.subtracts
+        difference = ", background-subtracted: clip(frame - gel + 128, 0, 255)" if subtracts else ""
+        return {
+            "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){difference}; sensor: int32 (B,)",
+            "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the "
+            f"shorter side is above {side} pixels, else INTER_LINEAR"
+            + ("; the background is subtracted before" if subtracts else ""),
+        }
+
+    @property
+    def contract(self) -> str:
+        """Everything but the parameters that decides its features, as text."""
+        return json.dumps(asdict(self.config.model), sort_keys=True)
+
+    def untrained(self, seed: int = 0) -> Encoder:
+        """Return an untrained encoder of the same form: the control of every probe."""
+        return random_encoder(self.config, seed)
+
+    def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., jax.Array]:
+        """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
+        return partial(touch_features, net=self.net, pooling=pooling, join=join)
+
+    def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
+        """Return a frame u8 (h, w, 3) as the network reads it, its `background` subtracted if there is one."""
+        frames = [frame] if background is None else subtract_background([frame], background)
+        return touch_evaluation(frames, self.config.model.image_size)[0]
+
+    def preprocess(self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None) -> np.ndarray:
+        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder does so.
+
+        Raises UserError if the encoder needs a `background`, the picture of the untouched gel, and there is none. Use
+        `Preprocess` for a camera: it stores the background.
+        """
+        if self.needs_background and background is None:
+            raise UserError(f"{self.source} needs background-subtracted frames. Give the background, an untouched gel.")
+        return Preprocess(self, background)(frame)
+
+    def encode_touch(
+        self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
+        join: Join = "mean",
+    ) -> np.ndarray:  # fmt: skip
+        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3); not unit-norm.
+
+        H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments
+        of three are joined by `join`. `sensor` is one name, names (B,), or rows i32 (B,). `pooling`: the class token
+        (which alignment trains), the mean of the patch tokens, or both (B, 2E). Raises UserError for another shape or
+        type.
+        """
+        frames = np.asarray(frames)
+        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+        side = self.config.model.image_size
+        if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
+            raise UserError(
+                f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
+                f"{frames.shape}; resize each frame with encoder.preprocess(frame)"
+            )
+        check_frames(self.config.model, frames.shape[1])
+        rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
+        count, key = len(frames), (pooling, join)
+        if key not in self._compiled:
+            self._compiled[key] = jax.jit(self.traceable(pooling, join))
+        if not count:  # the network has no shape for nothing: embed one touch and return none
+            frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
+        return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
+
+    @cached_property
+    def _placed(self) -> Params:
+        """The parameters on the device."""
+        return jax.device_put(self.params)
+
+    @cached_property
+    def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
+        """What was called: touch by pooling and join, other parts by their method."""
+        return {}
+
+    @cached_property
+    def tokenizer(self) -> Tokenizer | None:
+        """The tokenizer of the text tower."""
+        return None if self.tokenizer_file is None else load_tokenizer(self.tokenizer_file)
+
+    def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
+        """Return embeddings f32 (B, E) of photographs, RGB (h, w, 3) of any size each; not unit-norm.
+
+        Each is resized and cropped as in training. Raises UserError without an image tower, and for another shape.
+        """
+
+        def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
+            return net.encode_image(params, normalise_image(pixels)).astype(jnp.float32)
+
+        tower, size = self._part("encode_image", run, "image", "lora"), self.config.model.image_size
+        images = [images] if getattr(images, "ndim", 0) == 3 else images
+        pixels = (vision_evaluation(to_rgb(np.asarray(image), "the image"), size) for image in images)
+        return self._embeddings(tower, pixels, batch)
+
+    def encode_text(self, texts: str | Sequence[str], *, batch: int = 64) -> np.ndarray:
+        """Return embeddings f32 (L, E) of texts; not unit-norm.
+
+        Raises UserError without a text tower, or without a tokenizer.json in the folder of the weights.
+        """
+
+        def run(net: Net, params: Params, batch: tuple[jax.Array, jax.Array]) -> jax.Array:
+            return net.encode_text(params, *batch).astype(jnp.float32)
+
+        tower = self._part("encode_text", run, "text")
+        assert self.whole is not None and self.whole.text is not None
+        tokenizer, text = self.tokenizer, self.whole.text
+        if tokenizer is None:
+            raise UserError(f"there is no tokenizer.json in the folder of {self.source}; copy the one of its training")
+        if tokenizer.vocab_size > text.vocab:
+            raise UserError(
+                f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
+                f"{text.vocab}; copy the tokenizer of its training"
+            )
+        texts = [texts] if isinstance(texts, str) else list(texts)
+        if not all(isinstance(sentence, str) for sentence in texts):
+            raise UserError("texts must be a string or a sequence of strings")
+        ids, mask = tokenizer.encode(texts, text.length)
+        return self._embeddings(tower, zip(ids, mask, strict=True), batch)
+
+    def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
+        values = run_in_batches(tower, items, batch)
+        return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
+
+    def similarity(
+        self,
+        touch: npt.ArrayLike,
+        texts: str | Sequence[str] | npt.NDArray[np.floating],
+        *,
+        probabilities: bool = False,
+    ) -> np.ndarray:
+        """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
+
+        With `probabilities`, return their softmax over the texts with the learned temperature: a zero-shot classifier.
+        Raises UserError without a text tower. Training with `center_embeddings` subtracted the batch mean first.
+        """
+        embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
+        z_touch, z_text = _unit(touch), _unit(embeddings)
+        if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
+            width = z_text.shape[-1]
+            raise UserError(f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}")
+        cosine = z_touch @ z_text.T
+        if not probabilities:
+            return np.asarray(np.clip(cosine, -1, 1))
+        scale = self._part("scale", lambda net, params: net.scale(params), "logit_scale")
+        return np.asarray(jax.nn.softmax(scale() * cosine, axis=1))
+
+    def match(self, first: npt.ArrayLike, second: npt.ArrayLike) -> np.ndarray:
+        """Return matching logits f32 (B,) of two sets of touch features (B, E), pooling class (Eq. 5).
+
+        A positive logit predicts the same place. Raises UserError without a matching head.
+        """
+
+        def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
+            return net.match(params, losses.normalise(first), losses.normalise(second))
+
+        head = self._part("match", run, "matcher")
+        return np.asarray(head(np.asarray(first, np.float32), np.asarray(second, np.float32)))
+
+    def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
+        """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
+        params = {name: self.part_params(name)}
+        if method not in self._compiled:
+            params |= {key: self.others[key] for key in more if key in self.others}
+            net = build(usable(self.whole or self.config.model))
+            self._compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
+        return self._compiled[method]
+
+    def part_params(self, name: str) -> Params:
+        """Return the parameters of a part: image, text, decoder, matcher or logit_scale. Raises UserError."""
+        if name not in self.others:
+            raise UserError(f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has one")
+        return dict(self.others)[name]
+
+
+def _unit(values: npt.ArrayLike) -> np.ndarray:
+    return np.asarray(losses.normalise(jnp.asarray(values, jnp.float32)))
+
+
+def check_frames(model: ModelConfig, frames: int) -> None:
+    """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of the model's clips."""
+    if frames != 1 and frames < model.frames:
+        raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
+
+
+def touch_features(
+    params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
+) -> jax.Array:
+    """Return features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,): a traceable `encode_touch`."""
+    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
+        if value not in get_args(kind):
+            raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
+    clips = normalise_touch(clips)
+    if pooling == "class":
+        return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)
+    both = net.encode_poolings(params, clips, sensor, join)  # an unused half is not computed
+    return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
+
+
+def random_encoder(config: Config, seed: int = 0) -> Encoder:
+    """Return an untrained encoder of the same form: the control of every probe."""
+    config = touch_only(config)
+    return Encoder(config, {"touch": build(config.model).init(jax.random.key(seed))["touch"]}, f"random({seed})")
+
+
+def bare_model(model: ModelConfig) -> ModelConfig:
+    """Return a model without towers and heads."""
+    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0)
+
+
+def touch_only(config: Config) -> Config:
+    """Return the configuration of the touch encoder alone."""
+    return replace(config, model=bare_model(config.model), data=replace(config.data, on_bad_sample="error"))

@@ -1,0 +1,356 @@
+"""Families of encoders that others published: how their files are recognised, read and fed."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, UNIVERSAL, ModelConfig, Stack
+from anytouch_jax.config.parsing import Above0, Count, check, read_value
+from anytouch_jax.errors import ConfigError
+from anytouch_jax.nn.functional import Part
+from anytouch_jax.nn.vit import Resample, Vit, VitConfig
+from anytouch_jax.weights import load
+from anytouch_jax.weights.convert import check_arrays, file_shapes, fill, refuse_unknown
+from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth, vit
+from anytouch_jax.weights.safetensors import WeightsError
+from anytouch_jax.weights.tree import flatten
+
+Size = tuple[int, int]
+ALIASES = {"mini": "gelsight_mini"}  # names of T3's files
+SHARED = ("trunk", "post_norm")  # what T3's sensors have in common
+_HEADS = {192: 3} | VISION_HEADS
+_DECODER = Stack(512, 8, 16, 2048)  # a family has none
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """How a family prepares a frame RGB u8, in this order. A config.json may change it (`"preparation"`).
+
+    `difference`: Sparsh's frame - background + 127 in whole grey levels, AnyTouch 2's + 130 in floats, or SITR's plain
+    difference without an offset, in grey levels.
+    """
+
+    background: Literal["keep", "subtract", "either"] = "keep"
+    difference: Literal["none", "levels", "offset", "plain"] = "none"
+    portrait: bool = False  # Rotate a frame that is wider than high by 90 degrees clockwise.
+    crop: Literal["none", "rows", "centre", "square"] = "none"
+    shorter: Count[int] | None = None  # Shorter side before a centre crop. None: 8/7 of the image size.
+    filter: Literal["bilinear", "bicubic"] = "bilinear"
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: Above0[tuple[float, float, float]] = (1.0, 1.0, 1.0)
+    newest_first: bool = False  # The order of the frames for the network. Clips are given oldest first.
+    stride: Count[int] = 1  # Distance of the frames of a clip.
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
+class Family:
+    """One layout of a family's files.
+
+    A file is of the family if, after one of the `prefixes`, it has all keys in `needs` and none in `lacks`, and
+    `beside` without the prefix. The first of `needs` is the patch kernel, which has five axes in a family of `video`.
+    Keys in `unused` (a regex) are not read, and neither are those without the prefix.
+    """
+
+    name: str
+    title: str
+    licence: str
+    sensors: str  # What it was trained on, in words.
+    table: tuple[Entry, ...]
+    needs: tuple[str, ...]
+    preparation: Preparation
+    lacks: tuple[str, ...] = ()
+    beside: str | None = None
+    prefixes: tuple[str, ...] = ("",)
+    unused: str = ""
+    eps: float = 1e-6
+    resample: Resample = "none"
+    image_size: Size | None = None  # None: that of the stored positions.
+    frames: int = 1
+    video: bool = False
+    names: tuple[str, ...] = ()  # Sensors of the rows of tokens.
+    feature: Literal["class", "mean", "projected", "unit"] = "class"
+    tokens: Literal["normed", "patches", "hidden"] = "normed"
+
+    def weights(self, weights: Weights) -> dict[str, np.ndarray] | None:
+        """Return the arrays of the encoder without their prefix, None if the file is of another family."""
+        if self.beside is not None and self.beside not in weights:
+            return None
+        for prefix in self.prefixes:
+            own = {key.removeprefix(prefix): x for key, x in weights.items() if key.startswith(prefix)}
+            if not own.keys() >= {*self.needs} or own.keys() & {*self.lacks}:
+                continue
+            if (own[self.needs[0]].ndim == 5) == self.video:
+                return {key: x for key, x in own.items() if not re.fullmatch(self.unused, key)}
+        return None
+
+
+# fmt: off
+_APACHE, _NON_COMMERCIAL, _IMAGES = "Apache-2.0", "CC BY-NC 4.0: non-commercial", "photographs, no touch"
+_TIMM_NEEDS = ("patch_embed.proj.weight", "cls_token", "pos_embed", "blocks.0.attn.qkv.weight")
+_HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_token")
+_PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
+_PHOTO = Preparation(crop="centre", filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD)
+_DINOV2: dict[str, Any] = {"unused": r"mask_token|embeddings\.mask_token", "image_size": (224, 224)}
+_HF_VIT: dict[str, Any] = {"prefixes": ("vit.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
+FAMILIES = (
+    *(
+        Family(
+            "sparsh", title, _NON_COMMERCIAL, "DIGIT, GelSight, GelSight Mini",
+            table, ("patch_embed.proj.weight", "blocks.0.ls1.gamma"),
+            Preparation("either", "levels", portrait=True, crop="rows", newest_first=True, stride=stride),
+            prefixes=("teacher_encoder.backbone.", "target_encoder.backbone.", "target_encoder.", "encoder.", ""),
+            lacks=("cls_token",), unused="mask_token", image_size=(320, 240), frames=frames, video=frames == 4,
+            feature="mean", tokens="patches",
+        )
+        for title, table, frames, stride in (("Sparsh", vit.SPARSH, 2, 5), ("Sparsh V-JEPA", vit.SPARSH_VIDEO, 4, 2))
+    ),
+    Family(
+        "anytouch2", "AnyTouch 2", "MIT", "GelSight, DIGIT, GelSight Mini, DuraGel by tokens",
+        vit.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
+        Preparation("subtract", "offset", mean=CLIP_MEAN, std=CLIP_STD),  # not ImageNet's, unlike AnyTouch
+        lacks=("video_patch_embedding.weight",), prefixes=("touch_mae_model.",), eps=1e-5, frames=4, video=True,
+        unused=r"(decoder|mask_token|new_position_ids).*", feature="projected", tokens="hidden",
+        names=("gelsight", "digit", "sensor2", "gelsight_mini", "duragel"),
+    ),
+    Family(
+        "sitr", "SITR", "MIT by its README, without a licence file", "GelSight designs, by calibration images",
+        vit.SITR, (*_TIMM_NEEDS, "contrastive_head.weight"),
+        Preparation("subtract", "plain", crop="square",
+                    mean=(-1.2223, -1.8114, -1.7090), std=(11.7932, 12.7956, 13.6452)),
+        prefixes=("base_model.", ""), unused=r"decoder_pred\..*", eps=1e-5, feature="unit",
+    ),
+    Family(
+        "dinov2", "DINOv2 (Hugging Face)", _APACHE, _IMAGES,
+        vit.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
+        prefixes=("dinov2.", "dinov2_with_registers.", ""), resample="bicubic", **_DINOV2,
+    ),
+    Family(
+        "dinov2", "DINOv2 (its authors' layout)", _APACHE, _IMAGES,
+        vit.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma"), _PHOTO, resample="shifted", **_DINOV2,
+    ),
+    Family(
+        "vit_mae", "ViT-MAE (Hugging Face)", _NON_COMMERCIAL, _IMAGES,
+        vit.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO,
+        beside="decoder.mask_token", **_HF_VIT,
+    ),
+    Family(
+        "vit", "ViT or DeiT (Hugging Face)", _APACHE, _IMAGES,
+        vit.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO, **_HF_VIT,
+    ),
+    Family(
+        "t3", "T3", "MIT", "one file for each sensor",
+        vit.T3, (*_TIMM_NEEDS, "trunk.norm.weight"), replace(_PHOTO, filter="bilinear"), resample="bicubic",
+    ),
+    Family(
+        "vit", "ViT, DeiT or MAE (timm's layout)", "that of the weights (DeiT: Apache-2.0, MAE: CC BY-NC 4.0)", _IMAGES,
+        vit.TIMM, (*_TIMM_NEEDS, "norm.weight"), _PHOTO, unused=_PARTS, resample="antialias",
+    ),
+)
+# fmt: on
+
+
+@dataclass(frozen=True)
+class FamilyModel:
+    """An encoder of a family, as its file has it: the form of its network, its preparation, its parameters."""
+
+    family: Family
+    form: VitConfig
+    preparation: Preparation
+    image_size: Size
+    params: dict[str, np.ndarray] = field(repr=False)
+
+
+def load_family(
+    path: Path, *, heads: int | None = None, image_size: Any = None
+) -> tuple[FamilyModel | None, Weights | None]:
+    """Return the encoder of a file or folder of a family, or None; and the arrays of the file if it was read.
+
+    See `read_family`. A folder of T3 has trunk.pth and encoders/SENSOR.pth. Raises WeightsError.
+    """
+    if not path.exists() or path.suffix.lower() == ".npz" or load.is_run_folder(path):
+        return None, None
+    trunks = (path / "trunk.pth",) if path.is_dir() else (path.parent / "trunk.pth", path.parent.parent / "trunk.pth")
+    trunk, sensors = next((file for file in trunks if file.is_file()), None), dict[str, Path]()
+    if path.is_dir() and trunk is not None:
+        sensors = {ALIASES.get(file.stem, file.stem): file for file in sorted(path.glob("encoders/*.pth"))}
+    file = next(iter(sensors.values())) if sensors else load.find_weights_file(path)
+    weights = load.read_weights(file)
+    if not weights.keys() >= {*_TIMM_NEEDS} or weights.keys() & {"norm.weight", "blocks.0.ls1.gamma"}:
+        if file.name == "trunk.pth":
+            raise WeightsError(f"{file} is the trunk of T3 alone; give its folder, or encoders/SENSOR.pth")
+        return read_family(file, weights, _folder(file), heads=heads, image_size=image_size), weights
+    if trunk is None:
+        raise WeightsError(f"{file} is an encoder of T3 without its trunk.pth; put that beside it or into its parent")
+    rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
+    sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
+    names, models = (*sensors, UNIVERSAL), []
+    for one in sensors.values():
+        content = weights if one == file else load.read_weights(one)
+        models.append(
+            read_family(one, {**content, **rest}, _folder(trunk), heads=heads, image_size=image_size, sensors=names)
+        )
+    first = models[0]
+    if first is None or any(model is None or model.form != first.form for model in models):
+        raise WeightsError(f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a time")
+    params = {
+        name: array
+        if name.split("/")[0] in SHARED or len(models) == 1
+        else np.stack([m.params[name] for m in models if m])
+        for name, array in first.params.items()
+    }
+    return replace(first, params=params), None
+
+
+def _folder(file: Path) -> dict[str, Any]:
+    """Return the config.json beside a file, with the statistics of Hugging Face's preprocessor_config.json."""
+    config, theirs = (load.read_settings(file.with_name(f"{name}config.json")) for name in ("", "preprocessor_"))
+    found = {ours: theirs[key] for key, ours in (("image_mean", "mean"), ("image_std", "std")) if key in theirs}
+    changes = config.get("preparation", {})
+    return config | ({"preparation": found | changes} if isinstance(changes, dict) and found | changes else {})
+
+
+def find_family(weights: Weights) -> tuple[Family, dict[str, np.ndarray]] | None:
+    """Return the family of a file and the arrays of its encoder, None for a file of no family."""
+    found = ((family, own) for family in FAMILIES if (own := family.weights(weights)) is not None)
+    return next(found, None)
+
+
+def read_family(
+    path: Path, weights: Weights, folder: Mapping[str, Any], *, heads: int | None = None, image_size: Any = None,
+    sensors: tuple[str, ...] = (),
+) -> FamilyModel | None:  # fmt: skip
+    """Return the encoder of a file, None for a file of no family.
+
+    `folder` is the config.json in its folder. It gives the number of heads, the epsilon of LayerNorms and changes of
+    the preparation. `image_size` is a side or (height, width). `sensors` are T3's. Raises WeightsError.
+    """
+    if (found := find_family(weights)) is None:
+        return None
+    family, own = found
+    try:
+        size = image_size if image_size is None else (image_size,) * 2 if isinstance(image_size, int) else image_size
+        form, size = form_of(family, own, folder, heads, size and tuple(size), sensors)
+        settings = {**asdict(family.preparation), **folder.get("preparation", {})}
+        preparation = read_value(Preparation, settings, "preparation")
+        entries, shapes = entries_of(family, form)
+        own = {key: np.asarray(x, np.float32) for key, x in own.items()}
+        check_arrays(f"{family.title} weights", own, file_shapes(entries, shapes))
+        params = fill(entries, own, shapes)
+    except (WeightsError, ConfigError) as error:
+        raise WeightsError(f"{path}: {error}") from None
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise WeightsError(
+            f"{path} is not a whole file of {family.title}: {error} is missing or of an odd shape; download it again"
+        ) from None
+    load.check_finite(path, params)
+    return FamilyModel(family, form, preparation, size, params)
+
+
+def entries_of(family: Family, form: VitConfig) -> tuple[list[Entry], dict[str, Shape]]:
+    """Return the arrays of a file of this form, and the shapes of our parameters."""
+    shapes = {name: tuple(leaf.shape) for name, leaf in flatten(Part(Vit, form).abstract()).items()}
+    return each_layer(family.table, shapes), shapes
+
+
+def form_of(
+    family: Family, weights: Weights, folder: Mapping[str, Any], heads: int | None, image_size: Size | None,
+    sensors: tuple[str, ...],
+) -> tuple[VitConfig, Size]:  # fmt: skip
+    """Return the form of the network that made a file, and the size of its images, from the shapes of its arrays."""
+    rows = {row.name: row for row in family.table}
+
+    def has(name: str) -> bool:
+        return name in rows and rows[name].key.format(0) in weights
+
+    def shape(name: str) -> Shape:
+        array = weights[rows[name].key.format(0)]
+        array = array if rows[name].part is None else np.split(array, 3)[0]
+        return rows[name].read(array).shape
+
+    tubelet, pixels, width = shape("patch/kernel")
+    patch, mlp = math.isqrt(pixels // 3), shape("blocks/mlp/up/kernel")[1]
+    frames, size = max(family.frames, tubelet), image_size or family.image_size
+    grid: tuple[int, int, int] | None = None
+    if not has("frequency"):
+        places = shape("position")[0] - has("class_token")
+        grid = _grid(places, frames // tubelet, family.name == "sparsh", image_size, patch)
+        frames, native = grid[0] * tubelet, (grid[1] * patch, grid[2] * patch)
+        size = (image_size if family.resample == "none" else size) or native
+        if family.resample == "none" and size != native:
+            raise WeightsError(f"{family.title} has images of {native[0]} x {native[1]} pixels; leave image_size out")
+    assert size is not None
+    if size[0] % patch or size[1] % patch or min(size) < patch:
+        raise WeightsError(f"image_size {size[0]} x {size[1]} is no multiple of the patches of {patch} pixels")
+    outputs = shape("projection/kernel")[1] if has("projection/kernel") else 0
+    own = shape("sensor_tokens") if has("sensor_tokens") else (0, 0)
+    if own[0]:
+        numbered = tuple(f"sensor{row}" for row in range(own[0] - 1))
+        sensors = (*family.names[: own[0] - 1], *numbered[len(family.names) :], UNIVERSAL)
+    eps = folder.get("layer_norm_eps", family.eps)
+    if not isinstance(eps, float | int) or not 0 < eps < 1:
+        raise WeightsError(f"layer_norm_eps of the config.json is {str(eps)[:40]}; correct it")
+    return VitConfig(
+        ModelConfig(
+            image_size=max(size),
+            patch=patch,
+            embed=outputs or width,
+            touch=Stack(width, find_depth(rows["blocks/norm1/scale"].key, weights), _heads(width, heads, folder), mlp),
+            decoder=_DECODER,
+            frames=frames,
+            sensors=sensors or (UNIVERSAL,),
+            sensor_tokens=own[1],
+            norm_eps=float(eps),
+        ),
+        tubelet,
+        grid,
+        axes=shape("frequency")[0] if has("frequency") else 2,
+        resample="antialias" if family.name == "dinov2" and has("registers") else family.resample,
+        class_token=has("class_token"),
+        registers=shape("registers")[0] if has("registers") else 0,
+        patch_bias=has("patch/bias"),
+        layer_scale=has("blocks/scale1/scale"),
+        pre_norm=has("pre_norm/scale"),
+        trunk=find_depth(rows["trunk/norm1/scale"].key, weights) if has("trunk/norm1/scale") else 0,
+        calibration=shape("calibration/kernel")[0] if has("calibration/kernel") else 0,
+        outputs=outputs,
+        output_bias=has("projection/bias"),
+    ), size
+
+
+def _grid(places: int, time: int, portrait: bool, size: Size | None, patch: int) -> tuple[int, int, int]:
+    """Return (time, rows, columns) of a number of stored positions: of `size`, in Sparsh's shape of 4:3, or square."""
+    shapes: list[Callable[[int], Size]] = [lambda n: (math.isqrt(n), math.isqrt(n))]
+    if portrait:
+        shapes.insert(0, lambda n: (4 * math.isqrt(n // 12), 3 * math.isqrt(n // 12)))
+        if size is not None:
+            shapes = [lambda n: (size[0] // patch, size[1] // patch)]
+    for steps in dict.fromkeys((time, 1)):
+        for shape in shapes:
+            rows, columns = shape(places // steps)
+            if steps * rows * columns == places and places:
+                return steps, rows, columns
+    asked = "no grid of patches" if size is None else f"not those of {size[0]} x {size[1]} pixels"
+    raise WeightsError(f"its {places} positions are {asked}; give the image_size of its training")
+
+
+def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:
+    """Return the number of heads: as given, of a config.json of Hugging Face or ours, or of the published width."""
+    stacks = folder.get("model", {})
+    ours = stacks.get("touch", {}) if isinstance(stacks, dict) else {}
+    ours = ours.get("heads") if isinstance(ours, dict) else None
+    count = heads or ours or folder.get("num_attention_heads") or _HEADS.get(width)
+    if count is None:
+        refuse_unknown({"touch": width})
+    if type(count) is not int or not 0 < count <= 1024 or width % count:
+        raise WeightsError(f"a width of {width} cannot have {str(count)[:40]} heads; correct the number of heads")
+    return count

@@ -34,10 +34,10 @@ def print_table(markdown: str) -> None:
         print(markdown)
 
 
-def default_models() -> tuple[Path, ...]:
-    """Return the encoder that commands use when none is named, and report it."""
-    log(f"encoder: {DEFAULT} (name others with --model)")
-    return (Path(DEFAULT),)
+def log_default(models: Sequence[Path]) -> None:
+    """Report the encoder that a command used because none was named. Call it after the work."""
+    if not models:
+        log(f"encoder: {DEFAULT} (name others with --model)")
 
 
 def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:

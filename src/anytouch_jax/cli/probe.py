@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
+from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import (
     check_apart,
     check_folder,
     check_home,
-    default_models,
     log,
     print_table,
     refuse_unused,
 )
 from anytouch_jax.config.parsing import Count, NotNegative
 from anytouch_jax.errors import UserError
-
-Options = TypeVar("Options", bound="ProbeOptions")
 
 
 @dataclass(frozen=True)
@@ -112,14 +110,14 @@ def run_label(options: LabelOptions) -> int:
     """Probe a label column, print a table, and write JSON with --out."""
     from anytouch_jax.evaluate.probing import probe_label, probe_table
 
-    options = _with_default(options)
     if options.leave_out is not None:
         refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
-    if options.save is not None and len(options.model) != 1:
+    if options.save is not None and len(_models(options)) != 1:
         raise UserError(f"--save writes the head of one encoder. Give one --model, not {len(options.model)}.")
     check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
     print_table(probe_table(probe_label(**_settings(options), log=log)))
+    log_default((*options.model, *options.features))
     return 0
 
 
@@ -127,7 +125,6 @@ def run_tasks(options: TasksOptions) -> int:
     """Probe named tasks, print a table, and write JSON with --out."""
     from anytouch_jax.evaluate.probing import probe_table, probe_tasks
 
-    options = _with_default(options)
     if options.frames is None:
         refuse_unused(options, ("join",), "without --frames: tasks use stills or single segments")
     if options.frames == 1:
@@ -135,6 +132,7 @@ def run_tasks(options: TasksOptions) -> int:
     tasks = {"tasks": "all"} if options.tasks == ("all",) else {}
     results = probe_tasks(**_settings(options) | tasks, log=log)
     print_table(probe_table(results["results"], results["paper"]))
+    log_default((*options.model, *options.features))
     return 0
 
 
@@ -142,14 +140,10 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     """Probe a public benchmark, print a table, and write JSON with --out."""
     from anytouch_jax.evaluate.probing import probe_benchmark, probe_table
 
-    results = probe_benchmark(**_settings(_with_default(options)), log=log)
+    results = probe_benchmark(**_settings(options), log=log)
     print_table(probe_table(results["results"], results["paper"]))
+    log_default((*options.model, *options.features))
     return 0
-
-
-def _with_default(options: Options) -> Options:
-    """Return options that probe the default encoder if they name none."""
-    return options if options.model or options.features else replace(options, model=default_models())
 
 
 def _settings(options: ProbeOptions) -> dict[str, Any]:
@@ -160,7 +154,14 @@ def _settings(options: ProbeOptions) -> dict[str, Any]:
     if isinstance(options, BatteryOptions) and options.cache is not None:
         check_home(options.cache, "--cache")
     enable_compilation_cache()
-    return {("models" if name == "model" else name): value for name, value in vars(options).items()}
+    settings = dict(vars(options)) | {"models": _models(options)}
+    del settings["model"]
+    return settings
+
+
+def _models(options: ProbeOptions) -> tuple[Path, ...]:
+    """Return the encoders to probe: those named, or that of the package if there are no features either."""
+    return options.model or (() if options.features else (Path(DEFAULT),))
 
 
 def _files_read(options: ProbeOptions) -> tuple[Path, ...]:

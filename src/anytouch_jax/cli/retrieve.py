@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from anytouch_jax.cli.output import check_folder, default_models, log, print_table, refuse_unused
+from anytouch_jax.cli.arguments import DEFAULT
+from anytouch_jax.cli.output import check_folder, log, log_default, print_table, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.config.parsing import Count, Range
 from anytouch_jax.errors import UserError
@@ -57,7 +58,7 @@ def run(options: RetrieveOptions) -> int:
         refuse_unused(options, ("seeds",), "without --by-chance")
     check_folder(options.out, read=(options.data, *options.model))
     enable_compilation_cache()
-    encoders = {str(path): features.load_encoder(path) for path in options.model or default_models()}
+    encoders = {str(path): features.load_encoder(path) for path in options.model or (Path(DEFAULT),)}
     if options.controls:
         encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
     for encoder in encoders.values():
@@ -90,6 +91,7 @@ def run(options: RetrieveOptions) -> int:
     if options.out is not None:
         about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
         atomic_write(options.out, json.dumps(about | {"results": plain(scores)}, indent=2) + "\n")
+    log_default(options.model)
     return 0
 
 

@@ -218,7 +218,11 @@ def test_numbers_out_of_range_are_errors(kind, options, message):
         (ModelConfig, {"dtype": "float16"}, "--model.dtype must be one of float32, bfloat16, float64, not 'float16'"),
         (OptimConfig, {"decay": "cosin"}, "--optim.decay must be one of linear, cosine, not 'cosin'"),
         (DataConfig, {"order": "alternating"}, "--data.order must be one of alternate, random, not 'alternating'"),
-        (DataConfig, {"background": "substract"}, "--data.background must be one of keep, subtract, either, not 'substract'"),
+        (
+            DataConfig,
+            {"background": "substract"},
+            "--data.background must be one of keep, subtract, either, not 'substract'",
+        ),
         (DataConfig, {"require": ("image", "txt")}, r"--data.require\[1\] must be one of image, text, not 'txt'"),
         (DataConfig, {"require": "image"}, "--data.require must be a list, not 'image'"),
         (Config, {"towers": "pretraned"}, "towers must be one of none, scratch, pretrained, not 'pretraned'"),

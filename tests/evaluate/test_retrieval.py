@@ -245,7 +245,7 @@ BAD[3, 2] = np.nan
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"gallery_size": 241}, "needs 240 other touches .* there are 239"),
+        ({"gallery_size": 241}, "needs 240 other touches .* There are 239"),
         ({"gallery_size": 1}, "too small"),
         ({"gallery_touch": ["touch 0"] * COUNT}, "'touch 0' twice"),
         ({"gallery_touch": [f"other {i}" for i in range(COUNT)]}, "share no touch"),

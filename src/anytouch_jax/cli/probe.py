@@ -12,6 +12,7 @@ from anytouch_jax.cli.output import (
     check_folder,
     check_home,
     log,
+    log_default,
     print_table,
     refuse_unused,
 )

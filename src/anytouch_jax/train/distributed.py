@@ -8,8 +8,9 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,8 @@ _CONTINUE = "run the same command again to continue from the last complete check
 _COUNTS = ("JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
-class Process(NamedTuple):
+@dataclass(frozen=True)
+class Process:
     """This process among those of a run: number `index` of `count`."""
 
     count: int

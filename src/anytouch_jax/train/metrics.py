@@ -141,7 +141,7 @@ class Record:
 
     def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Append the line of a step and return it. A number that is not finite becomes null, as JSON has no NaN."""
-        row = {"step": step}
+        row: dict[str, Any] = {"step": step}
         for name, value in numbers.items():
             value = value.item() if hasattr(value, "item") else value
             row[name] = None if isinstance(value, float) and not math.isfinite(value) else value

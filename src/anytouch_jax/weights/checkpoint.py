@@ -403,7 +403,8 @@ def read_record(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"checkpoint {folder} has format {stored}; this program reads {FORMAT!r}")
     for field, (kind, valid) in _FIELDS.items():
         value = record.get(field)
-        if type(value) is not kind or not all(valid(*item) for item in (value.items() if kind is dict else ())):
+        items: Any = value.items() if isinstance(value, dict) else ()
+        if type(value) is not kind or not all(valid(*item) for item in items):
             raise CheckpointError(f"checkpoint {folder} is damaged: {field} in {RECORD} is missing or of another type")
     return record
 

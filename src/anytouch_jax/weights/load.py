@@ -204,7 +204,7 @@ def check_finite(path: str | Path, arrays: Mapping[str, Any]) -> None:
 
 def _fit(loaded: Loaded, config: Config) -> Params:
     """Return the touch encoder and decoder with this run's positions and sensor rows."""
-    parts = {name: loaded.params[name] for name in ("touch", "decoder") if name in loaded.params}
+    parts: Params = {name: loaded.params[name] for name in ("touch", "decoder") if name in loaded.params}
     rows = config.model.patches + 1
     if loaded.config.model.patches + 1 != rows:
         parts = {n: p | {"position": resize_position(np.asarray(p["position"]), rows)} for n, p in parts.items()}

@@ -22,8 +22,6 @@ import numpy as np
 from anytouch_jax.config import parse_json, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors
-from anytouch_jax.weights.tree import flatten
 
 if TYPE_CHECKING:
     from anytouch_jax.weights.load import Loaded
@@ -97,6 +95,9 @@ def write_encoder(
     `parts` of the model are kept if it has them. `notes` is Markdown for the card: data with licences, results, limits.
     Raises WeightsError for values that float16 cannot hold.
     """
+    from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors  # imports jax
+    from anytouch_jax.weights.tree import flatten
+
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     params = {name: loaded.params[name] for name in parts if name in loaded.params}

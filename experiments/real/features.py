@@ -15,12 +15,14 @@ from experiments.real.recordings import Recordings
 def encoder_features(
     encoder: Encoder, data: Recordings, sensor: str = "gelsight_mini", pooling: str = "both"
 ) -> np.ndarray:
-    """Return the class token and the mean of the patch tokens (n, 2E)."""
+    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over train frames."""
     touches = (
         encoder.preprocess(frame, data.backgrounds[place])
         for frame, place in zip(data.frames, data.background, strict=True)
     )
-    return run_in_batches(lambda batch: encoder.encode_touch(batch, sensor, pooling=pooling), touches, 64)
+    x = run_in_batches(lambda batch: encoder.encode_touch(batch, sensor, pooling=pooling), touches, 64)
+    fit = x[data.split == "train"]
+    return np.asarray((x - fit.mean(0)) / (fit.std(0) + 1e-6), np.float32)
 
 
 def pixel_values(data: Recordings) -> np.ndarray:

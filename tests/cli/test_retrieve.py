@@ -43,7 +43,6 @@ def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--no-controls"], "--model"),
         (["--split", "unused"], "unused"),
         (["--model", "nowhere"], "nowhere"),
         (["--gallery", "5000"], "5000"),

@@ -91,12 +91,8 @@ class DataConfig:
     flip: Share = 0.5  # Probability of a mirror image, for each direction.
     affine: NotNegative[tuple[float, float, float]] = (0.0, 0.0, 0.0)
     """Largest turn (degrees), shift and zoom (shares of the side)."""
-    jitter: NotNegative[tuple[float, float, float, float]] = (
-        0.4,
-        0.4,
-        0.5,
-        0.3,
-    )  # Brightness, contrast, saturation, hue.
+    jitter: NotNegative[tuple[float, float, float, float]] = (0.4, 0.4, 0.5, 0.3)
+    """Brightness, contrast, saturation, hue."""
     rotation: NotNegative[float] = 20.0  # Largest rotation of photographs, degrees.
     tokenizer: str | None = None  # Tokenizer file. None: the run's, else CLIP's, else trained on the captions.
     threads: NotNegative[int] = 2  # Threads that read and augment.

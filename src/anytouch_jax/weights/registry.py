@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 DEFAULT = "anytouch-tiny"
 FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md
 WEIGHTS, CARD = "model.safetensors", "config.json"
-PARTS = ("touch", "text", "logit_scale")  # what features and zero-shot questions need
+PARTS = ("touch", "decoder", "text", "logit_scale")  # for features, further training and zero-shot questions
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
 _FILES = ["*.safetensors", "*.safetensors.index.json", "*.pth", "*.pt", "*.bin", "config.json", "tokenizer.json"]
 
@@ -124,7 +124,7 @@ def write_encoder(
         "background": loaded.config.data.background,
         "trained_sensors": loaded.trained_sensors,
         "stage": loaded.config.stage,
-        "steps": loaded.config.run.steps,
+        "steps": loaded.metadata.get("step", loaded.config.run.steps),
         "recipe": loaded.config.recipe,
         "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any, get_args
 
@@ -175,7 +175,9 @@ class FamilyEncoder(Encoder):
         clips, parts = self._clips(clips), []
         for part in jnp.moveaxis(clips, 1, 0):  # one for a family of clips
             parts.append(pooled(self.family, self.form, self._run(params, part, rows), pooling))
-        total = jnp.concatenate(parts, axis=-1) if join == "concat" else sum(parts)
+        if join == "concat":
+            return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
+        total = reduce(jnp.add, parts)
         return (total / len(parts) if join == "mean" else total).astype(jnp.float32)
 
     def _tokens(self, params: Any, clips: jax.Array, rows: jax.Array) -> jax.Array:
@@ -264,23 +266,23 @@ def prepare(frame: np.ndarray, background: np.ndarray | None, steps: Preparation
         image = image[(high - side) // 2 :][:side, (wide - side) // 2 :][:, :side]
     elif steps.crop == "centre":
         shorter, short = steps.shorter or round(max(size) * 8 / 7), min(high, wide)
-        image = _resized(image, tuple(int(shorter * side / short) for side in (high, wide)), steps.filter)
+        image = _resized(image, (int(shorter * high / short), int(shorter * wide / short)), steps.filter)
         top, left = (round((there - wanted) / 2) for there, wanted in zip(image.shape[:2], size, strict=True))
         image = image[top : top + size[0], left : left + size[1]]
     image = _resized(image, size, steps.filter)
     image = image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
-    return (image - np.float32(steps.mean)) / np.float32(steps.std)
+    return (image - np.asarray(steps.mean, np.float32)) / np.asarray(steps.std, np.float32)
 
 
-def _resized(image: np.ndarray, size: tuple[int, ...], kernel: str) -> np.ndarray:
+def _resized(image: np.ndarray, size: Size, kernel: str) -> np.ndarray:
     """Resize by Pillow, with its antialiasing; floats stay floats."""
-    if image.shape[:2] == tuple(size):
+    if image.shape[:2] == size:
         return image
     how = {"bilinear": Image.Resampling.BILINEAR, "bicubic": Image.Resampling.BICUBIC}[kernel]
     if image.dtype == np.uint8:
-        return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize(size[::-1], how))
+        return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize((size[1], size[0]), how))
     planes = (Image.fromarray(np.ascontiguousarray(image[..., colour])) for colour in range(3))
-    return np.stack([np.asarray(plane.resize(size[::-1], how)) for plane in planes], axis=-1)
+    return np.stack([np.asarray(plane.resize((size[1], size[0]), how)) for plane in planes], axis=-1)
 
 
 def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder:

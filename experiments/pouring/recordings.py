@@ -228,10 +228,24 @@ def load_policy(folder: Path | str) -> Touch:
         numbers = {name: array for name, array in arrays.items() if name != "about"}
         if wrong := [name for name, x in numbers.items() if x.dtype.kind != "f" or not np.isfinite(x).all()]:
             raise ValueError(f"{wrong[0]} has values that are not finite numbers")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        _check_head(head)
+        if pooling not in ("class", "mean", "both") or not 0 < votes < 1 << 20:
+            raise ValueError(f"it has pooling {str(pooling)[:40]} and {votes} votes")
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise UserError(f"{folder / POLICY} is no pouring policy ({error})") from None
     if mark != encoder.fingerprint:
         raise UserError(
             f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}. Learn the policy again."
         )
     return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=votes)
+
+
+def _check_head(head: Head) -> None:
+    """Raise ValueError for arrays of an MLP that do not fit together."""
+    width = head.mean.shape
+    for weight, bias in ((head.basis, None), *head.layers):
+        if weight.ndim != 2 or weight.shape[:1] != width or (bias is not None and bias.shape != weight.shape[1:]):
+            raise ValueError(f"a layer of shape {weight.shape} does not fit the one before")
+        width = weight.shape[1:]
+    if not head.layers or width != (len(ACTIONS),):
+        raise ValueError(f"it needs a layer with {len(ACTIONS)} actions")

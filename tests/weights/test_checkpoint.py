@@ -31,7 +31,11 @@ from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
 
 DATA = Path(__file__).parent / "data"
-METADATA = {"sensors": ["digit", "universal"], "preprocessing": {"mean": [0.5], "size": 112}, "source": "a test"}
+METADATA = {
+    "sensors": ["digit", "universal"],
+    "preprocessing": {"mean": [0.5], "size": 112},
+    "source": {"init": "a test"},
+}
 
 
 class State(NamedTuple):

@@ -22,6 +22,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, atomic_write, lock
@@ -126,7 +127,7 @@ def _claim(scenes: Scenes, out: Path) -> None:
 def _read_settings(file: Path) -> dict[str, Any]:
     """Return the settings of a data set. Raises UserError for another file."""
     try:
-        settings = json.loads(file.read_text())
+        settings = parse_json(file.read_bytes())
     except ValueError:
         settings = None
     if not isinstance(settings, dict) or "version" not in settings:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
-from anytouch_jax.config import Config, from_json, to_json
+from anytouch_jax.config import Config, from_json, parse_json, to_json
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.weights.checkpoint import read_record, steps
@@ -181,8 +181,9 @@ def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
     rows: dict[str, dict[str, Any]] = {}
     for line in lines:
         with contextlib.suppress(ValueError):
-            row = json.loads(line)
-            if line.endswith("\n") and isinstance(row, dict) and row.get("step", start) < start:
+            row = parse_json(line)
+            step = row.get("step") if isinstance(row, dict) else None
+            if line.endswith("\n") and isinstance(step, int) and step < start:
                 rows[line] = row
     if rewrite and len(rows) < len(lines):
         atomic_write(path, "".join(rows))

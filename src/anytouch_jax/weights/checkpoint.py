@@ -293,8 +293,9 @@ def _load(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
         with _ORBAX, context:
             stored = flatten(ocp.metadata(folder).metadata)
             for name, like in wanted.items():  # before memory is taken for them
-                if name not in stored or tuple(stored[name].shape) != like.shape:
-                    raise ValueError(f"{name} is not stored in shape {like.shape}")
+                form = stored.get(name)
+                if form is None or (tuple(form.shape), np.dtype(form.dtype)) != (like.shape, np.dtype(like.dtype)):
+                    raise ValueError(f"{name[:200]} is not stored as {like.dtype} {like.shape}")
             return flatten(ocp.load(folder, nest(wanted))) if wanted else {}
     except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
         reason = " ".join(str(error).split())[:300]
@@ -429,9 +430,14 @@ def _is_file(name: str, value: Any) -> bool:
 
 # The fields of a record: the type of each, and the check of its values by name.
 _TYPES = re.compile(r"bool|u?int(4|8|16|32|64)|b?float(16|32|64)|float[48]_e\dm\d\w*|complex(64|128)")
+_METADATA: dict[str, Callable[[Any], bool]] = {  # of a run, that its readers use
+    "seen": lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value),
+    "source": lambda value: isinstance(value, dict) and ("sensor" not in value or {"run", "frames"} <= value.keys()),
+    "data": lambda value: isinstance(value, str),
+}
 _FIELDS: dict[str, tuple[type, Callable[[str, Any], bool]]] = {
     "config": (str, lambda name, value: True),
-    "metadata": (dict, lambda name, value: True),
+    "metadata": (dict, lambda name, value: name not in _METADATA or _METADATA[name](value)),
     "step": (int, lambda name, value: True),
     "metrics": (dict, lambda name, value: value is None or type(value) in (int, float)),
     "arrays": (dict, lambda name, value: _is_form(value)),

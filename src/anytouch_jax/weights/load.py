@@ -16,7 +16,7 @@ from anytouch_jax.files import read_arrays
 from anytouch_jax.weights import checkpoint, compatible, registry
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
 from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
-from anytouch_jax.weights.keymaps import Weights
+from anytouch_jax.weights.keymaps import Weights, param_shapes
 from anytouch_jax.weights.safetensors import (
     BACKGROUND_KEY,
     MODEL_KEY,
@@ -93,6 +93,7 @@ def load_model(
     if is_run_folder(path):
         params, text, metadata = checkpoint.load_params(path, step)
         config: Config = from_json(text)
+        _check_shapes(path, params, config.model)
         trained = metadata.get("seen")
         drawn, from_run = config.objective.universal_start + config.objective.universal_end > 0, True
     else:
@@ -108,6 +109,15 @@ def load_model(
     if trained is not None and "touch" in params and (from_run or not stored_rows):
         params |= {"touch": serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
     return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)
+
+
+def _check_shapes(path: Path, params: Params, model: ModelConfig) -> None:
+    """Raise WeightsError if the arrays of a run are not those of its configuration; runs of version 0.1 have more."""
+    arrays, wanted = flatten(params), param_shapes(model)
+    check_arrays(
+        f"arrays of {path}", {name: array for name, array in arrays.items() if name in wanted},
+        {name: shape for name, shape in wanted.items() if name.partition("/")[0] in params},
+    )  # fmt: skip
 
 
 def trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[str, ...] | None:
@@ -425,4 +435,6 @@ def read_settings(path: Path) -> dict[str, Any]:
         value = parse_json(path.read_bytes())
     except ValueError as error:
         raise WeightsError(f"{path} {error}; correct it, or move the weights to a folder without it") from None
-    return value if isinstance(value, dict) else {}
+    if not isinstance(value, dict):
+        raise WeightsError(f"{path} is no JSON object; correct it, or move the weights to a folder without it")
+    return value

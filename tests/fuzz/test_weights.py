@@ -1,0 +1,357 @@
+"""Hostile weights: .pth pickles that call, claim or repeat, safetensors with wrong headers, shards, and NaN."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import pickletools
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anytouch_jax.weights.safetensors import read_safetensors
+from tests.fuzz.harness import Case, cut, flipped, pick
+from tests.weights.conftest import Call, Global, Tensor, legacy_bytes, tensor, zip_bytes
+
+SIZES = {"F32": 4, "F16": 2, "BF16": 2, "F64": 8, "I64": 8, "I8": 1, "BOOL": 1, "U8": 1, "F8_E4M3": 1}
+
+
+def safetensors(
+    arrays: dict[str, np.ndarray], metadata: Any, edit=lambda header: None, length: int | None = None
+) -> bytes:
+    """The bytes of a safetensors file whose header may be edited."""
+    header: dict[str, Any] = {"__metadata__": metadata} if metadata else {}
+    body = b""
+    for name, array in arrays.items():
+        raw = np.ascontiguousarray(array, np.float32).tobytes()
+        header[name] = {"dtype": "F32", "shape": list(array.shape), "data_offsets": [len(body), len(body) + len(raw)]}
+        body += raw
+    text = edit(header)
+    text = (text if isinstance(text, str) else json.dumps(header)).encode("utf-8", "surrogatepass")
+    return struct.pack("<Q", len(text) if length is None else length) + text + body
+
+
+# Each returns (name, bytes, ending, refused by every command, refused where weights are used). ------------------------
+
+
+def header(rng, arrays, metadata):
+    name = pick(rng, arrays)
+    kind = pick(
+        rng,
+        "offset, overlap, shape, dtype, dtype name, missing, negative, huge, "
+        "more, twice, deep, digits, metadata, empty, length, list",
+    )
+
+    def edit(header):
+        entry = header[name]
+        start, end = entry["data_offsets"]
+        other = pick(rng, [one for one in arrays if one != name])
+        if kind == "offset":
+            entry["data_offsets"] = [start + int(rng.integers(1, 1 << 40)), end + int(rng.integers(1, 1 << 40))]
+        elif kind == "overlap":
+            entry["data_offsets"] = header[other]["data_offsets"]
+            entry["shape"] = [*header[other]["shape"][::-1], 1]
+        elif kind == "shape":
+            entry["shape"] = pick(rng, ([0], [1 << 40, 1 << 40], [*entry["shape"], 2], [(1 << 64) - 1], [10**10, 1]))
+        elif kind == "dtype":
+            entry["dtype"] = pick(rng, [one for one in SIZES if SIZES[one] != 4])
+        elif kind == "dtype name":
+            entry["dtype"] = pick(rng, ("F31", "", None, 3, "f" * 10_000, "C64"))
+        elif kind == "missing":
+            del entry[pick(rng, entry)]
+        elif kind == "negative":
+            entry["shape"] = [-1]
+        elif kind == "huge":
+            entry["shape"], entry["data_offsets"] = [10**10], [start, start + 4 * 10**10]
+        elif kind == "more":
+            header["n" * 100_000] = {"dtype": "F32", "shape": [], "data_offsets": [0, 0]}
+        elif kind == "twice":
+            text = json.dumps(header)
+            return text[:-1] + f', "{name}": {json.dumps(header[other])}' + "}"
+        elif kind == "deep":
+            return '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"
+        elif kind == "digits":
+            entry["shape"] = 0
+            return json.dumps(header).replace('"shape": 0', '"shape": [' + "9" * 5000 + "]")
+        elif kind == "metadata":
+            header["__metadata__"] = pick(rng, (3, [], {"a": 1}, {"a": {"b": "c"}}, "x"))
+        elif kind == "empty":
+            header.clear()
+        elif kind == "list":
+            return json.dumps([header])
+        return None
+
+    length = int(pick(rng, (0, 1, 7, 1 << 40, (1 << 64) - 1))) if kind == "length" else None
+    return f"header: {kind} of {name}", safetensors(arrays, metadata, edit, length), "safetensors", True, True
+
+
+def own_metadata(rng, arrays, metadata):
+    """The description of the network, in the metadata of our files."""
+    key = "anytouch_jax.model"
+    model = json.loads(metadata[key])
+    field = pick(rng, model)
+    values = (None, -1, 0, 1.5, "x", [], {}, 10**10, True, [1] * 1000, 10**30, "y" * 100_000, [{"a": 1}], 7)
+    value = pick(rng, [value for value in values if value != model[field] and type(value) is not type(model[field])])
+    model[field] = value
+    text = json.dumps(model)
+    kind = pick(rng, ("field",) * 4 + ("gone", "cut", "deep", "digits", "NaN", "empty", "seen", "background"))
+    edit = {
+        "gone": None,
+        "cut": text[: len(text) // 2],
+        "deep": "[" * 100_000,
+        "digits": "5" * 5000,
+        "NaN": '{"patch": NaN}',
+        "empty": "",
+    }.get(kind, text)
+    changed = {name: value for name, value in metadata.items() if name != key or edit is not None}
+    if kind == "seen":
+        changed |= {"anytouch_jax.seen": pick(rng, ("", "nothing", ",,,", "a" * 100_000, "digit,digit"))}
+    elif kind == "background":
+        changed |= {"anytouch_jax.background": pick(rng, ("", "no", "x" * 100_000))}
+    elif edit is not None:
+        changed[key] = edit
+    fine = ("gone", "seen") + (
+        ("field",) if field in ("image", "text", "frames", "dtype", "attention", "lora_rank", "lora_alpha") else ()
+    )
+    # None may be the default of a field.
+    return (
+        f"metadata: {kind} {field}={str(value)[:12]}",
+        safetensors(arrays, changed),
+        "safetensors",
+        False,
+        kind not in (*fine, "field"),
+    )
+
+
+def not_finite(rng, arrays, metadata):
+    name = pick(rng, arrays)
+    value = pick(rng, (np.nan, np.inf, -np.inf, 1e39))
+    changed = np.array(arrays[name], np.float64 if value == 1e39 else np.float32)
+    changed.reshape(-1)[int(rng.integers(changed.size))] = value
+    arrays = arrays | {name: changed}
+    if rng.random() < 0.5:
+        return f"{name} has {value}", zip_bytes({key: tensor(one) for key, one in arrays.items()}), "pth", False, True
+    with np.errstate(over="ignore"):
+        return f"{name} has {value}", safetensors(arrays, metadata), "safetensors", False, True
+
+
+def other_arrays(rng, arrays, metadata):
+    name = pick(rng, arrays)
+    array = arrays[name]
+    kind = pick(
+        rng,
+        "missing, more, shape, zero, transposed, prefix, two prefixes, scalar, none, type, many",
+    )
+    rest = {key: one for key, one in arrays.items() if key != name}
+    changed = {
+        "missing": rest,
+        "more": arrays | {"x" * 300: np.zeros(2, np.float32)},
+        "shape": rest | {name: np.zeros((3, 5, 7))},
+        "zero": rest | {name: np.zeros((0, *array.shape))},
+        "transposed": rest | {name: np.concatenate([array, array])},
+        "prefix": {f"module.{key}": one for key, one in arrays.items()},
+        "scalar": rest | {name: np.float32(1)},
+        "two prefixes": {("module." if i % 2 else "model.") + key: one for i, (key, one) in enumerate(arrays.items())},
+        "none": {"a": np.zeros(3)},
+        "type": rest | {name: array.astype(np.int64)},
+        "many": {f"k{i}": np.zeros(1) for i in range(20_000)},
+    }[kind]
+    wrong = kind not in ("prefix", "type") and not (kind == "transposed" and array.ndim == 0)
+    name = f"arrays: {kind} {name}"
+    if rng.random() < 0.5 or kind == "type":
+        return (
+            name,
+            zip_bytes({key: tensor(np.asarray(one)) for key, one in changed.items()}),
+            "pth",
+            False,
+            wrong and kind != "more",
+        )
+    return name, safetensors({k: np.asarray(one) for k, one in changed.items()}, metadata), "safetensors", False, wrong
+
+
+def bytes_damaged(rng, arrays, metadata):
+    ending = pick(rng, ("pth", "legacy", "safetensors"))
+    tensors = {key: tensor(one) for key, one in arrays.items()}
+    data = (
+        {"pth": zip_bytes, "legacy": legacy_bytes}[ending](tensors)
+        if ending != "safetensors"
+        else safetensors(arrays, metadata)
+    )
+    kind = pick(rng, "cut, cut, header, random, empty, html, lfs, zeros")
+    data = {
+        "cut": cut(rng, data),
+        "header": flipped(rng, data, 0, 60, 4),
+        "random": rng.bytes(3000),
+        "empty": b"",
+        "html": b"\n <!DOCTYPE html><html>sign in</html>",
+        "zeros": bytes(len(data)),
+        "lfs": b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 12\n",
+    }[kind]
+    ending = pick(rng, ("pth", "pt", "ckpt", "bin")) if ending in ("pth", "legacy") else ending
+    wrong = kind != "header"
+    return f"{ending} {kind}", data, ending, wrong, wrong
+
+
+def hostile_pickle(rng, arrays, metadata):
+    some = {key: tensor(one) for key, one in arrays.items()}
+    name = pick(rng, some)
+    data = np.zeros(8, np.float32)
+    side = int(pick(rng, (10**10, 1 << 40, 1 << 62, 1 << 66)))
+    kind = pick(
+        rng,
+        "call, expanded, many expanded, beyond, length, negative, kind, "
+        "object, list, nested, keys, state, shape, numbers",
+    )
+    wrong: Any = {
+        "call": some
+        | {
+            "x": Call(
+                Global(*pick(rng, (("os", "system"), ("builtins", "eval"), ("numpy", "load")))), ("touch hacked",)
+            )
+        },
+        "expanded": some | {name: Tensor(data, (side,), (0,))},
+        "many expanded": {f"k{i}": Tensor(data, (1 << 14,), (0,)) for i in range(int(rng.integers(1000, 5000)))},
+        "beyond": some | {name: Tensor(data, (4, 4), (4, 1))},
+        "length": some | {name: Tensor(data, (8,), (1,), length=side)},
+        "negative": some | {name: Tensor(data, (-1,), (1,))},
+        "kind": some | {name: Tensor(data, (8,), (1,), kind="Quantised")},
+        "object": Call(Global("torch.nn.modules.linear", "Linear"), ()),
+        "list": list(some.values()),
+        "state": {"model": {}, "epoch": 3},
+        "nested": {"model": {"model": {"model": {"model": {"model": {"model": some}}}}}},
+        "keys": {3: tensor(np.zeros(2)), **some},
+        "shape": some | {name: Tensor(data, (1,) * 40, (1,) * 40)},
+        "numbers": {"state_dict": {"a": 3.5, "b": "x"}},
+    }[kind]
+    return f"pickle: {kind} {side if kind in ('expanded', 'length') else ''}", zip_bytes(wrong), "pth", True, True
+
+
+def raw_pickle(rng, arrays, metadata):
+    """Bytes for the pickle machine: a flood of operations, deep containers, long numbers, operations at random."""
+    codes = [op.code.encode("latin1") for op in pickletools.opcodes]
+    programs = {
+        "deep list": b"\x80\x02" + b"](" * 200_000 + b"e" * 200_000 + b".",
+        "deep tuple": b"\x80\x02)" + b"\x85" * 200_000 + b".",
+        "deep key": b"\x80\x02})" + b"\x85" * 200_000 + b"K\1s.",
+        "long number": b"\x80\x02\x8b" + struct.pack("<i", 1 << 20) + b"\xff" * (1 << 20) + b".",
+        "digits": b"I" + b"9" * 200_000 + b"\n.",
+        "memo": b"\x80\x02Nr\xff\xff\xff\x7f.",
+        "bytearray": b"\x96" + struct.pack("<Q", 1 << 40) + b".",
+        "frame": b"\x80\x04\x95" + struct.pack("<Q", 1 << 60) + b".",
+        "get": b"\x80\x02h\x05.",
+        "random": b"\x80\x02" + b"".join(pick(rng, codes) for _ in range(60)),
+        "plain": pickle.dumps({"a": np.zeros(3)}),
+        "stop": b".",
+        "dup": b"\x80\x02]" + b"2" * 500_000 + b".",
+        "doubling": b"\x80\x02](K\1e" + b"2\x86" * 200 + b".",
+        "doubled key": b"\x80\x02}(K\1" + b"2\x86" * 60 + b"K\1u.",
+    }
+    kind = pick(rng, programs)
+    data = programs[kind]
+    if rng.random() < 0.5:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive:
+            archive.writestr("archive/data.pkl", data)
+        data = stream.getvalue()
+    return f"pickle machine: {kind}", data, "pth", True, True
+
+
+KINDS = (
+    header,
+    header,
+    own_metadata,
+    own_metadata,
+    not_finite,
+    other_arrays,
+    other_arrays,
+    bytes_damaged,
+    hostile_pickle,
+    raw_pickle,
+)
+
+
+def make(rng, folder: Path, things) -> Case:
+    if rng.random() < 0.1:
+        return shards(rng, folder, things)
+    own = rng.random() < 0.5
+    arrays, metadata = read_safetensors(things.weights if own else things.release)
+    kind = pick(rng, KINDS)
+    if kind in (other_arrays, hostile_pickle, bytes_damaged, not_finite) and not own:
+        (folder / "config.json").write_text(json.dumps({"model": {"touch": {"heads": 2}, "decoder": {"heads": 2}}}))
+    name, data, ending, always, used = kind(rng, arrays, metadata)
+    file = folder / f"w.{ending}"
+    file.write_bytes(data)
+    return Case(*command(rng, f"{'own' if own else 'release'}, {name}", file, folder, things, always, used))
+
+
+def command(rng, name, file, folder, things, always, used):
+    embed = ("embed", "--model", file, "--data", things.frames, "--out", folder / "f.npz")
+    export = ("export", "--to", "safetensors", "--model", file, "--out", folder / "out.safetensors")
+    words = pick(
+        rng, (("info", file), ("info", file), export, export, embed) if used or always else (("info", file), export)
+    )
+    return f"{name}, {words[0]}", words, used if words[0] == "embed" else always
+
+
+def shards(rng, folder: Path, things) -> Case:
+    """Weights in two files, with an index that does not fit them."""
+    arrays, metadata = read_safetensors(things.release)
+    names = sorted(arrays)
+    parts = {
+        "a-00001-of-00002.safetensors": names[: len(names) // 2],
+        "a-00002-of-00002.safetensors": names[len(names) // 2 :],
+    }
+    where = {name: file for file, inside in parts.items() for name in inside}
+    for file, inside in parts.items():
+        (folder / file).write_bytes(safetensors({name: arrays[name] for name in inside}, metadata))
+    (folder / "config.json").write_text(json.dumps({"model": {"touch": {"heads": 2}, "decoder": {"heads": 2}}}))
+    kind = pick(
+        rng,
+        "whole, lost, outside, absolute, type, empty, swapped, html, cut, missing name, folder, device",
+    )
+    index: Any = {"metadata": {"total_size": 1}, "weight_map": where}
+    first = next(iter(where))
+    if kind == "lost":
+        (folder / "a-00002-of-00002.safetensors").unlink()
+    elif kind in ("outside", "absolute", "folder", "device"):
+        places = {
+            "outside": "../" + things.release.name,
+            "absolute": str(things.release),
+            "folder": ".",
+            "device": "/dev/zero",
+        }
+        where[first] = places[kind]
+    elif kind == "type":
+        index = pick(
+            rng,
+            ([], {"weight_map": []}, {"weight_map": {first: 3}}, {"weight_map": None}, 3, {"weight_map": {first: {}}}),
+        )
+    elif kind == "empty":
+        index["weight_map"] = {}
+    elif kind == "swapped":
+        where[first] = where[names[-1]]
+    elif kind == "missing name":
+        where["nothing.weight"] = where[first]
+    elif kind in ("html", "cut"):
+        (folder / "a-00001-of-00002.safetensors").write_bytes(
+            b"<html>" if kind == "html" else safetensors(arrays, metadata)[:-9]
+        )
+    file = folder / "a.safetensors.index.json"
+    file.write_text(json.dumps(index))
+    place = file if rng.random() < 0.7 else folder / "a-00001-of-00002.safetensors"
+    wrong = kind != "whole"
+    return Case(*command(rng, f"shards: {kind}", place, folder, things, wrong, wrong))
+
+
+def test_hostile_weights(survives):
+    survives(make, 60)
+
+
+@pytest.mark.slow
+def test_many_hostile_weights(survives):
+    survives(make, 0.14)

@@ -168,12 +168,12 @@ def test_impossible_models_are_errors():
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        (Stack, {"heads": 0}, "heads must be 1 or more, not 0"),
-        (Stack, {"width": -4}, "width must be 1 or more, not -4"),
-        (TextTower, {"length": 0}, "--model.text.length must be 1 or more, not 0"),
-        (ModelConfig, {"patch": 0}, "--model.patch must be 1 or more, not 0"),
+        (Stack, {"heads": 0}, "heads must be 1 to 1048576, not 0"),
+        (Stack, {"width": -4}, "width must be 1 to 1048576, not -4"),
+        (TextTower, {"length": 0}, "--model.text.length must be 1 to 1048576, not 0"),
+        (ModelConfig, {"patch": 0}, "--model.patch must be 1 to 1048576, not 0"),
         (ModelConfig, {"temperature": 0.0}, "--model.temperature must be above 0, not 0.0"),
-        (ModelConfig, {"lora_rank": -1}, "--model.lora-rank must be 0 or more, not -1"),
+        (ModelConfig, {"lora_rank": -1}, "--model.lora-rank must be 0 to 1048576, not -1"),
         (ModelConfig, {"decoder": Stack(18, 1, 2, 72)}, "--model.decoder.width must be a multiple of 4 .*, not 18"),
         (LossConfig, {"groups": 0}, "--objective.groups must be 1 or more, not 0"),
         (LossConfig, {"mask_ratio": 1.5}, "--objective.mask-ratio must be 0 to 1, not 1.5"),

@@ -28,6 +28,8 @@ MEMORY = 1 << 30  # bytes that a command may take more
 _LIMIT = 6 << 30  # bytes of address space that it gets, so that a bomb hurts nobody
 LETTERS, LINES = 600, 60  # of one line of a message, of a message
 _ANSWERS = {0, 1, 2}
+# How `info` and `contact` report what they could not use, with status 0.
+_DAMAGE = re.compile("cannot be used|cannot embed|cannot be read|is damaged")
 _RULE = re.compile(r"[-|: ]*[╭╰─╮╯│]")  # the option parser draws boxes
 
 
@@ -110,7 +112,7 @@ def faults(case: Case) -> list[str]:
         found.append(f"{len(lines)} lines: {lines[-1][:160]}")
     if done.status == 2 and not done.err.strip():
         found.append("status 2 without a sentence")
-    if done.status == 0 and case.corrupt:
+    if done.status == 0 and case.corrupt and not _DAMAGE.search(done.out):
         found.append("accepted: " + (done.out.strip().splitlines() or [""])[-1][:160])
     if done.status == 0 and not case.corrupt and case.check is not None and (wrong := case.check(done)):
         found.append(wrong)

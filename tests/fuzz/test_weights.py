@@ -292,10 +292,8 @@ def make(rng, folder: Path, things) -> Case:
 def command(rng, name, file, folder, things, always, used):
     embed = ("embed", "--model", file, "--data", things.frames, "--out", folder / "f.npz")
     export = ("export", "--to", "safetensors", "--model", file, "--out", folder / "out.safetensors")
-    words = pick(
-        rng, (("info", file), ("info", file), export, export, embed) if used or always else (("info", file), export)
-    )
-    return f"{name}, {words[0]}", words, used if words[0] == "embed" else always
+    words = pick(rng, (("info", file), ("info", file), export, export, embed)[: 5 if used or always else 3])
+    return f"{name}, {words[0]}", words, used or always
 
 
 def shards(rng, folder: Path, things) -> Case:

@@ -34,7 +34,7 @@ from anytouch_jax.cli import (
     verify,
 )
 from anytouch_jax.cli.arguments import RENAMED, parse_options
-from anytouch_jax.errors import CheckError, UserError
+from anytouch_jax.errors import CheckError, UserError, shorten
 
 
 class Command(NamedTuple):
@@ -140,7 +140,7 @@ def guarded(program: str, run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    print(f"{program}: {sentence}", file=sys.stderr)
+    print(f"{program}: {shorten(sentence)}", file=sys.stderr)
     return status
 
 
@@ -159,7 +159,7 @@ def _missing_devices() -> UserError | None:
 def _show_warning(default: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any) -> None:
     """Print a UserWarning of the library as a sentence, without the line of code that Python shows."""
     if category is UserWarning:
-        print(message, file=sys.stderr)
+        print(shorten(str(message)), file=sys.stderr)
     else:
         default(message, category, *where)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, from_json
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, shorten
 
 if TYPE_CHECKING:
     from anytouch_jax.weights.keymaps import Weights
@@ -37,7 +37,8 @@ def run(options: InfoOptions) -> int:
     if not options.paths:
         raise UserError("There is nothing to describe. Name a file or a folder.")
     for number, path in enumerate(options.paths):
-        print("\n" * bool(number) + "\n".join(_lines(path)))
+        lines = "\n".join(_lines(path)).split("\n")
+        print("\n" * bool(number) + "\n".join(map(shorten, lines)))
     return 0
 
 
@@ -151,7 +152,7 @@ def _weights(path: Path, weights: Weights | None = None) -> list[str]:
     import numpy as np
 
     from anytouch_jax.weights import load, safetensors
-    from anytouch_jax.weights.convert import detect_layout
+    from anytouch_jax.weights.convert import detect_layout, to_params
 
     weights = load.read_weights(path) if weights is None else weights
     metadata = safetensors.read_file_metadata(path)
@@ -167,6 +168,10 @@ def _weights(path: Path, weights: Weights | None = None) -> list[str]:
     ]
     if layout not in ("clip", "openclip"):
         lines.append(_sensors(model, load.trained_sensors(metadata, model)))
+        try:
+            to_params(weights, model)
+        except UserError as error:
+            lines.append(f"These weights cannot be used: {error}")
     elif not load.clip_activation(path):
         lines.append("The activation is unknown. OpenAI's CLIP wants quick_gelu.")
     if unknown:

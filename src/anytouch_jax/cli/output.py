@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.cli.arguments import DEFAULT, spelled
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, shorten
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
@@ -19,7 +19,7 @@ def log(sentence: str) -> None:
     """Print a sentence that is not a result on standard error."""
     from rich.console import Console
 
-    Console(stderr=True, highlight=False).print(sentence, markup=False, soft_wrap=True)
+    Console(stderr=True, highlight=False).print(shorten(sentence), markup=False, soft_wrap=True)
 
 
 def print_table(markdown: str) -> None:

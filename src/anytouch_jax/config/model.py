@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from anytouch_jax.config.parsing import Above0, Count, NotNegative, check
+from anytouch_jax.config.parsing import Above0, NotNegative, Range, check
 from anytouch_jax.errors import ConfigError
 
 UNIVERSAL = "universal"
@@ -14,6 +14,9 @@ SENSORS = (
     "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
 )  # fmt: skip
 STEM = (24, 64)  # channels of the convolutions of patch_encoder "convolutional"
+_MOST = 1 << 20  # of every size: a damaged configuration must not ask for the whole memory
+Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
+Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 
 
@@ -39,10 +42,10 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
 class Stack:
     """A stack of transformer blocks."""
 
-    width: Count[int]  # Channels.
-    depth: NotNegative[int]  # Blocks.
-    heads: Count[int]  # Attention heads.
-    mlp: Count[int]  # Hidden channels of the MLP in a block.
+    width: Size  # Channels.
+    depth: Annotated[int, Range(0, 1024, "0 to 1024")]  # Blocks.
+    heads: Size  # Attention heads.
+    mlp: Size  # Hidden channels of the MLP in a block.
 
     def __post_init__(self) -> None:
         check(self)
@@ -55,8 +58,8 @@ class TextTower:
     """CLIP's text tower."""
 
     stack: Stack
-    vocab: Count[int] = 49408  # Tokens of the vocabulary.
-    length: Count[int] = 77  # Tokens of a caption, with start and end.
+    vocab: Size = 49408  # Tokens of the vocabulary.
+    length: Size = 77  # Tokens of a caption, with start and end.
     end_token: int | None = None  # Token to pool, at its first position. None pools the largest id (CLIP).
 
     def __post_init__(self) -> None:
@@ -70,23 +73,23 @@ class ModelConfig:
     `sensors` names the rows of sensor tokens (Sec. 3.5), and of patch encoders if each has its own (T3).
     """
 
-    image_size: Count[int]  # Side of an image, pixels.
-    patch: Count[int]  # Side of a patch, pixels.
-    embed: Count[int]  # Values of an embedding.
+    image_size: Size  # Side of an image, pixels.
+    patch: Size  # Side of a patch, pixels.
+    embed: Size  # Values of an embedding.
     touch: Stack  # Touch encoder.
     decoder: Stack  # Decoder of stage 1.
     image: Stack | None = None  # Image tower. Stage 1 has none.
     text: TextTower | None = None  # Text tower. Stage 1 has none.
-    frames: Count[int] = 3  # Frames of a clip.
+    frames: Size = 3  # Frames of a clip.
     sensors: tuple[str, ...] = SENSORS  # Sensors with tokens. "universal" serves all other sensors.
-    sensor_tokens: NotNegative[int] = 5  # Tokens of each sensor.
+    sensor_tokens: Number = 5  # Tokens of each sensor.
     activation: Literal["gelu", "quick_gelu"] = "gelu"  # Activation of the encoders. OpenAI CLIP needs quick_gelu.
     norm_eps: NotNegative[float] = 1e-5  # Epsilon of layer norms.
     decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
-    lora_rank: NotNegative[int] = 0  # Rank of the image tower's LoRA. 0: off.
+    lora_rank: Number = 0  # Rank of the image tower's LoRA. 0: off.
     lora_alpha: float = 16.0  # Scale of LoRA, divided by its rank.
     temperature: Above0[float] = 0.07  # Temperature of InfoNCE at the start. It is learned.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # Type of the arithmetic. Parameters are float32.

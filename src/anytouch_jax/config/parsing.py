@@ -37,7 +37,7 @@ def parse_json(text: str | bytes) -> Any:
     """Return the value of JSON of at most 64 MiB, 64 levels and 40 digits a number.
 
     Raises ConfigError with a clause such as "is not JSON" for other text, and for values that no file of ours has: NaN,
-    infinite numbers, and halves of a Unicode pair. All readers of JSON use it.
+    infinite numbers, halves of a Unicode pair, and a name twice in one object. All readers of JSON use it.
     """
     if len(text) > _JSON_BYTES:
         raise ConfigError(f"has {len(text):,} bytes of JSON, more than {_JSON_BYTES:,}")
@@ -49,10 +49,18 @@ def parse_json(text: str | bytes) -> Any:
             raise ConfigError(f"has the number {digits}, which is out of range")
         return value
 
+    def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in pairs]
+        if len(value := dict(pairs)) < len(pairs):
+            raise ConfigError(f"has {max(names, key=names.count)!r} twice in one object")
+        return value
+
     try:
         text = text.decode("utf-8") if isinstance(text, bytes) else text
         integer: Any = functools.partial(number, kind=int)
-        value = json.loads(text, parse_int=integer, parse_float=number, parse_constant=number)
+        value = json.loads(
+            text, parse_int=integer, parse_float=number, parse_constant=number, object_pairs_hook=distinct
+        )
         if _depth(value) > _JSON_DEPTH:
             raise RecursionError
         json.dumps(value, ensure_ascii=False).encode()

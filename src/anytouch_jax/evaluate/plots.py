@@ -50,8 +50,9 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError) as error:
         raise UserError(f"{file} is not the metrics.jsonl of a run ({error}). Give a run folder.") from None
     for number, line in enumerate(lines, 1):
-        names = ("step", *(name for name in (*TERMS, "loss") if line.get(name) is not None)) if type(line) is dict else ()
-        if not names or not all(isinstance(line.get(name), int | float) for name in names):
+        row = line if isinstance(line, dict) else {}
+        values = [row.get("step"), *(row[name] for name in (*TERMS, "loss") if row.get(name) is not None)]
+        if not all(isinstance(value, int | float) for value in values):
             raise UserError(f"Line {number} of {file} has no step, or a loss that is not a number. Remove the line.")
     if not lines:
         raise UserError(f"{file} has no step yet. Train first.")

@@ -307,7 +307,7 @@ def exported(rng, folder: Path) -> Case:
 
 
 def test_hostile_arrays(survives):
-    survives(make, 80)
+    survives(make, 40)
 
 
 @pytest.mark.slow

@@ -175,7 +175,7 @@ def make(rng, folder: Path, things) -> Case:
 
 
 def test_hostile_json(survives):
-    survives(make, 60)
+    survives(make, 30)
 
 
 @pytest.mark.slow

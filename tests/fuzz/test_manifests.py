@@ -368,7 +368,7 @@ def make(rng, folder: Path, things) -> Case:
 
 
 def test_hostile_manifests(survives):
-    survives(make, 60)
+    survives(make, 25)
 
 
 @pytest.mark.slow

@@ -101,7 +101,7 @@ def make(rng, folder: Path, things) -> Case:
 
 
 def test_hostile_numbers(survives):
-    survives(make, 100)
+    survives(make, 60)
 
 
 @pytest.mark.slow

@@ -404,7 +404,7 @@ def film(rng, folder: Path, things) -> Case:
 
 
 def test_hostile_pictures(survives):
-    survives(make, 60)
+    survives(make, 25)
 
 
 @pytest.mark.slow

@@ -273,7 +273,7 @@ def metrics(rng, folder: Path) -> Case:
 
 
 def test_hostile_runs(survives):
-    survives(make, 40)
+    survives(make, 25)
 
 
 @pytest.mark.slow

@@ -347,7 +347,7 @@ def shards(rng, folder: Path, things) -> Case:
 
 
 def test_hostile_weights(survives):
-    survives(make, 60)
+    survives(make, 25)
 
 
 @pytest.mark.slow

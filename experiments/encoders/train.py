@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--corpus", type=Path, required=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, nargs=2, default=(2400, 500), help="steps of stage 1 and of stage 2")
+    parser.add_argument("--steps", type=int, nargs=2, default=(1800, 500), help="steps of stage 1 and of stage 2")
     options = parser.parse_args()
     data = [str(path) for path in (*sorted(options.corpus.glob("*/manifest.parquet")), *options.real)]
     weights = REAL_SHARE if options.real else []

@@ -12,6 +12,7 @@ from places import EXPERIMENTS
 from scripts import visit
 
 from anytouch_jax.errors import UserError
+from experiments.real import page as real
 from experiments.records import read_records, write_record
 from experiments.tables import report
 from experiments.tables.results import read
@@ -73,7 +74,11 @@ def test_a_study_starts_only_as_a_script():
 
 
 def test_every_file_of_results_has_a_page():
-    assert {path.stem for path in RESULTS.glob("*.jsonl")} == {*PAGES, "matrix"}
+    assert {path.stem for path in RESULTS.glob("*.jsonl")} == {*PAGES, "matrix", "real"}
+
+
+def test_the_page_of_real_recordings_is_what_its_records_give():
+    assert (RESULTS / "real.md").read_text() == real.page(RESULTS / "real.jsonl")
 
 
 def drop(path: Path, key: str) -> None:

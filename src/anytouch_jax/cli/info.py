@@ -53,7 +53,7 @@ def _lines(path: Path) -> list[str]:
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
     weights = None
-    if path.is_dir() or (suffix in _WEIGHTS and not description.is_file()):
+    if path.is_dir() or (suffix in _WEIGHTS and suffix != ".npz" and not description.is_file()):
         from anytouch_jax.weights.families import load_family
 
         model, weights = load_family(path)

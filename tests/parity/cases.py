@@ -230,6 +230,14 @@ def _tower(params: Params, *inputs: Any, net: Net, read: Callable[..., jax.Array
     return read(net.bind(params), *inputs)
 
 
+def _image(module: Any, pixels: Any) -> jax.Array:
+    return module.image(pixels)
+
+
+def _text(module: Any, *text: Any) -> jax.Array:
+    return module.text(*text)
+
+
 def _clip(case: Case) -> None:
     pixels = jnp.asarray(channel_last(case.inputs("pixel_values"), clip=False))
     masks = {
@@ -251,7 +259,7 @@ def _clip(case: Case) -> None:
             for output, read in (
                 ("last_hidden_state", lambda module, *text: module.text.hidden(*text)),
                 ("pooled", lambda module, *text: module.text.pooled(*text)),
-                ("projected", AnyTouch.encode_text),
+                ("projected", _text),
             ):
                 array = f"out/{sub}/text_{output}_{name}"
                 if array in case.arrays:
@@ -259,14 +267,14 @@ def _clip(case: Case) -> None:
         for output, read in (
             ("last_hidden_state", lambda module, image: module.image.hidden(image)),
             ("pooled", lambda module, image: module.image.pooled(image)),
-            ("projected", AnyTouch.encode_image),
+            ("projected", _image),
         ):
             array = f"out/{sub}/vision_{output}"
             if array in case.arrays:
                 case.compare(array, _tower(params, pixels, net=net, read=read))
         if f"out/{sub}/logits_per_image" in case.arrays:
-            z_image = losses.normalise(_tower(params, pixels, net=net, read=AnyTouch.encode_image))
-            z_text = losses.normalise(_tower(params, *texts["pad_eot"], net=net, read=AnyTouch.encode_text))
+            z_image = losses.normalise(_tower(params, pixels, net=net, read=_image))
+            z_text = losses.normalise(_tower(params, *texts["pad_eot"], net=net, read=_text))
             case.compare(f"out/{sub}/logits_per_image", jnp.exp(params["logit_scale"]) * z_image @ z_text.T)
 
 

@@ -2,7 +2,7 @@
 
     python -m experiments.encoders.corpus data/corpus --touches 4000
 
-The same command again continues. A shard is a data set of its own, with a manifest; all have the same objects and
+The same command again continues. Each shard is a data set with a manifest. All have the same objects and
 splits. `label.contact` comes from the simulator's depth, so that no picture has to be judged.
 """
 

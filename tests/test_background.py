@@ -21,6 +21,7 @@ from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.encoder.preprocess import Preprocess
+from anytouch_jax.errors import UserError
 from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy
 
@@ -102,6 +103,25 @@ def test_a_row_without_a_background_is_named_or_skipped(touches):
     ((ids, _),) = evaluation(holed, rows, settings(touches, on_bad_sample="skip"))
     assert ids.tolist() == [rows[0], rows[2]]
     assert len(list(evaluation(holed, rows, settings(touches, "keep")))) == 1
+
+
+def test_the_first_frame_of_a_recording_stands_in_for_a_missing_background(encoder, touches):
+    table = manifests.read(touches)
+    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    rows = table.rows_of("test")
+    sequence = table.codes("sequence", own=True)
+    number = np.array(columns["frame_index"])
+    first = [min(np.flatnonzero(sequence == sequence[row]), key=lambda at: number[at]) for row in rows]
+    bare = manifests.from_columns(columns | {"background_path": [None] * len(table)}, touches.parent / "bare.parquet")
+    stated = [columns["path"][dict(zip(rows.tolist(), first, strict=True)).get(row, row)] for row in range(len(table))]
+    given = manifests.from_columns(columns | {"background_path": stated}, touches.parent / "stated.parquet")
+    said: list[str] = []
+    ids, values = embed_rows(encoder, bare, rows, log=said.append)
+    np.testing.assert_array_equal(values, embed_rows(encoder, given, rows, log=said.append)[1])
+    assert ids.tolist() == rows.tolist() and any("`anytouch data contact MANIFEST`" in words for words in said)
+    alone = manifests.select_rows(bare, rows[:1])
+    with pytest.raises(UserError, match=r"row \d+ of .* are stills and have no background_path"):
+        embed_rows(encoder, alone, np.array([0]))
 
 
 def test_a_sight_takes_its_first_frame_for_the_background_unless_told(encoder):

@@ -22,7 +22,8 @@ from anytouch_jax.sim.scene import Scenes
 
 SENSORS = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
 SHARD = 850  # touches, each by every sensor
-TOUCHED = 0.1  # mm of the deepest point that count as contact
+GRADES = ("fine", "fine", "coarse", "fine")  # of one shard after the other
+TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 
 def mark_contact(manifest: Path) -> None:
@@ -46,7 +47,8 @@ def main() -> None:
     begun = time.monotonic()
     for first in range(0, options.touches, SHARD):
         scenes = Scenes(
-            touches=min(SHARD, options.touches - first), sensors=SENSORS, seed=options.seed, grade="coarse",
+            touches=min(SHARD, options.touches - first), sensors=SENSORS, seed=options.seed,
+            grade=GRADES[first // SHARD % len(GRADES)], depth=(0.15, 1.0),
             frames=options.frames, objects=480, size=128, first=first,
             vision=0.4, text=0.7,
         )  # fmt: skip

@@ -20,7 +20,8 @@ class ContactOptions:
 
     Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --picture contact.png
 
-    The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown.
+    The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown. Pictures of the
+    untouched gel that had to be estimated are stored beside it, as the background_path of their rows.
     """
 
     manifest: Positional[Path]  # Manifest to mark (.csv, .parquet).
@@ -72,6 +73,10 @@ def run(options: ContactOptions) -> int:
         )
     backgrounds = contact.read_backgrounds(manifest, options.background)
     scores = contact.contact_scores(manifest, backgrounds=backgrounds, workers=options.threads)
+    if target is not None and scores.gels:
+        folder = target.with_name(f"{target.stem}_backgrounds")
+        manifest = contact.store_backgrounds(manifest, scores, folder)
+        log(f"{folder}: {len(scores.gels)} pictures of the untouched gel, now the background_path of their rows")
     marked, report = contact.mark_contact(
         manifest, scores, thresholds=thresholds, share=options.share, drop=options.drop
     )

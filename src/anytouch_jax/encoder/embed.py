@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.data.loading.evaluation import evaluation
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path
 
@@ -79,7 +79,7 @@ def embed_rows(
     for name in sorted(set(text_column(manifest, "sensor")[rows])) if sensor_row is None else ():
         encoder.sensor_row(name, log)
     if on_bad_sample == "error":
-        check_backgrounds(encoder, manifest, rows)
+        manifest = with_backgrounds(encoder, manifest, rows, log)
     settings = {"data.batch_size": min(batch, len(rows)), "data.on_bad_sample": on_bad_sample}
     config, ids = encoder.config.with_settings(settings), []
 
@@ -148,14 +148,30 @@ def embed_frames(
     return Features(values, index, keys, max(0, len(names) - length + 1) - len(index))
 
 
-def check_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray) -> None:
-    """Raise UserError if the encoder needs background-subtracted frames and one of `rows` has no background_path."""
+def with_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray, log: Log = warn) -> Manifest:
+    """Return the manifest with a background for each of `rows` if the encoder needs one.
+
+    The first frame of a recording stands in for a background that is missing, as with a camera. Raises UserError for a
+    still without one.
+    """
     missing = rows[~manifest.present("background_path")[rows]]
-    if encoder.needs_background and len(missing):
+    if not encoder.needs_background or not len(missing):
+        return manifest
+    sequence = manifest.codes("sequence", own=True)
+    advice = "`anytouch data contact MANIFEST` estimates and stores pictures of the untouched gel."
+    stills = missing[np.bincount(sequence)[sequence[missing]] == 1]
+    if len(stills):
         raise UserError(
-            f"{manifest.where(int(missing[0]))} and {len(missing) - 1} other rows have no background_path, which "
-            f"{encoder.source} subtracts; add backgrounds, or pass --on-bad-sample skip to embed"
+            f"{manifest.where(int(stills[0]))} and {len(stills) - 1} other rows are stills and have no "
+            f"background_path, which {encoder.source} subtracts. {advice} Or pass --on-bad-sample skip to embed."
         )
+    order = np.lexsort((np.asarray(manifest.table["frame_index"]), sequence))
+    first = order[np.searchsorted(sequence[order], sequence[missing])]
+    log(f"{len(missing)} rows have no background_path. The first frame of their recording is subtracted. {advice}")
+    cells, paths = manifest.column("background_path").to_pylist(), manifest.column("path").to_pylist()
+    for row, other in zip(missing.tolist(), first.tolist(), strict=True):
+        cells[row] = paths[other]
+    return replace_column(manifest, "background_path", cells)
 
 
 def text_column(manifest: Manifest, name: str) -> np.ndarray:

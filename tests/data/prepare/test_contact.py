@@ -350,3 +350,19 @@ def test_one_sided_and_unreadable_pictures(tmp_path):
     assert picture.shape[0] == 28 + 28 + c.TILE  # one kept frame (its file is lost: a blank tile), no dropped one
     with pytest.raises(UserError, match="nothing to show"):
         c.contact_sheet(manifest, _scores([np.nan, 9]), tmp_path / "c.png")
+
+
+def test_an_estimated_gel_is_stored_and_becomes_the_background(tmp_path):
+    pictures, contact = press_film("dotted", 0.5, frames=16)
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), picture[..., ::-1])
+    columns = {"path": [f"{number}.png" for number in range(16)], "sensor": ["gelsight_mini"] * 16,
+               "sequence": ["a"] * 16, "frame_index": list(range(16)), "split": ["train"] * 16}  # fmt: skip
+    table = manifests.from_columns(columns, tmp_path / "a.csv")
+    stored = c.store_backgrounds(table, c.contact_scores(table), tmp_path / "gels")
+    assert len({stored.file(row, "background_path") for row in range(16)}) == 1
+    free = np.mean([decode(stored.file(row)) for row in np.flatnonzero(~contact)], axis=0)
+    assert np.abs(scale_picture(free.astype(np.uint8)).astype(int) - decode(stored.file(0, "background_path"))).mean() < 3
+    again = c.contact_scores(stored)
+    assert again.counts == {"given": 16} and not again.gels
+    np.testing.assert_allclose(again.score, c.contact_scores(table).score, atol=0.5)

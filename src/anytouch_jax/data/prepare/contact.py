@@ -12,11 +12,13 @@ of other recordings of the unit (see `untouched_gel`). Where it cannot be decide
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from hashlib import sha256
 from pathlib import Path
 
 import cv2
@@ -56,13 +58,15 @@ TILE, PER_ROW = 120, 10  # of contact_sheet
 class ContactScores:
     """Scores f32 (rows,), NaN if unknown. `reasons` (rows,) names the source of the background, or why it failed.
 
-    `recordings` have no background picture, and for `decided` of them the untouched gel was estimated.
+    `recordings` have no background picture, and for `decided` of them the untouched gel was estimated. `gels` holds
+    the rows without a background picture whose untouched gel was given otherwise or estimated.
     """
 
     score: np.ndarray
     reasons: np.ndarray
     recordings: int = 0
     decided: int = 0
+    gels: tuple[tuple[np.ndarray, UntouchedGel], ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -156,6 +160,7 @@ def contact_scores(
     reasons = np.full(len(manifest), "not asked for", dtype=object)
     has_background = manifest.present("background_path")[rows]
     recordings = decided = 0
+    gels: list[tuple[np.ndarray, UntouchedGel]] = []
     with ThreadPoolExecutor(workers) as pool:
 
         def assign(score_row: Callable[[int], _Scored], some: np.ndarray) -> None:
@@ -169,6 +174,7 @@ def contact_scores(
         for group in _groups(manifest, rows[~has_background]):
             gel, source = _gel_of_group(manifest, group, pool, backgrounds or {})
             if gel is not None:
+                gels.append((group, gel))
                 assign(partial(_score_row, manifest, gel, source), group)
                 continue
             for recording, gel, source in _estimates(manifest, group, pool):
@@ -177,8 +183,24 @@ def contact_scores(
                 if gel is None:
                     reasons[recording] = f"none: {source}"
                 else:
+                    gels.append((recording, gel))
                     assign(partial(_score_row, manifest, gel, source), recording)
-    return ContactScores(score, reasons, recordings, decided)
+    return ContactScores(score, reasons, recordings, decided, tuple(gels))
+
+
+def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -> Manifest:
+    """Write the untouched gels of `scores.gels` to `folder`, and return the manifest with them as background_path.
+
+    The pictures are PNG of at most LONG_SIDE pixels. Rows of the split `background` stay without one. Raises OSError.
+    """
+    cells = manifest.column("background_path").to_pylist()
+    is_free = manifest.text_column("split") == "background"
+    for rows, gel in scores.gels:
+        name = folder / f"{sha256(gel.picture.tobytes()).hexdigest()[:16]}.png"
+        atomic_write(name, cv2.imencode(".png", gel.picture[..., ::-1])[1].tobytes())
+        for row in rows[~is_free[rows]].tolist():
+            cells[row] = Path(os.path.relpath(name, manifest.files[manifest.source[row]].parent)).as_posix()
+    return replace_column(manifest, "background_path", cells)
 
 
 def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedGel]:

@@ -13,37 +13,28 @@ from experiments.real.recordings import Recordings
 
 
 def encoder_features(
-    encoder: Encoder, data: Recordings, sensor: str = "gelsight_mini", pooling: str = "both", clips: bool = False
+    encoder: Encoder, data: Recordings, sensor: str = "gelsight_mini", pooling: str = "both"
 ) -> np.ndarray:
-    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over train frames.
-
-    With `clips` a frame is embedded together with the two before it.
-    """
-    touches = np.stack([
+    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over train frames."""
+    touches = (
         encoder.preprocess(frame, data.backgrounds[place])
         for frame, place in zip(data.frames, data.background, strict=True)
-    ])  # fmt: skip
-    samples = (touches[rows] for rows in data.clip) if clips else iter(touches)
-    x = run_in_batches(lambda batch: encoder.encode_touch(batch, sensor, pooling=pooling), samples, 64)
+    )
+    x = run_in_batches(lambda batch: encoder.encode_touch(batch, sensor, pooling=pooling), touches, 64)
     fit = x[data.split == "train"]
     return np.asarray((x - fit.mean(0)) / (fit.std(0) + 1e-6), np.float32)
 
 
-def pixel_values(data: Recordings, clips: bool = False) -> np.ndarray:
-    """Return 200 principal components of 32 x 24 pixels and of their difference from the background.
-
-    With `clips` also of the differences from the two frames before.
-    """
-    small = _small(data.frames)
-    parts = [small, small - _small(data.backgrounds)[data.background]]
-    if clips:
-        parts += [small - small[data.clip[:, step]] for step in (0, 1)]
-    return components(np.concatenate(parts, -1).reshape(len(small), -1), data)
-
-
-def _small(pictures: np.ndarray) -> np.ndarray:
-    """Return pictures (n, 24, 32, 3) f32 in 0..1."""
-    return np.stack([cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA) for one in pictures]).astype(np.float32) / 255
+def pixel_values(data: Recordings) -> np.ndarray:
+    """Return 200 principal components of 32 x 24 pixels and of their difference from the background."""
+    small = np.stack([cv2.resize(frame, (32, 24), interpolation=cv2.INTER_AREA) for frame in data.frames]).astype(
+        np.float32
+    )
+    gel = np.stack([cv2.resize(frame, (32, 24), interpolation=cv2.INTER_AREA) for frame in data.backgrounds]).astype(
+        np.float32
+    )
+    values = np.concatenate([small, small - gel[data.background]], -1).reshape(len(small), -1) / 255
+    return components(values, data)
 
 
 def components(values: np.ndarray, data: Recordings, count: int = 200) -> np.ndarray:

@@ -12,22 +12,19 @@ import numpy as np
 from anytouch_jax.data.manifest import manifest as manifests
 
 SET = "incipient_slip-gelsight_mini_markers"
-STRIDE = 2  # between the numbers of neighbours in a clip
 
 
 @dataclass(frozen=True)
 class Recordings:
     """Frames u8 RGB (n, h, w, 3), a background for each, and one value of every column a frame.
 
-    `background` numbers a row of `backgrounds`. `clip` (n, 3) numbers the frame two steps before, one step before, and
-    the frame itself. At the start of a clip its first frame stands in for those before it. A frame without a background of its unit gets the first frame of its
+    `background` numbers a row of `backgrounds`. A frame without a background of its unit gets the first frame of its
     sequence: that is what `Preprocess` does with a camera.
     """
 
     frames: np.ndarray
     backgrounds: np.ndarray
     background: np.ndarray
-    clip: np.ndarray
     recording: np.ndarray
     finger: np.ndarray
     split: np.ndarray
@@ -60,20 +57,13 @@ def read(path: str | Path) -> Recordings:
         name = columns["background_path"][row] or first[columns["sequence"][row]]
         background.append(pictures.setdefault(name, len(pictures)))
 
-    place_of = {(columns["sequence"][row], int(columns["frame_index"][row])): n for n, row in enumerate(rows)}
-    before = np.array([
-        place_of.get((columns["sequence"][row], int(columns["frame_index"][row]) - STRIDE), n)
-        for n, row in enumerate(rows)
-    ])  # fmt: skip
-    clip = np.stack([before[before], before, np.arange(len(rows))], 1)
-
     def picture(name: str) -> np.ndarray:
         return cv2.cvtColor(cv2.imread(str(root / name), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
     take = {name: values[rows] for name, values in columns.items()}
     return Recordings(
         np.stack([picture(name) for name in take["path"]]), np.stack([picture(name) for name in pictures]),
-        np.array(background), clip, take["recording"].astype(str), np.array([unit[:4] for unit in take["unit"]]),
+        np.array(background), take["recording"].astype(str), np.array([unit[:4] for unit in take["unit"]]),
         take["split"].astype(str), take["object_fold"].astype(int), take["label.object"].astype(str),
         take["label.slip"].astype(int), manifest.content_hash,
     )  # fmt: skip

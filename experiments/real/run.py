@@ -12,7 +12,6 @@ import argparse
 import dataclasses
 import json
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,7 @@ from experiments.benchmarks import machine
 from experiments.real import features, page, recordings, scores
 from experiments.records import write_record
 
-CLIPS = ", clips"
-BASELINES = {
-    "pixels": features.pixel_values,
-    f"pixels{CLIPS}": partial(features.pixel_values, clips=True),
-    "HOG and local binary patterns": features.classical_values,
-}
+BASELINES = {"pixels": features.pixel_values, "HOG and local binary patterns": features.classical_values}
 UNTRAINED = "untrained:"
 
 
@@ -80,10 +74,9 @@ def main() -> None:
             encoder = load(name)
             about = {"kind": "encoder", "config": json.loads(json.dumps(dataclasses.asdict(encoder.config))),
                      "fingerprint": encoder.fingerprint, "milliseconds": milliseconds(encoder, data)}  # fmt: skip
-            for row, clips in ((name, False), (f"{name}{CLIPS}", True)):
-                x = features.encoder_features(encoder, data, clips=clips)
-                write_record(options.out, row, record_of(x, data, common | about))
-                print(row, flush=True)
+            x = features.encoder_features(encoder, data)
+            write_record(options.out, name, record_of(x, data, common | about))
+            print(name, flush=True)
     atomic_write(options.out.with_suffix(".md"), page.page(options.out))
 
 

@@ -13,7 +13,7 @@ from experiments.real.scores import HEADS, TASKS, Score
 from experiments.records import read_records
 
 Record = dict[str, Any]
-_CHANCE = {"object": "1 of 39 objects", "object, other finger": "1 of 39 objects", "slip, objects left out": "53 %"}
+TRAINED = "trained with labels"
 
 
 def page(results: Path) -> str:
@@ -41,6 +41,7 @@ def page(results: Path) -> str:
             _percent(record["tasks"]["object, linear"]["share"]),
         )
         for name, record in records.items()
+        if "label_curve" in record
     ]
     lines += [markdown_table(("features", *counts, "all"), rows, "lrrrr"), ""]
     lines += ["## Time", "", "One frame, preprocessing included, on this machine: " + _machine(records), ""]
@@ -58,9 +59,9 @@ def page(results: Path) -> str:
 def _table(records: dict[str, Record], task: str) -> str:
     """Return the rows of a task: score, interval, and the differences from pixels and from the untrained network."""
     rows = []
-    for head in HEADS:
+    for head in (*HEADS, TRAINED):
         key = f"{task}, {head}"
-        scores = {name: _score(record["tasks"][key]) for name, record in records.items()}
+        scores = {name: _score(record["tasks"][key]) for name, record in records.items() if key in record["tasks"]}
         untrained = next((name for name in scores if name.startswith("untrained:")), None)
         for name, score in sorted(scores.items(), key=lambda item: -item[1].share):
             low, high = score.interval()

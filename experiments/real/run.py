@@ -20,11 +20,12 @@ import numpy as np
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.files import atomic_write
 from experiments.benchmarks import machine
-from experiments.real import features, page, recordings, scores
+from experiments.real import features, page, recordings, scores, training
 from experiments.records import write_record
 
 BASELINES = {"pixels": features.pixel_values, "HOG and local binary patterns": features.classical_values}
 UNTRAINED = "untrained:"
+CNN = "small CNN from scratch"
 
 
 def load(name: str) -> Encoder:
@@ -46,15 +47,39 @@ def milliseconds(encoder: Encoder, data: recordings.Recordings, rounds: int = 30
 
 def record_of(x: np.ndarray, data: recordings.Recordings, about: dict[str, Any]) -> dict[str, Any]:
     """Return the scores of features (n, d) on every task, with whether each recording was right."""
-    tasks = {}
-    for task, row in scores.table({"": x}, data).items():
-        score = row[""]
-        tasks[task] = {
-            "share": score.share, "interval": score.interval(), "option": score.option,
-            "correct": score.correct.astype(int).tolist(), "groups": score.groups.tolist(),
-        }  # fmt: skip
+    tasks = {task: task_record(row[""]) for task, row in scores.table({"": x}, data).items()}
     curve = {str(count): scores.label_curve(x, data, count) for count in (1, 2, 5)}
     return about | {"tasks": tasks, "label_curve": curve, "machine": dataclasses.asdict(machine.describe())}
+
+
+def task_record(score: scores.Score) -> dict[str, Any]:
+    """Return a score as it stands in a record."""
+    return {
+        "share": score.share, "interval": score.interval(), "option": score.option,
+        "correct": score.correct.astype(int).tolist(), "groups": score.groups.tolist(),
+    }  # fmt: skip
+
+
+def trained_records(models: list[str], data: recordings.Recordings, common: dict[str, Any], out: Path) -> None:
+    """Score a small CNN on every task, and the encoders trained with labels on the first task."""
+    about = common | {"machine": dataclasses.asdict(machine.describe())}
+    pictures = training.cnn_pictures(data)
+    tasks = {
+        f"{task}, {page.TRAINED}": task_record(score(pictures, data, training.cnn_scores))
+        for task, score in scores.TASKS.items()
+    }
+    write_record(out, CNN, about | {"kind": "baseline", "tasks": tasks})
+    print(CNN, flush=True)
+    for name in models:
+        encoder = load(name)
+        x = np.stack([
+            encoder.preprocess(frame, data.backgrounds[place])
+            for frame, place in zip(data.frames, data.background, strict=True)
+        ])  # fmt: skip
+        score = scores.object_score(x, data, training.fine_tuned_scores(encoder))
+        about |= {"kind": "encoder", "fingerprint": encoder.fingerprint}
+        write_record(out, f"{name}, fine-tuned", about | {"tasks": {f"object, {page.TRAINED}": task_record(score)}})
+        print(f"{name}, fine-tuned", flush=True)
 
 
 def main() -> None:
@@ -62,6 +87,7 @@ def main() -> None:
     parser.add_argument("models", nargs="*")
     parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"))
     parser.add_argument("--out", type=Path, default=Path("experiments/results/real.jsonl"))
+    parser.add_argument("--trained", action="store_true", help="train a CNN and the encoders with labels too: an hour")
     parser.add_argument("--page", action="store_true", help="make the page from the records, and nothing else")
     options = parser.parse_args()
     if not options.page:
@@ -77,6 +103,8 @@ def main() -> None:
             x = features.encoder_features(encoder, data)
             write_record(options.out, name, record_of(x, data, common | about))
             print(name, flush=True)
+        if options.trained:
+            trained_records(options.models, data, common, options.out)
     atomic_write(options.out.with_suffix(".md"), page.page(options.out))
 
 

@@ -362,7 +362,9 @@ def test_an_estimated_gel_is_stored_and_becomes_the_background(tmp_path):
     stored = c.store_backgrounds(table, c.contact_scores(table), tmp_path / "gels")
     assert len({stored.file(row, "background_path") for row in range(16)}) == 1
     free = np.mean([decode(stored.file(row)) for row in np.flatnonzero(~contact)], axis=0)
-    assert np.abs(scale_picture(free.astype(np.uint8)).astype(int) - decode(stored.file(0, "background_path"))).mean() < 3
+    assert (
+        np.abs(scale_picture(free.astype(np.uint8)).astype(int) - decode(stored.file(0, "background_path"))).mean() < 3
+    )
     again = c.contact_scores(stored)
     assert again.counts == {"given": 16} and not again.gels
     np.testing.assert_allclose(again.score, c.contact_scores(table).score, atol=0.5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from experiments.real import features, page, run, scores
+from experiments.real import features, page, run, scores, training
 from experiments.real.recordings import Recordings
 from experiments.records import write_record
 
@@ -92,3 +92,20 @@ def test_the_page_has_every_row_and_refuses_mixed_data(data, tmp_path):
     write_record(file, "b", {"data": "other"})
     with pytest.raises(UserError, match="different data"):
         page.page(file)
+
+
+def test_a_small_network_learns_what_the_pictures_show(data, monkeypatch):
+    """Objects differ by their colour. A shift moves no colour."""
+    y = np.searchsorted(data.names, data.object)
+    x = np.broadcast_to(200 * np.eye(6, dtype=np.uint8)[y][:, None, None], (len(y), 16, 16, 6))
+    monkeypatch.setattr(training, "EPOCHS", (20,))
+    monkeypatch.setattr(training.SmallCnn.__init__, "__defaults__", (0, (8, 8)))
+    assert scores.object_score(x, data, training.cnn_scores).share == 1.0
+
+
+def test_shifted_pictures_keep_their_size_and_values():
+    pictures = np.arange(2 * 20 * 20 * 3, dtype=np.int64).reshape(2, 20, 20, 3)
+    moved = training._shifted(pictures, np.random.default_rng(3))
+    assert moved.shape == pictures.shape
+    assert all(np.isin(one, other).all() for one, other in zip(moved, pictures, strict=True))
+    assert not np.array_equal(moved, pictures)

@@ -98,7 +98,7 @@ def test_a_small_network_learns_what_the_pictures_show(data, monkeypatch):
     """Objects differ by their colour. A shift moves no colour."""
     y = np.searchsorted(data.names, data.object)
     x = np.broadcast_to(200 * np.eye(6, dtype=np.uint8)[y][:, None, None], (len(y), 16, 16, 6))
-    monkeypatch.setattr(training, "EPOCHS", (20,))
+    monkeypatch.setattr(training, "EPOCHS", (80,))
     monkeypatch.setattr(training.SmallCnn.__init__, "__defaults__", (0, (8, 8)))
     assert scores.object_score(x, data, training.cnn_scores).share == 1.0
 

@@ -28,11 +28,31 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_cache_in_the_home(tmp_path_factory):
-    """Commands keep compiled programs: not in the home of whoever runs the tests."""
+def compiled_once(tmp_path_factory):
+    """Compile each program once for all modules, workers and commands, in a folder of this session.
+
+    Nothing is written to the home of whoever runs the tests.
+    """
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # workers have folders of their own below that of the session
+        folder = folder.parent
+    settings = {
+        "jax_compilation_cache_dir": None,
+        "jax_persistent_cache_min_compile_time_secs": 0.1,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    for name, value in settings.items():
+        jax.config.update(name, value)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        for name, value in (settings | {"jax_compilation_cache_dir": enable_compilation_cache()}).items():
+            patch.setenv(name.upper(), str(value))  # for child processes
         yield
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,25 +64,6 @@ def _free_compiled_programs():
 
 
 @pytest.fixture(scope="session")
-def compiled_once(_no_cache_in_the_home):
-    """Compile each program once for the whole session, the command line's own cache included; nothing in the home."""
-    from anytouch_jax.train.mesh import enable_compilation_cache
-
-    settings = {
-        "jax_compilation_cache_dir": None,
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    before = {name: getattr(jax.config, name) for name in settings}
-    for name, value in settings.items():
-        jax.config.update(name, value)
-    enable_compilation_cache()
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
-@pytest.fixture(scope="session")
 def world(tmp_path_factory):
     """The manifest of a small world on disk (see runs.py)."""
     from runs import make_world
@@ -71,7 +72,7 @@ def world(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def tiny_run(tmp_path_factory, world, compiled_once):
+def tiny_run(tmp_path_factory, world):
     """A run folder of stage 1 after two steps: one of stills, one of clips."""
     from runs import run_config, train
 

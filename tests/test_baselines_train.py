@@ -25,7 +25,7 @@ def data(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "stage"), EVERY)
-def test_a_baseline_trains_and_embeds(data, tmp_path, compiled_once, name, stage):
+def test_a_baseline_trains_and_embeds(data, tmp_path, name, stage):
     config = baselines.apply(name, run_config(data, stage, batch=4, steps=4))
     # The parameters of one still and one clip step are what two steps of the alternating order move.
     result = train(replace(config, optim=replace(config.optim, warmup=1)), tmp_path / "r", stop_after=2)

@@ -38,13 +38,8 @@ print(result.resumed, result.step)
 """
 
 
-@pytest.fixture(autouse=True)
-def _compiled_once(compiled_once):
-    """Most runs here share their programs."""
-
-
 @pytest.fixture(scope="session")
-def straight(tmp_path_factory, world, compiled_once):
+def straight(tmp_path_factory, world):
     """Stage 1, four steps at once: (run folder, result)."""
     run = tmp_path_factory.mktemp("straight") / "run"
     return run, train(run_config(world), run)

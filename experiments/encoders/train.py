@@ -14,17 +14,16 @@ from anytouch_jax.cli.app import main as anytouch
 
 NOTES = Path(__file__).with_name("anytouch-tiny.md")
 DATA = [
-    "--preset", "tiny", "--data.background", "either", "--data.contact-only", "--data.affine", "10", "0.05", "0.15",
-    "--data.jitter", "0.3", "0.3", "0.3", "0.1", "--data.cache", "6000",
+    "--preset", "tiny", "--batch", "64", "--data.background", "subtract", "--data.contact-only",
+    "--data.jitter", "0", "0", "0", "0", "--data.cache", "5000",
 ]  # fmt: skip
-STAGE1 = [*DATA, "--batch", "64", "--optim.learning-rate", "1e-3"]
-SMALL = ["width=128", "depth=2", "heads=4", "mlp=512"]  # the image tower: photographs are few and simple
+STAGE1 = [*DATA, "--optim.learning-rate", "1e-3", "--objective.norm-pix-loss"]
+SMALL = ("width=128", "depth=2", "heads=4", "mlp=512")  # the image tower: photographs are few and simple
 STAGE2 = [
-    *DATA, "--batch", "64", "--optim.learning-rate", "5e-4", "--optim.layer-decay", "0.7",
-    "--model.match-head", "cosine", "--objective.match-weight", "4", "--objective.match-keep", "0.5",
-    "--data.negatives", "same_sensor",
+    *DATA, "--optim.learning-rate", "7e-4", "--optim.layer-decay", "0.75", "--model.dtype", "bfloat16",
+    "--model.match-head", "cosine", "--objective.match-weight", "8", "--objective.match-keep", "0.5",
+    "--data.negatives", "same_sensor", "--model.text.stack.depth", "2",
     *(word for part in SMALL for word in (f"--model.image.{part.partition('=')[0]}", part.partition("=")[2])),
-    "--model.text.stack.depth", "2",
 ]  # fmt: skip
 REAL_SHARE = ["--data.weights", "incipient_slip-gelsight_mini_markers", "5", "gelslam-gelsight_mini", "10"]
 
@@ -34,7 +33,7 @@ def main() -> None:
     parser.add_argument("--corpus", type=Path, required=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, nargs=2, default=(1800, 500), help="steps of stage 1 and of stage 2")
+    parser.add_argument("--steps", type=int, nargs=2, default=(3200, 2000), help="steps of stage 1 and of stage 2")
     options = parser.parse_args()
     data = [str(path) for path in (*sorted(options.corpus.glob("*/manifest.parquet")), *options.real)]
     weights = REAL_SHARE if options.real else []

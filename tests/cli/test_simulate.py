@@ -13,7 +13,7 @@ SMALL = ["--objects", "6", "--frames", "2", "--size", "32"]
 
 
 @pytest.fixture(autouse=True)
-def _no_physics(monkeypatch, compiled_once):
+def _no_physics(monkeypatch):
     monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
 
 

@@ -39,11 +39,6 @@ TINY_RUN = options_of(
 )
 
 
-@pytest.fixture(autouse=True)
-def _compiled_once(compiled_once):
-    """Most runs here share their programs."""
-
-
 def parse(*words: object) -> command.TrainRequest:
     return command.parse(command.TrainOptions, "train", ["--data", "m.csv", "--run", "r", *map(str, words)])
 
@@ -320,7 +315,7 @@ def agree(run: Path, other: Path) -> None:
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["stage 1", "stage 2"])
-def lone(request, tmp_path_factory, world, compiled_once):
+def lone(request, tmp_path_factory, world):
     """(stage, run folder, result) of twenty steps on one device."""
     run = tmp_path_factory.mktemp("alone") / "run"
     return request.param, run, train(config_of(world, request.param), run, mesh=make_mesh(1))

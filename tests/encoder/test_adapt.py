@@ -47,7 +47,7 @@ def stored(folder, config, params, **metadata):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, data, compiled_once):
+def run(tmp_path_factory, data):
     """A stage-1 run whose tokens matter: larger than at the start of training."""
     config = run_config(data)
     params = build(config.model).init(jax.random.key(0))
@@ -229,7 +229,7 @@ def test_a_run_without_its_trained_sensors_is_adapted_with_a_warning(run, table,
 
 
 @pytest.mark.slow
-def test_what_training_saw_is_written_down(world, tiny_run, tmp_path, compiled_once):
+def test_what_training_saw_is_written_down(world, tiny_run, tmp_path):
     assert checkpoint.read_metadata(tiny_run)["seen"] == ["digit", "gelsight_mini"]
     rows = [line for line in world.read_text().splitlines() if "gelsight_mini" not in line]
     (world.parent / "digit_only.csv").write_text("\n".join(rows))
@@ -240,7 +240,7 @@ def test_what_training_saw_is_written_down(world, tiny_run, tmp_path, compiled_o
     assert checkpoint.read_metadata(tmp_path / "r")["seen"] == ["digit", "gelsight_mini"]
 
 
-def test_the_command(run, data, tmp_path, capsys, compiled_once):
+def test_the_command(run, data, tmp_path, capsys):
     args = ["adapt", "--model", run, "--data", data, "--sensor", "gelslim", "--labels", "hardness", "--frames", 8]
     args += ["--steps", 40, "--out"]
     assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 0

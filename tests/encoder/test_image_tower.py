@@ -73,6 +73,6 @@ def test_a_run_without_an_image_tower_is_one_sentence(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_tower_of_a_run_that_was_trained(world, tmp_path, compiled_once):
+def test_the_tower_of_a_run_that_was_trained(world, tmp_path):
     train(run_config(world, 2), tmp_path / "r", stop_after=1)
     assert image_tower_encoder(tmp_path / "r").encode_touch(STILLS).shape == (2, 12)

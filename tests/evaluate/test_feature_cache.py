@@ -34,7 +34,7 @@ ROWS = np.arange(3)
 
 
 @pytest.fixture(scope="module")
-def subtracting(compiled_once) -> Encoder:
+def subtracting() -> Encoder:
     config = tiny_config()
     return random_encoder(replace(config, data=replace(config.data, background="subtract")))
 
@@ -95,7 +95,7 @@ def pictures(tmp_path_factory) -> Manifest:
 
 
 @pytest.fixture(scope="module")
-def encoder(compiled_once) -> Encoder:
+def encoder() -> Encoder:
     return random_encoder(tiny_config())
 
 

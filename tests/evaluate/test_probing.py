@@ -228,7 +228,7 @@ def touches(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def encoder(compiled_once) -> Encoder:
+def encoder() -> Encoder:
     return random_encoder(tiny_config())
 
 

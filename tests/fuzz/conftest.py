@@ -34,7 +34,7 @@ class Things:
 
 
 @pytest.fixture(scope="session")
-def things(tmp_path_factory, compiled_once):
+def things(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fuzz")
     manifest = make_world(folder / "world")
     config = tiny_config()

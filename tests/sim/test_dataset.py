@@ -24,7 +24,7 @@ SCENES = Scenes(touches=10, objects=24, seed=4, sensors=("digit", "tac3d"), size
 
 
 @pytest.fixture(autouse=True)
-def _no_physics(monkeypatch, compiled_once):
+def _no_physics(monkeypatch):
     monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
 
 

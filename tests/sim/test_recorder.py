@@ -138,7 +138,7 @@ def _small_grid():
 
 
 @pytest.fixture(scope="module")
-def takes(compiled_once, _small_grid):
+def takes(_small_grid):
     """Six touches by a camera and by a sensor of fields: [(recording, take)] by sensor."""
     scenes = SCENES
     things, splits = scene.objects_and_splits(scenes)

@@ -69,7 +69,7 @@ def test_a_run_of_yours_is_asked_for_in_one_line(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_of_yours_is_scored_next_to_ours(tmp_path, monkeypatch, capsys, tiny_run, compiled_once):
+def test_a_run_of_yours_is_scored_next_to_ours(tmp_path, monkeypatch, capsys, tiny_run):
     size = replace(plan.QUICK, own=24, fine=24, coarse=24, other=24, objects=24, frames=6)
     monkeypatch.setattr(page, "SIZE", size)
     monkeypatch.setenv("RUN", str(tiny_run))

@@ -117,7 +117,7 @@ def test_changed_sizes_are_written_next_to_the_data():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_the_whole_way_at_the_smallest_size(tmp_path, compiled_once, capsys):
+def test_the_whole_way_at_the_smallest_size(tmp_path, capsys):
     sizes = {"own": 24, "fine": 24, "coarse": 24, "other": 24, "objects": 24, "frames": 6, "steps1": 2, "steps2": 2}
     words = ["--quick", "--set", *(f"{name}={number}" for name, number in sizes.items())]
     words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]

@@ -19,11 +19,6 @@ pytestmark = pytest.mark.slow  # the fixture trains two translations
 FIT = ("--steps", 2, "--batch", 4)
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(compiled_once):
-    """The command keeps compiled programs: not in the home of whoever runs the tests."""
-
-
 @pytest.fixture(scope="module")
 def world_of_pairs(tmp_path_factory):
     return make_pairs(tmp_path_factory.mktemp("pairs"), {"train": 6, "test": 3})

@@ -44,22 +44,17 @@ FIELD = replace(IMAGE, field=(20, 20, 6))
 SENSORS = {"source": "gelsight_mini", "target": "duragel"}
 
 
-@pytest.fixture(autouse=True)
-def _compiled(compiled_once):
-    """Every program once a session."""
-
-
 def design(shape=IMAGE, encoder="somewhere", **options) -> Design:
     return Design("gelsight_mini", "duragel", shape, encoder, Fit(**({"steps": 40, "batch": 8} | options)))
 
 
 @pytest.fixture(scope="module")
-def made(compiled_once) -> Generator:
+def made() -> Generator:
     return training.fit(ENCODER, X, Y, **SENSORS, options=Fit(steps=2, batch=8), shape=IMAGE)[0]
 
 
 @pytest.fixture(scope="module")
-def regressed(compiled_once) -> Generator:
+def regressed() -> Generator:
     options = Fit(steps=2, batch=8)
     return training.fit(ENCODER, X, FIELDS, source="digit", target="tac3d", options=options, shape=FIELD)[0]
 

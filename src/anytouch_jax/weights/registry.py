@@ -92,6 +92,7 @@ def write_encoder(
 ) -> Path:
     """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16, config.json, README.md.
 
+    The copy computes in float32, whatever its training did.
     `parts` of the model are kept if it has them. `notes` is Markdown for the card: data with licences, results, limits.
     Raises WeightsError for values that float16 cannot hold.
     """
@@ -109,6 +110,7 @@ def write_encoder(
     model = replace(
         model, image=model.image if "image" in params else None, text=model.text if "text" in params else None,
         match_head=model.match_head if "matcher" in params else "none", lora_rank=0,
+        dtype="float32",
     )  # fmt: skip
     write_safetensors(folder / WEIGHTS, arrays, loaded.export_metadata() | {MODEL_KEY: to_json(model), "source": ""})
     if tokenizer is not None and "text" in params:
@@ -141,6 +143,7 @@ def _page(card: Mapping[str, Any], notes: str) -> str:
         "either": "A picture of the untouched gel is subtracted if you give one. It also works without.",
         "keep": "The picture of the untouched gel is not used.",
     }[card["background"]]
+    given = ", background" if card["background"] == "subtract" else ""
     return f"""---
 library_name: anytouch_jax
 tags: [tactile, touch, jax]
@@ -154,7 +157,7 @@ An encoder of touch for camera-based tactile sensors, by AnyTouch (ICLR 2025) in
 import anytouch_jax as at
 
 encoder = at.load_encoder("{card["name"]}")
-features = encoder.encode_touch(encoder.preprocess(frame), "digit")  # (1, {card["features"]})
+features = encoder.encode_touch(encoder.preprocess(frame{given}), "digit")  # (1, {card["features"]})
 ```
 
 | | |

@@ -49,7 +49,7 @@ DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_ST
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
-CHECKED  := src tests docs $(wildcard experiments)
+CHECKED  := src tests docs $(wildcard experiments integrations)
 OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if $(STOP_AFTER), --stop-after $(STOP_AFTER))$(if $(SAVE), --save-every $(SAVE))$(if $(BATCH), --batch $(BATCH))
 # Simulated data are made when they are what is asked for and are not there.
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))

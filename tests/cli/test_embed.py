@@ -233,6 +233,10 @@ def test_the_head_of_a_probe_names_the_rows_of_a_manifest(embed, anytouch, world
     assert "object" in about and "ball, cube" in about and "--pooling both --frames 1" in about
     saved = load_head(head)
     assert (saved.classes.tolist(), saved.label, saved.pooling, saved.frames) == (["ball", "cube"], "object", "both", 1)
+    assessed = saved.assess(arrays["features"])
+    np.testing.assert_array_equal(arrays["set"], assessed.in_set)
+    np.testing.assert_array_equal(arrays["novel"], assessed.novel)
+    assert arrays["classes"].tolist() == ["ball", "cube"] and arrays["contact"].shape == arrays["p"].shape
 
 
 def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
@@ -242,8 +246,17 @@ def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
     labels, p = load_head(head)(np.array([line["features"] for line in lines], np.float32))
     assert [line["label"] for line in lines] == labels.tolist()
     np.testing.assert_allclose([line["p"] for line in lines], p.max(1), atol=1e-6)
+    assert {tuple(line["set"]) for line in lines} <= {(), ("ball",), ("cube",), ("ball", "cube")}
+    assert {line["novel"] for line in lines} <= {True, False}
+    assert [line["contact"] for line in lines] == [None, None]  # no picture of the untouched gel
+    gel = np.full((32, 32, 3), 40, np.uint8)
+    gel[8:24, 8:24] = 200  # of which neither frame is a tint
+    cv2.imwrite(str(tmp_path / "gel.png"), gel)
+    touched = anytouch(*words, "--background", tmp_path / "gel.png", "--out", "-").out.splitlines()
+    assert [json.loads(line)["contact"] for line in touched] == [True, True]
     assert anytouch(*words, "--out", tmp_path / "f.npz").status == 0
     with np.load(tmp_path / "f.npz") as file:
+        assert np.isnan(file["contact"]).all() and file["novel"].dtype == bool and file["set"].shape == (2, 2)
         assert file["label"].tolist() == labels.tolist() and file["about/pooling"] == "both"
     assert "--pooling both" in mistake(*words, "--pooling", "class", "--out", "-")
 

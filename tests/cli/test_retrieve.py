@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from touch_world import make_touches
 
@@ -63,3 +64,23 @@ def test_a_report_of_what_is_not_there_is_one_sentence(touches, tmp_path, capsys
     assert main(["report", *words, "--out", str(tmp_path / "report")]) == 2
     done = capsys.readouterr().err.strip()
     assert done.startswith("anytouch report: ") and "s1" in done and not (tmp_path / "report").exists()
+
+
+def test_stored_touches_are_searched_by_a_frame(anytouch, mistake, tmp_path, tiny_run, world):
+    index = tmp_path / "index.npz"
+    assert anytouch("embed", "--model", tiny_run, "--data", world, "--out", index).status == 0
+    with np.load(index) as file:
+        path = str(file["key/path"][3])
+    words = ("retrieve", "--index", index, "--model", tiny_run, "--query")
+    gel = ("--sensor", "digit", "--count", 4, "--out", tmp_path / "hits.json")
+    done = anytouch(*words, world.parent / path, *gel)
+    assert done.status == 0, done.err
+    hits = json.loads((tmp_path / "hits.json").read_text())["hits"]
+    assert len(hits) == 4 and hits[0]["path"] in done.out
+    cosines = [float(hit["cosine"]) for hit in hits]
+    assert cosines == sorted(cosines, reverse=True)
+    assert "text tower" in mistake(*words, "a soft sponge")
+    assert "--query" in mistake(*words[:-1])
+    assert "--split" in mistake(*words, "x", "--split", "val")
+    assert "--count" in mistake("retrieve", "--data", world, "--count", 3)
+    assert "--index" in mistake("retrieve")

@@ -16,8 +16,10 @@ from anytouch_jax.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
+    from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.embed import Features
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.encoder.novelty import ContactGate
     from anytouch_jax.encoder.preprocess import Preprocess
     from anytouch_jax.evaluate.heads import LinearHead
 
@@ -30,7 +32,7 @@ class FrameOptions:
     """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
     sensor: str | None = None
     """Sensor of the frames. Without it, and for an unknown sensor, the universal tokens are used."""
-    background: Path | None = None  # Picture of the untouched gel, for an encoder of background-subtracted touches.
+    background: Path | None = None  # Picture of the untouched gel: it is subtracted, and decides contact.
     rotate: Literal[0, 90, 180, 270] = 0  # Turn the frames clockwise by so many degrees, before anything else.
     flip: Literal["none", "across", "down"] = "none"
     """Mirror the frames after that: across exchanges left and right, down exchanges top and bottom."""
@@ -41,7 +43,8 @@ class FrameOptions:
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """Arithmetic: that of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     head: Path | None = None
-    """Also predict the class with this head of `anytouch probe label --save`: its label and probability p."""
+    """Also predict the class with this head of `anytouch probe label --save`: its label, probability p, conformal set
+    and whether the touch is novel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +85,8 @@ def run(options: EmbedOptions) -> int:
     if is_manifest:
         features = _embed_manifest(encoder, options, pooling)
     else:
-        row, preprocess, about = frames_input(encoder, options, data)
-        features = _embed_frames(encoder, options, pooling, row, preprocess)
+        row, preprocess, gate, about = frames_input(encoder, options, data)
+        features = _embed_frames(encoder, options, pooling, row, preprocess, gate)
         log_universal(encoder, options)
     about |= {"pooling": pooling, "input": " ".join(map(str, options.data))}
     save_features(options.out, encoder, features, head, options, about)
@@ -121,36 +124,56 @@ def save_features(
     options: FrameOptions,
     about: dict[str, str],
 ) -> None:
-    """Write features to `out`, with what a `head` predicts, and metadata."""
+    """Write features to `out`, with what a `head` predicts, and metadata; log a sensor that is not the one named."""
     from anytouch_jax.encoder.embed import save_npz
 
     if head is not None and len(features.values):
-        label, p = head(features.values)
-        features = replace(features, predictions={"label": label, "p": p.max(1)})
+        features = replace(features, predictions=features.predictions | _predictions(head, features.values))
+        sensors = features.keys.get("sensor")
+        names = {options.sensor} - {None} if sensors is None else set(sensors.tolist())
+        for name in sorted(map(str, names) if head.calibration is not None else ()):
+            values = features.values if sensors is None else features.values[sensors == name]
+            if head.calibration is not None and (warning := head.calibration.sensor_warning(head.scaled(values), name)):
+                log(warning)
     about |= {"encoder": encoder.source, "weights": encoder.fingerprint, "dtype": encoder.config.model.dtype}
     save_npz(out, features, about | {"frames": str(options.frames), "join": options.join})
 
 
-def frames_input(encoder: Encoder, options: FrameOptions, data: Path) -> tuple[int, Preprocess, dict[str, str]]:
-    """Return the sensor's row and the preprocessing of the frames of a folder, a video or a camera, and their metadata.
+def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the arrays that a head adds to features: label, p, and of a calibrated head set, classes and novelty."""
+    if head.calibration is None:
+        label, p = head(values)
+        return {"label": label, "p": p.max(1)}
+    assessed = head.assess(values)
+    about = {"set": assessed.in_set, "classes": head.classes, "novelty": assessed.novelty, "novel": assessed.novel}
+    return {"label": assessed.label, "p": assessed.p.max(1), **about}
+
+
+def frames_input(
+    encoder: Encoder, options: FrameOptions, data: Path
+) -> tuple[int, Preprocess, ContactGate, dict[str, str]]:
+    """Return the sensor's row, preprocessing, contact gate and metadata of the frames of a folder, video or camera.
 
     The picture of the untouched gel is that of --background, or that of the folder if the encoder needs it. What is
     subtracted is logged.
     """
     from anytouch_jax.data.images import BACKGROUND, decode, list_images
+    from anytouch_jax.encoder.novelty import ContactGate
     from anytouch_jax.encoder.preprocess import Preprocess
 
     row, gel = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.background
-    if gel is None and encoder.subtracts and data.is_dir():
+    if gel is None and data.is_dir():
         gel = list_images(data)[1].get(BACKGROUND)
     background = str(gel) if gel is not None else "the first frame" if encoder.needs_background else "not subtracted"
-    if gel is not None and not encoder.subtracts:
-        log("--background is not used: this encoder was trained on frames without background subtraction")
+    if options.background is not None and not encoder.subtracts:
+        log("--background only decides contact: this encoder was trained on frames without background subtraction")
     if options.background is None and encoder.needs_background:
         log(f"this encoder needs background-subtracted frames: {background} is the background (see --background)")
-    preprocess = Preprocess(encoder, None if gel is None else decode(gel), rotate=options.rotate, flip=options.flip)
+    picture = None if gel is None else decode(gel)
+    preprocess = Preprocess(encoder, picture, rotate=options.rotate, flip=options.flip)
+    gate = ContactGate(picture, options.sensor or UNIVERSAL, first=encoder.needs_background)
     about = {"background": background if encoder.subtracts else "not subtracted", "rotate": str(options.rotate)}
-    return row, preprocess, about | {"sensor": options.sensor or UNIVERSAL, "flip": options.flip}
+    return row, preprocess, gate, about | {"sensor": options.sensor or UNIVERSAL, "flip": options.flip}
 
 
 def log_universal(encoder: Encoder, options: FrameOptions) -> None:
@@ -192,20 +215,42 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     more = [name for name in manifest.table.column_names if name in ("object", "unit") or name.startswith("label.")]
     keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
-    return embedding.Features(values, rows, keys, len(usable) - len(rows))
+    touched = {} if options.head is None else {"contact": _contact(manifest, rows)}
+    return embedding.Features(values, rows, keys, len(usable) - len(rows), touched)
 
 
-def _embed_frames(encoder: Encoder, options: EmbedOptions, pooling: Any, row: int, preprocess: Preprocess) -> Features:
+def _contact(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
+    """Return the contact of `rows` (n,): label.contact, or by the row's background picture; NaN if unknown."""
+    import numpy as np
+
+    from anytouch_jax.data.prepare import contact
+
+    known, limits = contact.known_contact(manifest)[rows], contact.threshold_of_rows(manifest, None, 0.0)[rows]
+    scored = rows[np.isnan(known) & manifest.present("background_path")[rows]]
+    score = contact.contact_scores(manifest, scored).score[rows] if len(scored) else np.full(len(rows), np.nan)
+    return np.where(np.isnan(known), np.where(np.isnan(score), np.nan, score > limits), known)
+
+
+def _embed_frames(
+    encoder: Encoder, options: EmbedOptions, pooling: Any, row: int, preprocess: Preprocess, gate: ContactGate
+) -> Features:
     """Embed every clip of consecutive frames of a folder or a video, keyed by its last frame."""
     import numpy as np
 
     from anytouch_jax.encoder.embed import embed_frames
 
-    data, times = options.data[0], list[float]()
+    data, times, contact = options.data[0], list[float](), list[float]()
+
+    def frames() -> Iterator[tuple[int, str, np.ndarray | None]]:
+        for number, name, frame in _numbered_frames(data, options.on_bad_sample, times):
+            contact.append(np.nan if frame is None else gate(frame))
+            yield number, name, frame
+
     features = embed_frames(
-        encoder, _numbered_frames(data, options.on_bad_sample, times), row, preprocess, length=options.frames,
-        pooling=pooling, join=options.join, batch=options.batch,
+        encoder, frames(), row, preprocess, length=options.frames, pooling=pooling, join=options.join,
+        batch=options.batch,
     )  # fmt: skip
+    features.predictions["contact"] = np.asarray(contact)[features.rows]
     if "path" not in features.keys:
         log_if_cut(data, len(times))
         features.keys["time"] = np.asarray(times)[features.rows]

@@ -226,6 +226,7 @@ def _arrays(path: Path) -> list[str]:
             f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
             f"for features of {len(head.mean)} with --pooling {head.pooling} --frames {head.frames}, "
             f"encoder {head.fingerprint}",
+            "without calibration: save it again" if head.calibration is None else head.calibration.summary(),
         ]
     if not {"features", "rows"} <= arrays.keys():
         return []

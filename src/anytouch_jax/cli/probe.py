@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import (
@@ -16,8 +16,10 @@ from anytouch_jax.cli.output import (
     print_table,
     refuse_unused,
 )
-from anytouch_jax.config.parsing import Count, NotNegative
+from anytouch_jax.config.parsing import Count, NotNegative, Range
 from anytouch_jax.errors import UserError
+
+Inner = Annotated[float, Range(0.001, 0.999, "between 0.001 and 0.999")]
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class LabelOptions(ProbeOptions):
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says so."""
     save: Path | None = None  # Write the linear head of one --model as .npz, for embed --head and stream --head.
+    coverage: Inner = 0.9  # Share of touches whose set of classes holds the true one, of a saved head.
+    false_alarms: Inner = 0.05  # Share of known touches that a saved head calls novel.
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,8 @@ class TasksOptions(BatteryOptions):
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a clip longer than the model's are joined.
     order: Literal["right", "shuffled", "repeated"] = "right"
     """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""
+    counterfactual: bool = False
+    """Does touch matter? Compare the touch of one --model with shuffled, shifted, background-only and mean touch."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +121,8 @@ def run_label(options: LabelOptions) -> int:
         refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
     if options.save is not None and len(_models(options)) != 1:
         raise UserError(f"--save writes the head of one encoder. Give one --model, not {len(options.model)}.")
+    if options.save is None:
+        refuse_unused(options, ("coverage", "false_alarms"), "without --save, which writes the calibrated head")
     check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
     print_table(probe_table(probe_label(**_settings(options), log=log)))
@@ -131,9 +139,32 @@ def run_tasks(options: TasksOptions) -> int:
     if options.frames == 1:
         refuse_unused(options, ("order",), "on stills")
     tasks = {"tasks": "all"} if options.tasks == ("all",) else {}
-    results = probe_tasks(**_settings(options) | tasks, log=log)
+    settings = _settings(options) | tasks
+    if settings.pop("counterfactual"):
+        return _run_counterfactual(options, settings)
+    results = probe_tasks(**settings, log=log)
     print_table(probe_table(results["results"], results["paper"]))
     log_default((*options.model, *options.features))
+    return 0
+
+
+def _run_counterfactual(options: TasksOptions, settings: dict[str, Any]) -> int:
+    """Print the scores of real touch and of the controls, their paired differences, and a verdict for each task."""
+    import json
+
+    from anytouch_jax.evaluate.counterfactual import gains_table, probe_counterfactual, verdicts
+    from anytouch_jax.evaluate.probing import probe_table
+    from anytouch_jax.files import atomic_write
+
+    refuse_unused(options, ("features", "order", "controls"), "with --counterfactual, which makes its own controls")
+    out = settings.pop("out")
+    results, gains = probe_counterfactual(**settings, log=log)
+    print_table(probe_table(results["results"], results["paper"]))
+    print_table(gains_table(gains))
+    print("\n" + "\n".join(verdicts(gains)))
+    if out is not None:
+        atomic_write(out, json.dumps(results | {"gains": gains}, indent=2, allow_nan=False))
+    log_default(options.model)
     return 0
 
 

@@ -6,14 +6,19 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_folder, log, log_default, print_table, refuse_unused
-from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
 from anytouch_jax.config.parsing import Count, Range
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from anytouch_jax.encoder.encoder import Encoder
 
 
 @dataclass(frozen=True)
@@ -22,10 +27,19 @@ class RetrieveOptions:
 
     Example: anytouch retrieve --model runs/stage2 --data data/scenes/manifest.parquet
 
-    A gallery holds the true touch once, and the touches most similar to it in position, depth and force.
+    A gallery holds the true touch once, and the touches most similar to it in position, depth and force. With --index,
+    list the stored touches nearest to --query instead.
     """
 
-    data: Path  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
+    data: Path | None = None  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
+    index: Path | None = None  # Features of `anytouch embed` to search in, of any sensors.
+    query: str | None = (
+        None  # What to look for in --index: a picture, a folder or video (its last clip), or a sentence.
+    )
+    sensor: str | None = None  # Sensor of the query. Without it the universal tokens are used.
+    background: Path | None = None  # Picture of the untouched gel of the query.
+    count: Count[int] = 10  # Nearest touches to list.
+    approximate: bool = False  # Search by a graph (usearch), for a million features and more.
     model: tuple[Path, ...] = ()  # Encoders to compare: names, run folders or weights files (default: anytouch-tiny).
     split: str = "test"  # Split to retrieve in.
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
@@ -42,7 +56,12 @@ class RetrieveOptions:
 
 
 def run(options: RetrieveOptions) -> int:
-    """Score cross-sensor retrieval, print a table, and write JSON with --out."""
+    """Score cross-sensor retrieval, or search an index, print a table, and write JSON with --out."""
+    if options.index is not None:
+        return _search(options)
+    refuse_unused(options, ("query", "sensor", "background", "count", "approximate"), "without --index")
+    if options.data is None:
+        raise UserError("Give a manifest with --data, or features to search in with --index.")
     import numpy as np
 
     from anytouch_jax.data.manifest import manifest as manifests
@@ -93,6 +112,65 @@ def run(options: RetrieveOptions) -> int:
         atomic_write(options.out, json.dumps(about | {"results": plain(scores)}, indent=2) + "\n")
     log_default(options.model)
     return 0
+
+
+def _search(options: RetrieveOptions) -> int:
+    """List the stored touches nearest to a query."""
+    from anytouch_jax.encoder.encoder import load_encoder
+    from anytouch_jax.errors import shorten
+    from anytouch_jax.evaluate.search import load_index
+    from anytouch_jax.evaluate.statistics import markdown_table
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    others = ("data", "split", "frames", "pooling", "gallery", "by_chance", "seeds", "controls")
+    refuse_unused(options, others, "with --index, whose features are searched")
+    if options.query is None or options.index is None:
+        raise UserError("Give what to look for with --query: a picture, a folder, a video or a sentence.")
+    if len(options.model) > 1:
+        raise UserError(f"A search takes one encoder, not {len(options.model)}. Give one --model.")
+    check_folder(options.out, read=(options.index, *options.model))
+    index = load_index(options.index, approximate=options.approximate)
+    enable_compilation_cache()
+    encoder = load_encoder((options.model or (Path(DEFAULT),))[0])
+    index.check(encoder.source, encoder.fingerprint)
+    ids, cosines = index.search(_query(options, encoder, index.about), options.count)
+    hits = [{"cosine": f"{cosine:.3f}"} | index.describe(row) for row, cosine in zip(ids[0], cosines[0], strict=True)]
+    head = list(hits[0])
+    print_table(markdown_table(head, [[shorten(hit[name]) for name in head] for hit in hits]))
+    if options.out is not None:
+        about = {"index": str(options.index), "query": options.query}
+        atomic_write(options.out, json.dumps(about | {"hits": hits}, indent=2) + "\n")
+    log_default(options.model)
+    return 0
+
+
+def _query(options: RetrieveOptions, encoder: Encoder, about: dict[str, str]) -> np.ndarray:
+    """Return features (1, d) of a picture, of the last clip of a folder or video, or of a sentence."""
+    import numpy as np
+
+    from anytouch_jax.data import images
+    from anytouch_jax.encoder.preprocess import Preprocess
+
+    path, pooling = Path(str(options.query)), about.get("pooling", "class")
+    length = int(about.get("frames", "1")) if about.get("frames", "1").isdecimal() else 1
+    if not path.exists():
+        refuse_unused(options, ("sensor", "background"), f"on the sentence {path!s:.60}. There is no such file")
+        if pooling != "class":
+            raise UserError(f"A sentence is compared with features of pooling class, not {pooling}. Embed again.")
+        return encoder.encode_text(str(options.query))
+    if path.is_dir():
+        frames = [images.decode(file) for file in images.list_images(path)[0][-length:]]
+    elif path.suffix.lower() in images.SUFFIXES:
+        frames = [images.decode(path)] * length
+    else:
+        frames = list(images.frames_from_video(path))[-length:]
+    if len(frames) < length:
+        raise UserError(f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more frames.")
+    gel = None if options.background is None else images.decode(options.background)
+    preprocess = Preprocess(encoder, gel)
+    clip = np.stack([preprocess(frame) for frame in frames])[None]
+    join: Any = about.get("join", "mean")
+    return encoder.encode_touch(clip, options.sensor or UNIVERSAL, pooling=pooling, join=join)  # type: ignore[arg-type]
 
 
 def _cells(score: Any) -> tuple[str, ...]:

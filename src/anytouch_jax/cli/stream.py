@@ -44,10 +44,10 @@ def run(options: StreamOptions) -> int:
     from anytouch_jax.encoder.embed import Features
 
     source, live = stream.open_source(data)
-    row, preprocess, about = embed.frames_input(encoder, options, data)
+    row, preprocess, gate, about = embed.frames_input(encoder, options, data)
     embedded = stream.stream(
         encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
-        pooling=pooling, join=options.join, log=log,
+        pooling=pooling, join=options.join, log=log, contact=gate,
     )  # fmt: skip
     result = stream.collect(embedded, (lambda frame: _print_line(frame, live, head)) if lines else None)
     if result.error is not None and not result.total:
@@ -65,6 +65,7 @@ def run(options: StreamOptions) -> int:
             about |= {"started": f"{result.started:.6f}"}
             about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
         features = Features(result.values, result.numbers, {"frame_index": result.numbers, "time": result.time})
+        features.predictions["contact"] = result.contact
         embed.save_features(options.out, encoder, features, head, options, about)
     embed.log_universal(encoder, options)
     for line in stream.budget(result):
@@ -81,7 +82,12 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
         line |= {"picture": frame.picture, "missed": frame.missed}
-    if head is not None:
+    if head is not None and head.calibration is not None:
+        one = head.assess(frame.values[None])
+        line |= {"label": str(one.label[0]), "p": round(float(one.p.max()), 6)}
+        line |= {"set": head.classes[one.in_set[0]].tolist(), "novel": bool(one.novel[0])}
+    elif head is not None:
         (label,), p = head(frame.values[None])
         line |= {"label": str(label), "p": round(float(p.max()), 6)}
+    line |= {"contact": None if frame.contact != frame.contact else bool(frame.contact)}
     print(json.dumps(line | {"features": values}), flush=True)

@@ -61,11 +61,12 @@ class Frame(NamedTuple):
 
 
 class Clip(NamedTuple):
-    """Frames u8 (T, H, W, 3) up to frame `last`, and the seconds of resizing it."""
+    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN."""
 
     last: Frame
     frames: np.ndarray
     resize: float
+    contact: float = float("nan")
 
 
 class Embedded(NamedTuple):
@@ -73,7 +74,8 @@ class Embedded(NamedTuple):
 
     `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`: seconds from the grabbed
     frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds. `time`: the time
-    stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`.
+    stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`. `contact`: 1, 0 or
+    NaN (unknown).
     """
 
     number: int
@@ -85,6 +87,7 @@ class Embedded(NamedTuple):
     time: float = 0.0
     picture: str = "ok"
     missed: int = 0
+    contact: float = float("nan")
 
 
 class Mailbox:
@@ -150,12 +153,14 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
 def stream(
     encoder: Encoder, source: Source, preprocess: Preprocess | None = None, *, live: bool, sensor: int,
     frames: int = 1, stride: int = 1, pooling: Pooling = "class", join: Join = "mean", log: Log = warn,
+    contact: Callable[[np.ndarray], float] | None = None,
 ) -> Generator[Embedded]:  # fmt: skip
     """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
 
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
     `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy, and `log` gets one
-    sentence each about a missed read, a frozen and a black picture. Close the iterator to stop and to release the
+    sentence each about a missed read, a frozen and a black picture. `contact` decides contact of a frame, as
+    `novelty.ContactGate` does. Close the iterator to stop and to release the
     source. Raises UserError for a wrong length, and CameraError if no frame can be read for RETRY seconds.
     """
     check_frames(encoder.config.model, frames)
@@ -164,7 +169,7 @@ def stream(
     embed = compile_for_one(encoder, sensor, frames, pooling, join)
     mailbox = Mailbox(replace=live)
     arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
-    arguments = (arrived, preprocess or Preprocess(encoder), frames, stride, mailbox)
+    arguments = (arrived, preprocess or Preprocess(encoder), frames, stride, mailbox, contact)
     reader = threading.Thread(target=_read, args=arguments, daemon=True)
 
     def embedded() -> Generator[Embedded]:
@@ -181,7 +186,8 @@ def stream(
                 seconds = (last.decode, clip.resize, copied - begin, end - copied)
                 stamp = at if last.time is None else last.time
                 age = end - last.read
-                yield Embedded(last.number, at, values, seconds, age, started, stamp, last.picture, last.missed)
+                about = (last.picture, last.missed, clip.contact)
+                yield Embedded(last.number, at, values, seconds, age, started, stamp, *about)
         finally:
             mailbox.close()
             if reader.ident is not None:
@@ -205,7 +211,10 @@ def compile_for_one(
     return lambda clip: compiled(params, clip, row)
 
 
-def _read(arrived: Iterator[Frame], preprocess: Preprocess, frames: int, stride: int, mailbox: Mailbox) -> None:
+def _read(
+    arrived: Iterator[Frame], preprocess: Preprocess, frames: int, stride: int, mailbox: Mailbox,
+    contact: Callable[[np.ndarray], float] | None = None,
+) -> None:  # fmt: skip
     """Put the newest clip of preprocessed frames into the mailbox: the reader's thread. No clip has a missed read."""
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
     missed = 0
@@ -217,7 +226,9 @@ def _read(arrived: Iterator[Frame], preprocess: Preprocess, frames: int, stride:
             begin = time.perf_counter()
             ring.append(preprocess(frame.pixels))
             resize = time.perf_counter() - begin
-            if len(ring) == ring.maxlen and not mailbox.put(Clip(frame, np.stack(list(ring)[::stride]), resize)):
+            touched = float("nan") if contact is None else contact(frame.pixels)
+            clip = np.stack(list(ring)[::stride])
+            if len(ring) == ring.maxlen and not mailbox.put(Clip(frame, clip, resize, touched)):
                 break
         mailbox.close()
     except BaseException as error:
@@ -332,6 +343,7 @@ class Result(NamedTuple):
     frozen: int = 0
     black: int = 0
     error: CameraError | None = None
+    contact: np.ndarray = np.zeros(0)
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
@@ -362,6 +374,7 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         numbers.astype(np.int64), at, seconds.reshape(-1, len(PARTS)), age, total, interrupted,
         stored[-1].started if stored else 0.0, np.asarray([frame.time for frame in stored]),
         stored[-1].missed if stored else 0, pictures["frozen"], pictures["black"], failure,
+        np.asarray([frame.contact for frame in stored]),
     )  # fmt: skip
 
 

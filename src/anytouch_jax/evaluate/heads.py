@@ -7,15 +7,16 @@ numbers of neighbours (kNN) or epochs (the authors' gradient-trained layer).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import expit, softmax
 
+from anytouch_jax.encoder import novelty
+from anytouch_jax.encoder.novelty import Assessment, Calibration
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import logistic
 from anytouch_jax.evaluate.logistic import Logistic
@@ -32,7 +33,7 @@ Predict = Callable[[Array], list[Array]]  # features (m, d) -> class numbers or 
 PENALTIES = (1.0, 0.1, 0.01, 0.001, 0.0001)  # of logistic regression
 RIDGE = (100.0, 10.0, *PENALTIES)
 NEIGHBOURS = (20, 10, 5, 1)
-FORMAT = "anytouch_jax.head.1"
+FORMATS = ("anytouch_jax.head.2", "anytouch_jax.head.1")  # the second has no calibration
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,7 @@ def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., 
 
 @dataclass(frozen=True, eq=False)
 class LinearHead:
-    """A saved linear classifier of features.
+    """A saved linear classifier of features, with its calibration (None in files of older versions).
 
     `classes` (K,) str; `weights` (d, columns) and `bias` (columns,), one column for two classes, else K; features minus
     `mean` (d,) are divided by `scale` (d,). It predicts `label` from features of `frames` a touch and `pooling` by the
@@ -287,15 +288,32 @@ class LinearHead:
     pooling: Pooling
     frames: int
     fingerprint: str
+    calibration: Calibration | None = None
 
     def __call__(self, features: npt.ArrayLike) -> tuple[Array, Array]:
         """Return the likeliest class (n,) str and probabilities f32 (n, K) of features (n, d)."""
+        temperature = 1.0 if self.calibration is None else self.calibration.temperature
+        p = novelty.probabilities(self.scaled(features) @ self.weights + self.bias, temperature)
+        return self.classes[p.argmax(1)], p
+
+    def scaled(self, features: npt.ArrayLike) -> Array:
+        """Return features (n, d) minus the mean, over the scale. Raises UserError for another shape."""
         x = np.asarray(features, np.float32)
         if x.ndim != 2 or x.shape[1] != len(self.mean):
             raise UserError(f"This head reads features (n, {len(self.mean)}), not {x.shape}.")
-        logits = ((x - self.mean) / self.scale) @ self.weights + self.bias
-        p = np.concatenate([expit(-logits), expit(logits)], axis=1) if logits.shape[1] == 1 else softmax(logits, axis=1)
-        return self.classes[p.argmax(1)], p
+        return (x - self.mean) / self.scale
+
+    def assess(self, features: npt.ArrayLike) -> Assessment:
+        """Return what the head predicts for features (n, d), and whether to believe it.
+
+        Raises UserError for a head without calibration.
+        """
+        label, p = self(features)
+        known = self.calibration
+        if known is None:
+            raise UserError("This head has no calibration. Save it again with `anytouch probe label --save`.")
+        distance = known.novelty(self.scaled(features))
+        return Assessment(label, p, 1 - p <= known.set_limit, distance, distance > known.novelty_limit)
 
     def check(self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean") -> None:
         """Raise UserError unless the head was fitted on features of that encoder, pooling and number of frames."""
@@ -310,6 +328,52 @@ class LinearHead:
             )
 
 
+def calibrate(
+    head: LinearHead, features: Array, y: Array, groups: Array, sensors: Array, fit: Array, val: Array,
+    folds: Iterable[tuple[Array, Array]], penalty: float, *, coverage: float = novelty.COVERAGE,
+    false_alarms: float = novelty.FALSE_ALARMS,
+) -> LinearHead:  # fmt: skip
+    """Return the head with a calibration from rows that it was not fitted on.
+
+    `features` (N, d), class names `y` (N,) str, `groups` (N,) and `sensors` (N,) are of all rows. `fit` and `val` are
+    row numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted again with `penalty` predict these.
+    Rows of a class that a fit lacks are not used. Raises UserError if none is left.
+    """
+    count, logits, used = len(head.classes), [head.scaled(features[val]) @ head.weights + head.bias], [val]
+    numbers = np.searchsorted(head.classes, y)
+    for inside, outside in folds:
+        classes = np.unique(numbers[inside])
+        kept = outside[np.isin(numbers[outside], classes)]
+        if not len(kept) or len(classes) < min(count, 3):
+            continue
+        (model,) = linear_path(features[inside], numbers[inside], (penalty,))
+        several = (features[kept] - model.mean) / model.scale @ model.fit.weights + model.fit.bias
+        if len(classes) < count:
+            partial = several
+            several = np.full((len(kept), count), -1e3, np.float32)  # e**-1000 is 0: classes that the fit lacks
+            several[:, classes] = partial
+        logits.append(several)
+        used.append(kept)
+    rows, z = np.concatenate(used), np.concatenate(logits).astype(np.float64)
+    known = np.isin(y[rows], head.classes)
+    rows, z = rows[known], z[known]
+    if not len(rows):
+        raise UserError("No row is left to calibrate on. Give rows of split val, or classes of several groups.")
+    truth = numbers[rows]
+    temperature = novelty.fit_temperature(z, truth, groups[rows])
+    p = novelty.probabilities(z, temperature)
+    limit = novelty.conformal_limit(1 - p[np.arange(len(truth)), truth], groups[rows], coverage)
+    chosen = fit[novelty.choose_references(groups[fit])]
+    both = np.concatenate([fit, val])
+    whitening = novelty.fit_whitening(head.scaled(features[fit]))
+    references, x = (head.scaled(features[some]) @ whitening for some in (chosen, both))
+    scores = novelty.novelty_scores(x, references, groups[both], groups[chosen])
+    novel = novelty.conformal_limit(scores, groups[both], 1 - false_alarms)
+    recordings = len(np.unique(groups[rows]))
+    limits = (coverage, limit, false_alarms, novel, recordings)
+    return replace(head, calibration=Calibration(temperature, *limits, whitening, references, sensors[chosen]))
+
+
 def linear_head(
     model: LinearModel, names: Array, *, label: str, pooling: Pooling, frames: int, fingerprint: str
 ) -> LinearHead:
@@ -321,9 +385,12 @@ def linear_head(
 
 def save_head(path: str | Path, head: LinearHead) -> None:
     """Write a head as `.npz` atomically. Raises OSError."""
+    known = head.calibration
     arrays = {"mark" if name == "fingerprint" else name: value for name, value in vars(head).items()}
+    del arrays["calibration"]
+    arrays |= {} if known is None else known.arrays()
     with atomic_path(path) as part, open(part, "wb") as file:
-        np.savez(file, format=FORMAT, **arrays)
+        np.savez(file, format=FORMATS[known is None], **arrays)
 
 
 def load_head(path: str | Path) -> LinearHead:
@@ -336,9 +403,11 @@ def load_head(path: str | Path) -> LinearHead:
             if arrays[name].shape != () or arrays[name].dtype.kind != "U" or arrays[name].dtype.itemsize > 4096:
                 raise ValueError(f"{name} is not a short text")
             arrays[name] = str(arrays[name])
-        if arrays.pop("format") != FORMAT:
+        if arrays.pop("format") not in FORMATS:
             raise ValueError("it has no format of a head")
-        head = LinearHead(frames=int(arrays.pop("frames")), fingerprint=arrays.pop("mark"), **arrays)
+        known = Calibration.from_arrays(arrays, len(arrays["mean"]))
+        arrays = {name: value for name, value in arrays.items() if not name.startswith("calibration/")}
+        head = LinearHead(frames=int(arrays.pop("frames")), fingerprint=arrays.pop("mark"), calibration=known, **arrays)
         _check_head(head)
         return head
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:

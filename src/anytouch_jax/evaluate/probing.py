@@ -22,12 +22,13 @@ import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, logistic, splits, statistics, tasks
 from anytouch_jax.evaluate import heads as probe_heads
 from anytouch_jax.evaluate.feature_cache import RANDOM, RAW, FeatureSource, Order
-from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearModel, ProbeHead, Scaling
+from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearHead, LinearModel, ProbeHead, Scaling
 from anytouch_jax.evaluate.splits import SIDES, LabelledFeatures, RowRoles, Selection, Split
 from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
@@ -306,13 +307,14 @@ def probe_label(
     leave_out: str | None = None, where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
     pooling: Pooling = "class", join: Join = "mean", seeds: int = 5, protocol: Protocol = "honest",
     controls: bool = True, cache: Path | None = None, save: Path | None = None, out: Path | None = None,
-    log: Log = print,
+    coverage: float = novelty.COVERAGE, false_alarms: float = novelty.FALSE_ALARMS, log: Log = print,
 ) -> list[ProbeResult]:  # fmt: skip
     """Probe a label column with features of every model, of features files, and of the controls.
 
     `group` is the column that no split cuts. `leave_out` tests every value of a column held out, instead of the splits.
-    `where` keeps rows whose column exceeds a number. `save` writes the linear head of the only model, `out` the results
-    as JSON. Print the results with `probe_table`. Raises UserError.
+    `where` keeps rows whose column exceeds a number. `save` writes the linear head of the only model, calibrated to a
+    `coverage` of its sets and a share of `false_alarms` of novelty. `out` writes the results as JSON. Print the results
+    with `probe_table`. Raises UserError.
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
@@ -338,6 +340,7 @@ def probe_label(
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             assert tested.fitted is not None
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
+            head = _calibrated(head, x, rows, results[0].penalty or 1.0, coverage, false_alarms, log)
             probe_heads.save_head(save, head)
             log(f"{save}: the linear head")
     if leave_out is None:
@@ -345,6 +348,32 @@ def probe_label(
     if out is not None:
         atomic_write(out, probe_json(results))
     return results
+
+
+def _calibrated(
+    head: LinearHead, x: Array, rows: TaskRows, penalty: float, coverage: float, false_alarms: float, log: Log
+) -> LinearHead:
+    """Return the head with its calibration, and log what it says; without one if the data do not allow it."""
+    fit, val = (np.flatnonzero(rows.split == name) for name in ("train", "val"))
+    try:
+        folds = splits.group_folds(fit, rows.groups, np.unique(rows.labels, return_inverse=True)[1], splits.FOLDS)
+        head = probe_heads.calibrate(
+            head, x, rows.labels, rows.groups, rows.sensors, fit, val, folds, penalty, coverage=coverage,
+            false_alarms=false_alarms,
+        )  # fmt: skip
+    except UserError as error:
+        log(f"The head has no calibration: {error}")
+        return head
+    known = head.calibration
+    assert known is not None
+    log(known.summary())
+    for limit, share, what in (
+        (known.set_limit, coverage, "sets hold every class"),
+        (known.novelty_limit, 1 - false_alarms, "no touch is novel"),
+    ):
+        if np.isinf(limit):
+            log(f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With fewer {what}.")
+    return head
 
 
 def label_rows(
@@ -391,7 +420,7 @@ def probe_tasks(
     frames: int | None = None, pooling: Pooling = "class", join: Join = "mean", order: Order = "right",
     max_rows: int | None = None, universal: bool = False, recipe: GradientRecipe | None = None,
     paper: float | None = None, controls: bool = True, cache: Path | None = None, out: Path | None = None,
-    log: Log = print, **sides: Names,
+    keep: dict[tuple[str, ...], list[GroupSums]] | None = None, log: Log = print, **sides: Names,
 ) -> dict[str, Any]:  # fmt: skip
     """Probe named tasks with features of every model, of features files, and of the controls.
 
@@ -404,8 +433,8 @@ def probe_tasks(
 
     `protocol` "published" reports both protocols. `frames` replaces that of each task. `order` shuffles the frames of
     clips, or repeats the last. `universal`: the universal tokens for all sensors. `paper`: the accuracy that the report
-    names. `out` writes JSON. `sides`: train_sensors, test_sensors, train_units and test_units, names or patterns to fit
-    on and to test on. Raises UserError.
+    names. `out` writes JSON. `keep` gets the test rows of every seed, by the four keys. `sides`: train_sensors,
+    test_sensors, train_units and test_units, names or patterns to fit on and to test on. Raises UserError.
     """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
@@ -430,8 +459,10 @@ def probe_tasks(
             about |= {"order": "right"} if plan.frames == 1 else {}
             for name, each in itertools.product(heads, protocols):
                 head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
-                scored = _score(labelled, plan, head, each, seeds)
+                scored, runs = _score(labelled, plan, head, each, seeds)
                 names = {"features": source.name, "task": plan.task.name, "head": name, "protocol": each}
+                if keep is not None:
+                    keep[tuple(names.values())] = runs
                 results.append(names | scored | about | {"notes": notes + scored["notes"]})
         log(f"probed {source.name}")
     report = {
@@ -514,8 +545,10 @@ def _labelled(source: FeatureSource, plan: _Plan) -> LabelledFeatures:
     return LabelledFeatures(x, plan.roles.y, plan.names, plan.roles.groups)
 
 
-def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Protocol, seeds: int) -> dict[str, Any]:
-    """Score a head on all splits of all seeds."""
+def _score(
+    data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Protocol, seeds: int
+) -> tuple[dict[str, Any], list[GroupSums]]:
+    """Score a head on all splits of all seeds. Return the test rows of each seed, too."""
     roles, chosen, sizes, unfinished = plan.roles, list[float](), list[int](), 0
     runs, baselines = list[GroupSums](), list[GroupSums]()
     for seed in range(seeds):
@@ -535,4 +568,4 @@ def _score(data: LabelledFeatures, plan: _Plan, head: ProbeHead, protocol: Proto
         "train": round(float(np.mean(sizes))), "test": len(runs[0].groups), "classes": data.names.tolist(),
         "groups": len(np.unique(runs[0].groups)), "chosen": chosen,
         "notes": [f"{unfinished} of {len(chosen)} fits did not converge"] if unfinished else [],
-    }  # fmt: skip
+    }, runs  # fmt: skip

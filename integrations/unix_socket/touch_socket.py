@@ -1,0 +1,47 @@
+"""Features and contact of a live camera over a Unix socket: one JSON line a frame, for a controller without ROS.
+
+python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
+"""
+
+import contextlib
+import json
+import socket
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+
+def serve(embedded: Iterable[Any], path: str) -> None:
+    """Send each frame of a stream to all clients of the socket at `path`. A client that is too slow is dropped."""
+    clients: list[socket.socket] = []
+    with socket.socket(socket.AF_UNIX) as server, contextlib.ExitStack() as stack:
+        server.bind(path)
+        stack.callback(Path(path).unlink, missing_ok=True)
+        server.listen()
+        server.setblocking(False)
+        for frame in embedded:
+            with contextlib.suppress(BlockingIOError):
+                clients.append(stack.enter_context(server.accept()[0]))
+                clients[-1].setblocking(False)
+            contact = None if frame.contact != frame.contact else bool(frame.contact)  # NaN is unknown
+            line = {"frame": frame.number, "time": frame.time, "contact": contact, "features": frame.values.tolist()}
+            for client in list(clients):
+                try:
+                    client.sendall(json.dumps(line).encode() + b"\n")
+                except OSError:
+                    clients.remove(client)
+                    client.close()
+
+
+if __name__ == "__main__":
+    import anytouch_jax as at
+    from anytouch_jax.data.images import decode
+    from anytouch_jax.encoder.novelty import ContactGate
+    from anytouch_jax.encoder.stream import open_source, stream
+
+    camera, sensor, address, *gel = sys.argv[1:]
+    encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(camera)
+    background = decode(gel[0]) if gel else None
+    preprocess, gate = at.Preprocess(encoder, background), ContactGate(background, sensor)
+    serve(stream(encoder, source, preprocess, live=live, sensor=encoder.sensor_row(sensor), contact=gate), address)

@@ -1,0 +1,169 @@
+"""Does touch matter for a task? The same probe on touches that were exchanged, shifted, emptied or averaged.
+
+A probe can score well on what a recording shows besides touch: the gel, the light, the order of the data. Each control
+removes one thing. Shuffled touch is that of another row, and time-shifted touch that of half a recording later.
+Background only is the untouched gel. Mean touch is the mean of all features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.encoder import Encoder, load_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import statistics
+from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore, encoder_features
+from anytouch_jax.evaluate.probing import probe_tasks
+from anytouch_jax.evaluate.statistics import Array, GroupSums
+
+REAL, SHUFFLED, SHIFTED, BACKGROUND, MEAN = (
+    "real touch", "shuffled touch", "time-shifted touch", "background only", "mean touch",
+)  # fmt: skip
+Log = Callable[[str], None]
+
+
+def probe_counterfactual(
+    models: Sequence[str | Path], data: Sequence[str | Path], tasks: Any = "all", *, log: Log = print, **options: Any
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to each of the others.
+
+    An entry of the second has task, head, control, difference, low and high. The last two are a 95 % interval of the
+    paired difference of accuracy or R2, over the same test groups and seeds. Background only needs a background_path on
+    every row. Without it the control is left out, which is logged. `options` are others of `probe_tasks`. Raises
+    UserError.
+    """
+    if len(models) != 1:
+        raise UserError(f"A counterfactual probe takes one encoder, not {len(models)}. Give one --model.")
+    table, encoder = manifests.read([str(path) for path in data]), load_encoder(models[0])
+    encoding = {name: options[name] for name in ("pooling", "join") if name in options}
+    cache = options.pop("cache", None)
+    sources = touch_sources(table, encoder, cache=cache, log=log, **encoding)
+    runs: dict[tuple[str, ...], list[GroupSums]] = {}
+    options |= {"controls": False, "features": ()}
+    results = probe_tasks(sources, table, tasks, keep=runs, log=log, **options)
+    gains = []
+    for (name, task, head, protocol), several in runs.items():
+        if name != REAL:
+            real = runs[REAL, task, head, protocol]
+            measured = real[0].sums.shape[1] > 2
+            entry = {"task": task, "head": head, "protocol": protocol, "control": name}
+            gains.append(entry | paired_gain(real, several, measured))
+    return results, gains
+
+
+def touch_sources(
+    table: Manifest, encoder: Encoder, *, cache: Path | None = None, log: Log = print, **encoding: Any
+) -> list[FeatureSource]:
+    """Return features of the real touch and of the four controls; "background only" where rows have backgrounds."""
+    real = encoder_features(encoder, table, folder=cache, log=log, **encoding)
+
+    def from_real(partners: Callable[[Array, int], Array]) -> FeatureStore:
+        return FeatureStore(lambda rows, frames: real.get(partners(rows, frames)[:, None], frames))
+
+    def average(rows: Array, frames: int) -> Array:
+        values = real.get(rows[:, None], frames)
+        return np.repeat(values.mean(0, keepdims=True), len(values), 0)
+
+    def shifted(rows: Array, frames: int) -> Array:
+        return shift_in_time(table, rows, frames)
+
+    stores = {REAL: real, SHUFFLED: from_real(lambda rows, _: shuffle_rows(table, rows)), SHIFTED: from_real(shifted)}
+    if table.present("background_path").all():
+        stores[BACKGROUND] = FeatureStore(_background_features(table, encoder, **encoding))
+    else:
+        log(f"{BACKGROUND}: left out, as some rows have no background_path")
+    stores[MEAN] = FeatureStore(average)
+    return [FeatureSource(name, store, encoder) for name, store in stores.items()]
+
+
+def shuffle_rows(table: Manifest, rows: Array) -> Array:
+    """Return for each of `rows` (n,) another row of the same sensor, drawn with a fixed seed."""
+    rng, sensor, partners = np.random.default_rng(0), table.codes("sensor")[rows], rows.copy()
+    for name in np.unique(sensor):
+        here = np.flatnonzero(sensor == name)
+        turned = rng.permutation(here)
+        partners[turned] = rows[np.roll(turned, 1)]  # nobody keeps its own
+    return partners
+
+
+def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
+    """Return for each of `rows` (n,) the row half a recording later, around the end; one frame alone stays."""
+    ends = np.arange(len(table)) if frames == 1 else np.unique(table.clips(frames)[:, -1])
+    sequence, number = table.codes("sequence", own=True), np.asarray(table.column("frame_index"))
+    ends = ends[np.lexsort((number[ends], sequence[ends]))]
+    _, first, place, counts = np.unique(sequence[ends], return_index=True, return_inverse=True, return_counts=True)
+    later = (np.arange(len(ends)) - first[place] + counts[place] // 2) % counts[place] + first[place]
+    partner = np.arange(len(table))
+    partner[ends] = ends[later]
+    return partner[rows]
+
+
+def _background_features(table: Manifest, encoder: Encoder, **encoding: Any) -> Callable[[Array, int], Array]:
+    pictures: dict[Path, Array] = {}
+
+    def empty(clips: Array, rows: Array) -> Array:
+        result = np.empty_like(clips)
+        for place, row in enumerate(rows.tolist()):
+            file = table.file(row, "background_path")
+            if file not in pictures:
+                gel = decode(file)
+                pictures[file] = encoder.prepare(gel, gel if encoder.subtracts else None)
+            result[place] = pictures[file]
+        return result
+
+    def compute(rows: Array, frames: int) -> Array:
+        return embed_rows(encoder, table, rows, frames, edit=empty, log=lambda _: None, **encoding)[1]
+
+    return compute
+
+
+def paired_gain(real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool) -> dict[str, float | None]:
+    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95 % interval."""
+    metric = statistics.r2_of if measured else statistics.mean_of
+    width = real[0].sums.shape[1]
+
+    def gain(sums: Array) -> Array:
+        return metric(sums[..., :width]) - metric(sums[..., width:])
+
+    both = [GroupSums(a.groups, np.concatenate([a.sums, b.sums], 1)) for a, b in zip(real, other, strict=True)]
+    low, high = statistics.bootstrap_interval(both, gain)
+    return {"difference": float(np.mean([gain(run.sums.sum(0)) for run in both])), "low": low, "high": high}
+
+
+def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
+    """Return one sentence for each task and head on whether touch matters."""
+    lines = []
+    for key in dict.fromkeys((gain["task"], gain["head"], gain["protocol"]) for gain in gains):
+        own = {g["control"]: g for g in gains if (g["task"], g["head"], g["protocol"]) == key}
+        without = [gain for name, gain in own.items() if name != SHIFTED]
+        above = [gain for gain in without if gain["low"] is not None and gain["low"] > 0]
+        if len(above) == len(without):
+            least = min(without, key=lambda gain: gain["difference"])
+            points = f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to {100 * least['high']:.1f})"
+            sentence = f"Touch matters for {key[0]}: it adds {points} to {least['control']}"
+            late = own.get(SHIFTED)
+            if late is not None and late["low"] is not None:
+                sentence += ", and the moment matters" if late["low"] > 0 else ", and any moment of a recording serves"
+        else:
+            failed = ", ".join(gain["control"] for gain in without if gain not in above)
+            sentence = f"There is no sign that touch matters for {key[0]}: real touch is not above {failed}"
+        lines.append(f"{sentence} ({key[1]}).")
+    return lines
+
+
+def gains_table(gains: Sequence[dict[str, Any]]) -> str:
+    """Return the paired differences as a Markdown table, in points of 100."""
+    rows = []
+    for gain in gains:
+        interval = "-" if gain["low"] is None else f"{100 * gain['low']:.1f} to {100 * gain['high']:.1f}"
+        rows.append((gain["task"], gain["head"], f"real above {gain['control']}", f"{100 * gain['difference']:.1f}",
+                     interval))  # fmt: skip
+    return statistics.markdown_table(("task", "head", "compared", "points", "95 %"), rows)

@@ -1,0 +1,88 @@
+"""Search by touch: the nearest of many stored features to a frame, a clip or a sentence.
+
+The index is a features file of `anytouch embed`. Search is exact, by numpy. With `approximate`, usearch (an extra)
+builds a graph of neighbours, which pays for itself from about a million features on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.heads import nearest
+from anytouch_jax.evaluate.statistics import Array, unit_rows
+from anytouch_jax.files import read_arrays
+
+SHOWN = ("path", "frame_index", "sensor", "unit", "sequence", "object")  # keys of a hit, besides labels
+
+
+@dataclass(frozen=True, eq=False)
+class TouchIndex:
+    """Unit features f32 (n, d) with their `keys` (n,) and what made them (`about`: weights, pooling, frames)."""
+
+    values: Array
+    keys: dict[str, Array]
+    about: dict[str, str]
+    source: str = "the index"
+    graph: Any = field(default=None, repr=False)
+
+    def search(self, features: Array, count: int = 10) -> tuple[Array, Array]:
+        """Return row numbers i64 (m, count) and cosines f32 (m, count) of the nearest, nearest first, of (m, d).
+
+        Raises UserError for another width, and for features that are not finite.
+        """
+        features = np.atleast_2d(np.asarray(features, np.float32))
+        if features.ndim != 2 or features.shape[1] != self.values.shape[1] or not np.isfinite(features).all():
+            raise UserError(
+                f"{self.source} holds features of {self.values.shape[1]} finite values, not {features.shape}."
+            )
+        count, query = min(count, len(self.values)), unit_rows(features)
+        if self.graph is None:
+            return nearest(self.values, query, count)
+        found = [self.graph.search(row, count) for row in query]
+        ids = np.stack([np.asarray(each.keys, np.int64) for each in found])
+        return ids, np.stack([1 - np.asarray(each.distances, np.float32) for each in found])
+
+    def check(self, source: str, fingerprint: str) -> None:
+        """Raise UserError unless the index was made by the encoder with that fingerprint."""
+        if self.about.get("weights") != fingerprint:
+            raise UserError(
+                f"{self.source} was made by another encoder ({self.about.get('weights', 'unknown')}) than {source} "
+                f"({fingerprint}). Embed again, or name its encoder with --model."
+            )
+
+    def describe(self, row: int) -> dict[str, str]:
+        """Return what is known of a row: its place, sensor, object and labels."""
+        names = [name for name in self.keys if name in SHOWN or name.startswith("label.")]
+        return {name: str(self.keys[name][row]) for name in names}
+
+
+def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
+    """Return the index of a features file. Raises UserError for another file, and without usearch if `approximate`."""
+    try:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is not a features file of `anytouch embed`: {error}") from None
+    values = arrays.get("features", np.zeros(0))
+    keys = {name.removeprefix("key/"): array for name, array in arrays.items() if name.startswith("key/")}
+    if values.ndim != 2 or values.dtype.kind != "f" or not values.size or not np.isfinite(values).all():
+        raise UserError(f"{path} needs finite features (n, d), not {values.dtype} {values.shape}. Embed again.")
+    if any(array.shape != values.shape[:1] for array in keys.values()):
+        raise UserError(f"{path}: its keys must be one for each of the {len(values)} rows. Embed again.")
+    about = {name.removeprefix("about/"): str(array)[:200] for name, array in arrays.items() if name[:6] == "about/"}
+    unit = unit_rows(values.astype(np.float32)).astype(np.float32)
+    return TouchIndex(unit, keys, about, str(path), _graph(unit) if approximate else None)
+
+
+def _graph(values: Array) -> Any:
+    try:
+        from usearch.index import Index
+    except ImportError:
+        raise UserError('Approximate search needs usearch: pip install "anytouch_jax[search]"') from None
+    graph = Index(ndim=values.shape[1], metric="cos", dtype="f32")
+    graph.add(np.arange(len(values)), values)
+    return graph

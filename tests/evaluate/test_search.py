@@ -1,0 +1,60 @@
+"""Search by touch: exact neighbours, the same by a graph, and files that are no index."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.search import load_index
+
+
+def write(path, values, **more):
+    keys = {
+        "key/path": np.array([f"{i}.png" for i in range(len(values))]),
+        "key/label.object": np.full(len(values), "a"),
+    }
+    np.savez(path, **{"features": values, "rows": np.arange(len(values)), "about/weights": "12ab", **keys, **more})
+    return path
+
+
+def test_the_nearest_are_those_of_largest_cosine(tmp_path):
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((500, 8)).astype(np.float32) * rng.uniform(0.1, 10, (500, 1)).astype(np.float32)
+    index = load_index(write(tmp_path / "f.npz", values))
+    query = rng.standard_normal((3, 8))
+    ids, cosines = index.search(query, 7)
+    cosine = query @ values.T / np.linalg.norm(query, axis=1)[:, None] / np.linalg.norm(values, axis=1)
+    np.testing.assert_array_equal(ids, np.argsort(-cosine, axis=1)[:, :7])
+    np.testing.assert_allclose(cosines, -np.sort(-cosine, axis=1)[:, :7], atol=1e-5)
+    assert index.search(3 * values[4], 1)[0].tolist() == [[4]]
+    assert index.search(values[:1], 9999)[0].shape == (1, 500)
+    assert index.describe(4) == {"path": "4.png", "label.object": "a"}
+    index.check("here", "12ab")
+    with pytest.raises(UserError, match="another encoder"):
+        index.check("here", "other")
+    for wrong in (np.ones((1, 7)), np.full((1, 8), np.nan)):
+        with pytest.raises(UserError, match="8 finite values"):
+            index.search(wrong)
+
+
+def test_a_graph_finds_almost_the_same(tmp_path):
+    pytest.importorskip("usearch")
+    values = np.random.default_rng(1).standard_normal((400, 16)).astype(np.float32)
+    path = write(tmp_path / "f.npz", values)
+    exact, graph = load_index(path).search(values[:20], 5), load_index(path, approximate=True).search(values[:20], 5)
+    assert np.mean([len(set(a) & set(b)) / 5 for a, b in zip(exact[0], graph[0], strict=True)]) > 0.9
+    np.testing.assert_array_equal(graph[0][:, 0], np.arange(20))
+    np.testing.assert_allclose(graph[1][:, 0], 1, atol=1e-4)
+
+
+def test_a_hostile_file_is_refused(tmp_path):
+    with pytest.raises(UserError, match="finite features"):
+        load_index(write(tmp_path / "f.npz", np.full((2, 3), np.inf)))
+    with pytest.raises(UserError, match="keys must be one"):
+        load_index(write(tmp_path / "f.npz", np.ones((2, 3)), **{"key/path": np.array(["a"])}))
+    np.savez(tmp_path / "p.npz", features=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(UserError, match="not a features file"):
+        load_index(tmp_path / "p.npz")
+    with pytest.raises(UserError, match="not a features file"):
+        load_index(tmp_path / "gone.npz")

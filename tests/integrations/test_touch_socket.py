@@ -1,0 +1,72 @@
+"""The example of a controller without ROS: lines over a Unix socket, and the imports of the ROS node."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+from places import ROOT
+
+FOLDER = ROOT / "integrations"
+
+
+def example():
+    spec = importlib.util.spec_from_file_location("touch_socket", FOLDER / "unix_socket" / "touch_socket.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_client_gets_whole_lines_and_a_lost_one_stops_nothing(tmp_path):
+    path, stop = str(tmp_path / "touch.sock"), threading.Event()
+
+    def frames():
+        number = 0
+        while not stop.is_set():
+            contact = (1.0, 0.0, float("nan"))[number % 3]
+            yield SimpleNamespace(number=number, time=0.1 * number, contact=contact, values=np.arange(3.0))
+            number += 1
+            time.sleep(0.002)
+
+    server = threading.Thread(target=example().serve, args=(frames(), path), daemon=True)
+    server.start()
+    try:
+        clients = [socket.socket(socket.AF_UNIX) for _ in range(2)]
+        for client in clients:
+            client.settimeout(20)
+            while client.connect_ex(path):
+                time.sleep(0.01)
+        for client in clients:
+            lines = client.makefile()
+            several = [json.loads(lines.readline()) for _ in range(3)]
+            assert {line["contact"] for line in several} == {True, False, None}
+            assert several[0]["features"] == [0, 1, 2]
+            first = several[0]["frame"]
+            assert [line["frame"] for line in several] == [first, first + 1, first + 2]
+            lines.close()
+            client.close()  # the other goes on
+    finally:
+        stop.set()
+        server.join(20)
+    assert not server.is_alive() and not (tmp_path / "touch.sock").exists()
+
+
+def test_rclpy_is_imported_in_the_node_only():
+    users = set()
+    for folder in ("src", "integrations", "experiments"):
+        for file in (ROOT / folder).rglob("*.py"):
+            source = file.read_text()
+            if "rclpy" in source and any(
+                "rclpy" in ast.unparse(node) for node in ast.walk(ast.parse(source))
+                if isinstance(node, ast.Import | ast.ImportFrom)
+            ):  # fmt: skip
+                users.add(file.name)
+    assert users == {"touch_node.py"}
+    for file in FOLDER.rglob("*.py"):
+        assert len(file.read_text().splitlines()) <= 50

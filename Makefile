@@ -30,7 +30,6 @@ WEIGHTS    ?= runs/anytouch-tiny
 DEMO       ?= runs/demo
 DEMO_STEPS ?= 200
 DEMO_STEPS1 ?= 400
-PAGES      ?= q1_sensors q2_space q3_perception ablations new_sensor dynamics real_probes datasets
 
 train-stage1: RUN ?= runs/stage1
 train-stage2 probe export-onnx: RUN ?= runs/stage2
@@ -55,7 +54,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments notebooks corpus weights docs clean
+.PHONY: help results release-check setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments notebooks corpus weights docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -139,18 +138,20 @@ export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a separate v
 experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
 	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
-notebooks: $(STAMP) ## run the pages of experiments/ to .ipynb and HTML in runs/notebooks: [PAGES="q1_sensors ..." RUN= DATA=]
-	@mkdir -p runs/notebooks
-	@for page in $(PAGES); do echo $$page; \
-	  $(PY) -m jupytext --quiet --to ipynb --output runs/notebooks/$$page.ipynb experiments/tables/$$page.py && \
-	  PYTHONPATH=$(CURDIR) $(if $(RUN),RUN=$(abspath $(RUN)) )$(if $(findstring file,$(origin DATA)),,DATA=$(abspath $(DATA)) )$(if $(RESULTS),RESULTS=$(abspath $(RESULTS)) )$(if $(FIGURES),FIGURES=$(abspath $(FIGURES)) )$(PY) -m nbconvert --log-level WARN --to notebook --execute --inplace runs/notebooks/$$page.ipynb && \
-	  $(PY) -m nbconvert --log-level WARN --to html runs/notebooks/$$page.ipynb || exit 1; done
+results: $(STAMP) ## the pages of experiments/results from their data alone: [OUT=]
+	$(PY) -m experiments.pages $(OUT)
+
+notebooks: $(STAMP) ## run the notebooks of experiments/notebooks again, in place: [PAGES="01 04" SCENES= for other scenes]
+	$(if $(findstring file,$(origin SCENES)),,SCENES=$(abspath $(SCENES)) )$(PY) -m experiments.notebooks.execute $(PAGES)
 
 corpus: $(STAMP) ## the simulated touches that the shipped encoders are trained on: [CORPUS=data/corpus]
 	$(PY) -m experiments.encoders.corpus $(CORPUS)
 
 weights: $(STAMP) ## train the shipped encoder again: [CORPUS= REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
 	$(PY) -m experiments.encoders.train --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
+
+release-check: $(STAMP) ## build a release, install it into an empty environment, run the README there (network)
+	$(PY) -m tests.release
 
 docs: $(DOCS)/.made
 docs: $(STAMP) ## the documentation site, in build/site, in a separate venv

@@ -78,21 +78,12 @@ def write() -> None:
     if (RESULTS / "figures").is_dir():
         shutil.copytree(RESULTS / "figures", DOCS / "results" / "figures")
     pages = {
-        page: DOCS / "results" / ("paper.md" if page.name == "README.md" else page.name)
+        page: DOCS / "results" / ("index.md" if page.name == "README.md" else page.name)
         for page in RESULTS.glob("*.md")
     }
     pages |= {ROOT / name: DOCS / name.lower() for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
     for page, target in sorted(pages.items()):
         target.write_text(_inside(page.read_text(encoding="utf-8"), page, target, pages), encoding="utf-8")
-    titles = {
-        t: t.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
-        for t in pages.values()
-        if t.parent.name == "results"
-    }
-    listed = "\n".join(f"* [{title}]({target.name})" for target, title in sorted(titles.items()))
-    (DOCS / "results" / "index.md").write_text(
-        f"# Results\n\nEach page is made from its data alone.\n\n{listed}\n", encoding="utf-8"
-    )
 
 
 def _inside(text: str, page: Path, target: Path, pages: dict[Path, Path]) -> str:

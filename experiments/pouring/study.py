@@ -8,14 +8,12 @@ cylinder, and that of the standing one. The encoder is frozen or fine-tuned.
 `make pouring` takes the encoders of `make experiments`, one a seed, and trains the missing ones (`STUDY=`).
 `RUNS="anytouch=path static=path t3=a,b,c"` takes encoders of yours: a path, or one a seed. `none` without a path is an
 untrained encoder, `static` the run of `anytouch` on single frames. A row without a run is left out. Finished rows are
-not run again. `QUICK=1` is a trial of minutes, and `TABLE=1` only makes the page from its records. `SEEDS=`, `TRIALS=`,
-`DEMOS=` (a thousand of 84 pixels take 9 GB), `TUNE=` (steps of fine-tuning), `MODES=`, `NAME=` (of the page) and `OUT=`
-change size and place.
+not run again. `QUICK=1` is a trial of minutes. `SEEDS=`, `TRIALS=`, `DEMOS=` (a thousand of 84 pixels take 9 GB),
+`TUNE=` (steps of fine-tuning), `MODES=`, `NAME=` (of the records) and `OUT=` change size and place.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict
 from functools import cache
@@ -28,7 +26,6 @@ from anytouch_jax.config import preset
 from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots
-from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.pouring import bounds as pouring_bounds
 from experiments.pouring import policy as pouring_policy
@@ -39,7 +36,7 @@ from experiments.records import read_records, write_record
 from experiments.tables import env, plan
 from experiments.tables.work import Work
 
-QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+QUICK = env.switch("QUICK")
 RUNS, STUDY = env.runs(), env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 SEEDS = env.numbers("SEEDS", "0" if QUICK else "0,1,2")
 MODES = env.names("MODES", "frozen" if QUICK else "frozen,fine-tuned", table.MODES)
@@ -47,7 +44,7 @@ TRIALS, DEMOS = env.number("TRIALS", 10 if QUICK else 60), env.number("DEMOS", 1
 TUNE = env.number("TUNE", 20 if QUICK else max(400, DEMOS))
 OUT = env.path("OUT", "experiments/results")
 NAME = env.path("NAME", "pouring-quick" if QUICK else "pouring").name
-RESULTS, PAGE = OUT / f"{NAME}.jsonl", OUT / f"{NAME}.md"
+RESULTS = OUT / f"{NAME}.jsonl"
 TASK = Task()
 
 
@@ -155,7 +152,7 @@ def do_seed(seed: int) -> None:
 
 
 def draw_demonstration(figures: Path) -> None:
-    """Draw frames of the gel while the cylinder empties, and their change from the standing cylinder; write a film."""
+    """Draw frames of the gel while the cylinder empties, and their change from the standing cylinder."""
     one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
     last = int(one.steps[0]) - 1
     moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
@@ -168,48 +165,15 @@ def draw_demonstration(figures: Path) -> None:
         ["frame", "change x 2"],
         standing,
     )
-    pouring.write_film(figures / "pouring.gif", one, TASK)
 
 
 def main() -> None:
     if unknown := set(RUNS) - set(table.PAPER):
         raise UserError(f"RUNS names {', '.join(table.PAPER)}, not {', '.join(sorted(unknown))}")
     enable_compilation_cache()
-    for seed in () if TABLE else SEEDS:
+    for seed in SEEDS:
         do_seed(seed)
-    figures = OUT / "figures"
-    if not TABLE or not (figures / "pouring.gif").exists():
-        draw_demonstration(figures)
-    rows = table.read_rows(RESULTS)
-    runs = {run for row in rows for run in row.runs}
-    seeds = sorted({run.split("/")[0] for run in runs}, key=lambda name: int(name))
-    fewer = [f"{row.name}, {row.mode} ({len(row.runs)})" for row in rows if len(row.runs) < len(runs)]
-    picture = f"{NAME}.png"
-    table.draw(figures / picture, rows)
-    settings = max((row.settings for row in rows), key=len)
-    used = json.loads(settings)
-    other = "" if used["policy"] == pouring_policy.VERSION else " Policies of today's code learn otherwise (`policy`)."
-    text = f"""# Pouring by touch alone (simulated), {used["demonstrations"]} demonstrations
-
-{len(runs)} runs a row ({len(seeds)} seeds of learning, {len(runs) // len(seeds)} trials each{
-        "; fewer: " + ", ".join(fewer) if fewer else ""
-    }); mean
-|poured - {TASK.target:g} g| with its 95 % interval over seeds (Student's t; the runs of a seed share one policy).
-The paper's numbers are of a robot: only the order can be
-compared. Differences are paired, run by run; a sign agrees when the interval over seeds leaves zero out, and none is
-claimed of fewer than three. Each row has one encoder unless several are named below. Settings (`version` is that of the
-flow and the load, {VERSION} now):
-{settings}.
-
-{table.table(rows)}
-![errors](figures/{picture})
-![frames](figures/pouring_frames.png)
-![film](figures/pouring.gif)
-
-Made by `SEEDS={",".join(seeds)} make pouring`, from `{NAME}.jsonl`.{other}
-"""
-    atomic_write(PAGE, text)
-    print(text)
+    draw_demonstration(OUT / "figures")
 
 
 if __name__ == "__main__":

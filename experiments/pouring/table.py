@@ -1,4 +1,4 @@
-"""The pouring table in the form of the paper's Table 4, made from the records of its rows alone."""
+"""Rows of the pouring study from its records: errors, and paired differences."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.pouring.physics import Task
 from experiments.pouring.trials import Error, Trials, error
 from experiments.records import read_records
-from experiments.verdicts import seed_interval, verdict
+from experiments.verdicts import seed_interval
 
 Array = npt.NDArray[Any]
 MODES = ("fine-tuned", "frozen")
@@ -26,14 +25,13 @@ TITLES = {
     "anytouch": "AnyTouch",
     "blind": "blind: time and own actions",
     "count": "blind: the best number of pours",
-    "load": "bound: told the load on the gel, no picture",
+    "load": "bound: knows the load, sees no picture",
     "expert": "expert: sees the scales",
 }
 PAPER = {"none": (5.22, 49.1), "t3": (2.33, 9.74), "static": (2.45, 9.60), "anytouch": (1.56, 8.22)}
 BLIND = ("blind", "count")
 SHOWN = "shown stills"  # of the run `anytouch` in place of one trained on stills: says nothing of such training
 DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the others see stills
-CLAIMS = (("anytouch", "static"), ("anytouch", "t3"), ("static", "none"), ("t3", "none"), ("anytouch", "none"))
 
 
 class Row(NamedTuple):
@@ -149,80 +147,3 @@ def difference(a: Row, b: Row) -> Difference:
     change = np.array([a.wrong[a.runs.index(run)] - b.wrong[b.runs.index(run)] for run in shared])
     each = _by_seed(change, shared)
     return Difference(float(change.mean()), *seed_interval(each), each)
-
-
-def table(rows: Sequence[Row]) -> str:
-    """Return the table: mean errors and the paper's, then each of the paper's orders with its paired difference."""
-    by = {(row.name, row.mode): row for row in rows}
-    lines = []
-    for name, title in TITLES.items():
-        if not any(row.name == name for row in rows):
-            continue
-        cells = []
-        for number, mode in enumerate(MODES):
-            row = by.get((name, mode)) or by.get((name, "bound"))
-            cells += [_cell(row) if row else "-", _paper(name, number)]
-        lines.append((title, "yes" if name in DYNAMIC else "no" if name in PAPER else "-", *cells))
-    head = ("policy", "sees segments", "fine-tuned, g", "paper", "frozen, g", "paper")
-    parts = [markdown_table(head, lines)]
-    trained = [row for row in rows if row.mode != "bound"]
-    if trained:
-        used = "; ".join(f"{TITLES[row.name]}, {row.mode}: {', '.join(row.sources)}" for row in trained)
-        parts.append(f"Encoders: {used}.")
-    claims = [_claim(by, mode, better, worse) for mode in MODES for better, worse in CLAIMS]
-    claims += [_claim(by, mode, name, bound) for mode in MODES for name in PAPER for bound in BLIND]
-    result = [claim for claim in claims if claim]
-    if result:
-        parts.append(
-            markdown_table(
-                ("smaller error, as claimed", "than", "mode", "difference, g (95 % over seeds)", "sign"), result
-            )
-        )
-    return "\n\n".join(parts) + "\n"
-
-
-def _claim(by: Mapping[tuple[str, str], Row], mode: str, better: str, worse: str) -> tuple[str, ...] | None:
-    a, b = by.get((better, mode)), by.get((worse, "bound" if worse in BLIND else mode))
-    if a is None or b is None or any(SHOWN in source for source in (*a.sources, *b.sources)):
-        return None
-    change = difference(a, b)
-    words = _words(Error(*change[:3]), "+.1f")
-    return TITLES[better], TITLES[worse], mode, words, verdict(change.low, change.high, len(change.each), wanted=-1)
-
-
-def _paper(name: str, mode: int) -> str:
-    return f"{PAPER[name][mode]:g}" if name in PAPER else "-"
-
-
-def _cell(row: Row) -> str:
-    return _words(row.error) + (f", {row.lost} never turned back" if row.lost else "")
-
-
-def _words(result: Error, form: str = ".1f") -> str:
-    if result.low is None or result.high is None:
-        return f"{result.mean:{form}}"
-    return f"{result.mean:{form}} ({result.low:{form}} to {result.high:{form}})"
-
-
-def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Every run's poured mass by row, and the row's mean error, as PNG."""
-    from matplotlib.figure import Figure
-
-    from anytouch_jax.evaluate.plots import write_figure
-
-    places = [(name, mode) for name in TITLES for mode in (*MODES, "bound")]
-    order = sorted(rows, key=lambda row: places.index((row.name, row.mode)))
-    figure = Figure(figsize=(7.5, 0.8 + 0.42 * len(order)), layout="constrained")
-    axis = figure.subplots()
-    for place, row in enumerate(order):
-        jitter = 0.5 * (np.arange(len(row.poured)) / max(len(row.poured) - 1, 1) - 0.5)
-        colour = f"C{list(TITLES).index(row.name)}"
-        axis.scatter(row.poured, place + jitter, s=14, color=colour, alpha=0.8, linewidths=0)
-    names = [f"{TITLES[row.name]}{'' if row.mode == 'bound' else ', ' + row.mode}" for row in order]
-    errors = [f"{name} ({row.wrong.mean():.1f} g)" for name, row in zip(names, order, strict=True)]
-    axis.set_yticks(range(len(order)), errors)
-    axis.axvline(order[0].target, color="#222222", linewidth=1)
-    axis.set(xlabel="poured, g (mean error in brackets)", xlim=(-2, 102))
-    axis.invert_yaxis()
-    axis.grid(axis="x", alpha=0.25)
-    write_figure(path, figure)

@@ -3,7 +3,7 @@
     python -m experiments.real.run DATA=../shared/real_touch2/manifest.csv anytouch-tiny runs/weights/stage1
 
 Each model is a name, a run folder or a weights file; `untrained:MODEL` is the same network without training. Every row
-goes to `experiments/results/real.jsonl`, and the page `real.md` is made from that file alone (`--page`).
+goes to `experiments/results/real.jsonl`. `make results` makes the page from that file alone.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.files import atomic_write
 from experiments.benchmarks import machine
-from experiments.real import features, page, recordings, scores, training
+from experiments.real import features, recordings, scores, training
 from experiments.records import write_record
 
 BASELINES = {"pixels": features.pixel_values, "HOG and local binary patterns": features.classical_values}
@@ -65,7 +64,7 @@ def trained_records(models: list[str], data: recordings.Recordings, common: dict
     about = common | {"machine": dataclasses.asdict(machine.describe())}
     pictures = training.cnn_pictures(data)
     tasks = {
-        f"{task}, {page.TRAINED}": task_record(score(pictures, data, training.cnn_scores))
+        f"{task}, {scores.TRAINED}": task_record(score(pictures, data, training.cnn_scores))
         for task, score in scores.TASKS.items()
     }
     write_record(out, CNN, about | {"kind": "baseline", "tasks": tasks})
@@ -78,7 +77,7 @@ def trained_records(models: list[str], data: recordings.Recordings, common: dict
         ])  # fmt: skip
         score = scores.object_score(x, data, training.fine_tuned_scores(encoder))
         about |= {"kind": "encoder", "fingerprint": encoder.fingerprint}
-        write_record(out, f"{name}, fine-tuned", about | {"tasks": {f"object, {page.TRAINED}": task_record(score)}})
+        write_record(out, f"{name}, fine-tuned", about | {"tasks": {f"object, {scores.TRAINED}": task_record(score)}})
         print(f"{name}, fine-tuned", flush=True)
 
 
@@ -88,24 +87,21 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"))
     parser.add_argument("--out", type=Path, default=Path("experiments/results/real.jsonl"))
     parser.add_argument("--trained", action="store_true", help="train a CNN and the encoders with labels too: an hour")
-    parser.add_argument("--page", action="store_true", help="make the page from the records, and nothing else")
     options = parser.parse_args()
-    if not options.page:
-        data = recordings.read(options.data)
-        common = {"data": data.content_hash}
-        for name, compute in BASELINES.items():
-            write_record(options.out, name, record_of(compute(data), data, common | {"kind": "baseline"}))
-            print(name, flush=True)
-        for name in options.models:
-            encoder = load(name)
-            about = {"kind": "encoder", "config": json.loads(json.dumps(dataclasses.asdict(encoder.config))),
-                     "fingerprint": encoder.fingerprint, "milliseconds": milliseconds(encoder, data)}  # fmt: skip
-            x = features.encoder_features(encoder, data)
-            write_record(options.out, name, record_of(x, data, common | about))
-            print(name, flush=True)
-        if options.trained:
-            trained_records(options.models, data, common, options.out)
-    atomic_write(options.out.with_suffix(".md"), page.page(options.out))
+    data = recordings.read(options.data)
+    common = {"data": data.content_hash}
+    for name, compute in BASELINES.items():
+        write_record(options.out, name, record_of(compute(data), data, common | {"kind": "baseline"}))
+        print(name, flush=True)
+    for name in options.models:
+        encoder = load(name)
+        about = {"kind": "encoder", "config": json.loads(json.dumps(dataclasses.asdict(encoder.config))),
+                 "fingerprint": encoder.fingerprint, "milliseconds": milliseconds(encoder, data)}  # fmt: skip
+        x = features.encoder_features(encoder, data)
+        write_record(options.out, name, record_of(x, data, common | about))
+        print(name, flush=True)
+    if options.trained:
+        trained_records(options.models, data, common, options.out)
 
 
 if __name__ == "__main__":

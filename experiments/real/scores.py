@@ -17,6 +17,7 @@ from experiments.real.recordings import Recordings
 Array = np.ndarray
 PENALTIES = (10.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001)
 NEIGHBOURS = (50, 20, 10, 5, 1)
+TRAINED = "trained with labels"  # the head of a network that is trained whole, on this task
 
 
 class Score(NamedTuple):

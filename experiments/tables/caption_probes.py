@@ -6,9 +6,8 @@ label. The test split has pairs of primitive and texture that training never had
 trained alike. Then the sensor left out: linear probes of contact frames on the frozen features of each.
 
 `python -m experiments.tables.caption_probes` takes 20 minutes a seed on one core, with the encoders of
-`make experiments` (`STUDY=`). `STEPS=`, `SEEDS=` and `QUICK=1` change the size. `TABLE=1` makes the page from its
-records. Finished seeds are not run again. `CONVOLUTIONS=1` has encoders whose patches are read by small convolutions,
-and its own page.
+`make experiments` (`STUDY=`). `STEPS=`, `SEEDS=` and `QUICK=1` change the size. Finished seeds are not run
+again. `CONVOLUTIONS=1` has encoders whose patches are read by small convolutions, and its own records.
 """
 
 from __future__ import annotations
@@ -29,10 +28,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
-from anytouch_jax.evaluate.statistics import markdown_table
-from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -40,19 +36,17 @@ from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
 from experiments.records import read_records, write_record
 from experiments.tables import cuts, env, plan
-from experiments.tables.by_object import probe_table, probed
+from experiments.tables.by_object import probed
 from experiments.tables.work import Work
-from experiments.verdicts import seed_interval
 
-QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+QUICK = env.switch("QUICK")
 SIZE = plan.QUICK if QUICK else plan.FULL
 STUDY = env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
 CONVOLUTIONS = env.switch("CONVOLUTIONS")
 OUT, PLAIN = env.path("OUT", "experiments/results"), "named_quick" if QUICK else "named"
 NAME = PLAIN.replace("named", "named_convolutional") if CONVOLUTIONS else PLAIN
 RESULTS = OUT / f"{NAME}.jsonl"
-THERE = ",".join(sorted(read_records(RESULTS), key=int)) if TABLE else ""
-SEEDS = env.numbers("SEEDS", THERE or ("0" if QUICK else "0,1,2"))  # the table alone is of all that are there
+SEEDS = env.numbers("SEEDS", "0" if QUICK else "0,1,2")
 STEPS = env.number("STEPS", 5 if QUICK else 1200)
 NAMED, UNNAMED = ("hardness", "roughness", "material"), ("indenter",)  # by captions
 LABELS = (*NAMED, *UNNAMED)
@@ -240,12 +234,10 @@ def by_convolutions(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work
 def one_seed(seed: int) -> dict[str, Any]:
     """Return the record of a seed. What it lacks, or has of other settings, is measured first."""
     result = read_records(RESULTS).get(str(seed), {})
-    if not TABLE and result.get("settings") != SETTINGS:
+    if result.get("settings") != SETTINGS:
         result = {}
     if {"probes", CONVOLUTIONAL} <= set(result):
         return result
-    if TABLE:
-        raise UserError(f"{RESULTS} has no whole record of seed {seed}. Run this page without TABLE=1.")
     work = Work(STUDY)
     first = training(seed).init
     assert first is not None
@@ -263,58 +255,10 @@ def one_seed(seed: int) -> dict[str, Any]:
     return result
 
 
-def percent(values: list[float]) -> str:
-    low, high = seed_interval(values)
-    interval = "" if low is None or high is None else f" ({100 * low:.1f} to {100 * high:.1f})"
-    return f"{100 * np.mean(values):.1f} %{interval}"
-
-
-def row(runs: list[dict[str, Any]], label: str) -> tuple[str, ...]:
-    ways = [(run["scores"][label], run[CONVOLUTIONAL]["scores"][label]) for run in runs]
-    known = [percent([own["commonest"] for own, _ in ways])]
-    known += [percent([way[number][part] for way in ways]) for number in (0, 1) for part in ("train", "test")]
-    return (label, *known)
-
-
-def joined(run: dict[str, Any], label: str) -> dict[str, Any]:
-    """Both files' counts of a label, by object."""
-    one, other = run["probes"][label], run[CONVOLUTIONAL]["probes"][label]
-    return one | {"right": one["right"] | {CONVOLUTIONAL: other["right"][CONVOLUTIONAL]}}
-
-
 def main() -> None:
     enable_compilation_cache()
-    runs = [one_seed(seed) for seed in SEEDS]
-    head = ("label", "commonest answer of train", "its own frames", "objects never touched")
-    head += ("convolutional: its own frames", "convolutional: objects never touched")
-    accuracies = markdown_table(head, [row(runs, label) for label in LABELS])
-    probed_runs = [{label: joined(run, label) for label in LABELS} for run in runs]
-    columns = (*NAMES, CONVOLUTIONAL, "pixels", "commonest")
-    left_out = probe_table(probed_runs, columns, ("untrained", "pixels"), NAMED, UNNAMED)
-    seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
-    made = f"SEEDS={','.join(map(str, SEEDS))} python -m experiments.tables.caption_probes"
-    made = f"CONVOLUTIONS=1 {made}" if CONVOLUTIONS else made
-    inside = ", with small convolutions inside its patches" if CONVOLUTIONS else ""
-    text = f"""# What captions name, of objects never touched
-
-The encoder of Tables 2 to 4{inside}, trained with the labels themselves ({runs[0]["settings"]["steps"]} steps of
-{BATCH} contact frames of four sensors), {seeds}; mean with its 95 % interval over seeds. The test split has pairs of
-primitive and texture that training never had. Captions name hardness, roughness and material; they do not name the
-indenter. Beside it a convolutional network with group norms, trained in the same way.
-
-{accuracies}
-
-## {plan.UNSEEN}, left out of training: linear probes of contact frames (mean and spread over seeds)
-
-{runs[0]["settings"]["touches"]} touches of the same objects; none of those tested was touched in training, by any
-sensor. AnyTouch is that of Tables 2 to 4{inside}, of the same seeds; captions name the first three labels.
-
-{left_out}
-
-Made by `{made}` ({runs[0]["machine"]}), from `{NAME}.jsonl`.
-"""
-    atomic_write(OUT / f"{NAME}.md", text)
-    print(text)
+    for seed in SEEDS:
+        one_seed(seed)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,8 @@ direction of a slide.
 
     make long-clips RUN=runs/stage2 DATA=data/scenes/manifest.parquet
 
-`OUT=` is the folder of the page and of `long_clips.jsonl`, a line a length. `ROWS=` bounds the moments of a task. A
+`OUT=` is the folder of `long_clips.jsonl`, a line a length. `ROWS=` bounds the moments of a task. A
 length that was measured with the same encoder and data is not measured again. `QUICK=1` is a trial of a minute or two.
-`TABLE=1` makes the page from its records alone.
 """
 
 from __future__ import annotations
@@ -26,17 +25,14 @@ from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import probing, tasks
-from anytouch_jax.evaluate.statistics import markdown_table
-from anytouch_jax.files import atomic_write
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
-from experiments.benchmarks.pareto import pareto
 from experiments.benchmarks.speed import interleaved
 from experiments.records import read_records, write_record
 from experiments.tables import env
 
 RUN, DATA = env.path("RUN", "runs/stage2"), env.path("DATA", "data/scenes/manifest.parquet")
-QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+QUICK = env.switch("QUICK")
 OUT, NAME = env.path("OUT", "experiments/results"), "long_clips-quick" if QUICK else "long_clips"
 ROWS = env.number("ROWS", 100 if QUICK else 1500)
 ROUNDS, BATCH = (3, 8) if QUICK else (9, 32)
@@ -104,13 +100,9 @@ def probed(of: Moments, frames: int, join: Any) -> dict[str, Any]:
     return {"tasks": found}
 
 
-def record_of(key: str, of: Moments | None, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def record_of(key: str, of: Moments, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return the record of a length, measured first unless it was measured with these settings."""
     record = read_records(RESULTS).get(key)
-    if of is None:
-        if record is None:
-            raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
-        return record
     settings = SETTINGS | {"encoder": of.encoder.fingerprint, "manifest": of.table.content_hash}
     if record is None or record["settings"] != settings:
         record = {"run": RUN.name, "machine": machine.describe().sentence(), "settings": settings} | measure()
@@ -118,48 +110,11 @@ def record_of(key: str, of: Moments | None, measure: Callable[[], dict[str, Any]
     return record
 
 
-def cell(name: str, one: dict[str, Any]) -> str:
-    scale, digits = (1, 2) if name == "force" else (100, 1)
-    interval = "" if one["low"] is None else f" ({scale * one['low']:.{digits}f} to {scale * one['high']:.{digits}f})"
-    return f"{scale * one['mean']:.{digits}f}{interval}"
-
-
 def main() -> None:
-    of = None if TABLE else moments()
-    time_taken = record_of("time", of, lambda: {"ms": milliseconds(of.encoder)})
-    cost = time_taken["ms"]
-    rows: list[dict[str, Any]] = []
-    for (frames, join), ms in zip(LOOKS, cost, strict=True):
-        about = {"frames": frames, "join": join if frames > 3 else "-", "ms": ms, "ratio": ms / cost[1]}
-        rows.append(about | record_of(f"{frames}-{join}", of, partial(probed, of, frames, join)))
-    head = ("frames", "joined by", "ms a clip", "time / 3 frames", "slip %", "force R2", "twist %", "slide %")
-    body = [
-        (str(one["frames"]), one["join"], f"{one['ms']:.2f}", f"{one['ratio']:.2f}",
-         *(cell(name, one["tasks"][name]) for name in TASKS))
-        for one in rows
-    ]  # fmt: skip
-    first = rows[0]["tasks"]
-    chance = (cell(name, first[name] | {"mean": first[name]["chance"], "low": None}) for name in TASKS)
-    body.append(("*the commonest answer*", "-", "-", "-", *chance))
-    tested = ", ".join(f"{name} {one['test']}" for name, one in first.items())
-    text = f"""# Longer clips: what they cost and what they show
-
-Made by `make long-clips` from the run `{time_taken["run"]}`. {time_taken["machine"]}
-Linear probes of frozen features, one fit, on objects never touched in training, 95 % over them; moments: {tested}.
-An accuracy equal to that of the commonest answer is one: the probe found nothing and gives the same answer for all.
-Time: a clip in a batch of {BATCH}, the median of {ROUNDS} rounds in turns.
-
-{markdown_table(head, body)}
-
-![Slip against time](figures/{NAME}.png)
-"""
-    atomic_write(OUT / f"{NAME}.md", text)
-    points = {
-        f"{one['frames']} {one['join']}".removesuffix(" -"): (one["ms"], 1 - one["tasks"]["slip"]["mean"])
-        for one in rows
-    }
-    pareto(OUT / "figures" / f"{NAME}.png", points, x="ms a clip", y="share of slips classified wrongly")
-    print(text)
+    of = moments()
+    record_of("time", of, lambda: {"ms": milliseconds(of.encoder)})
+    for frames, join in LOOKS:
+        record_of(f"{frames}-{join}", of, partial(probed, of, frames, join))
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.evaluate import plots
-from experiments.tables import paper, questions, real, scores
+from experiments.tables import columns, paper, scores
+from experiments.tables.columns import commonest, title
 from experiments.tables.results import Column, Run, change, spread, values
-from experiments.tables.tables import commonest, title
 
 STAGES = (
     ("untrained", "no pre-training"),
@@ -21,24 +21,6 @@ STAGES = (
 )
 MARKS = ("o", "s", "^", "D", "v")
 COLOURED = 12  # touches that get a colour and their lines; the others are grey
-
-
-def draw_all(runs: Sequence[Run], folder: Path) -> list[Path]:
-    """Every picture for which there is a run; a file is named after its question."""
-    result = []
-    for name, draw in (
-        ("q1", q1),
-        ("q2", q2),
-        ("q3", q3),
-        ("ablations", ablations),
-        ("dynamics", dynamics),
-        ("new_sensor", new_sensor),
-        ("real", real_touch),
-    ):
-        if any(run.question == name for run in runs):
-            path = draw(runs, folder / f"{name}.png")
-            result += [path] if path is not None else []
-    return result
 
 
 def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | None:
@@ -86,8 +68,8 @@ def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | No
 def q1(runs: Sequence[Run], path: Path) -> Path:
     """The columns of Table 1 as sensors are added: the material, as there, and the form of the indenter."""
     names = list(paper.TABLE1)
-    figure, axes = _panels(1, len(questions.FOUR), 3.0, 3.2)
-    for axis, column, form, theirs in zip(axes, questions.FOUR, questions.FORM, questions.FOUR_PAPER, strict=True):
+    figure, axes = _panels(1, len(columns.FOUR), 3.0, 3.2)
+    for axis, column, form, theirs in zip(axes, columns.FOUR, columns.FORM, columns.FOUR_PAPER, strict=True):
         _line(axis, [spread(runs, "q1", name, column) for name in names], "material", "C0")
         _line(axis, [spread(runs, "q1", name, form) for name in names], "form", "C1")
         axis.set_title(f"{column.title}\n(grey, right axis: paper, {theirs})", fontsize=8)
@@ -100,7 +82,7 @@ def q1(runs: Sequence[Run], path: Path) -> Path:
         )
         right = axis.twinx()
         right.plot(
-            [paper.TABLE1[name][questions.FOUR.index(column)] for name in names], "--", color="#999999", linewidth=1
+            [paper.TABLE1[name][columns.FOUR.index(column)] for name in names], "--", color="#999999", linewidth=1
         )
         right.tick_params(labelsize=7, colors="#999999")
     axes[0].set_ylabel("accuracy, %")
@@ -112,9 +94,9 @@ def q1(runs: Sequence[Run], path: Path) -> Path:
 def q3(runs: Sequence[Run], path: Path) -> Path:
     """Static and dynamic tasks, a panel a task, a line a model: mean and interval; dotted, one answer for all."""
     names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
-    columns = (*questions.SIX[:3], questions.FOUR[2], *questions.dynamic("clips"))
-    figure, axes = _lines(names, columns)
-    for axis, column in zip(axes, columns, strict=False):
+    shown = (*columns.SIX[:3], columns.FOUR[2], *columns.dynamic("clips"))
+    figure, axes = _lines(names, shown)
+    for axis, column in zip(axes, shown, strict=False):
         for place, name in enumerate(names):
             _dot(axis, place, spread(runs, "q3", name, column), "C0" if name == "anytouch" else "#7a94b0")
         chance = commonest(runs, "q3", column)
@@ -127,10 +109,10 @@ def q3(runs: Sequence[Run], path: Path) -> Path:
 def ablations(runs: Sequence[Run], path: Path) -> Path:
     """What leaving out a part changes, in points: the material and the paper's change, and the form."""
     names = [name for name in paper.TABLE6 if name != "anytouch"]
-    figure, axes = _lines(names, questions.FOUR)
-    for number, (axis, column) in enumerate(zip(axes, questions.FOUR, strict=True)):
+    figure, axes = _lines(names, columns.FOUR)
+    for number, (axis, column) in enumerate(zip(axes, columns.FOUR, strict=True)):
         for place, name in enumerate(names):
-            for shift, colour, one in ((-0.15, "C0", column), (0.15, "C1", questions.FORM[number])):
+            for shift, colour, one in ((-0.15, "C0", column), (0.15, "C1", columns.FORM[number])):
                 whole = values(runs, "ablations", "anytouch", one)
                 result = change(values(runs, "ablations", name, one), whole, None)
                 if result.mean is not None:
@@ -139,7 +121,7 @@ def ablations(runs: Sequence[Run], path: Path) -> Path:
             axis.scatter(theirs, place, s=22, marker="D", color="#bbbbbb", zorder=1)
         axis.axvline(0, color="#222222", linewidth=0.7)
         axis.set_xlabel(
-            f"blue: material, orange: form, points\ndiamonds: paper, {questions.FOUR_PAPER[number]}", fontsize=7
+            f"blue: material, orange: form, points\ndiamonds: paper, {columns.FOUR_PAPER[number]}", fontsize=7
         )
     plots.write_figure(path, figure)
     return path
@@ -152,13 +134,13 @@ def dynamics(runs: Sequence[Run], path: Path) -> Path:
     for i, axis in enumerate(axes):
         for place, view in enumerate(views):
             for shift, name in ((-0.2, "anytouch"), (0.2, "static_only")):
-                result = spread(runs, "dynamics", name, questions.dynamic(view)[i])
+                result = spread(runs, "dynamics", name, columns.dynamic(view)[i])
                 if result is not None:
                     _bar(axis, place + shift, result, 0.38, "C0" if name == "anytouch" else "#bbbbbb")
-        axis.set_title(questions.dynamic("clips")[i].title, fontsize=9)
+        axis.set_title(columns.dynamic("clips")[i].title, fontsize=9)
         axis.set_xticks(range(len(views)), views, rotation=30, fontsize=8)
         axis.axhline(0, color="#222222", linewidth=0.6)
-        chance = commonest(runs, "dynamics", questions.dynamic("clips")[i])
+        chance = commonest(runs, "dynamics", columns.dynamic("clips")[i])
         if chance:
             axis.axhline(chance, linestyle=":", color="#222222", linewidth=1)
     axes[0].set_ylabel("%; blue: AnyTouch, grey: stills only")
@@ -183,28 +165,6 @@ def new_sensor(runs: Sequence[Run], path: Path) -> Path:
         axis.set_xticks(range(len(counts)), list(map(str, counts)))
     axes[0].set_ylabel("accuracy, %")
     axes[-1].legend(frameon=False, fontsize=7)
-    plots.write_figure(path, figure)
-    return path
-
-
-def real_touch(runs: Sequence[Run], path: Path) -> Path:
-    """Tasks on real touch, a panel each: ours, an untrained encoder and raw pixels, a dot a seed with its interval."""
-    several = [run for run in runs if run.question == "real"]
-    tasks = list(dict.fromkeys(row["task"] for run in several for row in run.about["rows"]))
-    views = (real.OURS, real.UNTRAINED, real.PIXELS)
-    figure, axes = _panels(1, len(tasks), 3.0, 2.4)
-    for axis, task in zip(axes, tasks, strict=True):
-        for number, run in enumerate(several):
-            for row in run.about["rows"]:
-                if row["task"] == task and row["view"] in views:
-                    result = tuple(None if row[key] is None else 100 * row[key] for key in ("mean", "low", "high"))
-                    shift = 0.18 * (number - (len(several) - 1) / 2)
-                    ours = row["view"] == real.OURS
-                    _dot(axis, views.index(row["view"]) + shift, result, "C0" if ours else "#7a94b0")  # type: ignore[arg-type]
-        axis.set_title(task, fontsize=8)
-        axis.set(ylim=(len(views) - 0.5, -0.5), xlabel="accuracy, %")
-        axis.set_yticks(range(len(views)), views if axis is axes[0] else [], fontsize=8)
-        axis.grid(alpha=0.25)
     plots.write_figure(path, figure)
     return path
 

@@ -114,25 +114,6 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in result.items() if len(several) > 1)
 
 
-def drawn(runs: Sequence[Run]) -> str:
-    """Which data sets were made more than once, by content and seeds, in words; empty where none was."""
-    result: dict[str, dict[str, set[int]]] = {}
-    for run in runs:
-        for name, value in run.about.get("data", {}).items():
-            result.setdefault(name, {}).setdefault(value[:8], set()).add(run.seed)
-    return "; ".join(
-        f"{name} " + ", ".join(f"{value} (seeds {', '.join(map(str, sorted(of)))})" for value, of in several.items())
-        for name, several in sorted(result.items())
-        if len(several) > 1
-    )
-
-
-def comparable(runs: Sequence[Run]) -> list[Run]:
-    """The runs of those questions whose runs do not differ in what they must share."""
-    whole = {name: [run.about for run in runs if run.question == name] for name in {run.question for run in runs}}
-    return [run for run in runs if not differences(whole[run.question])]
-
-
 def values(runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest") -> Seeds:
     """Return {seed: printed value} of a cell."""
     return {
@@ -177,11 +158,3 @@ def change(first: Seeds, second: Seeds, expected: float | None, better: int = 1)
     sides = shown if better > 0 else [shown[0], shown[2], shown[1]]
     word = NO_SIGN if not expected and len(seeds) >= CLAIM else verdict(low, high, len(seeds), wanted=expected or 1.0)
     return Change(word, *sides, len(seeds))  # type: ignore[arg-type]
-
-
-def together(changes: Sequence[tuple[Seeds, Seeds, int]], expected: float | None) -> Change:
-    """The mean of several changes, seed by seed, over those cells that both sides have: what a whole row says."""
-    whole = [(a, b, better) for a, b, better in changes if a and b]
-    seeds = set.intersection(*(a.keys() & b.keys() for a, b, _ in whole)) if whole else set()
-    first = {seed: float(np.mean([better * (a[seed] - b[seed]) for a, b, better in whole])) for seed in seeds}
-    return change(first, dict.fromkeys(first, 0.0), expected)

@@ -1,6 +1,6 @@
 """The matrix of experiments: `make experiments [QUICK=1]`, or `python -m experiments.tables.run`.
 
-Makes the missing runs, one line of `matrix.jsonl` each, and renders `experiments/results/README.md` from all lines.
+Makes the missing runs, one line of `matrix.jsonl` each, and then the pages of results.
 `plan.py` lists the runs, and `--plan` prints them. Stop it at any time: the same command continues. The same command in
 a second terminal shares the work.
 The results of a question are of one version of the simulator and of one size. Give those of another a new folder with
@@ -19,7 +19,8 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import jax
 
 from anytouch_jax.errors import UserError
-from experiments.tables import plan, report
+from experiments.pages import __main__ as pages
+from experiments.tables import plan
 from experiments.tables.execute import check_results, execute, is_done
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,12 +29,12 @@ ROOT = Path(__file__).resolve().parents[2]
 def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plan", action="store_true", help="print every run and stop")
-    parser.add_argument("--render", action="store_true", help="only render the tables from matrix.jsonl")
+    parser.add_argument("--render", action="store_true", help="only make the pages from matrix.jsonl")
     parser.add_argument("--quick", action="store_true", help="toy sizes: does it work?")
     parser.add_argument("--only", nargs="+", help="only these questions")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=0,1")
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
-    about = "folder of README.md and matrix.jsonl (default: experiments/results; with --quick or --set in --work)"
+    about = "folder of the pages and of matrix.jsonl (default: experiments/results; with --quick or --set in --work)"
     parser.add_argument("--out", type=Path, help=about)
     parser.add_argument("--real", type=Path, help="manifest of real touch (default: ../shared/real_touch/manifest.csv)")
     return parser.parse_args(argv)
@@ -74,7 +75,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if asked.render:
             return _render(chosen)
         check_results(chosen.leaves, chosen.out / "matrix.jsonl")
-        report.check_page(chosen.out)
         return _execute(chosen)
     except UserError as error:
         print(error, file=sys.stderr)
@@ -119,7 +119,8 @@ def _print(chosen: Chosen) -> int:
 
 
 def _render(chosen: Chosen) -> int:
-    print(report.write(chosen.out / "matrix.jsonl", chosen.out))
+    for path in pages.write(chosen.out):
+        print(path)
     return 0
 
 

@@ -7,8 +7,7 @@
 
 `python -m experiments.tables.teaching` takes an hour or more a seed. Finished runs are not made again.
 `TOUCHES=260 MORE=0 STEPS1=20 STEPS2=20 SEEDS=0 GRADES=fine` is a trial of minutes. `WORK=` and `OUT=` are folders of
-runs and results. `TABLE=1` makes the page from its records. `CONVOLUTIONS=1` has encoders whose patches are read by
-small convolutions, and its own page.
+runs and results. `CONVOLUTIONS=1` has encoders whose patches are read by small convolutions, and its own records.
 
 Six touches of each object by the sensor left out: with two a probe cannot distinguish encoders. `MORE=` touches a grade
 are trained on alone. The paper's data are contact frames, so only frames with six tenths of the strongest contact of
@@ -21,6 +20,7 @@ leave the plateau sooner than 150.
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,20 +30,17 @@ from anytouch_jax.cli import app
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows, text_column
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
 from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
-from anytouch_jax.evaluate.statistics import markdown_table
-from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import VERSION
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
 from experiments.records import read_records, write_record
 from experiments.tables import env
-from experiments.tables.by_object import ahead, by_object, gathered, probe_table, probed
+from experiments.tables.by_object import by_object, probed
 
-WORK, OUT, TABLE = env.path("WORK", "runs/teaching"), env.path("OUT", "experiments/results"), env.switch("TABLE")
+WORK, OUT = env.path("WORK", "runs/teaching"), env.path("OUT", "experiments/results")
 TOUCHES, STEPS1, STEPS2 = env.number("TOUCHES", 1200), env.number("STEPS1", 600), env.number("STEPS2", 4000)
 MORE = env.number("MORE", 2 * TOUCHES, least=0)
 OBJECTS = env.number("OBJECTS", min(TOUCHES // 2, 500))
@@ -160,10 +157,6 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
     """Return the record of a grade and a seed. It is measured first if it is missing, or of other encoders."""
     key = f"{grade}-{seed}"
     found = read_records(RESULTS).get(key)
-    if TABLE:
-        if found is None:
-            raise UserError(f"{RESULTS} has no record {key}. Run this page without TABLE=1.")
-        return found
     encoders = {f"stage {stage}": load_encoder(run) for stage, run in zip((1, 2), prepare(seed), strict=True)}
     about: dict[str, Any] = {
         "settings": SETTINGS,
@@ -180,51 +173,9 @@ def scored(grade: str, seed: int) -> dict[str, Any]:
     return found
 
 
-NAMES = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
-RIVALS = ("untrained", "pixels")  # of the probes
-
-
-def retrieval_table(found: list[dict[str, Any]]) -> str:
-    """Shares of the seeds together, and how far stage 2 is ahead: together, and seed by seed."""
-    (counts, first), (_, five) = (gathered([one["retrieval"][part] for one in found]) for part in ("top1", "top5"))
-    rows, best = [], first["stage 2"]
-    for name in NAMES:
-        shares = [f"{100 * np.mean(part[name], 0).sum() / counts.sum():.1f} %" for part in (first, five)]
-        change = each = "-"
-        if name != "stage 2":
-            change = ahead(counts, np.mean(best, 0), np.mean(first[name], 0))
-            each = "; ".join(ahead(counts, a, b) for a, b in zip(best, first[name], strict=True))
-        rows.append((name, *shares, change, each))
-    return markdown_table(
-        ("features", "top-1 of 50", "top-5", "stage 2 ahead by (points, 95 % over objects)", "seed by seed"), rows
-    )
-
-
 def main() -> None:
-    files = {grade: [scored(grade, seed) for seed in SEEDS] for grade in GRADES}
-    first = files[GRADES[0]][0]
-    if any(one["settings"] != first["settings"] for found in files.values() for one in found):
-        raise UserError(f"{RESULTS} has records made by different settings. Run this page without TABLE=1.")
-    size = " ".join(f"{name.upper()}={first['settings'][name]}" for name in ("touches", "more", "objects"))
-    size += " STEPS1={} STEPS2={}".format(*first["settings"]["steps"])
-    size += f" SEEDS={','.join(map(str, SEEDS))} GRADES={','.join(GRADES)}{' CONVOLUTIONS=1' if CONVOLUTIONS else ''}"
-    touch = first["config"]["model"]["touch"]
-    network = f"preset tiny with a touch tower of {touch['width']} x {touch['depth']}"
-    network += f" at {first['config']['model']['image_size']} pixels"
-    network += ", small convolutions inside its patches" if CONVOLUTIONS else ""
-    lines = [
-        "# Simulated scenes as teachers",
-        "",
-        f"Made by `{size} python -m experiments.tables.teaching`, {network}.",
-        "",
-    ]
-    for grade, found in files.items():
-        lines += [f"## Retrieval, {grade} data, {len(SEEDS)} seed{'s' if len(SEEDS) > 1 else ''}", ""]
-        lines += [retrieval_table(found), ""]
-        lines += [f"## {LEFT_OUT}, left out of training, {grade} data: linear probes (mean and spread over seeds)", ""]
-        lines += [probe_table([one["probes"] for one in found], NAMES[:5], RIVALS, NAMED, UNNAMED), ""]
-    atomic_write(OUT / f"{NAME}.md", "\n".join(lines))
-    print("\n".join(lines))
+    for grade, seed in product(GRADES, SEEDS):
+        scored(grade, seed)
 
 
 if __name__ == "__main__":

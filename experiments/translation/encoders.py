@@ -17,7 +17,6 @@ from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.retrieval import deepest_rows
-from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.train.progress import silent
 from anytouch_jax.weights.tree import interpolate
 from experiments.records import read_records, write_record
@@ -97,16 +96,3 @@ def score_retrieval(results: Path, name: str, seed: int, encoder: Encoder, sourc
     assert pooled is not None
     shares = {part: float(np.mean(getattr(pooled, part))) for part in ("top1", "top5")}
     write_record(results, key, {"encoder": source, "queries": len(pooled.top1)} | shares)
-
-
-def retrieval_table(results: Path) -> str:
-    """Return the mean shares over seeds of every encoder that has a retrieval record, "" without any."""
-    records = {key: one for key, one in read_records(results).items() if key.startswith(RETRIEVAL)}
-    by_name: dict[str, list[dict[str, float]]] = {}
-    for key, one in records.items():
-        by_name.setdefault(key.removeprefix(RETRIEVAL).rsplit("_", 1)[0], []).append(one)
-    rows = [
-        (name, *(f"{100 * np.mean([one[part] for one in several]):.1f} %" for part in ("top1", "top5")))
-        for name, several in sorted(by_name.items())
-    ]
-    return markdown_table(("encoder", "first of 50", "among the first five"), rows) if rows else ""

@@ -22,7 +22,7 @@ from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.command import run_script
 from experiments.translation import generator, pairs, training
-from experiments.translation.page import picture_grid
+from experiments.translation.pictures import picture_grid
 
 
 @dataclass(frozen=True)

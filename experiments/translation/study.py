@@ -10,7 +10,7 @@ of the pairs (`encoders.py`). In the environment: `RUNS="anytouch=runs/stage2 t3
 path, or one a seed). `REMAINING="coarse.parquet ..."` writes `coarse_remaining.parquet` next to each and stops: train
 encoders of yours on that. `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
 and `OUT=` are folders of the scenes, the pairs and the results. `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` change the
-size, `QUICK=1` is a trial of minutes, and `TABLE=1` only makes the page from `translation.jsonl`.
+size, and `QUICK=1` is a trial of minutes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import select_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -38,14 +37,14 @@ from experiments.records import read_records, write_record
 from experiments.tables import env, plan
 from experiments.tables.work import Work
 from experiments.translation import encoders as own_encoders
-from experiments.translation import page as translated
 from experiments.translation import pairs, training
 from experiments.translation.encoders import score_retrieval
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
-from experiments.translation.page import PIXELS, TASKS, one_table, picture_grid, runs_of
+from experiments.translation.pictures import picture_grid
+from experiments.translation.settings import PIXELS, TASKS, one_table, runs_of
 
-QUICK, TABLE = env.switch("QUICK"), env.switch("TABLE")
+QUICK = env.switch("QUICK")
 USUAL = plan.QUICK if QUICK else plan.FULL
 SIZE = replace(USUAL, steps1=env.number("STEPS1", USUAL.steps1))
 LONGER = {} if SIZE == USUAL else {"steps1": SIZE.steps1}
@@ -190,12 +189,8 @@ def main() -> None:
         raise UserError(
             "STEPS1 is for encoders that this study trains; leave it out with RUNS, whose encoders are trained"
         )
-    if not TABLE:
-        enable_compilation_cache()
-        make_all()
-    text = translated.page(RESULTS)
-    atomic_write(OUT / f"{NAME}.md", text)
-    print(text)
+    enable_compilation_cache()
+    make_all()
 
 
 if __name__ == "__main__":

@@ -37,12 +37,14 @@ SCRATCH_VOCABULARY, TOKENIZER, CHECKPOINTS = 2048, "tokenizer.json", "checkpoint
 def pretrain(
     config: Config, run: str | Path, *, init: str | Path | None = None, clip: str | Path | None = None,
     stop_after: int | None = None, log: Log = print, mesh: Mesh | None = None,
+    curve: bool = False,
 ) -> FitResult:  # fmt: skip
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
     `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1.
     `clip` is CLIP weights for the towers. Stage 1 starts the touch encoder from their image tower, as the paper does.
-    A resumed run reads neither. `mesh` is the devices to train on, all of them if None. Raises UserError for a mistake
+    A resumed run reads neither. `mesh` is the devices to train on, all of them if None. `curve` shows the loss of all
+    steps on a terminal. Raises UserError for a mistake
     in the settings, the data or the folder.
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
@@ -84,6 +86,7 @@ def pretrain(
             config, params=params, loss_fn=partial(loss, net=net, config=config), batches=loader.stream, run_dir=run,
             trained=partial(objectives.trained_by, config=config), stop_after=stop_after, metadata=metadata,
             on_report=partial(_draw_reconstructions, run=run, net=net, config=config), log=log, mesh=mesh,
+            curve=curve,
         )  # fmt: skip
 
 

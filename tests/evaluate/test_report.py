@@ -57,6 +57,9 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
     ]
     numbers = {"x": np.float32(0.5), "bad": float("nan"), "list": np.arange(2), "path": Path("a"), "part": parts[1]}
     path = write_report(out, parts, title="Title", numbers=numbers)
+    html = (out / "report.html").read_text()
+    assert html.count('src="data:image/png;base64,') == 2 and 'src="figures' not in html
+    assert "<td>two lines</td>" in html and "<title>Title</title>" in html and "<h2>First</h2>" in html
     assert path.read_text() == (
         "# Title\n\n## First\n\nWords.\n\n![First](figures/shot.png)\n\n"
         "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## Second\n\n![Second](figures/mine.png)\n"

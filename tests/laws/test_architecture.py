@@ -24,16 +24,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     "ops": set(),
     "errors": set(),
     "files": set(),
+    "bars": set(),
     "batch": set(),
     "config": {"errors"},
     "nn": {"ops", "config"},
     "objectives": {"ops", "nn.functional", "batch", "config"},
     "weights": {"nn", "config", "files", "errors"},
-    "data": {"config", "batch", "files", "errors"},
+    "data": {"config", "batch", "files", "errors", "bars"},
     "sim": {"data.manifest", "data.tokenizer", "config", "files", "errors"},
     "train": {"batch", "config", "weights", "files", "errors"},
     # ops: unit-norm embeddings, and the contrast that fits a new sensor's tokens
-    "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "files", "errors"},
+    "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "files", "errors", "bars"},
     # objectives: stage 1's errors on pixels are measured by stage 1's own functions
     "evaluate": {"encoder", "objectives", "data", "ops", "config", "files", "errors"},
 }

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from experiments.pages.matrix import VIEWS
 from experiments.records import read_records, write_record
 from experiments.tables import plan, real, scores
-from experiments.tables.questions import FORM, FOUR, GRASP, SIX, SPACE, STATIC, VIEWS, dynamic
+from experiments.tables.columns import FORM, FOUR, GRASP, SIX, SPACE, STATIC, dynamic
 from experiments.tables.results import Column
 
 Mean = Callable[[str, str, int, str, str], float]  # (question, name, seed, view, task) -> 0..1
@@ -53,9 +54,6 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
         "dynamics": (*(one for view in VIEWS for one in dynamic(view)), *STATIC),
     }.get(leaf.question, ())  # fmt: skip
     result = [(one.view, one.task, one.metric) for one in columns]
-    if leaf.question == "q3" and leaf.name in scores.READ:
-        tasks = (*scores.STATIC, scores.FORM)
-        result += [(f"read: {way}", task, "accuracy") for way in scores.WAYS for task in tasks]
     if leaf.question == "new_sensor":
         views = ["seen"] if leaf.name == "seen" else [scores.NOTHING]
         for count in scores.FRAMES if leaf.name != "seen" else ():

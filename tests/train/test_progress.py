@@ -3,7 +3,7 @@ from __future__ import annotations
 import io
 import sys
 
-from anytouch_jax.train.progress import progress, silent, summary, to_stderr
+from anytouch_jax.train.progress import chart, progress, silent, summary, to_stderr
 
 
 class Terminal(io.StringIO):
@@ -26,6 +26,27 @@ def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
             advance(row(step))
     shown = screen.getvalue()
     assert "3/3" in shown and "loss 0.5000" in shown and "saved at step 1" in shown
+
+
+def test_a_curve_is_drawn_on_request(monkeypatch):
+    shown = {}
+    for curve in (False, True):
+        monkeypatch.setattr(sys, "stderr", Terminal())
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "120")
+        screen = sys.stderr
+        with progress(0, 3, to_stderr, curve=curve) as advance:
+            for step, loss in enumerate((3.0, None, 1.0)):
+                advance(row(step, loss=loss))
+        shown[curve] = screen.getvalue()
+    assert "█" in shown[True] and "3.0000" in shown[True] and "█" not in shown[False]
+
+
+def test_the_curve_falls_with_the_loss():
+    lines = chart([8.0] * 50 + [1.0] * 50, width=10, height=4).splitlines()
+    assert [line[10:] for line in lines] == ["█████     "] * 3 + ["█████▁▁▁▁▁"]
+    assert lines[0].startswith("   8.0000 ") and lines[-1].startswith("   1.0000 ")
+    assert len(set(chart([2.0, 2.0]).splitlines()[-1][10:])) == 1  # no change, no division by zero
 
 
 def test_elsewhere_some_twenty_lines_are_said():

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
@@ -247,14 +248,23 @@ def _embed_frames(
             yield number, name, frame
 
     features = embed_frames(
-        encoder, frames(), row, preprocess, length=options.frames, pooling=pooling, join=options.join,
-        batch=options.batch,
+        encoder, tracked(frames(), _frame_count(data), "frames embedded"), row, preprocess, length=options.frames,
+        pooling=pooling, join=options.join, batch=options.batch,
     )  # fmt: skip
     features.predictions["contact"] = np.asarray(contact)[features.rows]
     if "path" not in features.keys:
         log_if_cut(data, len(times))
         features.keys["time"] = np.asarray(times)[features.rows]
     return features
+
+
+def _frame_count(data: Path) -> int:
+    """Return the number of frames of a folder or a video, as far as it is known before reading."""
+    from anytouch_jax.data import images
+
+    if data.suffix.lower() in images.SUFFIXES and data.is_file():
+        return 1
+    return len(images.list_images(data)[0]) if data.is_dir() else images.count_frames(data)
 
 
 def _numbered_frames(

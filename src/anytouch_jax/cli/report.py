@@ -21,14 +21,14 @@ class ReportOptions:
     data: Path  # Manifest of simulated scenes, or one with the same columns.
     stage1: Path  # Run folder of stage 1.
     stage2: Path  # Run folder of stage 2.
-    out: Path  # Folder for report.md, report.json and figures/.
+    out: Path  # Folder for report.html (one file with its pictures), report.md, report.json, figures/.
     touches: Count[int] = 200  # Touches of the test split to use, and half as many of train and val.
     gallery: Annotated[int, Range(2, math.inf, "2 or more")] = 50  # Touches in a retrieval gallery.
     seed: Seed = 0  # Random seed.
 
 
 def run(options: ReportOptions) -> int:
-    """Write report.md, report.json and figures/."""
+    """Write report.html, report.md, report.json and figures/."""
     from anytouch_jax.evaluate.report import demo_report
     from anytouch_jax.train.mesh import enable_compilation_cache
 

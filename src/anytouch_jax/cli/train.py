@@ -62,6 +62,7 @@ class TrainOptions:
     seed: int = 0  # Random seed.
     on_bad_sample: Literal["error", "skip"] = "error"  # Stop at a sample that cannot be read, or replace and count it.
     tensorboard: bool = False  # Also write TensorBoard events.
+    curve: bool = False  # Draw the loss in the terminal while training.
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def run(request: TrainRequest) -> int:
             with joined() as place:
                 result = pretrain(
                     config, options.run, init=options.init, clip=options.clip_weights, stop_after=options.stop_after,
-                    log=log,
+                    log=log, curve=options.curve,
                 )  # fmt: skip
     except Terminated:
         log(f"stopped by SIGTERM before the first step of {options.run}. Run the same command again to continue.")

@@ -17,6 +17,7 @@ import numpy as np
 import optax
 import pyarrow as pa
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -227,7 +228,7 @@ def _fit(
 
     tokens = jnp.asarray(params["touch"]["sensor_tokens"][row])
     state, root, history = tx.init(tokens), jax.random.key(seed), []
-    for number in range(steps):
+    for number in tracked(range(steps), steps, "steps"):
         tokens, state, value = step(tokens, state, jax.random.fold_in(root, number), arrays)
         history.append(value)
     return np.asarray(tokens), tuple(float(value) for value in history)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pyarrow as pa
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.errors import UserError
@@ -105,7 +106,7 @@ def embed_rows(
         sensor = sensor if sensor_row is None else np.full_like(sensor, sensor_row)
         return encoder.encode_touch(clips, sensor, pooling=pooling, join=join)
 
-    values = run_in_batches(encode, touches(), config.data.batch_size)
+    values = run_in_batches(encode, tracked(touches(), len(rows), "frames embedded"), config.data.batch_size)
     if not ids:
         raise UserError(f"none of the {len(rows)} rows can be read; check them with `anytouch data verify`")
     return np.concatenate(ids), values

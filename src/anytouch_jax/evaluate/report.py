@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -59,10 +61,10 @@ class Section:
 def write_report(
     folder: Path, sections: Sequence[Section], *, title: str = "Report", numbers: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write `folder`/report.md, report.json (`numbers`) and copies of the figures, and return the path of report.md.
+    """Write `folder`/report.html, report.md, report.json (`numbers`) and the figures, and return the path of report.md.
 
-    The figures are written first and report.md last, each atomically, so an existing report is always complete. Raises
-    UserError for a missing figure, OSError for a full disk.
+    report.html is one file with its pictures inside. The figures are written first and report.md last, each atomically,
+    so an existing report is always complete. Raises UserError for a missing figure, OSError for a full disk.
     """
     parts = [f"# {title}"]
     for section in sections:
@@ -75,8 +77,26 @@ def write_report(
         parts += [section.table, section.notes]
     if numbers is not None:
         atomic_write(folder / "report.json", json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n")
-    atomic_write(folder / "report.md", "\n\n".join(part.strip() for part in parts if part) + "\n")
+    text = "\n\n".join(part.strip() for part in parts if part) + "\n"
+    atomic_write(folder / "report.html", html_page(text, folder, title))
+    atomic_write(folder / "report.md", text)
     return folder / "report.md"
+
+
+def html_page(text: str, folder: Path, title: str) -> str:
+    """Return Markdown as an HTML page of one file. Its pictures, whose paths are relative to `folder`, lie inside."""
+    from markdown_it import MarkdownIt
+
+    def inside(match: re.Match[str]) -> str:
+        return f'src="data:image/png;base64,{base64.b64encode((folder / match[1]).read_bytes()).decode()}"'
+
+    body = re.sub(r'src="(figures/[^"]+)"', inside, MarkdownIt().enable("table").render(text))
+    style = (
+        "body{font:16px/1.5 sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}img{max-width:100%}"
+        "table{border-collapse:collapse;display:block;overflow-x:auto}td,th{border:1px solid #ccc;padding:.2em .6em}"
+    )
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>'
+    return f'<!doctype html>\n<html lang="en"><head>{head}<style>{style}</style></head>\n<body>{body}</body></html>\n'
 
 
 def demo_report(

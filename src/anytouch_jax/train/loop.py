@@ -72,15 +72,16 @@ def fit(
     metadata: Mapping[str, Any] | None = None,
     log: Log | None = None,
     mesh: Mesh | None = None,
+    curve: bool = False,
 ) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
     `params` are the first parameters. When a run continues, only their shapes matter. `loss_fn` and `trained` are those
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
-    `on_report(step, params, batch)` draws figures and must not keep the arrays. SIGTERM and Ctrl-C finish the step,
-    save and return. If one of several processes gets the signal, all stop a step later. Raises UserError for settings
-    that changed since the start, too many skipped steps in a row, a full disk, an unreadable checkpoint, and a folder
-    that some process cannot see.
+    `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
+    SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal, all stop a step
+    later. Raises UserError for settings that changed since the start, too many skipped steps in a row, a full disk, an
+    unreadable checkpoint, and a folder that some process cannot see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
     log, lead = log or to_stderr, jax.process_index() == 0
@@ -107,7 +108,7 @@ def fit(
         checkpoints.check_space(state)
         record = Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead)
         stack.enter_context(contextlib.closing(record))
-        advance = stack.enter_context(progress(start, stop, log))
+        advance = stack.enter_context(progress(start, stop, log, curve=curve))
         loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report)
         interrupt = stack.enter_context(signals())
         return loop.run(state, start, stop, batches, loss_fn, trained, interrupt)

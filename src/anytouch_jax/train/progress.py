@@ -6,8 +6,10 @@ import contextlib
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 Log = Callable[[str], None]
 _WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its time reports it
@@ -24,8 +26,11 @@ def silent(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(start: int, stop: int, log: Log) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Give a function for the metrics of each step. It moves a bar on a terminal, else logs about twenty lines."""
+def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Give a function for the metrics of each step. It moves a bar on a terminal, else logs about twenty lines.
+
+    With `curve` a terminal also shows the loss of all steps so far.
+    """
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
 
@@ -38,11 +43,38 @@ def progress(start: int, stop: int, log: Log) -> Iterator[Callable[[Mapping[str,
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    losses: list[float] = []
+
+    class Bar(Progress):
+        """A bar below the curve of the loss."""
+
+        def get_renderables(self) -> Iterator[Any]:
+            if curve and losses:
+                yield Text(chart(losses))
+            yield self.make_tasks_table(self.tasks)
+
+    def advance(row: Mapping[str, Any]) -> None:
+        losses.extend(() if row["loss"] is None else (row["loss"],))
+        bar.update(task, completed=row["step"] + 1, description=summary(row))
 
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Bar(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("compiling", total=stop, completed=start)
-        yield lambda row: bar.update(task, completed=row["step"] + 1, description=summary(row))
+        yield advance
+
+
+def chart(losses: Sequence[float], width: int = 64, height: int = 8) -> str:
+    """Draw losses as text: a column is the mean of equally many steps. The scale is written on the left."""
+    columns = [float(part.mean()) for part in np.array_split(np.asarray(losses), min(width, len(losses)))]
+    low, high = min(columns), max(columns)
+    eighths = [1 + round((8 * height - 1) * (value - low) / ((high - low) or 1.0)) for value in columns]
+    lines = []
+    for line in reversed(range(height)):
+        mark = {height - 1: f"{high:9.4f} ", 0: f"{low:9.4f} "}.get(line, " " * 10)
+        lines.append(mark + "".join(" ▁▂▃▄▅▆▇█"[min(8, max(0, full - 8 * line))] for full in eighths))
+    return "\n".join(lines)
 
 
 def summary(row: Mapping[str, Any]) -> str:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from experiments.real import features, page, run, scores, training
+from experiments.pages.studies import real
+from experiments.real import features, run, scores, training
 from experiments.real.recordings import Recordings
 from experiments.records import write_record
 
@@ -83,15 +84,23 @@ def test_binary_patterns_count_corners_and_flat_places():
 def test_the_page_has_every_row_and_refuses_mixed_data(data, tmp_path):
     file = tmp_path / "real.jsonl"
     with pytest.raises(UserError, match="no record"):
-        page.page(file)
+        real(tmp_path)
     for name in ("pixels", "untrained:a", "a"):
-        about = {"data": data.content_hash} | ({"milliseconds": 3.0} if name != "pixels" else {})
+        about = {"data": data.content_hash}
+        about |= {"milliseconds": 3.0, "kind": "encoder"} if name != "pixels" else {"kind": "baseline"}
         write_record(file, name, run.record_of(planted(data, 1.0 if name == "a" else 5.0), data, about))
-    text = page.page(file)
-    assert text.count("| linear | a |") == 3 and "| a | 3.0 |" in text
+    made = real(tmp_path)
+    assert [row[2] for row in made.rows].count("a") == 6 and "`a` takes 3 ms a frame on a CPU." in made.findings
+    best = next(row for row in made.rows if row[:3] == ("object", "linear", "a"))
+    assert best[4].low > 0 and any(one.startswith("object: `a` is") for one in made.findings)
+    task = run.task_record(scores.object_score(planted(data, 0.1), data))
+    write_record(
+        file, "a CNN", {"data": data.content_hash, "kind": "baseline", "tasks": {"object, trained with labels": task}}
+    )
+    assert [row[2] for row in real(tmp_path).rows].count("a CNN") == 1
     write_record(file, "b", {"data": "other"})
     with pytest.raises(UserError, match="different data"):
-        page.page(file)
+        real(tmp_path)
 
 
 def test_a_small_network_learns_what_the_pictures_show(data, monkeypatch):

@@ -31,9 +31,9 @@ def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
     leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "grasp"]
     synthetic.write(tmp_path / "matrix.jsonl", leaves)
     assert matrix.main(["--render", "--out", str(tmp_path), "--work", str(tmp_path / "never")]) == 0
-    text = (tmp_path / "README.md").read_text()
-    assert capsys.readouterr().out.strip() == str(tmp_path / "README.md") and not (tmp_path / "never").exists()
-    assert "| AnyTouch | 3 | 50.0 (50.0 to 50.0) | 50.0 (50.0 to 50.0) | 80.53 | 99.00 |" in text
+    text = (tmp_path / "grasp.md").read_text()
+    assert capsys.readouterr().out.strip() == str(tmp_path / "grasp.md") and not (tmp_path / "never").exists()
+    assert "| during the grasp | 50.0 | 50.0 | 50.0 | - | - | - | 80.53 |" in text
 
 
 def test_sizes_can_be_changed():
@@ -140,4 +140,4 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, capsys):
     capsys.readouterr()
     assert matrix.main(words) == 0  # all is there
     assert "0 runs made, 8 were there, 0 failed" in capsys.readouterr().out
-    assert "toy sizes mean nothing" in (tmp_path / "out" / "README.md").read_text()
+    assert (tmp_path / "out" / "space.md").exists() and (tmp_path / "out" / "figures" / "grasp.png").exists()

@@ -34,7 +34,7 @@ from experiments.translation.generator import (
     save,
 )
 from experiments.translation.networks import STATES, Conv, Translation, UNet, doubled, halved, thumbnail_side
-from experiments.translation.page import picture_grid
+from experiments.translation.pictures import picture_grid
 
 X, Y, FIELDS = arrays(24)
 ENCODER = random_encoder(tiny_config())

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from anytouch_jax.bars import bar
 from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
@@ -397,13 +398,15 @@ class _Run:
                         raise AnnotateError(f"{self.streak} questions in a row failed, the last one: {reason}")
                     for later_key, later_job in queue:
                         self._fail(later_job, later_key, f"not asked: {_MAX_STREAK} before it failed")
+                advance(self.done)
                 if self.log and (self.done % 100 == 0 or self.done == len(questions)):
                     self.log(f"{self.done} of {len(questions)} questions, {len(self.failures)} failed")
 
         try:
-            async with client.connect() as connection, asyncio.TaskGroup() as group:
-                for _ in range(workers):
-                    group.create_task(work())
+            with bar(len(questions), "captions") as advance:
+                async with client.connect() as connection, asyncio.TaskGroup() as group:
+                    for _ in range(workers):
+                        group.create_task(work())
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
 

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.images import ImageError, decode_bytes
 from anytouch_jax.data.loading.threads import bounded_map
@@ -127,7 +128,7 @@ def scan(
         return _judge(data, path, decode and not is_field) if data else _FileState("empty")
 
     with closing(bounded_map(inspect, range(count), threads, 8 * max(threads, 1))) as states:
-        for file, state in enumerate(states):
+        for file, state in enumerate(tracked(states, count, "files checked")):
             result.state[file] = STATES.index(state.state)
             result.size[file], result.digest[file] = state.size, state.digest
             if state.colours is not None:

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import manifest as manifests
@@ -213,7 +214,8 @@ def _write_shards(
         suffix = re.search(r"\.[a-zA-Z0-9]{1,8}$", manifest.value(row, column))
         return _Piece(suffix.group() if suffix else "", data)
 
-    with closing(bounded_map(fetch, ids[done:].tolist(), threads)) as pieces:
+    with closing(bounded_map(fetch, ids[done:].tolist(), threads)) as every:
+        pieces = tracked(every, len(ids) - done, "files packed")
         piece = next(pieces, None)
         while piece is not None:
             path, rows, size = folder / f"{number:05d}.zip", 0, 0

@@ -1,0 +1,74 @@
+"""The simulated scenes and the pictures of the notebooks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+
+import anytouch_jax as at
+from anytouch_jax.data.images import decode
+from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.evaluate.retrieval import deepest_rows
+from anytouch_jax.sim.dataset import simulate
+from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.train.progress import silent
+
+DEMO = Path(__file__).resolve().parents[2] / "runs" / "demo" / "scenes"  # those of `make demo`
+
+
+def scenes() -> at.Manifest:
+    """Return the manifest of the scenes of `make demo`, or of the folder SCENES. They are simulated if missing."""
+    folder = Path(os.environ.get("SCENES") or DEMO)
+    if not (folder / "manifest.parquet").exists():
+        simulate(Scenes(touches=500, objects=250, size=128), folder)
+    return at.read_manifest(folder / "manifest.parquet")
+
+
+def deepest(table: at.Manifest, split: str, most: int) -> np.ndarray:
+    """Return the rows (n,) of the deepest frame of up to `most` touches of a split, by every sensor."""
+    rows = deepest_rows(table, table.rows_of(split))
+    touches = text_column(table, "touch")[rows]
+    return rows[np.isin(touches, np.unique(touches)[:most])]
+
+
+def embed(encoder: at.Encoder, table: at.Manifest, rows: np.ndarray) -> np.ndarray:
+    """Return the features (n, d) of rows, class token and mean of patches joined."""
+    return embed_rows(encoder, table, rows, pooling="both", log=silent)[1]
+
+
+def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
+    """Return the change of pictures from the untouched gel as features (n, d): what needs no encoder."""
+    size = (24, 24)
+    changes = [
+        cv2.resize(decode(table.file(int(row))), size).astype(np.float32)
+        - cv2.resize(decode(table.file(int(row), "background_path")), size)
+        for row in rows
+    ]
+    return np.stack(changes).reshape(len(rows), -1) / 255
+
+
+def show(pictures: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7) -> None:
+    """Show pictures in rows of `across`, each with a title."""
+    down = -(-len(pictures) // across)
+    figure, axes = plt.subplots(down, across, figsize=(size * across, (size + 0.2) * down), squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, picture, title in zip(axes.flat, pictures, titles, strict=False):
+        axis.imshow(picture)
+        axis.set_title(title, fontsize=8)
+    figure.tight_layout()
+    plt.show()
+
+
+def show_file(path: Path, width: float = 10) -> None:
+    """Show a picture file."""
+    picture = plt.imread(path)
+    plt.figure(figsize=(width, width * picture.shape[0] / picture.shape[1]))
+    plt.imshow(picture)
+    plt.axis("off")
+    plt.show()

@@ -1,0 +1,64 @@
+"""Make the pages of results again from their data: `python -m experiments.pages [FOLDER]`.
+
+FOLDER has the data, and gets the pages and figures. The default is experiments/results.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write
+from experiments.pages import matrix, page, speed, studies
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
+    "real": ("real.jsonl", studies.real),
+    "teaching": ("teaching.jsonl", studies.teaching),
+    "left_out": ("named.jsonl", studies.left_out),
+    "named": ("named.jsonl", studies.named),
+    "long_clips": ("long_clips.jsonl", studies.long_clips),
+    "pouring": ("pouring.jsonl", studies.pouring),
+    "translation": ("translation.jsonl", studies.translation),
+    "variants": (speed.VARIANTS, speed.variants),
+    "torch": (speed.TORCH[0], speed.torch),
+    "memory": (speed.MEMORY, speed.memory),
+    "photometry": (speed.SIMULATOR, speed.photometry),
+    "contact": (speed.SIMULATOR, speed.contact),
+}
+
+
+def pages(folder: Path) -> list[page.Page]:
+    """Return the pages of a folder, for the data that are there. Raises UserError for data that make no page."""
+    made = matrix.pages(folder / matrix.NAME)
+    return made + [make(folder) for data, make in STUDIES.values() if (folder / data).exists()]
+
+
+def index(several: list[page.Page]) -> str:
+    """Return the page that lists the others."""
+    lines = "\n".join(f"* [{one.question}]({one.name}.md)" for one in several)
+    return (
+        "# Results\n\nEach page answers one question. It is made from its data alone, by `make results`.\n"
+        "A finding stands on one page. An interval is one of 95 %.\n\n"
+        f"{lines}\n"
+    )
+
+
+def write(folder: Path) -> list[Path]:
+    """Write the pages, their figures and the index of a folder, and return the pages. Raises UserError."""
+    several = pages(folder)
+    for one in several:
+        page.draw(one, folder / "figures" / f"{one.name}.png")
+        atomic_write(folder / f"{one.name}.md", page.text(one))
+    atomic_write(folder / "README.md", index(several))
+    return [folder / f"{one.name}.md" for one in several]
+
+
+if __name__ == "__main__":
+    try:
+        for path in write(Path(sys.argv[1]) if len(sys.argv) > 1 else RESULTS):
+            print(path)
+    except UserError as error:
+        sys.exit(str(error))

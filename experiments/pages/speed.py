@@ -1,0 +1,190 @@
+"""Pages of the benchmarks, from their numbers alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.pages.page import Measure, Page, Value
+from experiments.records import read_records
+
+VARIANTS = "speed_stage1_stage2_embed_small.json"
+TORCH = ("torch_small.json", "torch_small_epyc_stage1.json", "torch_small_epyc.json", "torch_large.json")
+MEMORY, SIMULATOR = "memory_large.json", "simulator.jsonl"
+BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
+GIB = 2**30
+
+
+def _numbers(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
+
+
+def _ratio(row: dict[str, Any]) -> Value:
+    return Value(row["ratio"], row["ratio"] - row["ratio_iqr"] / 2, row["ratio"] + row["ratio_iqr"] / 2)
+
+
+def _machine(about: dict[str, Any]) -> str:
+    return f"{about['processor'].replace('(R)', '')}, {about['cores']} cores"
+
+
+def variants(folder: Path) -> Page:
+    """Variants of a step: time, error and memory."""
+    numbers = _numbers(folder / VARIANTS)
+    rows, ratios = [], {}
+    for several in numbers["results"].values():
+        for row in several:
+            error = row["error_gradient"] or row["error_output"]
+            ratios.setdefault(row["variant"], []).append(row["ratio"])
+            shown = (1e3 * row["seconds"], _ratio(row), error, row["temp_bytes"] / 2**20)
+            rows.append((row["workload"], row["variant"], *shown))
+    findings = [
+        f"{name}: a step takes {min(several):.2f} to {max(several):.2f} of the time in float32."
+        for name, several in ratios.items()
+        if name != "float32"
+    ]
+    return Page(
+        "variants",
+        "What do precision, attention and memory options cost?",
+        f"Variants of a step run in turns in one process, preset small ({_machine(numbers['machine'])}). {BATCHES} The "
+        "error is that of the gradient, or of the output of an embedding, against float64. From and to are quartiles.",
+        ("work", "variant", Measure("ms", ".0f", False), Measure("time / float32", ".2f"),
+         Measure("error", ".0e", False),
+         Measure("memory, MiB", ".0f", False)),
+        rows, findings, (VARIANTS,), 'make bench WHAT="stage1 stage2 embed" PRESET=small',
+    )  # fmt: skip
+
+
+def torch(folder: Path) -> Page:
+    """Ours next to PyTorch."""
+    names = ("ours, bfloat16", "PyTorch, eager float32", "PyTorch, eager bfloat16", "PyTorch, compiled bfloat16")
+    rows, ratios = [], {name: [] for name in names}  # type: ignore[var-annotated]
+    for file in TORCH:
+        numbers = _numbers(folder / file)
+        for work, found in numbers["results"].items():
+            by_name = {row["name"]: _ratio(row) for row in found["rows"]}
+            rows.append((_machine(numbers["machine"]), numbers["preset"], work, *(by_name.get(name) for name in names)))
+            for name in names:
+                ratios[name] += [by_name[name].mean] if name in by_name else []
+    findings = [
+        f"{name} takes {min(one):.2f} to {max(one):.2f} of our time in float32." for name, one in ratios.items()
+    ]
+    return Page(
+        "torch",
+        "How fast is it next to PyTorch?",
+        "Both train and embed with the same weights, batches and masks, in turns. The value is the time as a share of "
+        f"ours in float32. {BATCHES} From and to are quartiles.",
+        ("machine", "preset", "work", *(Measure(name, ".2f") for name in names)),
+        rows, findings, TORCH, "make bench-torch",
+    )  # fmt: skip
+
+
+def memory(folder: Path) -> Page:
+    """Memory and communication of a device."""
+    numbers = _numbers(folder / MEMORY)
+    several = [row for one in numbers["results"].values() for row in one]
+    rows = [
+        (f"{row['devices']} device{'s' * (row['devices'] > 1)}", "split" if row["fsdp"] > 1 else "whole",
+         row["state"] / GIB, row["temporary"] / GIB, row["sent"] / GIB)
+        for row in several
+    ]  # fmt: skip
+    split = [row for row in several if row["fsdp"] > 1]
+    return Page(
+        "memory",
+        "How much memory does a device need?",
+        f"A step of stage 1 on clips, preset large, {several[0]['batch_per_device']} samples a device. The state is "
+        "parameters and optimiser. It is kept whole on each device, or split over all of them. The compiler reports "
+        "these sizes.",
+        ("devices", "state is", *(Measure(f"{name}, GiB", ".2f", False) for name in ("state", "work", "sent"))),
+        rows,
+        [f"Split over {split[-1]['devices']} devices, the state of one is {split[-1]['state'] / GIB:.2f} GiB."],
+        (MEMORY,), "make bench WHAT=memory PRESET=large",
+        "State, work and traffic of a device.", lambda path: _lines(path, rows),
+    )  # fmt: skip
+
+
+def _lines(path: Path, rows: list[Any]) -> None:
+    from matplotlib.figure import Figure
+
+    from anytouch_jax.evaluate.plots import write_figure
+
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for axis, name, column in zip(axes, ("state", "work", "sent"), (2, 3, 4), strict=True):
+        for kind in ("whole", "split"):
+            points = [(int(row[0].split()[0]), row[column]) for row in rows if row[1] == kind or row[0] == "1 device"]
+            axis.plot(*np.transpose(points), "o-", markersize=3, label=f"state {kind}")
+        axis.set(title=f"{name}, GiB", xlabel="devices", ylim=(0, None))
+        axis.set_xscale("log", base=2)
+    axes[0].legend(frameon=False, fontsize=8)
+    write_figure(path, figure)
+
+
+def photometry(folder: Path) -> Page:
+    """Simulated pictures against real presses."""
+    records = [one for key, one in read_records(folder / SIMULATOR).items() if key.startswith("press-")]
+    numbers = [Measure("error", ".2f", False), Measure("PSNR, dB", ".1f", False), Measure("SSIM", ".3f", False)]
+    findings = []
+    for sensor in dict.fromkeys(one["sensor"] for one in records):
+        by = {one["renderer"]: one for one in records if one["sensor"] == sensor}
+        rival = by["taxim, shadow (in-sample)"]
+        findings += [
+            f"{sensor}: our error is {by['ours']['mae']:.1f} grey levels, that of taxim with shadow "
+            f"{rival['mae']:.1f}.",
+            f"{sensor}: taxim with shadow takes {rival['ms'] / by['ours']['ms']:.0f} times as long.",
+        ]
+    return Page(
+        "photometry",
+        "Do simulated pictures look like real presses?",
+        "The package taxim has real presses of a ball. Our light is fitted to the even presses, and this table scores "
+        "the odd ones. The error is the mean over the dent, in grey levels from 0 to 255. Taxim's own tables were made "
+        "from these very presses.",
+        ("sensor", "renderer", *numbers, Measure("error around the dent", ".2f", False), Measure("ms", ".0f", False)),
+        [(one["sensor"], one["renderer"], one["mae"], one["psnr"], one["ssim"], one["ring_mae"], one["ms"])
+         for one in records],
+        findings, (SIMULATOR,), "python -m experiments.benchmarks.run simulator",
+        "Error in the dent by renderer.", lambda path: _bars(path,
+        [(f"{one['sensor']}, {one['renderer']}", one["mae"]) for one in records]),
+    )  # fmt: skip
+
+
+def contact(folder: Path) -> Page:
+    """The contact solver: speed against error."""
+    records = [one for key, one in read_records(folder / SIMULATOR).items() if key.startswith("contact-")]
+    records.sort(key=lambda one: (one["fidelity"], one["grid"], one["iterations"] != "own", one["iterations"]))
+    rows = [
+        (one["fidelity"], f"{one['grid']} pixels", one["iterations"].replace("own", "until it converges"),
+         one["press_ms"] + one["shear_ms"], float(np.mean([*one["rms"].values()])), one["slip_points"],
+         float(np.mean([*one["picture"].values()])))
+        for one in records
+    ]  # fmt: skip
+    own = {(one[0], one[1]): one for one in rows if one[2].startswith("until")}
+    fast, exact = own["fast", "112 pixels"], own["exact", "112 pixels"]
+    return Page(
+        "contact",
+        "How fast and how exact is the contact solver?",
+        "Four surfaces are pressed into a gel and moved. The reference is the converged solution in float64 on the "
+        "finest grid. The error is that of displacements, over the largest one. The picture's error is in grey levels.",
+        ("fidelity", "grid", "iterations", Measure("ms a frame", ".1f", False), Measure("error, %", ".2f", False),
+         Measure("slip, points off", ".1f", False), Measure("picture off", ".2f", False)),
+        rows,
+        [f"On 112 pixels `fast` takes {fast[3]:.1f} ms a frame and `exact` {exact[3]:.0f} ms.",
+         f"On 112 pixels the picture of `fast` is {fast[6]:.1f} grey levels off."],
+        (SIMULATOR,), "python -m experiments.benchmarks.run simulator",
+        "Milliseconds a frame.", lambda path: _bars(path, [(", ".join(row[:3]), row[3]) for row in rows], log=True),
+    )  # fmt: skip
+
+
+def _bars(path: Path, rows: list[tuple[str, float]], *, log: bool = False) -> None:
+    from matplotlib.figure import Figure
+
+    from anytouch_jax.evaluate.plots import write_figure
+
+    figure = Figure(figsize=(7, 0.6 + 0.25 * len(rows)), layout="constrained")
+    axis = figure.subplots()
+    axis.barh([name for name, _ in rows], [value for _, value in rows], color="C0", log=log)
+    axis.invert_yaxis()
+    axis.tick_params(labelsize=8)
+    write_figure(path, figure)

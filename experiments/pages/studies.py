@@ -1,0 +1,308 @@
+"""Pages of the studies beside the matrix, from their records alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.statistics import mean_interval
+from experiments.pages.page import Measure, Page, Value, compare, over_seeds
+from experiments.pouring import table as pours
+from experiments.real.scores import HEADS, TASKS, TRAINED, Score
+from experiments.records import Record, read_records
+from experiments.tables.by_object import gathered
+from experiments.translation.settings import OURS, PIXELS, TRANSLATIONS, one_table, runs_of
+
+PATCHES = {"": "plain", "_convolutional": "convolutional"}
+NAMED, UNNAMED = ("hardness", "roughness", "material"), "indenter"
+
+
+def records_of(path: Path) -> dict[str, Record]:
+    """Return the records of a file. Raises UserError without any."""
+    records = read_records(path)
+    if not records:
+        raise UserError(f"{path} has no record. Run the study first.")
+    return records
+
+
+def by_objects(counts: np.ndarray, right: Sequence[np.ndarray], minus: Sequence[np.ndarray] | None = None) -> Value:
+    """Return the share in % that seeds have right, or its difference from another, with the interval over objects."""
+    mean = np.mean(right, 0) - (0 if minus is None else np.mean(minus, 0))
+    rows = np.repeat(mean / counts, counts)
+    low, high = mean_interval(rows, np.repeat(np.arange(len(counts)), counts))
+    return Value(float(rows.mean()), low, high).times(100)
+
+
+def teaching(folder: Path) -> Page:
+    """Retrieval by encoders that were trained on simulated scenes for hours."""
+    names = ("stage 2", "stage 1", "untrained", "untrained, whole picture", "pixels", "vector")
+    rows, findings = [], []
+    for suffix, patches in PATCHES.items():
+        for grade, several in _grades(folder / f"teaching{suffix}.jsonl").items():
+            counts, right = gathered([one["retrieval"]["top1"] for one in several])
+            _, five = gathered([one["retrieval"]["top5"] for one in several])
+            best = right["stage 2"]
+            ahead = {name: by_objects(counts, best, right[name]) for name in names[1:]}
+            rows += [
+                (f"{patches} patches", f"{grade} texture", name, by_objects(counts, right[name]), ahead.get(name),
+                 by_objects(counts, five[name])) for name in names
+            ]  # fmt: skip
+            what = f"{grade} texture, {patches} patches"
+            findings += [compare("AnyTouch", words, ahead[name], what) for name, words in _RIVALS.items()]
+    return Page(
+        "teaching", "Does training on simulated scenes find the same touch by another sensor?",
+        "Encoders are trained on simulated touch for hours. Then the same touch by another sensor and unit is searched "
+        "among 50 touches that resemble it in place, depth and force. The objects were never touched in training. "
+        "Patches are read by one linear layer (plain) or by small convolutions. The vector is contact area, place and "
+        "force. Intervals are over objects.",
+        ("encoder", "scenes", "features", Measure("first of 50, %"), Measure("stage 2 minus it", "+.1f"),
+         Measure("among the first five, %")),
+        rows, findings, ("teaching.jsonl", "teaching_convolutional.jsonl"), "python -m experiments.tables.teaching",
+    )  # fmt: skip
+
+
+_RIVALS = {"stage 1": "its first stage", "pixels": "raw pixels"}
+
+
+def _grades(path: Path) -> dict[str, list[Record]]:
+    """Return the records of every grade, seed by seed. Raises UserError for other settings."""
+    records = records_of(path)
+    if len({str(one["settings"]) for one in records.values()}) > 1:
+        raise UserError(f"{path} has records of different settings. Remove those of one.")
+    result: dict[str, list[Record]] = {}
+    for key, one in records.items():
+        result.setdefault(key.rsplit("-", 1)[0], []).append(one)
+    if len({len(several) for several in result.values()}) > 1:
+        raise UserError(f"{path} lacks a seed of {min(result, key=lambda grade: len(result[grade]))}. Run it again.")
+    return dict(sorted(result.items(), reverse=True))
+
+
+def left_out(folder: Path) -> Page:
+    """Probes of a sensor that was left out of training."""
+    rows, findings = [], []
+    for sensor, data, patches, several, best in _left_out(folder):
+        for title, labels in (("the three that captions name", NAMED), ("the indenter", (UNNAMED,))):
+            each = [gathered([one[label] for one in several]) for label in labels]
+            counts = each[0][0]
+            right = {
+                name: [np.mean(seed, 0) for seed in zip(*(found[name] for _, found in each), strict=True)]
+                for name in (best, "untrained", "pixels")
+            }
+            change = {name: by_objects(counts, right[best], right[name]) for name in ("untrained", "pixels")}
+            rows.append((sensor, data, f"{patches} patches", title, by_objects(counts, right[best]), *change.values()))
+            what = f"{sensor}, {data}, {patches} patches, {title}"
+            findings += [compare("AnyTouch", "an untrained encoder", change["untrained"], what)]
+    return Page(
+        "left_out", "Do features carry over to a sensor left out of training?",
+        "One sensor is left out of training. Its touches get the universal tokens. Linear probes read "
+        "the labels of its "
+        "contact frames, on objects never touched in training. Captions name hardness, roughness and material. They do "
+        "not name the indenter. Intervals are over objects.",
+        ("sensor", "training", "encoder", "label", Measure("AnyTouch, %"), Measure("minus untrained", "+.1f"),
+         Measure("minus pixels", "+.1f")),
+        rows, findings, [f"{name}{suffix}.jsonl" for name in ("teaching", "named") for suffix in PATCHES],
+        "python -m experiments.tables.teaching",
+    )  # fmt: skip
+
+
+def _left_out(folder: Path) -> Iterator[tuple[str, str, str, list[Mapping[str, Any]], str]]:
+    for suffix, patches in PATCHES.items():
+        for grade, several in _grades(folder / f"teaching{suffix}.jsonl").items():
+            yield "GelSlim", f"{grade} texture, hours", patches, [one["probes"] for one in several], "stage 2"
+    for suffix, patches in PATCHES.items():
+        several = [*records_of(folder / f"named{suffix}.jsonl").values()]
+        yield "DuraGel", "minutes", patches, [one["probes"] for one in several], "AnyTouch"
+
+
+CONVOLUTIONAL = "convolutional, with labels"
+
+
+def named(folder: Path) -> Page:
+    """Training with the labels themselves."""
+    rows, findings = [], []
+    for suffix, patches in PATCHES.items():
+        runs = [*records_of(folder / f"named{suffix}.jsonl").values()]
+        for label in (*NAMED, UNNAMED):
+            ways = {f"our encoder, {patches} patches": [run["scores"][label] for run in runs]}
+            if not suffix:
+                ways["a convolutional network"] = [run[CONVOLUTIONAL]["scores"][label] for run in runs]
+            for name, scores in ways.items():
+                part = {part: over_seeds([one[part] for one in scores]).times(100) for part in ("train", "test")}
+                common = [one["commonest"] for one in ways[next(iter(ways))]]
+                ahead = over_seeds([a["test"] - b for a, b in zip(scores, common, strict=True)]).times(100)
+                rows.append((label, name, part["train"], part["test"], ahead))
+                findings += [compare(name, "the commonest answer", ahead, label)] if not suffix else []
+    return Page(
+        "named", "Can a network learn what captions name?",
+        "Networks are trained with the labels themselves, on contact frames of four sensors. They are "
+        "tested on objects "
+        "never touched in training. Captions name hardness, roughness and material. They do not name the indenter. "
+        "Intervals are over seeds.",
+        ("label", "network", Measure("frames of training, %"), Measure("objects never touched, %"),
+         Measure("minus the commonest answer", "+.1f")),
+        sorted(rows, key=lambda row: (*NAMED, UNNAMED).index(row[0])), findings,
+        ("named.jsonl", "named_convolutional.jsonl"), "python -m experiments.tables.caption_probes",
+    )  # fmt: skip
+
+
+def long_clips(folder: Path) -> Page:
+    """Longer clips: cost and gain."""
+    records = records_of(folder / "long_clips.jsonl")
+    lengths = [("1", "mean"), ("3", "mean"), *((n, join) for n in ("5", "7") for join in ("mean", "sum", "concat"))]
+    if lost := [key for key in ("time", *("-".join(one) for one in lengths)) if key not in records]:
+        raise UserError(f"{folder / 'long_clips.jsonl'} has no record {lost[0]}. Run `make long-clips`.")
+    rows = []
+    for (frames, join), ms in zip(lengths, records["time"]["ms"], strict=True):
+        tasks = records[f"{frames}-{join}"]["tasks"]
+        values = [Value(one["mean"], one["low"], one["high"]).times(100) for one in tasks.values()]
+        rows.append((f"{frames} frame{'s' * (frames != '1')}", join if int(frames) > 3 else "", ms, *values))
+    first, last = rows[1], rows[-3]
+    findings = [f"Seven frames take {last[2] / first[2]:.1f} times as long as three."]
+    for number, task in enumerate(records["3-mean"]["tasks"], 3):
+        inside = all(row[number].low <= first[number].mean <= row[number].high for row in rows[2:])
+        findings.append(
+            f"{task}: {'no longer clip leaves' if inside else 'a longer clip leaves'} the interval of three frames."
+        )
+    return Page(
+        "long_clips", "Do longer clips show more?",
+        "A clip of more than three frames is embedded in segments of three. Their features are averaged, summed or "
+        "joined. Linear probes read the same moments at every length, on objects never touched in training. Intervals "
+        "are over objects. Force is an R2 in percent, the others are accuracies. One encoder was scored.",
+        ("clip", "segments", Measure("ms", ".2f", False),
+         *(Measure(f"{task}, %") for task in records["3-mean"]["tasks"])),
+        rows, findings, ("long_clips.jsonl",), "make long-clips",
+    )  # fmt: skip
+
+
+def pouring(folder: Path) -> Page:
+    """Pouring by touch alone."""
+    rows, findings, files = [], [], []
+    for name, demonstrations in (("pouring_200", 200), ("pouring", 1000)):
+        path = folder / f"{name}.jsonl"
+        records_of(path)
+        files.append(path.name)
+        found = {(row.name, row.mode): row for row in pours.read_rows(path)}
+        blind = found.get(("blind", "bound"))
+        order = [(one, mode) for one in pours.TITLES for mode in (*pours.MODES, "bound") if (one, mode) in found]
+        for one, mode in order:
+            row, change = found[one, mode], None
+            if blind is not None and one in pours.PAPER:
+                change = _grams(pours.difference(row, blind))
+            number = pours.MODES.index(mode) if mode in pours.MODES else None
+            theirs = pours.PAPER[one][number] if one in pours.PAPER and number is not None else None
+            shown = mode if mode in pours.MODES else ""
+            value = Value(row.error.mean, row.error.low, row.error.high)
+            rows.append((f"{demonstrations} demonstrations", pours.TITLES[one], shown, value, change, theirs))
+        for mode in pours.MODES:
+            for other in ("none", "t3", "static", "blind"):
+                a, b = found.get(("anytouch", mode)), found.get((other, "bound" if other == "blind" else mode))
+                change = None if a is None or b is None else _grams(pours.difference(a, b))
+                what = f"error, {demonstrations} demonstrations, {mode}"
+                findings.append(compare("AnyTouch", pours.TITLES[other], change, what, " g"))
+    return Page(
+        "pouring", "Can a policy pour by touch alone?",
+        "A simulated robot pours beads until 60 g have left the cylinder. It feels the gel and sees no "
+        "scales. The value "
+        "is the mean error. Policies learn from demonstrations, over a frozen encoder or with it. Intervals are over "
+        "seeds of learning. The paper's numbers are of a robot, so compare the order alone.",
+        ("data", "policy", "encoder", Measure("error, g"), Measure("minus blind", "+.1f"),
+         Measure("the paper", ".2f", False)),
+        rows, findings, files, "make pouring",
+    )  # fmt: skip
+
+
+def _grams(change: pours.Difference) -> Value:
+    return Value(change.mean, change.low, change.high, len(change.each))
+
+
+def translation(folder: Path) -> Page:
+    """One sensor's touch as another would feel it."""
+    rows, findings, files = [], [], []
+    for name, steps in (("translation", 400), ("translation_3000", 3000)):
+        path = folder / f"{name}.jsonl"
+        records_of(path)
+        files.append(path.name)
+        runs = [*runs_of(path).values()]
+        one_table([one["settings"] for one in runs], path)
+        errors: dict[tuple[str, str], dict[str, dict[int, float]]] = {}
+        for one in runs:
+            about = one["settings"]
+            row = errors.setdefault((about["name"], about["fit"]["tune"]), {})
+            row.setdefault(f"{about['from']}-{about['to']}", {})[about["fit"]["seed"]] = one["error"]
+        for (encoder, tune), by_task in errors.items():
+            values = [over_seeds([*by_task[task].values()]) if task in by_task else None for task in TRANSLATIONS]
+            rows.append((f"{steps} steps", _TRANSLATORS.get(encoder, encoder), _TUNES[tune], *values))
+        for (encoder, tune), by_task in errors.items():
+            other = errors.get(("t3", tune), {})
+            for task, words in TRANSLATIONS.items() if encoder in OURS[:1] else ():
+                shared = sorted(by_task.get(task, {}).keys() & other.get(task, {}).keys())
+                change = over_seeds([by_task[task][seed] - other[task][seed] for seed in shared]) if shared else None
+                what = f"error, {words}, {_TUNES[tune]}, {steps} steps"
+                findings.append(compare("AnyTouch", "T3-style", change, what, "", ".4f"))
+    return Page(
+        "translation", "Can one sensor's touch be turned into another's?",
+        "A generator turns the picture of one sensor into the picture or the force field of another. It reads the "
+        "features of an encoder. The pairs are simulated, and the test objects are new. The value is the mean squared "
+        "error, in units of the training deviation. Intervals are over seeds. Steps are those of stage 1.",
+        ("stage 1", "encoder", "use", *(Measure(words, ".4f") for words in TRANSLATIONS.values())),
+        rows, findings, files, "make translation",
+    )  # fmt: skip
+
+
+_TRANSLATORS = {
+    "anytouch": "AnyTouch", "anytouch_between": "AnyTouch, half-way to stage 2", "stage1": "AnyTouch, stage 1",
+    "anytouch_layer_decay": "AnyTouch, layer decay", "t3": "T3-style", PIXELS: "pixels, no encoder",
+}  # fmt: skip
+_TUNES = {"frozen": "frozen", "fine": "fine-tuned", "scratch": "from scratch"}
+
+
+def real(folder: Path) -> Page:
+    """Encoders on real recordings."""
+    path = folder / "real.jsonl"
+    records = records_of(path)
+    if len({record["data"] for record in records.values()}) > 1:
+        raise UserError(f"The records of {path} are of different data. Run all of them again.")
+    rows, findings = [], []
+    encoders = [
+        name for name in records if records[name].get("kind") == "encoder" and not name.startswith("untrained:")
+    ]
+    for task in TASKS:
+        for head in (*HEADS, TRAINED):
+            key = f"{task}, {head}"
+            scores = {name: _score(one["tasks"][key]) for name, one in records.items() if key in one["tasks"]}
+            for name, score in sorted(scores.items(), key=lambda item: -item[1].share):
+                fresh = next((other for other in scores if other.startswith("untrained:")), "")
+                changes = [_minus(score, scores.get(other)) if other != name else None for other in ("pixels", fresh)]
+                rows.append((task, head, name, Value(score.share, *score.interval()).times(100), *changes))
+                if name in encoders and head == "linear":
+                    findings += [
+                        compare(f"`{name}`", words, change, task)
+                        for words, change in zip(("pixels", "an untrained encoder"), changes, strict=True)
+                    ]
+    times = [
+        f"`{name}` takes {records[name]['milliseconds']:.0f} ms a frame on a CPU."
+        for name in encoders
+        if "milliseconds" in records[name]
+    ]
+    return Page(
+        "real", "What is an encoder worth on real recordings?",
+        "Heads are trained on recordings of 39 real objects by a GelSight Mini. A recording gets the mean score of its "
+        "frames. The penalty and the number of neighbours are chosen on validation recordings. Intervals are over "
+        "recordings, and differences are paired. One task tests the finger whose camera the head never met. The slip "
+        "task leaves objects out.",
+        ("task", "head", "features", Measure("right, %"), Measure("minus pixels", "+.1f"),
+         Measure("minus untrained", "+.1f")),
+        rows, [*findings, *times], (path.name,), "python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny",
+    )  # fmt: skip
+
+
+def _score(task: Record) -> Score:
+    return Score(np.array(task["correct"], bool), np.array(task["groups"]), task["option"])
+
+
+def _minus(score: Score, other: Score | None) -> Value | None:
+    return None if other is None else Value(*score.minus(other)).times(100)

@@ -1,0 +1,38 @@
+"""What the runs of the translation study are of, and which of them make a table together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from anytouch_jax.errors import UserError
+from experiments.records import Record, read_records
+
+TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
+TRANSLATIONS = {
+    "gelsight_mini-duragel": "GelSight Mini to DuraGel",
+    "gelsight_mini-tac3d": "GelSight Mini to Tac3D",
+    "digit-tac3d": "DIGIT to Tac3D",
+}
+PIXELS = "pixels"
+OURS = ("anytouch", "stage1")  # its variants, and its stage 1
+
+
+def runs_of(results: Path) -> dict[str, Record]:
+    """Return the records of translations by key, without those of retrieval and of overlap."""
+    return {key: record for key, record in read_records(results).items() if "settings" in record}
+
+
+def one_table(several: Sequence[dict[str, Any]], results: Path) -> None:
+    """Raise UserError for settings of runs that make no table together: other pairs or steps, another view of the touch
+    (errors of pictures of another size are no rivals), two encoders of one name and seed."""
+    kinds = ("touches", "size", "subtracts", "version", "steps1")
+    ways = {(*(one.get(kind, 1) for kind in kinds), one["fit"]["steps"]) for one in several}
+    known = {(one["name"], one["fit"]["seed"], one["encoder"]) for one in several}
+    made = {(one["from"], one["to"], one["pairs"], one.get("simulator")) for one in several}
+    if len(ways) > 1 or len(known) > len({one[:2] for one in known}) or len(made) > len({one[:2] for one in made}):
+        raise UserError(
+            f"{results}: runs on other pairs, of other steps, size or background, or of two encoders of one name "
+            f"make no table together ({sorted(map(str, ways | known | made))}): choose another OUT"
+        )

@@ -1,0 +1,52 @@
+"""Progress bars: with the time left on a terminal, after a while, and silent elsewhere."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from anytouch_jax import bars
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def screen_of(monkeypatch):
+    """Let the error stream be a terminal, from within a test: pytest replaces it between the phases of one."""
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    return sys.stderr
+
+
+def test_a_terminal_shows_a_bar_with_the_time_left(monkeypatch):
+    screen = screen_of(monkeypatch)
+    monkeypatch.setattr(bars, "WAIT", 0.0)
+    assert list(bars.tracked("abc", 3, "letters")) == ["a", "b", "c"]
+    assert "letters" in screen.getvalue() and "3/3" in screen.getvalue() and "0:00:00" in screen.getvalue()
+
+
+def test_short_work_shows_nothing(monkeypatch):
+    screen = screen_of(monkeypatch)
+    assert list(bars.tracked("abc", 3, "letters")) == ["a", "b", "c"]
+    assert "letters" not in screen.getvalue()
+
+
+def test_elsewhere_nothing_is_shown(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    monkeypatch.setattr(bars, "WAIT", 0.0)
+    assert list(bars.tracked(iter("abc"), None, "letters")) == ["a", "b", "c"]
+    assert sys.stderr.getvalue() == ""
+
+
+def test_an_error_takes_the_bar_away(monkeypatch):
+    screen = screen_of(monkeypatch)
+    monkeypatch.setattr(bars, "WAIT", 0.0)
+    with pytest.raises(ZeroDivisionError), bars.bar(2, "steps") as advance:
+        advance(1)
+        raise ZeroDivisionError
+    assert screen.getvalue().endswith("\x1b[?25h")  # the cursor is back

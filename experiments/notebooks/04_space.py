@@ -22,7 +22,7 @@ spaces = {
     "untrained": embed(at.random_encoder(encoder.config, 0), table, rows),
     "anytouch-tiny": embed(encoder, table, rows),
 }
-print(len(rows), "touches by", sorted(set(sensors)))
+print(len(rows), "touches by", ", ".join(sorted(set(sensors))))
 
 # %% [markdown]
 # ## The picture
@@ -50,7 +50,8 @@ for name, one in scores.items():
 
 # %%
 ours = scores["anytouch-tiny"]
-word = "sensor" if ours.silhouette_sensor > ours.silhouette_object else "object"
-print(f"The features of anytouch-tiny are ordered by {word} first.")
+order = {"sensor": ours.silhouette_sensor, "object": ours.silhouette_object}
+best = max(order, key=lambda name: order[name])
+ordered = f"by {best}" if order[best] > 0.1 else "neither by sensor nor by object"
 mixed = min(scores, key=lambda name: abs(scores[name].silhouette_sensor))
-print(f"Sensors are mixed best by: {mixed}.")
+print(f"The features of anytouch-tiny are ordered {ordered}. Sensors are mixed best in: {mixed}.")

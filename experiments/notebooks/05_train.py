@@ -13,22 +13,16 @@ import numpy as np
 
 import anytouch_jax as at
 from anytouch_jax.evaluate import plots
-from experiments.notebooks.scenes import scenes, show, show_file
+from experiments.notebooks.scenes import scenes, show, show_file, small
 
 table = scenes()
 work = Path(tempfile.mkdtemp())
 STEPS = 80
-SMALL = {"model.image_size": 56, "model.touch.width": 64, "model.touch.depth": 2, "model.touch.heads": 4,
-         "model.touch.mlp": 128, "model.decoder.width": 64, "model.decoder.depth": 1, "model.decoder.heads": 4,
-         "model.decoder.mlp": 128, "data.batch_size": 16, "run.steps": STEPS, "run.figure_every": STEPS,
-         "run.save_every": STEPS, "optim.learning_rate": 1e-3}  # fmt: skip
-TOWERS = {f"model.{tower}.{size}": number for tower in ("image", "text.stack")
-          for size, number in {"width": 64, "depth": 1, "heads": 4, "mlp": 128}.items()}  # fmt: skip
 
 
 def settings(stage: int) -> at.Config:
     """Return the small configuration of a stage."""
-    config = at.preset("tiny", stage=stage).with_settings(SMALL | (TOWERS if stage == 2 else {}))
+    config = small(at.preset("tiny", stage=stage), STEPS, batch=16)
     return replace(config, data=replace(config.data, manifests=tuple(map(str, table.files))))
 
 

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import anytouch_jax as at
+from experiments.notebooks.scenes import small
 
 # %% [markdown]
 # ## The network and the data
@@ -20,12 +21,9 @@ import anytouch_jax as at
 # The data are the example touches of the package, turned and mirrored. A batch is a named tuple of arrays.
 
 # %%
-SIDE, BATCH, STEPS = 56, 12, 60
-SMALL = {"model.image_size": SIDE, "model.touch.width": 64, "model.touch.depth": 2, "model.touch.heads": 4,
-         "model.touch.mlp": 128, "model.decoder.width": 64, "model.decoder.depth": 1, "model.decoder.heads": 4,
-         "model.decoder.mlp": 128, "data.batch_size": BATCH, "run.steps": STEPS, "optim.learning_rate": 1e-3,
-         "data.clip_share": 0.0}  # fmt: skip
-config = at.preset("tiny", stage=1).with_settings(SMALL)
+BATCH, STEPS = 12, 60
+config = small(at.preset("tiny", stage=1), STEPS, BATCH)
+SIDE = config.model.image_size
 net = at.build(config.model)
 touches = at.example_touches()
 pictures = np.stack([cv2.resize(touch.frame, (SIDE, SIDE)) for touch in touches])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -27,6 +28,24 @@ def scenes() -> at.Manifest:
     if not (folder / "manifest.parquet").exists():
         simulate(Scenes(touches=500, objects=250, size=128), folder)
     return at.read_manifest(folder / "manifest.parquet")
+
+
+def small(config: at.Config, steps: int, batch: int) -> at.Config:
+    """Return a configuration with a network and a schedule small enough for minutes on a CPU."""
+    tower, model = {"width": 64, "depth": 2, "heads": 4, "mlp": 128}, config.model
+    image, text = model.image, model.text
+    model = replace(
+        model,
+        image_size=56,
+        touch=replace(model.touch, **tower),
+        decoder=replace(model.decoder, **tower),
+        image=image and replace(image, **tower),
+        text=text and replace(text, stack=replace(text.stack, **tower)),
+    )
+    return replace(config, model=model).with_settings({
+        "data.batch_size": batch, "optim.learning_rate": 1e-3, "run.steps": steps, "run.save_every": steps,
+        "run.figure_every": steps,
+    })  # fmt: skip
 
 
 def deepest(table: at.Manifest, split: str, most: int) -> np.ndarray:

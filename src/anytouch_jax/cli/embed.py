@@ -259,7 +259,7 @@ def _embed_frames(
 
 
 def _frame_count(data: Path) -> int:
-    """Return the number of frames of a folder or a video, as far as it is known before reading."""
+    """Return the number of frames of a folder or a video, known before reading."""
     from anytouch_jax.data import images
 
     if data.suffix.lower() in images.SUFFIXES and data.is_file():

@@ -101,9 +101,9 @@ def test_seeds_alone_make_no_other_size():
     assert matrix.size_of(False, ["seeds=2", "steps1=7"]).name == "changed"
 
 
-def test_the_committed_results_are_of_one_simulator_and_can_be_shown():
+def test_the_committed_results_are_of_one_simulator():
     runs = results.read(ROOT / "experiments" / "results" / "matrix.jsonl")
-    assert len({results.simulated(run.about) for run in runs}) == 1 and len(results.comparable(runs)) == len(runs)
+    assert len({results.simulated(run.about) for run in runs}) == 1
 
 
 def test_changed_sizes_are_written_next_to_the_data():

@@ -54,7 +54,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help results release-check setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments notebooks corpus weights docs clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments results notebooks corpus weights release-check docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"

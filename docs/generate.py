@@ -18,6 +18,7 @@ from anytouch_jax.cli.app import COMMANDS, main
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 RESULTS = ROOT / "experiments" / "results"
+_LOW = "---\nsearch:\n  boost: 0.2\n---\n\n"  # a search finds how-to pages before results and references
 _ROOMS = {
     "encoder": "Encoders",
     "evaluate": "Probes",
@@ -47,7 +48,7 @@ def help_of(command: str) -> str:
 
 def commands_page() -> str:
     """Return the command reference: each command with its help."""
-    parts = ["# Command reference\n\nEach command answers `--help` with this text.\n"]
+    parts = [f"{_LOW}# Command reference\n\nEach command answers `--help` with this text.\n"]
     parts += [
         f"## anytouch {name}\n\n{command.summary}\n\n```text\n{help_of(name)}\n```\n"
         for name, command in COMMANDS.items()
@@ -62,7 +63,7 @@ def api_page() -> str:
         module, attribute = at._HOME[name]
         title = _ROOMS[module.split(".")[0]]
         rooms.setdefault(title, []).append(f"::: anytouch_jax.{module}.{attribute}\n")
-    parts = ["# API reference\n\nImport these names from `anytouch_jax`.\n"]
+    parts = [f"{_LOW}# API reference\n\nImport these names from `anytouch_jax`.\n"]
     for title in dict.fromkeys(_ROOMS.values()):
         parts += [f"## {title}\n", *rooms.get(title, [])]
     return "\n".join(parts)
@@ -83,7 +84,8 @@ def write() -> None:
     }
     pages |= {ROOT / name: DOCS / name.lower() for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
     for page, target in sorted(pages.items()):
-        target.write_text(_inside(page.read_text(encoding="utf-8"), page, target, pages), encoding="utf-8")
+        text = _inside(page.read_text(encoding="utf-8"), page, target, pages)
+        target.write_text(_LOW + text if target.parent.name == "results" else text, encoding="utf-8")
 
 
 def _inside(text: str, page: Path, target: Path, pages: dict[Path, Path]) -> str:

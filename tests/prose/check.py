@@ -23,6 +23,7 @@ MADE = (
     "docs/changelog.md",
 )  # copies, and help texts
 CODE = ("src/**/*.py",)
+NOTEBOOKS = ("experiments/notebooks/[0-9]*.py",)
 PHRASES = (
     "told", "tells", "tell", "less the", "anew", "likewise", "of its own", "as it is", "as they are",
     "where there is none", "where there are none", "so far as", "by heart",
@@ -152,10 +153,22 @@ def docstring_faults(file: Path, text: str) -> Iterator[Fault]:
                     yield Fault(file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
 
 
+def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
+    """Yield the faults of the text cells of a notebook in the percent form, whose lines begin with a hash."""
+    lines, inside = [], False
+    for line in text.splitlines():
+        if line.startswith("# %%"):
+            inside = line.startswith("# %% [markdown]")
+            lines.append("")
+        else:
+            lines.append(line[2:] if inside and line.startswith("# ") else "")
+    yield from page_faults(file, "\n".join(lines))
+
+
 def faults(root: Path) -> list[Fault]:
     """Return the faults of all pages and docstrings below `root`."""
     result: list[Fault] = []
-    for patterns, check in ((PAGES, page_faults), (CODE, docstring_faults)):
+    for patterns, check in ((PAGES, page_faults), (CODE, docstring_faults), (NOTEBOOKS, notebook_faults)):
         for file in sorted({file for pattern in patterns for file in root.glob(pattern)}):
             if file.relative_to(root).as_posix().startswith(MADE):
                 continue

@@ -63,6 +63,12 @@ def test_docstrings_are_checked_and_code_is_not():
     assert [line for line, _ in found] == [1, 5] and "31 words" in found[0][1] and "'tells'" in found[1][1]
 
 
+def test_the_text_of_a_notebook_is_checked_and_its_code_is_not():
+    text = f"# %% [markdown]\n# # Title?\n#\n# Fine.\n#\n# {LONG}\n\n# %%\n# a; b\nx = 1  # {LONG}\n"
+    found = list(check.notebook_faults(Path("a.py"), text))
+    assert [(fault.line, "31 words" in fault.reason) for fault in found] == [(6, True)]
+
+
 def test_the_exit_status_says_whether_there_are_faults(tmp_path, capsys):
     (tmp_path / "README.md").write_text("Fine.\n")
     assert check.main([str(tmp_path)]) == 0

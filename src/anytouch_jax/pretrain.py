@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -177,3 +179,13 @@ def _draw_reconstructions(step: int, params: Params, batch: Any, *, run: Path, n
         return
     image = reconstruction.reconstruction_panels(params, clip, sensor, net=net, config=config)
     reconstruction.write_png(run / "figures" / f"reconstruction_{step:06d}.png", image)
+
+
+class _Callable(ModuleType):
+    """A module that is called as its function: an import of this module hides the public name `at.pretrain`."""
+
+    def __call__(self, *args: Any, **options: Any) -> FitResult:
+        return pretrain(*args, **options)
+
+
+sys.modules[__name__].__class__ = _Callable

@@ -244,3 +244,13 @@ def _loaded_after_each(modules: list[str]) -> dict[str, set[str]]:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return {module: set(names) for module, names in json.loads(done.stdout).items()}
+
+
+def test_a_public_name_stays_callable_when_its_module_is_imported() -> None:
+    """`pretrain` is a module and the function in it: the import of one hides the other."""
+    import anytouch_jax as at
+    import anytouch_jax.pretrain
+
+    assert callable(at.pretrain)
+    with pytest.raises(TypeError, match="missing"):
+        at.pretrain()

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from runs import arrays_of, read_metrics, run_config, train
 from touch_world import make_touches
 
 from anytouch_jax.config import baselines
 from anytouch_jax.encoder.encoder import load_encoder
-from runs import arrays_of, read_metrics, run_config, train
 
 STILLS = np.random.default_rng(0).integers(0, 256, (2, 28, 28, 3), np.uint8)
 EVERY = [(name, stage) for name, one in baselines.BASELINES.items() for stage in one.stages]

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 from weights_world import save_clip
 
 from anytouch_jax.config import SENSORS, from_json
@@ -22,7 +23,6 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
-from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 
 TESTS = Path(__file__).parent
 ALONE = """

@@ -9,9 +9,9 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from runs import run_config, train
 
 from anytouch_jax.evaluate.heads import load_head
-from runs import run_config, train
 
 
 def write_video(path, frames, codec="MJPG"):

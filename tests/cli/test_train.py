@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 from gel_pictures import press
 from places import ROOT, SUPPORT
+from runs import SIZES, arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 
 from anytouch_jax.cli import train as command
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import close_shards
 from anytouch_jax.train.mesh import make_mesh
-from runs import SIZES, arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 
 
 def options_of(sizes: dict[str, object]) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from runs import run_config, train
 from touch_world import make_touches
 
 from anytouch_jax.cli import app
@@ -19,7 +20,6 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.tree import flatten
-from runs import run_config, train
 
 RNG = np.random.default_rng(0)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from runs import run_config
 from tiny_models import touch_model
 from weights_world import write_heads
 
@@ -20,7 +21,6 @@ from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint, convert, load, safetensors
-from runs import run_config
 
 RNG = np.random.default_rng(0)
 CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from runs import run_config, train
 from tiny_models import full_model
 
 from anytouch_jax.config import to_json
@@ -15,7 +16,6 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.weights import checkpoint, convert, safetensors
-from runs import run_config, train
 from tests.support.release_keys import release_names
 
 RNG = np.random.default_rng(0)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from runs import run_config
 
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import to_json
@@ -19,7 +20,6 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import align_embeddings, normalise_image
 from anytouch_jax.ops.losses import normalise
 from anytouch_jax.weights.checkpoint import Checkpoints
-from runs import run_config
 
 RNG = np.random.default_rng(0)
 TEXTS = ["a soft sponge", "a hard metal edge", "cloth"]

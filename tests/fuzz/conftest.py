@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from runs import make_world
 from tiny_models import tiny_config
 from weights_world import params_of, save_run
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.evaluate.heads import LinearHead, save_head
-from runs import make_world
 from tests.fuzz.harness import total, try_all
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from adam_moments import moments
 from places import ROOT, SUPPORT
+from runs import TIMING
 from train_toy import ROWS, stopping_batches, toy_batch, toy_batches, toy_config, toy_loss, toy_params
 
 from anytouch_jax.errors import ConfigError, UserError
@@ -23,7 +24,6 @@ from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
 from anytouch_jax.weights import checkpoint
-from runs import TIMING
 
 TOY = SUPPORT / "train_toy.py"
 SRC = ROOT / "src"

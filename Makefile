@@ -26,6 +26,7 @@ WORKERS    ?= 2
 CORPUS     ?= data/corpus
 REAL       ?=
 WEIGHTS    ?= runs/anytouch-tiny
+ENCODERS   ?=
 
 DEMO       ?= runs/demo
 DEMO_STEPS ?= 200
@@ -54,7 +55,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu pouring translation long-clips export-onnx experiments results notebooks corpus weights release-check docs clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu compare pouring translation long-clips export-onnx experiments results notebooks corpus weights release-check docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -120,6 +121,9 @@ bench-torch: $(STAMP) ## next to PyTorch, in a separate venv: [PRESET= BATCH= OU
 
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
 	$(PYTHON) -m experiments.benchmarks.gpu $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+
+compare: $(STAMP) ## encoders of all families: what they cost, and what your files know: [ENCODERS="a=FILE b=FILE" DATA=manifest LABEL=]
+	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))
 
 pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="anytouch=path static=path t3=path" STUDY= QUICK=1 OUT=]
 	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.pouring.study

@@ -29,7 +29,7 @@ from anytouch_jax.train.mesh import make_mesh
 from anytouch_jax.train.metrics import alone_in, begun_with
 from anytouch_jax.train.progress import silent
 from anytouch_jax.weights.checkpoint import CheckpointError, read_metadata, steps
-from anytouch_jax.weights.load import load_init
+from anytouch_jax.weights.families import load_start
 
 Params = dict[str, Any]
 Log = Callable[[str], None]
@@ -43,7 +43,8 @@ def pretrain(
 ) -> FitResult:  # fmt: skip
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
-    `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1.
+    `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1,
+    also of an encoder of photographs (see `load_start`).
     `clip` is CLIP weights for the towers. Stage 1 starts the touch encoder from their image tower, as the paper does.
     A resumed run reads neither. `mesh` is the devices to train on, all of them if None. `curve` shows the loss of all
     steps on a terminal. Raises UserError for a mistake
@@ -63,7 +64,7 @@ def pretrain(
             stored = read_metadata(run)
         _check_resume(run, manifest, stored, log, init=init, clip=clip)
     else:
-        params, notes, sensors = load_init(params, config, init=init, clip=clip)
+        params, notes, sensors = load_start(params, config, init=init, clip=clip)
     shard = (jax.process_index(), jax.process_count())
     loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
     for note in (*notes, *loader.notes):

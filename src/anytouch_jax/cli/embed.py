@@ -61,6 +61,7 @@ class EmbedOptions(FrameOptions):
     batch: Count[int] = 64  # Frames at a time.
     on_bad_sample: Literal["error", "skip"] = "error"
     """Stop at a row or picture that cannot be read, or skip and count it."""
+    column: str | None = None  # Also write the features into the LeRobot data set of the manifest, as this feature.
 
 
 def run(options: EmbedOptions) -> int:
@@ -77,7 +78,7 @@ def run(options: EmbedOptions) -> int:
     elif not data.exists():
         raise UserError(f"there is no manifest, folder or video at {data}. Give another path with --data.")
     else:
-        refuse_unused(options, ("split",), "with a folder or a video, which has no splits")
+        refuse_unused(options, ("split", "column"), "with a folder or a video, which has no splits and no columns")
         if data.is_file():
             refuse_unused(options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame")
     check_folder(options.out, read=(options.model, *options.data), suffix=".npz")
@@ -91,6 +92,8 @@ def run(options: EmbedOptions) -> int:
         log_universal(encoder, options)
     about |= {"pooling": pooling, "input": " ".join(map(str, options.data))}
     save_features(options.out, encoder, features, head, options, about)
+    if options.column is not None:
+        _write_columns(data.resolve().parent, options.column, features)
     for line in spread_lines(features.values):
         log(line)
     skipped = f", {features.skipped} skipped" if features.skipped else ""
@@ -214,7 +217,8 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
     )  # fmt: skip
     keys = {name: embedding.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
-    more = [name for name in manifest.table.column_names if name in ("object", "unit") or name.startswith("label.")]
+    others = ("object", "unit", "index", "timestamp")
+    more = [name for name in manifest.table.column_names if name in others or name.startswith("label.")]
     keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
     touched = {} if options.head is None else {"contact": _contact(manifest, rows)}
     return embedding.Features(values, rows, keys, len(usable) - len(rows), touched)
@@ -230,6 +234,22 @@ def _contact(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
     scored = rows[np.isnan(known) & manifest.present("background_path")[rows]]
     score = contact.contact_scores(manifest, scored).score[rows] if len(scored) else np.full(len(rows), np.nan)
     return np.where(np.isnan(known), np.where(np.isnan(score), np.nan, score > limits), known)
+
+
+def _write_columns(root: Path, column: str, features: Features) -> None:
+    """Write features into a LeRobot data set, a column for each camera. Raises UserError for another manifest."""
+    import numpy as np
+
+    from anytouch_jax.data.readers.lerobot import write_features
+
+    if "index" not in features.keys or not (root / "meta" / "info.json").is_file():
+        raise UserError(f"--column is for a manifest that `data index lerobot` wrote into the data set, not in {root}")
+    units = np.unique(features.keys["unit"])
+    for unit in units:
+        own = features.keys["unit"] == unit
+        name = column if len(units) == 1 else f"{column}.{unit.rpartition('.')[2]}"
+        write_features(root, name, features.values[own], features.keys["index"][own])
+        print(f"{root}: {own.sum()} features as {name}")
 
 
 def _embed_frames(

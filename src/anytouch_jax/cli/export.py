@@ -12,7 +12,9 @@ from anytouch_jax.config.parsing import Share
 from anytouch_jax.errors import UserError
 
 # What two networks must share to be interpolated.
-_SAME = ("touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "activation", "sensors")
+_SAME = (
+    "touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "pre_norm", "activation", "sensors",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ class DatasetOptions:
     Example: anytouch data index ycb_slide ~/data/YCB-Slide --out ~/data/YCB-Slide/ycb_slide.parquet
 
     Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel,
-    objectfolder, real_touch, taxim_presses, recordings. Use recordings for your data: a folder of pictures for each
+    objectfolder, real_touch, taxim_presses, gelsight_mini_pretrain, fota, tacbench_force, tacbench_pose, touchd_force,
+    freetacman, webdataset, lerobot, bags, recordings. Use recordings for your data: a folder of pictures for each
     recording, as OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder above.
     """
 
@@ -31,12 +32,17 @@ class DatasetOptions:
     task: Literal["material", "rough"] = "material"  # touch_and_go: the task whose lists decide the split.
     fold: int = 0  # feel: the fold k whose split_<k>.npy decides the split.
     export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
-    sensor: str | None = None  # recordings: the sensor, by its name in the configuration or a new name.
+    sensor: str | None = None
+    """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new name."""
     split_by: Literal["object", "recording"] = "object"
     """recordings: hold out whole objects, or recordings of each object."""
     labels: Path | None = None
     """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
     touch and text keep their names."""
+    url: str | None = None  # gelsight_mini_pretrain, fota, webdataset: address of the shards, as s3://BUCKET/FOLDER.
+    keys: tuple[str, ...] = ()  # lerobot, freetacman: tactile cameras. bags: topics of tactile images.
+    values: tuple[str, ...] = ()
+    """lerobot: features that become labels. bags: labels from other topics, as force_z=/ft:wrench.force.z."""
 
 
 def run(options: DatasetOptions) -> int:

@@ -53,7 +53,7 @@ class TrainOptions:
     towers: Literal["scratch", "pretrained"] = "scratch"
     """Stage 2: train small image and text towers, or start from CLIP weights (--clip-weights)."""
     baseline: str = "anytouch"  # Train a baseline or an ablation: unitouch, tlv_link, t3, static_only, no_matching, ...
-    init: Path | None = None  # Start from this stage-1 run or weights file.
+    init: Path | None = None  # Start from this stage-1 run or weights file: AnyTouch, DINOv2, ViT-MAE, ViT or CLIP.
     clip_weights: Path | None = None  # CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json.
     steps: int | None = None  # Steps of the whole schedule (default: 1000).
     stop_after: NotNegative[int | None] = None  # Stop after this many steps, without changing the schedule.

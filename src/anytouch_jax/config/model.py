@@ -85,6 +85,7 @@ class ModelConfig:
     sensor_tokens: Number = 5  # Tokens of each sensor.
     activation: Literal["gelu", "quick_gelu"] = "gelu"  # Activation of the encoders. OpenAI CLIP needs quick_gelu.
     norm_eps: NotNegative[float] = 1e-5  # Epsilon of layer norms.
+    pre_norm: bool = True  # Layer norm before the blocks of the touch encoder (CLIP). DINOv2 and MAE have none.
     decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.

@@ -83,6 +83,9 @@ class DataConfig:
     order: Literal["alternate", "random"] = "alternate"  # Batches of stills and clips: in turn, or mixed (release).
     weights: tuple[tuple[str, float], ...] | None = None  # Dataset and how often an epoch draws it. 0: never.
     negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
+    parts: NotNegative[int] = 0
+    """Cut large data into this many parts of whole shards. A slot of a batch draws from its own part, so that a host
+    reads its parts alone. 0: any row with any other. Stage 1 only."""
     require: tuple[Literal["image", "text"], ...] = ()  # Draw only rows that have these modalities.
     contact_only: bool = False  # Leave out rows that label.contact marks as free. Unmarked rows stay.
     aligned_text: bool = True  # Use the text of touches that other sensors or units recorded too.

@@ -82,7 +82,7 @@ def image_tower_encoder(path: str | Path) -> Encoder:
     if model.image is None or "image" not in params:
         raise UserError(f"{path} has no image tower; give a stage-2 run with one, or CLIP weights")
     tower = merge_lora(params, model.lora_alpha)["image"]
-    bare = replace(bare_model(model), touch=model.image, sensor_tokens=0, patch_encoder="shared")
+    bare = replace(bare_model(model), touch=model.image, sensor_tokens=0, patch_encoder="shared", pre_norm=True)
     fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
     touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
     return Encoder(replace(loaded.config, model=bare), touch, f"{path} (image tower)")

@@ -98,7 +98,7 @@ class TouchEncoder(nnx.Module):
         self.class_token = table(width)
         self.position = table(model.patches + 1, width)
         self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)
-        self.pre_norm = LayerNorm(width, model.norm_eps, model.dtype)
+        self.pre_norm = LayerNorm(width, model.norm_eps, model.dtype) if model.pre_norm else None
         self.blocks = stacked_blocks(model.touch, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
@@ -117,9 +117,13 @@ class TouchEncoder(nnx.Module):
         own = rows_of(self.sensor_tokens[...], sensor)
         return jnp.concatenate([start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1)
 
+    def _first(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+        x = self.tokens(clip, sensor, keep_ids)
+        return x if self.pre_norm is None else self.pre_norm(x)
+
     def hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the last hidden states (B, 1 + S + K, D), without the final norm (golden Q5)."""
-        x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
+        x = self._first(clip, sensor, keep_ids)
         return run_blocks(self.blocks, x, remat=self.remat)
 
     def states(self, clip: Array, sensor: Array, count: int) -> Array:
@@ -127,7 +131,7 @@ class TouchEncoder(nnx.Module):
 
         They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT, Ranftl et al. 2021).
         """
-        x = self.pre_norm(self.tokens(clip, sensor))
+        x = self._first(clip, sensor)
         states, before = [], 0
         for number in range(count):
             block = round(number * self.depth / (count - 1)) if count > 1 else self.depth
@@ -138,7 +142,7 @@ class TouchEncoder(nnx.Module):
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the touch embedding (B, E) of all patches or of `keep_ids` (B, K), not normalised."""
-        x = self.pre_norm(self.tokens(clip, sensor, keep_ids))
+        x = self._first(clip, sensor, keep_ids)
         return self.embedding(read_blocks(self.blocks, x, remat=self.remat))
 
     def embedding(self, token: Array) -> Array:

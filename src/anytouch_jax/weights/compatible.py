@@ -19,7 +19,7 @@ Params = dict[str, Any]
 # Settings that must be equal: some leave no trace in shapes.
 _FORM: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
 _FORM += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
-_FORM += ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps")
+_FORM += ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps", "pre_norm")
 
 
 def check_activation(path: Path, trained: str | None, config: Config) -> None:
@@ -39,10 +39,15 @@ def check_form(path: Path, before: ModelConfig, config: Config, preset: str = "c
         return
     trained = ", ".join(f"{name} {theirs}" for name, (theirs, _) in differing.items())
     used = ", ".join(str(ours) for _, ours in differing.values())
-    options = " ".join(f"--model.{name.replace('_', '-')} {theirs}" for name, (theirs, _) in differing.items())
+    options = " ".join(_option(name.replace("_", "-"), theirs) for name, (theirs, _) in differing.items())
     if differing.keys() & {"touch.width", "touch.depth"} and preset not in (config.preset, "custom"):
         trained, used, options = f"preset {preset}", f"preset {config.preset}", f"--preset {preset}"
     raise UserError(f"{path} was trained with {trained}, this run would use {used}: add {options}")
+
+
+def _option(name: str, value: Any) -> str:
+    """Return the option that gives a setting of the model a value."""
+    return f"--model.{name} {value}" if type(value) is not bool else f"--model.{'' if value else 'no-'}{name}"
 
 
 def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:

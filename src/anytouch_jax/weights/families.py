@@ -11,16 +11,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, UNIVERSAL, ModelConfig, Stack
+from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, UNIVERSAL, Config, ModelConfig, Stack
 from anytouch_jax.config.parsing import Above0, Count, check, read_value
-from anytouch_jax.errors import ConfigError
+from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Resample, Vit, VitConfig
-from anytouch_jax.weights import load
-from anytouch_jax.weights.convert import check_arrays, file_shapes, fill, refuse_unknown
+from anytouch_jax.weights import compatible, load, registry
+from anytouch_jax.weights.convert import KEYMAPS, check_arrays, file_shapes, fill, refuse_unknown
 from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth, vit
 from anytouch_jax.weights.safetensors import WeightsError
-from anytouch_jax.weights.tree import flatten
+from anytouch_jax.weights.tree import flatten, nest
 
 Size = tuple[int, int]
 ALIASES = {"mini": "gelsight_mini"}  # names of T3's files
@@ -254,6 +254,63 @@ def read_family(
         ) from None
     load.check_finite(path, params)
     return FamilyModel(family, form, preparation, size, params)
+
+
+def load_start(
+    fresh: dict[str, Any], config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
+) -> load.Start:
+    """Return the first parameters of a run, as `load.load_init`, where `init` may also be an encoder of photographs.
+
+    DINOv2, ViT-MAE, ViT and DeiT start the touch encoder. CLIP weights do so in stage 1, as `clip`. Raises UserError.
+    """
+    model, weights = (None, None) if init is None else load_family(registry.locate(init))
+    if model is None:
+        towers = any(re.fullmatch(KEYMAPS[name].mark, key) for name in ("clip", "openclip") for key in weights or ())
+        if towers and clip is None and config.stage == 1:
+            return load.load_init(fresh, config, clip=init)
+        return load.load_init(fresh, config, init=init, clip=clip)
+    start = load.load_init(fresh, config, clip=clip) if clip is not None else load.Start(fresh, [], ())
+    touch, notes = touch_of_photographs(model, str(init), config, start.params["touch"])
+    return start._replace(params={**start.params, "touch": touch}, notes=[*start.notes, *notes])
+
+
+def touch_of_photographs(
+    model: FamilyModel, source: str, config: Config, fresh: dict[str, Any]
+) -> tuple[dict[str, Any], list[str]]:
+    """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences to log.
+
+    The patch kernel is repeated over the frames and divided by their number. Its bias goes into the positions, which
+    are resized, and layer scales into the layers before them. Sensor tokens and the projection are those of `fresh`.
+    Raises UserError for another family, and for a network of another form than the run's.
+    """
+    form, ours = model.form, config.model
+    if model.family.sensors != _IMAGES or form.model.touch.depth == 0:
+        raise UserError(
+            f"{source} is an encoder of {model.family.title}; a run starts from weights of AnyTouch, DINOv2, ViT-MAE, "
+            "ViT, DeiT or CLIP"
+        )
+    if set(fresh["patch"]) != {"kernel"}:
+        raise UserError(f"{source} has one patch projection; leave out --model.patch-encoder convolutional")
+    kept = {name: getattr(ours, name) for name in ("embed", "frames", "sensor_tokens", "patch_encoder", "decoder")}
+    theirs = replace(form.model, **kept, decoder_norm_eps=ours.decoder_norm_eps, pre_norm=form.pre_norm)
+    compatible.check_form(Path(source), theirs, config)
+    if ours.activation != "gelu":
+        raise UserError(f"{source} was trained with gelu; leave out --model.activation {ours.activation}")
+    own = {name: array for name, array in model.params.items() if name.startswith(("blocks/", "post_norm/", "pre_"))}
+    for scale, branch in (("scale1", "attention/out"), ("scale2", "mlp/down")):
+        if (factor := own.pop(f"blocks/{scale}/scale", None)) is not None:
+            own[f"blocks/{branch}/kernel"] = own[f"blocks/{branch}/kernel"] * factor[:, None]
+            own[f"blocks/{branch}/bias"] = own[f"blocks/{branch}/bias"] * factor
+    position = compatible.resize_position(model.params["position"], ours.patches + 1)
+    position[1:] += model.params.get("patch/bias", np.float32(0))
+    shape = fresh["patch"]["kernel"].shape
+    own["patch/kernel"] = np.broadcast_to(model.params["patch/kernel"][0], shape) / np.float32(shape[-3])
+    touch = {name: fresh[name] for name in ("sensor_tokens", "projection")}
+    touch |= nest({**own, "position": position, "class_token": model.params["class_token"]})
+    notes = [f"{source} gives the touch encoder; its projection, the sensor tokens and the decoder start untrained"]
+    if form.registers:
+        notes.append(f"the {form.registers} register tokens of {source} are left out")
+    return touch, notes
 
 
 def entries_of(family: Family, form: VitConfig) -> tuple[list[Entry], dict[str, Shape]]:

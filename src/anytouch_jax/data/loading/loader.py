@@ -154,8 +154,9 @@ class Loader:
             for draw in sampler.take(int(before[stratum]), int(now[stratum]))
         ]
         rows = self.config.data.batch_size
-        order = np.random.default_rng([self._seed, _ORDER, step]).permutation(rows)
-        draws = [draws[at] for at in order]
+        if not self.config.data.parts:  # else a slot belongs to its part
+            order = np.random.default_rng([self._seed, _ORDER, step]).permutation(rows)
+            draws = [draws[at] for at in order]
         with_image = [slot for slot, (stratum, *_) in enumerate(draws) if stratum in _WITH_IMAGE]
         with_text = [slot for slot, (stratum, *_) in enumerate(draws) if stratum in _WITH_TEXT]
         image_row = np.full(pool.quota.images, rows, np.int32)

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
 from anytouch_jax.data.loading.matching import Matches, MatchKeys, is_shared_touch
-from anytouch_jax.data.loading.sampling import EpochSampler, StratumQuota
+from anytouch_jax.data.loading.sampling import EpochSampler, PartSampler, StratumQuota
 from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_rows
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
@@ -34,7 +34,7 @@ class Pool(NamedTuple):
     windows: np.ndarray
     quota: StratumQuota
     members: tuple[np.ndarray, ...]
-    samplers: tuple[EpochSampler, ...]
+    samplers: tuple[EpochSampler | PartSampler, ...]
 
     @property
     def draws(self) -> int:
@@ -101,7 +101,10 @@ def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, 
     data, frames = config.data, config.model.frames
     length = frames + config.reconstructs
     stills, clips = usable.rows[:, None], _clips(manifest, config, usable, length)
-    touch = tuple(_pool(config, usable, kind, ids, devices) for kind, ids in enumerate((stills, clips)) if len(ids))
+    shards = _shards(manifest) if data.parts else None
+    touch = tuple(
+        _pool(config, usable, kind, ids, devices, shards) for kind, ids in enumerate((stills, clips)) if len(ids)
+    )
     if len(touch) == 1 and data.clip_share:
         notes.append(f"split {data.split!r} has no clip of {length} frames, so all batches are stills")
     match: tuple[MatchPool | None, MatchPool | None] = (None, None)
@@ -132,7 +135,20 @@ def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> 
     return clips if good.all() else clips[good]
 
 
-def _pool(config: Config, usable: _Usable, kind: int, windows: np.ndarray, devices: int) -> Pool:
+def _shards(manifest: Manifest) -> np.ndarray:
+    """Return a number for the shard of each row, i64 (rows,): its path without the entry. A loose file's is its folder.
+
+    Rows of several manifests have different shards.
+    """
+    folder = pc.replace_substring_regex(manifest.column("path").combine_chunks(), r"/[^/]*$", "")
+    place = pc.replace_substring_regex(folder, r"\.parquet/[^/]*$", ".parquet")
+    codes = np.asarray(place.dictionary_encode().indices).astype(np.int64)
+    return codes * len(manifest.files) + manifest.source
+
+
+def _pool(
+    config: Config, usable: _Usable, kind: int, windows: np.ndarray, devices: int, shards: np.ndarray | None
+) -> Pool:
     has_image, has_text = usable.has_image[windows[:, -1]], usable.has_text[windows[:, -1]]
     strata = (has_image & ~has_text, has_image & has_text, ~has_image & has_text, ~has_image & ~has_text)
     members = tuple(np.flatnonzero(stratum) for stratum in strata)
@@ -140,6 +156,12 @@ def _pool(config: Config, usable: _Usable, kind: int, windows: np.ndarray, devic
         EpochSampler(len(ids), config.run.seed, _ALIGN + 4 * kind + s, usable.weights_of(windows[ids]))
         for s, ids in enumerate(members)
     )
+    if shards is not None:
+        if config.stage != 1 or usable.weights is not None:
+            raise UserError("--data.parts is for stage 1 without --data.weights; leave one of them out")
+        size, at = config.data.batch_size, shards[windows[:, -1]]
+        none = [EpochSampler(0, 0, 0)] * _NEITHER
+        samplers = (*none, PartSampler(at, size, config.data.parts, config.run.seed, _ALIGN + 4 * kind + _NEITHER))
     quota = StratumQuota([sampler.size for sampler in samplers], config.data.batch_size, devices)
     return Pool(windows, quota, members, samplers)
 

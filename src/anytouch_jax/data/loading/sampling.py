@@ -104,6 +104,58 @@ class EpochSampler:
         return items[order], copy[order]
 
 
+class PartSampler:
+    """An endless sequence of item ids in batches, whose slots draw from `parts` parts of whole shards.
+
+    `shard` i64 (items,) is the shard of each item. Shards go to the parts by size, the largest first, each to the
+    smallest part. Slot i of a batch of `batch` draws from part i * parts // batch. A part goes through its shards in a
+    seeded order, MIXED at a time, and through their items in a seeded order: all once, then again. So any number of
+    hosts that divides `parts` reads the same batches, each from its own shards. Raises UserError for too few shards.
+    """
+
+    MIXED = 4  # shards whose items are mixed
+
+    def __init__(self, shard: np.ndarray, batch: int, parts: int, seed: int, tag: int) -> None:
+        if batch % parts:
+            raise UserError(f"a batch of {batch} does not divide into --data.parts {parts}; change one of them")
+        self.size, self._batch, self._seed = len(shard), batch, (seed % 2**63, tag)
+        names, counts = np.unique(shard, return_counts=True)
+        if len(names) < parts:
+            raise UserError(f"--data.parts {parts} needs as many shards, and there are {len(names)}; lower it")
+        members: list[list[int]] = [[] for _ in range(parts)]
+        sizes = np.zeros(parts, np.int64)
+        for at in np.argsort(-counts, kind="stable"):
+            part = int(np.argmin(sizes))
+            members[part].append(int(names[at]))
+            sizes[part] += counts[at]
+        order = np.argsort(shard, kind="stable")
+        of = dict(zip(names.tolist(), np.split(order, np.cumsum(counts)[:-1]), strict=True))
+        self._parts = [[of[name] for name in part] for part in members]
+        self._sizes, self._orders = sizes, dict[tuple[int, int], np.ndarray]()
+
+    def take(self, start: int, count: int) -> list[tuple[int, int]]:
+        """Return (item, epoch of its part) at positions start .. start + count - 1 of the sequence."""
+        share, draws = self._batch // len(self._parts), []
+        for position in range(start, start + count):
+            step, slot = divmod(position, self._batch)
+            part, place = divmod(slot, share)
+            epoch, place = divmod(step * share + place, int(self._sizes[part]))
+            draws.append((int(self._order(part, epoch)[place]), epoch))
+        return draws
+
+    def _order(self, part: int, epoch: int) -> np.ndarray:
+        """Return the items of a part in the order of an epoch."""
+        if (part, epoch) not in self._orders:
+            while len(self._orders) > 2 * len(self._parts):
+                self._orders.pop(next(iter(self._orders)))
+            rng, shards = np.random.default_rng([*self._seed, part, epoch]), self._parts[part]
+            turn = rng.permutation(len(shards))
+            groups = [turn[at : at + self.MIXED] for at in range(0, len(turn), self.MIXED)]
+            items = [rng.permutation(np.concatenate([shards[i] for i in group])) for group in groups]
+            self._orders[part, epoch] = np.concatenate(items)
+        return self._orders[part, epoch]
+
+
 class StratumQuota:
     """How many rows of each stratum (vision, both, text, neither) a batch takes, so that its slots are full.
 

@@ -1,7 +1,9 @@
 """Files of a manifest: their bytes, loose or in a shard, and the distinct files of all path columns.
 
-The path `touch/00000.zip/17` is file 17 of that shard. A shard is a ZIP file without compression, so a random file
-costs one read of its length. Shards of version 1 are Parquet files with their index next to them.
+* `touch/00000.zip/17` is file 17 of a shard of `pack`: a ZIP file without compression, so a random file costs one read.
+* `data-000000.tar/17` is regular file 17 of a tar without compression, as WebDataset writes it.
+* `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of pictures of Hugging Face.
+* `touch/00000.parquet/17` is a shard of version 1 with its index next to it.
 """
 
 from __future__ import annotations
@@ -11,17 +13,19 @@ import io
 import math
 import os
 import stat
+import tarfile
 import threading
 import zipfile
 import zlib
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet
 
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.manifest.schema import PATHS
@@ -30,7 +34,9 @@ MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four chan
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
 _PARQUET_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
 _NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+_TAR_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8")])
 _OPEN = 64  # open shards at once
+_HELD = 256 << 20  # bytes of a Parquet column in memory
 _NPY_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 can fail in two threads
 
 
@@ -45,19 +51,25 @@ def read_file(path: Path) -> bytes:
     damaged shard, or is missing in its shard.
     """
     place = split_shard_path(path)
-    return _read_loose(path) if place is None else _shard(place[0]).read(place[1])
+    if place is None:
+        return _read_loose(path)
+    return (_column(place[0], path.parent.name) if path.parent != place[0] else _shard(place[0])).read(place[1])
 
 
 def split_shard_path(path: Path) -> tuple[Path, int] | None:
     """Return (shard, row) of a path into a shard, None for a loose file."""
-    if path.name.isascii() and path.name.isdecimal() and path.parent.suffix in (".zip", ".parquet"):
-        return path.parent, int(path.name)
+    if path.name.isascii() and path.name.isdecimal():
+        if path.parent.suffix in (".zip", ".parquet", ".tar"):
+            return path.parent, int(path.name)
+        if path.parent.parent.suffix == ".parquet":
+            return path.parent.parent, int(path.name)
     return None
 
 
 def close_shards() -> None:
     """Close all open shards, after they were rewritten."""
     _shard.cache_clear()
+    _column.cache_clear()
     _cached_index.cache_clear()
 
 
@@ -106,7 +118,9 @@ class _Shard:
             parts.append(part)
             length += len(part)
         data = parts[0] if len(parts) == 1 else b"".join(parts)
-        if "crc" in entry.dtype.names:
+        if "crc" not in entry.dtype.names and "sha256" not in entry.dtype.names:
+            valid = length == size
+        elif "crc" in entry.dtype.names:
             valid = zlib.crc32(data) == entry["crc"]
         else:
             valid = hashlib.sha256(data).digest() == entry["sha256"].tobytes()
@@ -122,6 +136,8 @@ def read_shard_index(path: Path) -> np.ndarray:
     """Return where the files of a shard lie in it, SHARD_INDEX (n,). Raises ShardError if it cannot be read."""
     if path.suffix == ".parquet":
         return _parquet_index(path.with_suffix(".index"))
+    if path.suffix == ".tar":
+        return np.array([member[1:] for member in tar_members(path)], _TAR_INDEX)
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -134,6 +150,60 @@ def read_shard_index(path: Path) -> np.ndarray:
     # `pack` writes ASCII names and no extra fields, so a local header is 30 bytes and the name.
     places = [(entry.header_offset + 30 + len(entry.filename), entry.file_size, entry.CRC) for entry in entries]
     return np.array(places, SHARD_INDEX)
+
+
+def tar_members(path: Path, file: BinaryIO | None = None) -> list[tuple[str, int, int]]:
+    """Return (name, offset, size) of the regular files in a tar without compression, in its order. Raises ShardError.
+
+    Only headers are read. `file` is the opened tar, if it lies elsewhere.
+    """
+    try:
+        with tarfile.open(path, "r:", fileobj=file) as archive:
+            members = [(member.name, member.offset_data, member.size) for member in archive if member.isreg()]
+    except FileNotFoundError:
+        raise ShardError(f"there is no shard {path}; copy it from where the data are") from None
+    except (tarfile.TarError, ValueError, OSError, OverflowError) as error:
+        raise ShardError(f"{path} is no whole tar without compression: {error}; download it again") from None
+    if any(size > MAX_BYTES for *_, size in members):
+        raise ShardError(f"{path} has a file of more than {MAX_BYTES} bytes")
+    return members
+
+
+class _Column:
+    """A column of files in a Parquet file. The row groups that were read last stay in memory, up to _HELD bytes."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        try:
+            self._file, self._name = pa.parquet.ParquetFile(path), name
+        except FileNotFoundError:
+            raise ShardError(f"there is no shard {path}; copy it from where the data are") from None
+        except (pa.ArrowException, OSError) as error:
+            raise ShardError(f"{path} is no whole Parquet file: {error}; download it again") from None
+        if name not in self._file.schema_arrow.names:
+            raise ShardError(f"{path} has no column {name!r}; index the data again")
+        groups = self._file.metadata
+        self._starts = np.cumsum([0, *(groups.row_group(i).num_rows for i in range(groups.num_row_groups))])
+        self._lock, self._held = threading.Lock(), dict[int, pa.ChunkedArray]()
+
+    def read(self, row: int) -> bytes:
+        if row >= self._starts[-1]:
+            raise ShardError(f"the shard has {self._starts[-1]} rows, no row {row}; index the data again")
+        group = int(np.searchsorted(self._starts, row, "right")) - 1
+        with self._lock:
+            if group not in self._held:
+                try:
+                    table = self._file.read_row_group(group, [self._name], use_threads=False)
+                except (pa.ArrowException, OSError) as error:
+                    raise ShardError(f"row group {group} of the shard is damaged: {error}; download it again") from None
+                while self._held and sum(held.nbytes for held in self._held.values()) + table.nbytes > _HELD:
+                    self._held.pop(next(iter(self._held)))
+                self._held[group] = table[self._name]
+            cells = self._held[group]
+        value = cells[row - int(self._starts[group])].as_py()
+        value = value.get("bytes") if isinstance(value, dict) else value
+        if not isinstance(value, bytes):
+            raise ShardError(f"row {row} of the shard has no bytes in column {self._name!r}")
+        return value
 
 
 def _parquet_index(path: Path) -> np.ndarray:
@@ -167,6 +237,7 @@ def unpack_npy(data: bytes) -> np.ndarray:
 
 
 _cached_index = lru_cache(None)(read_shard_index)  # 20 bytes a file; parsing takes about 5 us a file
+_column = lru_cache(16)(_Column)
 _shard = lru_cache(_OPEN)(_Shard)  # the least recently used one closes when its last reader is done
 
 

@@ -23,6 +23,7 @@ import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, ModelConfig, SpellingError, check_spelling
 from anytouch_jax.data.manifest.clips import clip_windows
+from anytouch_jax.data.manifest.remote import is_remote, local_copy
 from anytouch_jax.data.manifest.schema import (
     PATHS,
     SCHEMA,
@@ -280,6 +281,8 @@ def _placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
     folder = target.parent
 
     def relative(row: int, cell: str) -> str:
+        if is_remote(cell):
+            return cell
         file = os.path.normpath(manifest.files[manifest.source[row]].parent / cell)
         if not Path(file).is_relative_to(folder):
             raise ManifestError(
@@ -358,12 +361,14 @@ def misspelt_sensors(manifest: Manifest) -> Iterator[tuple[Literal["error", "war
 
 
 def resolve_path(root: str | Path, relative: str | None) -> Path:
-    """Return the file `relative` inside the folder `root` (absolute, resolved).
+    """Return the file `relative` inside the folder `root` (absolute, resolved), or the local copy of an address.
 
     Raises ManifestError if the path is empty, absolute, or leaves the folder by ".." or by a symbolic link.
     """
     if not relative:
         raise ManifestError("the path is empty")
+    if is_remote(relative):
+        return local_copy(relative)
     root, text = str(root), shown(relative)
     if "\0" in relative or len(relative) > _LONGEST_PATH:
         raise ManifestError(f"the path {text} is not a file name")

@@ -16,14 +16,28 @@ import pyarrow.parquet
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
+from anytouch_jax.data.manifest.remote import is_remote
 from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest, table_suffix
-from anytouch_jax.data.readers import feel, objectfolder, packs, recordings, robots, tacquad, touch_and_go, tvl
+from anytouch_jax.data.readers import (
+    bags,
+    corpora,
+    feel,
+    forces,
+    lerobot,
+    objectfolder,
+    packs,
+    recordings,
+    robots,
+    tacquad,
+    touch_and_go,
+    tvl,
+)
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, IndexOptions
 from anytouch_jax.errors import UserError
 
 __all__ = ["READERS", "DatasetError", "DatasetIndex", "DatasetReader", "IndexOptions", "IndexReport", "index"]
 
-_MODULES = (touch_and_go, robots, tvl, tacquad, feel, objectfolder, packs, recordings)
+_MODULES = (touch_and_go, robots, tvl, tacquad, feel, objectfolder, packs, corpora, forces, lerobot, bags, recordings)
 READERS = {name: reader for module in _MODULES for name, reader in module.READERS.items()}
 _INDEX_KEY = b"anytouch.index"  # in the schema of a Parquet file: the content hash with which `index` wrote it
 _OTHER_OUT = "name another file with --out, in a folder that contains the data"
@@ -123,7 +137,9 @@ def index(
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
     above = base.relative_to(target.parent)
     for column in set(PATHS) & columns.keys() if above != Path() else ():
-        columns[column] = [path and f"{above.as_posix()}/{path}" for path in columns[column]]
+        columns[column] = [
+            path and (path if is_remote(path) else f"{above.as_posix()}/{path}") for path in columns[column]
+        ]
     manifest = manifests.from_columns(columns, target)
     manifest.clips(2)  # raises for a repeated frame
     _check_links(manifest, base)
@@ -157,7 +173,7 @@ def _check_links(manifest: Manifest, base: Path) -> None:
     """Raise UserError for a folder that is a link out of ROOT, because none of its rows could be read."""
     root = manifest.files[0].parent
     paths = (path for name in PATHS for path in manifest.column(name).unique().drop_null().to_pylist())
-    for folder in dict.fromkeys(path.rpartition("/")[0] for path in paths):
+    for folder in dict.fromkeys(path.rpartition("/")[0] for path in paths if not is_remote(path)):
         place = (root / folder).resolve()
         if not place.is_relative_to(root.resolve()):
             raise UserError(f"{root / folder} leads out of {base}, to {place}; give the folder that really holds it")

@@ -12,13 +12,19 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, BinaryIO, Literal, TypeVar
 
-from anytouch_jax.config import parse_json
-from anytouch_jax.data.images import natural
+import cv2
+import numpy as np
+
+from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
+from anytouch_jax.data.images import frames_from_video, natural
+from anytouch_jax.data.manifest.remote import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_folder, atomic_write
 
 Columns = dict[str, list[Any]]
 Frames = dict[int, str]  # frame number -> file name, by number
@@ -41,6 +47,8 @@ class IndexOptions:
     `lists`: a folder with list files, searched before ROOT. `task`: the lists of Touch and Go that decide the split.
     `fold`: the `split_<k>.npy` of Feel. `export`: write pictures into ROOT for datasets of arrays or videos. `sensor`,
     `split_by`, `labels`: for recordings, their sensor, what is held out, and a table of labels by object or sequence.
+    `url`: the address of shards that are not in ROOT. `keys`: tactile cameras, or topics of images. `values`: what else
+    becomes a label, as NAME=PLACE.
     """
 
     val: float = 0.05
@@ -52,6 +60,9 @@ class IndexOptions:
     sensor: str | None = None
     split_by: Literal["object", "recording"] = "object"
     labels: Path | None = None
+    url: str | None = None
+    keys: tuple[str, ...] = ()
+    values: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not (0 <= self.val <= 1 and 0 <= self.test <= 1 and self.val + self.test <= 1):
@@ -146,6 +157,33 @@ class DatasetIndex:
         yield inside, folders, files
         for folder in folders:
             yield from self.walk(base, f"{inside}/{folder}".lstrip("/"), count=count)
+
+    def shards(self, suffix: str) -> Iterator[tuple[str, Callable[[], BinaryIO]]]:
+        """Yield the path of every shard below ROOT, or its address below the option `url`, and how to open it."""
+        if self.options.url is None:
+            for folder, _, files in self.walk():
+                for name in (name for name in files if name.endswith(suffix)):
+                    path = f"{folder}/{name}".lstrip("/")
+                    yield path, partial(open, self.root / path, "rb")
+            return
+        url = self.options.url.rstrip("/")
+        system, base = open_store(url)
+        for path in sorted(system.find(base)):
+            if path.endswith(suffix):
+                yield f"{url}{path.removeprefix(base.rstrip('/'))}", partial(system.open, path, "rb")
+
+    def need_sensor(self) -> str:
+        """Return the sensor of the option. Raises UserError without one."""
+        known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
+        if self.options.sensor is None or self.options.sensor in (*FIELD_SENSORS, UNIVERSAL):
+            raise UserError(f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new name")
+        check_spelling(self.options.sensor)
+        return self.options.sensor
+
+    def need_export(self, what: str) -> None:
+        """Raise DatasetError without the option `export`: the pictures of `what` must be written as files."""
+        if not self.options.export:
+            raise DatasetError(f"{self.root} has {what}; add --export to write their pictures next to them")
 
     def frames(
         self, folder: str, pattern: str = NUMBERED, files: Sequence[str] | None = None, *, count: bool = True
@@ -242,6 +280,31 @@ class DatasetIndex:
             self.skip("listed contact frame that is not on disk", "see the contact list", missing)
         has_value = {name: any(value is not None for value in column) for name, column in self.table.items()}
         return {name: column for name, column in self.table.items() if name in REQUIRED or has_value[name]}
+
+
+def save_png(file: Path, picture: np.ndarray) -> None:
+    """Write a picture RGB u8 (h, w, 3) as PNG, unless the file exists."""
+    if not file.is_file():
+        bgr = np.ascontiguousarray(picture[..., ::-1])
+        atomic_write(file, cv2.imencode(".png", bgr)[1].tobytes(), sync=False)
+
+
+def export_video(video: Path, frames: Iterable[np.ndarray] | None = None) -> int:
+    """Write the frames of a video as 000000.png, ... into a folder of its name, whole or not; return their number.
+
+    Raises ImageError for a video that cannot be read, UserError if nothing can be written.
+    """
+    count = 0
+    try:
+        with atomic_folder(video.with_suffix("")) as target:
+            for frame in frames_from_video(video) if frames is None else frames:
+                save_png(target / f"{count:06d}.png", frame)
+                count += 1
+    except OSError as error:
+        raise UserError(
+            f"the frames of {video} cannot be written next to it: {error.strerror}; make its folder writable"
+        ) from None
+    return count
 
 
 def hash_split(dataset: str, group: str, options: IndexOptions) -> str:

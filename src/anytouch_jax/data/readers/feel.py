@@ -22,7 +22,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from anytouch_jax.data.images import natural
@@ -34,6 +33,7 @@ from anytouch_jax.data.readers.common import (
     published_splits,
     read_json,
     read_lines,
+    save_png,
 )
 from anytouch_jax.files import atomic_write
 
@@ -51,9 +51,7 @@ def read(index: DatasetIndex) -> None:
         original = [name for name in index.listing("")[1] if name.endswith(".h5")]
         if not original:
             return
-        if not index.options.export:
-            raise DatasetError(f"{index.root} has {len(original)} original .h5 files and no feel.csv; add --export to "
-                               "write the pictures next to them (needs pip install h5py)")  # fmt: skip
+        index.need_export(f"{len(original)} original .h5 files and no feel.csv")
         count = export_grasps(index.root, original)
         index.notes.append(f"{count} grasps written from {len(original)} .h5 files")
         base = ""
@@ -165,10 +163,8 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
                     obj = _object_name(obj)
                     number = numbers[obj] = numbers.get(obj, -1) + 1
                     for key in PICTURES.keys() & grasp.keys():
-                        pixels = cv2.cvtColor(np.asarray(grasp[key][()]), cv2.COLOR_RGB2BGR)
                         sub, ending = PICTURES[key]
-                        picture = root / obj / sub / f"{number}{ending}.png"
-                        atomic_write(picture, cv2.imencode(".png", pixels)[1].tobytes(), sync=False)
+                        save_png(root / obj / sub / f"{number}{ending}.png", np.asarray(grasp[key][()]))
                     lines.append([obj, number, int(np.ravel(success)[0])])
         except (OSError, KeyError, ValueError) as error:
             raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None

@@ -6,14 +6,12 @@ import importlib.metadata
 import zipfile
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyarrow.compute as pc
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import PATHS
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
-from anytouch_jax.files import atomic_write
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, save_png
 
 
 def _real_touch(index: DatasetIndex) -> None:
@@ -63,8 +61,7 @@ def _taxim_presses(index: DatasetIndex) -> None:
             raise DatasetError(f"{path} is not a calibration pack of taxim: {error}") from None
         names = [f"press_{i:02d}" for i in range(len(images))]
         for name, image in zip(("background", *names), (gel, *images), strict=True):
-            if not (file := index.root / place / f"{name}.png").is_file():
-                atomic_write(file, cv2.imencode(".png", image)[1].tobytes(), sync=False)
+            save_png(index.root / place / f"{name}.png", image[..., ::-1])
         cells = {"sensor": sensor, "unit": f"taxim/{sensor}", "frame_index": 0}
         index.add(
             [f"{place}/{name}.png" for name in names],

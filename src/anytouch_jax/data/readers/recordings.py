@@ -20,17 +20,20 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pyarrow as pa
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
 from anytouch_jax.data.manifest.schema import EMPTY, check_label, typed_label
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, Frames, IndexOptions, read_lines
-from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_folder
+from anytouch_jax.data.readers.common import (
+    DatasetError,
+    DatasetIndex,
+    DatasetReader,
+    Frames,
+    IndexOptions,
+    export_video,
+    read_lines,
+)
 
 CAPTION = "caption.txt"
 MANIFESTS = (".csv", ".parquet")  # of an earlier index
@@ -42,10 +45,7 @@ PLAIN_COLUMNS = ("unit", "touch", "text")  # columns of a label table that do no
 def read(index: DatasetIndex) -> None:
     """Add every folder of pictures. Raises UserError without a sensor."""
     root, options = index.root, index.options
-    known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
-    if options.sensor is None or options.sensor in (*FIELD_SENSORS, UNIVERSAL):
-        raise UserError(f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new name")
-    check_spelling(options.sensor)
+    sensor = index.need_sensor()
     if options.export:
         _export_videos(index)
     recordings: dict[str, dict[str, Frames]] = {}  # folder -> finger -> frames
@@ -63,7 +63,7 @@ def read(index: DatasetIndex) -> None:
     for folder, fingers in recordings.items():
         for unit, frames in fingers.items():
             sequence = f"{folder}/{unit}".strip("/") or "."
-            index.add_recording(frames, folder, split=splits[folder], sensor=options.sensor, sequence=sequence,
+            index.add_recording(frames, folder, split=splits[folder], sensor=sensor, sequence=sequence,
                                 unit=unit or None, object=folder.split("/")[0] or None, dataset=root.name,
                                 **shared[folder])  # fmt: skip
     if options.labels is not None and recordings:
@@ -154,19 +154,10 @@ def _export_videos(index: DatasetIndex) -> None:
             if video.stem in folders:
                 continue
             folders.append(video.stem)
-            count = 0
             try:
-                with atomic_folder(video.with_suffix("")) as target:
-                    for frame in images.frames_from_video(video):
-                        data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))[1].tobytes()
-                        (target / f"{count:06d}.png").write_bytes(data)
-                        count += 1
+                count = export_video(video)
             except images.ImageError:
                 index.skip("video that cannot be read", str(video))
-            except OSError as error:
-                raise UserError(
-                    f"the frames of {video} cannot be written next to it: {error.strerror}; make its folder writable"
-                ) from None
             else:
                 if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
                     index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")

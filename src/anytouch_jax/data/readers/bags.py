@@ -1,0 +1,200 @@
+"""Recordings of robots in MCAP files and in ROS 1 and ROS 2 bags: topics of images become sequences."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from anytouch_jax.data.images import decode_bytes
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, save_png
+from anytouch_jax.errors import UserError
+
+FAR = 100_000_000  # nanoseconds: a label that is further from its frame is empty
+_CHANNELS = {"rgb8": (3, None), "bgr8": (3, cv2.COLOR_BGR2RGB), "rgba8": (4, cv2.COLOR_RGBA2RGB),
+             "bgra8": (4, cv2.COLOR_BGRA2RGB), "mono8": (1, cv2.COLOR_GRAY2RGB), "8UC1": (1, cv2.COLOR_GRAY2RGB),
+             "8UC3": (3, cv2.COLOR_BGR2RGB)}  # fmt: skip
+
+
+class Message(NamedTuple):
+    """A message of a recording: its topic, the time when it was logged in nanoseconds, its type, its content."""
+
+    topic: str
+    time: int
+    kind: str
+    content: Any
+
+
+def _bags(index: DatasetIndex) -> None:
+    """MCAP files, ROS 1 bags and folders of ROS 2 (with metadata.yaml): topics of images become sequences of PNG.
+
+    The time of a frame is that of its header, else that of the log, in nanoseconds (column `time`). Labels are the
+    values of other topics that are nearest in time, at most a tenth of a second away. Their `values` read
+    NAME=TOPIC:FIELD.
+    """
+    sensor = index.need_sensor()
+    places = _labels_wanted(index.options.values)
+    for path in _bag_files(index):
+        index.need_export(f"the recording {path}")
+        frames: dict[str, list[tuple[int, str]]] = {}
+        series: dict[str, list[tuple[int, Any]]] = {name: [] for name in places}
+        for message in read_messages(index.root / path):
+            for name, (topic, field) in places.items():
+                if message.topic == topic:
+                    series[name].append((_time(message), _field(message.content, field, message.topic)))
+            if index.options.keys and message.topic not in index.options.keys:
+                continue
+            if (picture := picture_of(message)) is not None:
+                own = frames.setdefault(message.topic, [])
+                stem = Path(path).with_suffix("").as_posix()
+                own.append((_time(message), f"{stem}/{message.topic.strip('/').replace('/', '.')}/{len(own):06d}.png"))
+                save_png(index.root / own[-1][1], picture)
+        if not frames:
+            index.skip("recording without images of the chosen topics", path)
+        for topic, rows in frames.items():
+            times = np.array([time for time, _ in rows])
+            labels = {f"label.{name}": nearest(times, one) for name, one in series.items()}
+            index.add(
+                [name for _, name in rows], sensor=sensor, unit=topic, sequence=f"{path}{topic}",
+                frame_index=list(range(len(rows))), time=times.tolist(), split=index.split_of(path), **labels,
+            )  # fmt: skip
+
+
+def nearest(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any]:
+    """Return the value of a series (time, value) that is nearest to each time, None if all are further than FAR."""
+    if not series:
+        return [None] * len(times)
+    order = sorted(series, key=lambda one: one[0])
+    stamps = np.array([time for time, _ in order])
+    after = (
+        np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1) if len(stamps) > 1 else np.zeros(len(times), int)
+    )
+    before = np.maximum(after - 1, 0)
+    chosen = np.where(np.abs(stamps[before] - times) <= np.abs(stamps[after] - times), before, after)
+    return [order[at][1] if abs(stamps[at] - time) <= FAR else None for at, time in zip(chosen, times, strict=True)]
+
+
+def _labels_wanted(values: tuple[str, ...]) -> dict[str, tuple[str, str]]:
+    places = {}
+    for value in values:
+        match = re.fullmatch(r"(\w+)=([^:=]+):([\w.\[\]]+)", value)
+        if match is None:
+            raise UserError(f"--values {value!r} is no NAME=TOPIC:FIELD; write force_z=/ft:wrench.force.z")
+        places[match[1]] = (match[2], match[3])
+    return places
+
+
+def _bag_files(index: DatasetIndex) -> Iterator[str]:
+    """Yield the paths of recordings below ROOT: files .mcap and .bag, and folders with metadata.yaml."""
+    for folder, _, files in index.walk():
+        if "metadata.yaml" in files:
+            yield folder
+            continue
+        yield from (f"{folder}/{name}".lstrip("/") for name in files if name.endswith((".mcap", ".bag")))
+
+
+def read_messages(path: Path) -> Iterator[Message]:
+    """Yield the messages of a recording in the order of their times. Raises DatasetError."""
+    try:
+        if path.suffix == ".mcap":
+            yield from _mcap_messages(path)
+            return
+        from rosbags.highlevel import AnyReader
+
+        with AnyReader([path]) as reader:
+            for connection, time, data in reader.messages():
+                yield Message(connection.topic, time, connection.msgtype, reader.deserialize(data, connection.msgtype))
+    except ImportError as error:
+        raise DatasetError(f"{path} needs a package: {error}; run pip install 'anytouch_jax[bags]'") from None
+    except (UserError, GeneratorExit):
+        raise
+    except Exception as error:  # both packages have many kinds of errors for a damaged file
+        raise DatasetError(f"{path} cannot be read: {error}; record it again, or repair it with mcap recover") from None
+
+
+def _mcap_messages(path: Path) -> Iterator[Message]:
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    stores: dict[str, Any] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            encoding, kind = channel.message_encoding, "" if schema is None else schema.name
+            if encoding == "json":
+                content = json.loads(message.data, object_hook=lambda one: SimpleNamespace(**one))
+            elif encoding in ("cdr", "ros1") and schema is not None:
+                name = kind if kind.count("/") == 2 else kind.replace("/", "/msg/")
+                if name not in stores:
+                    stores[name] = get_typestore(Stores.EMPTY)
+                    stores[name].register(get_types_from_msg(schema.data.decode(), name))
+                read = stores[name].deserialize_cdr if encoding == "cdr" else stores[name].deserialize_ros1
+                content = read(message.data, name)
+            else:
+                continue  # protobuf and others
+            yield Message(channel.topic, message.log_time, kind, content)
+
+
+def picture_of(message: Message) -> np.ndarray | None:
+    """Return the picture RGB u8 of a message of sensor_msgs or foxglove, None for another. Raises DatasetError."""
+    kind, content = message.kind.rsplit("/", 1)[-1].rsplit(".", 1)[-1], message.content
+    if kind == "CompressedImage":
+        data = base64.b64decode(content.data) if isinstance(content.data, str) else bytes(content.data)
+        return decode_bytes(data, f"a message of {message.topic}")
+    if kind not in ("Image", "RawImage") or not hasattr(content, "encoding"):
+        return None
+    if content.encoding not in _CHANNELS:
+        raise DatasetError(
+            f"{message.topic} has pictures of encoding {content.encoding}; choose other topics by --keys"
+        )
+    (channels, change), width, height = _CHANNELS[content.encoding], int(content.width), int(content.height)
+    raw = base64.b64decode(content.data) if isinstance(content.data, str) else content.data
+    flat = np.frombuffer(raw, np.uint8) if isinstance(raw, bytes) else np.asarray(raw, np.uint8)
+    step = int(content.step)
+    if height * step > flat.size or step < width * channels or not width or not height:
+        raise DatasetError(f"{message.topic} has a picture that is cut short")
+    picture = flat[: height * step].reshape(height, step)[:, : width * channels].reshape(height, width, channels)
+    return np.ascontiguousarray(picture if change is None else cv2.cvtColor(np.ascontiguousarray(picture), change))
+
+
+def _time(message: Message) -> int:
+    """Return the time of a message in nanoseconds: of its header, else when it was logged."""
+    header = getattr(message.content, "header", message.content)
+    stamp = getattr(header, "stamp", getattr(header, "timestamp", None))
+    seconds = getattr(stamp, "sec", getattr(stamp, "secs", 0))
+    rest = getattr(stamp, "nanosec", getattr(stamp, "nsec", getattr(stamp, "nsecs", 0)))
+    return int(seconds) * 1_000_000_000 + int(rest) if seconds or rest else int(message.time)
+
+
+def _field(content: Any, field: str, topic: str) -> Any:
+    """Return a number or text in a message, by its names and places, as position[2]. Raises DatasetError."""
+    value = content
+    try:
+        for name, place in re.findall(r"(\w+)|\[(\d+)\]", field):
+            value = value[int(place)] if place else getattr(value, name)
+    except (AttributeError, IndexError, TypeError):
+        raise DatasetError(f"messages of {topic} have no {field}; correct --values") from None
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, bool):
+        return int(value)
+    if not isinstance(value, int | float | str):
+        raise DatasetError(f"{field} of {topic} is no number or text; name a field in it")
+    return value
+
+
+READERS = {
+    "bags": DatasetReader(
+        _bags,
+        "<recording>.mcap, <recording>.bag, or a folder with metadata.yaml",
+        "nothing, unless their owner asks for it",
+        "as their owner says",
+        uses=("val", "test", "sensor", "keys", "values", "export"),
+    ),
+}

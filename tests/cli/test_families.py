@@ -1,0 +1,101 @@
+"""Encoders of other families through every command: embed, stream, probe, retrieve, export, and a start of training."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from places import ROOT
+from touch_world import make_touches
+
+from anytouch_jax import load_encoder
+from anytouch_jax.encoder import export
+from tests.weights.test_start import mae
+
+OTHERS = ROOT / "tests" / "parity" / "golden_others"
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory):
+    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 4, "val": 4, "test": 6}, each=2, frames=4)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A family of single photographs, and one of clips of 4 frames that needs a background and knows sensors."""
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "anytouch2").mkdir()
+    shutil.copy(OTHERS / "anytouch2_checkpoint-4frames.pth", folder / "anytouch2" / "model.pth")
+    (folder / "anytouch2" / "config.json").write_text(json.dumps({"num_attention_heads": 4}))
+    return {"vit_mae": mae(folder / "mae"), "anytouch2": folder / "anytouch2" / "model.pth"}
+
+
+FAMILIES = ("vit_mae", "anytouch2")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_probes_and_retrieval_of_a_family(anytouch, family, files, touches, tmp_path):
+    words = ("--model", files[family], "--data", touches)
+    out = tmp_path / "probe.json"
+    done = anytouch("probe", "label", *words, "--label", "hardness", "--no-controls", "--seeds", 1, "--out", out)
+    assert done.status == 0, done.err
+    assert f"{files[family]}: linear" in done.out and json.loads(out.read_text())
+    out = tmp_path / "retrieve.json"
+    done = anytouch("retrieve", *words, "--gallery", 6, "--out", out)
+    assert done.status == 0, done.err
+    names = {one["name"] for one in json.loads(out.read_text())["results"]}
+    assert {str(files[family]), "random encoder"} <= names
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_regression_tasks_of_a_family(anytouch, family, files, touches):
+    done = anytouch("probe", "tasks", "--model", files[family], "--data", touches, "--tasks", "force", "--frames", 4)
+    assert done.status == 0 and "force" in done.out, done.err
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_streamed_film_gives_the_features_of_embed(anytouch, family, files, tmp_path):
+    film, gel = tmp_path / "film.avi", tmp_path / "gel.png"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (48, 40))
+    for frame in range(9):
+        writer.write(np.full((40, 48, 3), 25 * frame, np.uint8))
+    writer.release()
+    cv2.imwrite(str(gel), np.full((40, 48, 3), 90, np.uint8))
+    words = ["--model", files[family], "--data", film, "--sensor", "digit", "--background", gel]
+    words += ["--frames", 4] if family == "anytouch2" else []
+    outs = [tmp_path / f"{name}.npz" for name in ("stream", "embed")]
+    for name, out in zip(("stream", "embed"), outs, strict=True):
+        done = anytouch(name, *words, "--out", out)
+        assert done.status == 0, done.err
+    with np.load(outs[0]) as a, np.load(outs[1]) as b:
+        assert len(a["features"]) > 3
+        np.testing.assert_allclose(a["features"], b["features"], atol=2e-5 * np.abs(b["features"]).max())
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_exported_family_gives_the_features_of_the_live_one(anytouch, family, files, tmp_path):
+    encoder, out = load_encoder(files[family]), tmp_path / "model.bin"
+    frames = encoder.form.model.frames
+    done = anytouch("export", "--model", files[family], "--out", out, "--frames", frames, "--platforms", "cpu")
+    assert done.status == 0, done.err
+    clip = np.random.default_rng(0).normal(size=(2, frames, *encoder.image_size, 3)).astype("f4")
+    sensor = "digit" if family == "anytouch2" else "universal"
+    live = encoder.encode_touch(clip, sensor)
+    np.testing.assert_allclose(export.load(out)(clip, sensor), live, atol=1e-5 * np.abs(live).max())
+    said = json.loads((tmp_path / "model.bin.json").read_text())
+    assert "float32" in said["input"] and said["preparation"]["mean"]
+
+
+def test_a_run_starts_from_a_family(anytouch, files, touches, tmp_path):
+    size = "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 --model.touch.heads 2"
+    size += " --model.touch.mlp 32 --model.norm-eps 1e-12 --model.decoder.width 8 --model.decoder.depth 1"
+    words = ["--run", tmp_path / "run", "--init", files["vit_mae"], "--batch", 2, "--steps", 2, "--stop-after", 1]
+    words += [*size.split(), "--model.decoder.heads", "2", "--data.clip-share", "0"]
+    done = anytouch("train", "--data", touches, *words)
+    assert done.status == 2 and "--model.no-pre-norm" in done.err, done.err
+    done = anytouch("train", "--data", touches, *words, "--model.no-pre-norm")
+    assert done.status == 0 and "gives the touch encoder" in done.err, done.err
+    assert "pre_norm" not in load_encoder(tmp_path / "run").params["touch"]

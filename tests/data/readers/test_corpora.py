@@ -1,0 +1,114 @@
+"""Corpora in shards: small look-alikes of gelsight-mini-pretrain and FoTa, on disk and in an object store."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+
+import fsspec
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.errors import UserError
+from tests.data.manifest.test_containers import png
+
+
+def table_of(root, name, **options):
+    report = index(name, root, options=IndexOptions(**options))
+    return report, report.manifest.table.to_pylist()
+
+
+def write_corpus(root, source, split, rows):
+    """A shard of gelsight-mini-pretrain with some of its 30 columns."""
+    columns = {"image": [png(row["value"]) for row in rows], "source": [source] * len(rows)}
+    columns |= {"split": [split] * len(rows), "markered": [True] * len(rows), "domain": ["real"] * len(rows)}
+    for name in ("capture", "frame_idx", "obj_name", "f_z", "side"):
+        columns[name] = [row.get(name) for row in rows]
+    (root / source).mkdir(parents=True, exist_ok=True)
+    pa.parquet.write_table(pa.table(columns), root / source / f"{split}-00000.parquet", row_group_size=2)
+
+
+@pytest.fixture
+def corpus(tmp_path):
+    film = [{"capture": "ep1", "frame_idx": i, "value": i} for i in range(4)]
+    write_corpus(tmp_path, "gelslam", "train", film)
+    presses = [{"capture": "ball", "obj_name": "sphere", "f_z": -1.5 * i, "value": 10 + i} for i in range(3)]
+    write_corpus(tmp_path, "feats", "test_unknown_indenters", presses)
+    write_corpus(tmp_path, "sparsh_force", "train", [{"capture": "c", "value": 20}])
+    write_corpus(tmp_path, "mystery", "train", [{"capture": "c", "value": 30}])
+    return tmp_path
+
+
+def test_rows_stay_in_their_shards_with_the_licence_of_their_source(corpus):
+    report, rows = table_of(corpus, "gelsight_mini_pretrain")
+    assert [decode(report.manifest.file(i))[0, 0, 0] for i in range(len(rows))] == [10, 11, 12, 0, 1, 2, 3, 30, 20]
+    assert [row["path"] for row in rows[:2]] == [
+        f"feats/test_unknown_indenters-00000.parquet/image/{i}" for i in (0, 1)
+    ]
+    film = [row for row in rows if row["dataset"].endswith("/gelslam")]
+    assert [row["frame_index"] for row in film] == [0, 1, 2, 3] and len({row["sequence"] for row in film}) == 1
+    assert len(report.manifest.clips(3)) == 2  # of the film alone
+    presses = rows[:3]
+    assert {row["split"] for row in presses} == {"test"} and [row["label.force_z"] for row in presses] == [0, -1.5, -3]
+    licences = {row["dataset"].rpartition("/")[2]: (row["license"], row["commercial"]) for row in rows}
+    assert licences["gelslam"] == ("MIT", True) and licences["sparsh_force"] == ("CC-BY-NC-4.0", False)
+    assert licences["mystery"] == ("not stated", False) and "unknown source" in " ".join(report.skipped)
+    assert rows[0]["label.markered"] == 1
+
+
+def test_shards_in_an_object_store_are_indexed_by_their_metadata(corpus, tmp_path, monkeypatch):
+    system, here = fsspec.filesystem("memory"), tmp_path / "here"
+    system.put(str(corpus), "/far", recursive=True)
+    here.mkdir()
+    monkeypatch.setenv("ANYTOUCH_CACHE", str(tmp_path / "cache"))
+    try:
+        report, rows = table_of(here, "gelsight_mini_pretrain", url="memory://far/")
+        _, near = table_of(corpus, "gelsight_mini_pretrain")
+        assert [row["path"] for row in rows] == [f"memory://far/{row['path']}" for row in near]
+        assert not (tmp_path / "cache").exists()
+        assert decode(report.manifest.file(1))[0, 0, 0] == 11
+    finally:
+        system.rm("/far", recursive=True)
+
+
+def write_tar(file, samples):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(file, "w") as archive:
+        for key, (value, labels) in samples.items():
+            for suffix, data in (("png", png(value)), ("json", json.dumps(labels).encode())):
+                info = tarfile.TarInfo(f"{key}.{suffix}")
+                info.size = len(data)
+                archive.addfile(info, io.BytesIO(data))
+
+
+def test_fota_names_sensors_by_data_set_and_takes_labels_from_json(tmp_path):
+    pose = {"x_mm": 1.5, "object_name": "key1", "nested": [1, 2]}
+    write_tar(
+        tmp_path / "panda_key1_Mini_Mini_left" / "train" / "data-000000.tar", {"a-0": (1, pose), "a-1": (2, pose)}
+    )
+    contact = {"has_contact": True, "contact_class": "rock"}
+    write_tar(tmp_path / "touch_and_go" / "val" / "data-000000.tar", {"b": (3, json.dumps(contact)), "c": (4, contact)})
+    report, rows = table_of(tmp_path, "fota")
+    assert [row["sensor"] for row in rows] == ["gelsight_mini"] * 2 + ["gelsight"] * 2
+    assert [row["split"] for row in rows] == ["train"] * 2 + ["val"] * 2
+    assert [decode(report.manifest.file(i))[0, 0, 0] for i in range(4)] == [1, 2, 3, 4]
+    assert rows[0]["object"] == "key1" and rows[0]["label.x_mm"] == 1.5
+    assert [row["label.contact"] for row in rows] == [None, None, 1, 1] and rows[2]["label.contact_class"] == "rock"
+    assert len({row["sequence"] for row in rows}) == 4 and report.reader.license == "MIT"
+    with pytest.raises(UserError, match="--sensor"):
+        write_tar(tmp_path / "unheard" / "train" / "data-000000.tar", {"a": (1, {})})
+        table_of(tmp_path, "fota")
+
+
+def test_any_webdataset_is_read_with_a_sensor(tmp_path):
+    write_tar(tmp_path / "shards" / "00.tar", {str(i): (i, {"hardness": i if i else "soft"}) for i in range(5)})
+    _, rows = table_of(tmp_path, "webdataset", sensor="digit", val=0.0, test=0.5)
+    assert [row["path"] for row in rows] == [f"shards/00.tar/{2 * i}" for i in range(5)]
+    assert [row["label.hardness"] for row in rows] == ["soft", "1", "2", "3", "4"]
+    (tmp_path / "shards" / "01.tar").write_bytes(b"no tar" * 200)
+    with pytest.raises(UserError, match=r"01\.tar is no whole tar"):
+        table_of(tmp_path, "webdataset", sensor="digit")

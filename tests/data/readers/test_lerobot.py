@@ -1,0 +1,148 @@
+"""A LeRobot data set (version 3) made here: read, embedded, written back; frame indices and time stamps agree."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.errors import UserError
+from tests.data.manifest.test_containers import png
+from tests.weights.test_start import mae
+
+FPS, LENGTHS = 10, (5, 4, 3)
+GEL, FILM, SCENE = "observation.images.gel", "observation.images.tactile_film", "observation.images.front"
+
+
+def make(root):
+    """Three episodes in two Parquet files and two films: a gel in Parquet, a tactile film, a camera of the scene."""
+    camera = {"shape": [32, 32, 3], "names": ["height", "width", "channels"]}
+    features = {GEL: camera | {"dtype": "image"}, FILM: camera | {"dtype": "video"}, SCENE: camera | {"dtype": "video"}}
+    features |= {"observation.force": {"dtype": "float32", "shape": [2], "names": None}}
+    features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index")}
+    info = {
+        "codebase_version": "v3.0", "fps": FPS, "features": features, "total_episodes": 3, "total_frames": 12,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+    }  # fmt: skip
+    (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    pa.parquet.write_table(
+        pa.table({"task_index": [0, 1], "__index_level_0__": ["press", "slide"]}), root / "meta" / "tasks.parquet"
+    )
+    rows, films, episodes = {0: [], 1: []}, {0: [], 1: []}, []
+    for episode, length in enumerate(LENGTHS):
+        home = 0 if episode < 2 else 1  # file of data and of film
+        first = len(films[home])
+        episodes.append(
+            {
+                "episode_index": episode,
+                "length": length,
+                "data/chunk_index": 0,
+                "data/file_index": home,
+                **{
+                    f"videos/{key}/{end}": value
+                    for key in (FILM, SCENE)
+                    for end, value in (
+                        ("chunk_index", 0),
+                        ("file_index", home),
+                        ("from_timestamp", first / FPS),
+                        ("to_timestamp", (first + length) / FPS),
+                    )
+                },
+                "stats/x": [0.5],
+            }
+        )
+        for frame in range(length):
+            number = sum(LENGTHS[:episode]) + frame
+            films[home].append(20 * number)
+            picture = {"bytes": png(10 * number), "path": None}
+            rows[home].append({
+                GEL: picture, "observation.force": [float(number), -1.0], "timestamp": frame / FPS,
+                "frame_index": frame, "episode_index": episode, "index": number, "task_index": episode % 2,
+            })  # fmt: skip
+    pa.parquet.write_table(
+        pa.Table.from_pylist(episodes), root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    )
+    for home in (0, 1):
+        for key in (FILM, SCENE):
+            target = root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            film = cv2.VideoWriter(str(target), cv2.VideoWriter_fourcc(*"mp4v"), FPS, (32, 32))
+            for value in films[home]:
+                film.write(np.full((32, 32, 3), value, np.uint8))
+            film.release()
+        target = root / "data" / "chunk-000" / f"file-{home:03d}.parquet"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        table = pa.Table.from_pylist(rows[home]).replace_schema_metadata({b"huggingface": b"{}"})
+        pa.parquet.write_table(table, target)
+    return root
+
+
+@pytest.fixture
+def root(tmp_path):
+    return make(tmp_path / "set")
+
+
+def rows_of(root, **options):
+    report = index("lerobot", root, options=IndexOptions(sensor="gelsight_mini", **options))
+    return report.manifest, report.manifest.table.to_pylist()
+
+
+def test_frames_of_parquet_and_film_have_the_indices_and_times_of_the_data_set(root):
+    with pytest.raises(UserError, match="--export"):
+        rows_of(root)
+    manifest, rows = rows_of(root, export=True, values=("observation.force",))
+    assert {row["unit"] for row in rows} == {GEL, FILM} and len(rows) == 24
+    numbers = [number for number, length in enumerate(LENGTHS) for _ in range(length)]
+    for key, factor in ((GEL, 10), (FILM, 20)):
+        own = [(at, row) for at, row in enumerate(rows) if row["unit"] == key]
+        assert [row["index"] for _, row in own] == list(range(12))
+        assert [row["episode"] for _, row in own] == numbers
+        assert [row["timestamp"] for _, row in own] == pytest.approx([row["frame_index"] / FPS for _, row in own])
+        values = [int(decode(manifest.file(at)).mean()) for at, _ in own]
+        np.testing.assert_allclose(values, factor * np.arange(12), atol=4)  # the film is lossy
+        assert [row["label.observation.force_0"] for _, row in own] == list(range(12))
+    assert rows[0]["label.task"] == "press" and len(manifest.clips(3)) == 2 * (3 + 2 + 1)
+
+
+def test_a_data_set_is_embedded_and_the_features_are_a_column(root, tmp_path, capsys):
+    rows_of(root, keys=(GEL,))
+    encoder, out = mae(tmp_path / "mae"), tmp_path / "features.npz"
+    words = ["embed", "--model", encoder, "--data", root / "lerobot.parquet", "--out", out, "--batch", 4]
+    words += ["--column", "observation.touch"]
+    assert main(list(map(str, words))) == 0, capsys.readouterr().err
+    with np.load(out) as file:
+        features, times, numbers = file["features"], file["key/timestamp"], file["key/index"]
+    for home in (0, 1):
+        table = pa.parquet.read_table(root / "data" / "chunk-000" / f"file-{home:03d}.parquet")
+        assert pa.types.is_fixed_size_list(table.schema.field("observation.touch").type)
+        at = [int(np.flatnonzero(numbers == number)[0]) for number in table["index"].to_pylist()]
+        np.testing.assert_array_equal(np.stack(table["observation.touch"].to_pylist()), features[at])
+        np.testing.assert_allclose(table["timestamp"].to_pylist(), times[at])
+        assert table[GEL].to_pylist()[0]["bytes"].startswith(b"\x89PNG")  # the rest is unchanged
+    info = json.loads((root / "meta" / "info.json").read_text())
+    assert info["features"]["observation.touch"] == {"dtype": "float32", "shape": [16], "names": None}
+    assert main(list(map(str, words))) == 2 and "choose another name" in capsys.readouterr().err
+
+
+def test_what_is_not_a_data_set_of_this_version_is_one_sentence(root, tmp_path):
+    with pytest.raises(UserError, match=f"choose with --keys from {GEL}"):
+        rows_of(root, keys=("observation.images.none",))
+    with pytest.raises(UserError, match="no feature effort"):
+        rows_of(root, keys=(GEL,), values=("effort",))
+    film = root / "videos" / FILM / "chunk-000" / "file-001.mp4"
+    film.write_bytes(film.read_bytes()[:50])
+    with pytest.raises(UserError, match="ffmpeg"):
+        rows_of(root, export=True)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    (root / "meta" / "info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
+    with pytest.raises(UserError, match=r"v2\.1.*convert it to v3"):
+        rows_of(root)

@@ -1,0 +1,33 @@
+"""Settings of the tactile camera, registered as the type `anytouch`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot.cameras.configs import CameraConfig
+
+
+@CameraConfig.register_subclass("anytouch")
+@dataclass(kw_only=True)
+class AnyTouchCameraConfig(CameraConfig):
+    """Settings of a tactile camera.
+
+    `width` and `height` are those of the oriented picture. `rotate` turns clockwise by degrees, then `flip` mirrors.
+    `background` is a picture of the untouched gel in the camera's own orientation. `encoder` and `sensor` are for
+    `AnyTouchCamera.features`.
+    """
+
+    index_or_path: int | Path
+    rotate: int = 0
+    flip: str = "none"
+    subtract: bool = True
+    background: Path | None = None
+    encoder: str = "anytouch-tiny"
+    sensor: str = "universal"
+
+    def __post_init__(self) -> None:
+        if self.rotate not in (0, 90, 180, 270):
+            raise ValueError(f"rotate is 0, 90, 180 or 270, not {self.rotate}")
+        if self.flip not in ("none", "across", "down"):
+            raise ValueError(f"flip is none, across or down, not {self.flip!r}")

@@ -1,0 +1,88 @@
+"""The camera of LeRobot: found by LeRobot's rules, oriented and subtracted pictures, features."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+from places import ROOT
+
+from anytouch_jax import load_encoder
+from tests.support import lerobot_interface
+from tests.weights.test_start import mae
+
+PACKAGE = ROOT / "integrations" / "lerobot_camera_anytouch"
+
+
+@pytest.fixture
+def plugin(monkeypatch):
+    """The package, imported as LeRobot does: by the name of the distribution."""
+    name = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]["name"]
+    assert name.startswith("lerobot_camera_")
+    for module, content in lerobot_interface.modules().items():
+        monkeypatch.setitem(sys.modules, module, content)
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    yield importlib.import_module(name)
+    for module in [one for one in sys.modules if one.startswith(name)]:
+        del sys.modules[module]
+
+
+@pytest.fixture
+def film(monkeypatch):
+    """Four pictures of 40 x 60: an even gel, then a press that grows in the upper left corner."""
+    frames = [np.full((40, 60, 3), 90, np.uint8) for _ in range(4)]
+    for i, frame in enumerate(frames):
+        frame[:10, :10] += 20 * i
+    monkeypatch.setattr(lerobot_interface.FilmCamera, "frames", frames)
+    return frames
+
+
+def test_lerobot_finds_the_camera_and_its_pictures_are_oriented_and_subtracted(plugin, film):
+    kind = lerobot_interface.CameraConfig.known["anytouch"]
+    config = kind(index_or_path=0, width=40, height=60, rotate=90)
+    camera = lerobot_interface.device_class(config)(config)
+    assert not camera.is_connected and (camera._camera.config.width, camera._camera.config.height) == (60, 40)
+    with camera_open(camera):
+        assert camera.is_connected and (camera.width, camera.height, camera.fps) == (40, 60, 30)
+        first, second, latest = camera.read(), camera.async_read(100), camera.read_latest()
+        assert first.shape == (60, 40, 3) and first.dtype == np.uint8
+        assert first[0, -1].tolist() == [148] * 3 and first[-1, 0].tolist() == [128] * 3  # turned clockwise
+        assert second[0, -1].tolist() == [168] * 3 and np.array_equal(latest, second)
+        camera.async_read(100)
+        with pytest.raises(TimeoutError):
+            camera.async_read(1)
+    assert not camera.is_connected
+    assert camera.find_cameras() == [{"name": "film", "type": "anytouch", "id": 0}]
+
+
+def camera_open(camera):
+    """Connect and disconnect, as LeRobot's base class does in a with statement."""
+    from contextlib import contextmanager
+
+    @contextmanager
+    def opened():
+        camera.connect()
+        try:
+            yield
+        finally:
+            camera.disconnect()
+
+    return opened()
+
+
+def test_features_are_those_of_the_encoder(plugin, film, tmp_path):
+    file = mae(tmp_path / "mae")
+    camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(index_or_path=0, encoder=str(file), subtract=False))
+    with camera_open(camera):
+        frame, encoder = camera.read(), load_encoder(file)
+        assert np.array_equal(frame, film[1])  # not subtracted
+        np.testing.assert_array_equal(camera.features(), encoder.encode_touch(encoder.preprocess(film[1]))[0])
+
+
+@pytest.mark.parametrize("wrong", [{"rotate": 45}, {"flip": "up"}])
+def test_wrong_settings_are_one_sentence(plugin, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        plugin.AnyTouchCameraConfig(index_or_path=0, **wrong)

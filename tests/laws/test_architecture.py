@@ -54,7 +54,7 @@ ONLY_IN: dict[str, set[str]] = {
     "tyro": {"cli"},
     "torch": set(),
     "tensorflow": set(),
-    "pickle": {"weights.torch_file"},
+    "pickle": {"weights.torch_file", "data.readers.forces"},
     "importlib": {"__init__", "cli.app"},
 }
 HARMLESS = {"importlib.metadata", "importlib.resources"}

@@ -10,11 +10,11 @@ import csv
 import hashlib
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar
+from typing import Any, BinaryIO, Literal
 
 import cv2
 import numpy as np
@@ -29,7 +29,6 @@ from anytouch_jax.files import atomic_folder, atomic_write
 Columns = dict[str, list[Any]]
 Frames = dict[int, str]  # frame number -> file name, by number
 Folder = tuple[str, list[str], list[str]]  # its path below a base, its folders, its files
-Key = TypeVar("Key")
 PARTS = ("train", "val", "test")  # published splits
 NUMBERED = r"(\d+)\.(?:png|jpe?g)"
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
@@ -318,12 +317,20 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
     return "val" if share < options.val else "test" if share < options.val + options.test else "train"
 
 
-def published_splits(path: Path, members: Iterable[tuple[Key, str]]) -> dict[Key, str]:
-    """Return member -> split of (member, split) pairs from the list `path`. Raises DatasetError for one in two."""
-    splits: dict[Key, str] = {}
-    for member, split in members:
-        if splits.setdefault(member, split) != split:
-            raise DatasetError(f"{path}: {member} is in {splits[member]} and in {split}")
+def published_splits(path: Path, lists: Mapping[str, Iterable[Any]], key: Callable[[Any], Any] = str) -> dict[Any, str]:
+    """Return `key` of member -> split from the lists of train, val and test in the file `path`, as far as it has them.
+
+    Raises DatasetError for a member in two lists, and for one that `key` cannot read.
+    """
+    splits: dict[Any, str] = {}
+    for part in PARTS:
+        try:
+            members = [key(member) for member in lists.get(part, ())]
+        except (TypeError, ValueError, IndexError, KeyError) as error:
+            raise DatasetError(f"{path}: its list {part} is not as expected: {error}") from None
+        for member in members:
+            if splits.setdefault(member, part) != part:
+                raise DatasetError(f"{path}: {member} is in {splits[member]} and in {part}")
     return splits
 
 

@@ -110,7 +110,7 @@ def _splits_of_fold(index: DatasetIndex, base: str) -> dict[str, str] | None:
     table = read_json(path) if path.suffix == ".json" else strings_in_pickle(path)
     if not {"train", "test"} <= table.keys() or not all(isinstance(names, list) for names in table.values()):
         raise DatasetError(f"{path}: expected the lists 'train' and 'test' of object names")
-    return published_splits(path, ((str(name), part) for part in PARTS for name in table.get(part, [])))
+    return published_splits(path, table)
 
 
 def strings_in_pickle(path: Path) -> dict[str, list[str]]:

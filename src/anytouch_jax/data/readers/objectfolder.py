@@ -10,7 +10,6 @@ from typing import Any
 
 from anytouch_jax.data.readers.common import (
     NUMBERED,
-    PARTS,
     DatasetError,
     DatasetIndex,
     DatasetReader,
@@ -70,11 +69,11 @@ def _lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple[int, int], s
         tables.append(read_json(path))
     try:
         labels = {int(name): int(value) for name, value in tables[0].items()}
-        members = [((int(name), int(n)), part) for part in PARTS for name, n in tables[1].get(part, [])]
+        splits = published_splits(paths[1], tables[1], lambda pair: (int(pair[0]), int(pair[1])))
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{' or '.join(map(str, paths))} is not as expected (id -> number; train, test: "
                            f"lists of [id, number]): {error}") from None  # fmt: skip
-    return labels, published_splits(paths[1], members)
+    return labels, splits
 
 
 def _real(index: DatasetIndex) -> None:

@@ -121,9 +121,9 @@ def _octopi(index: DatasetIndex) -> None:
     paths = [(part, path) for part, path in lists if path]
     splits: dict[str, str] = {}
     if len(paths) == len(PARTS):
-        folders = [(str(f), part) for part, path in paths for fs in read_json(path, list).values() for f in fs]
-        names = ((Path(folder.replace("\\", "/")).name, part) for folder, part in folders)
-        splits = published_splits(paths[0][1].with_name("*_samples.json"), names)
+        folders = {part: [f for fs in read_json(path, list).values() for f in fs] for part, path in paths}
+        name_of = lambda folder: Path(str(folder).replace("\\", "/")).name  # noqa: E731
+        splits = published_splits(paths[0][1].with_name("*_samples.json"), folders, name_of)
     else:
         index.notes.append("no train_, val_ and test_samples.json: split by hash of the object")
     for sample in index.listing(base)[0]:

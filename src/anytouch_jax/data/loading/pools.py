@@ -152,7 +152,7 @@ def _pool(
     has_image, has_text = usable.has_image[windows[:, -1]], usable.has_text[windows[:, -1]]
     strata = (has_image & ~has_text, has_image & has_text, ~has_image & has_text, ~has_image & ~has_text)
     members = tuple(np.flatnonzero(stratum) for stratum in strata)
-    samplers = tuple(
+    samplers: tuple[EpochSampler | PartSampler, ...] = tuple(
         EpochSampler(len(ids), config.run.seed, _ALIGN + 4 * kind + s, usable.weights_of(windows[ids]))
         for s, ids in enumerate(members)
     )

@@ -64,7 +64,7 @@ def open_store(address: str) -> tuple[Any, str]:
 
         system, path = fsspec.core.url_to_fs(address)
     except (ImportError, ValueError) as error:
-        raise UserError(f"{address} needs a package: {error}; run pip install 'anytouch_jax[remote]'") from None
+        raise UserError(f"{address} cannot be read: {error}; install the package for it (s3fs for s3)") from None
     return system, path
 
 

@@ -60,14 +60,14 @@ def _bags(index: DatasetIndex) -> None:
             index.skip("recording without images of the chosen topics", path)
         for topic, rows in frames.items():
             times = np.array([time for time, _ in rows])
-            labels = {f"label.{name}": nearest(times, one) for name, one in series.items()}
+            labels = {f"label.{name}": nearest_values(times, one) for name, one in series.items()}
             index.add(
                 [name for _, name in rows], sensor=sensor, unit=topic, sequence=f"{path}{topic}",
                 frame_index=list(range(len(rows))), time=times.tolist(), split=index.split_of(path), **labels,
             )  # fmt: skip
 
 
-def nearest(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any]:
+def nearest_values(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any]:
     """Return the value of a series (time, value) that is nearest to each time, None if all are further than FAR."""
     if not series:
         return [None] * len(times)

@@ -163,7 +163,8 @@ class DatasetIndex:
             for folder, _, files in self.walk():
                 for name in (name for name in files if name.endswith(suffix)):
                     path = f"{folder}/{name}".lstrip("/")
-                    yield path, partial(open, self.root / path, "rb")
+                    opened: Callable[[], Any] = partial((self.root / path).open, "rb")
+                    yield path, opened
             return
         url = self.options.url.rstrip("/")
         system, base = open_store(url)

@@ -206,11 +206,11 @@ def _freetacman(index: DatasetIndex) -> None:
                 index.skip("film that cannot be read", place)
                 continue
             frames = index.frames(place)
-            times = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))
+            times: Any = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))
             task, camera = folder.split("/")[-1] or stem.split("_")[0], next(key for key in wanted if key in stem)
             index.add_recording(
                 frames, place, split=index.split_of(stem.partition(f"_{camera}")[0]), sensor="freetacman", object=task,
-                sequence=place, unit=stem[stem.index(camera) :], **({"time": times} if times else {}),
+                sequence=place, unit=stem[stem.index(camera) :], time=times,
             )  # fmt: skip
 
 

@@ -134,7 +134,7 @@ def _vector_labels(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[s
     """Return label.NAME of numbers and label.NAME_0, ... of vectors."""
     labels: dict[str, list[Any]] = {}
     for name in names:
-        values = [row.get(name) for row in rows]
+        values: list[Any] = [row.get(name) for row in rows]
         if isinstance(values[0] if values else None, list):
             labels |= {f"label.{name}_{i}": [value[i] for value in values] for i in range(len(values[0]))}
         else:

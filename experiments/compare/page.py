@@ -37,10 +37,12 @@ def page(results: Path) -> str:
         ]  # fmt: skip
         head = ("encoder", "million parameters", "frames", "pixels", "GFLOP", "ms to prepare a frame", "ms a touch")
         lines += [markdown_table((*head, "processor ms a touch", "MiB"), rows, "lrrlrrrrr"), ""]
-        machines = {Machine(**one["machine"]).sentence().partition("; load")[0] for one in costs.values()}
+        machines = {Machine(**one["machine"] | {"load": 0.0}) for one in costs.values()}
         loads = sorted(one["machine"]["load"] for one in costs.values())
         repeats = " or ".join(map(str, sorted({one["repeats"] for one in costs.values()})))
-        lines += [f"Machine: {one}." for one in sorted(machines)]
+        names = ("processor", "cores", "GiB", "Python", "jax", "system")
+        each = [(m.processor, m.cores, f"{m.memory_gib:.0f}", m.python, m.jax, m.system) for m in machines]
+        lines += ["The machine:", "", markdown_table(names, sorted(each), "lrrlll")]
         lines += [
             "", f"Each was called {repeats} times. Other work ran on the machine, whose load was {loads[0]:.1f} to "
             f"{loads[-1]:.1f}. Times are the shortest of the calls, and processor times their median. Compare encoders "

@@ -220,11 +220,11 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
     others = ("object", "unit", "index", "timestamp")
     more = [name for name in manifest.table.column_names if name in others or name.startswith("label.")]
     keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
-    touched = {} if options.head is None else {"contact": _contact(manifest, rows)}
+    touched = {} if options.head is None else {"contact": contact_of_rows(manifest, rows)}
     return embedding.Features(values, rows, keys, len(usable) - len(rows), touched)
 
 
-def _contact(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
+def contact_of_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
     """Return the contact of `rows` (n,): label.contact, or by the row's background picture; NaN if unknown."""
     import numpy as np
 

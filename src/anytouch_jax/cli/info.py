@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from anytouch_jax.cli.output import check_folder, log, print_table, refuse_unused
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, from_json
 from anytouch_jax.errors import UserError, shorten
 
 if TYPE_CHECKING:
+    from anytouch_jax.data.manifest.manifest import Manifest
+    from anytouch_jax.encoder.health import UnitHealth
     from anytouch_jax.weights.keymaps import Weights
 
 _TABLES = (".csv", ".parquet")
@@ -26,20 +29,80 @@ class InfoOptions:
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
 
-    `anytouch info encoders` lists the encoders in the package.
+    `anytouch info encoders` lists the encoders in the package. `--health` checks the sensor units of a manifest.
     """
 
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
+    health: bool = False  # Check every sensor unit of a manifest, and print a verdict and what to do.
+    picture: Path | None = None  # PNG with a picture and the verdict of each unit, with --health.
+    model: Path | None = (
+        None  # Does this encoder see contact? With --health, on rows with a contact label or background.
+    )
 
 
 def run(options: InfoOptions) -> int:
     """Print some lines about every path."""
     if not options.paths:
         raise UserError("There is nothing to describe. Name a file or a folder.")
+    if options.health:
+        return _health(options)
+    refuse_unused(options, ("picture", "model"), "without --health")
     for number, path in enumerate(options.paths):
         lines = "\n".join(_lines(path)).split("\n")
         print("\n" * bool(number) + "\n".join(map(shorten, lines)))
     return 0
+
+
+def _health(options: InfoOptions) -> int:
+    """Print a table with the checks of every sensor unit, and what to do. Exit status 1 reports a fault."""
+    from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.encoder import health
+    from anytouch_jax.evaluate.statistics import markdown_table
+    from anytouch_jax.sim.sensing.sensors import SENSORS, bases
+
+    check_folder(options.picture, "--picture", read=options.paths, suffix=".png")
+    table = manifests.read(options.paths)
+    units = list(health.read_units(table))
+    if not units:
+        raise UserError("No picture of a sensor can be read. Check the manifest with `anytouch data verify`.")
+    # Only these looks are of real units.
+    real = [sensor for sensor in SENSORS.values() if isinstance(sensor.look, str)]
+    references = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
+    results = health.check_units(units, references)
+    if options.model is not None:
+        results = [_seen_by(options.model, table, unit) for unit in results]
+    marks = {True: "", False: "FAULT ", None: "? "}
+    for unit in results:
+        rows = [(check.name, marks[check.ok] + check.value, "" if check.ok else check.advice) for check in unit.checks]
+        print(f"\n{shorten(f'{unit.sensor} {unit.unit}')}: {unit.rows:,} frames, {unit.verdict}\n")
+        cells = [(name, shorten(value), advice if value.startswith("FAULT") else "") for name, value, advice in rows]
+        print_table(markdown_table(("check", "value", "what to do"), cells))
+    if options.picture is not None:
+        health.health_sheet(results, options.picture)
+        log(f"{options.picture}: a picture of each unit")
+    faulty = sum(bool(unit.faults) for unit in results)
+    print(f"\n{len(results) - faulty} of {len(results)} units are good")
+    return int(faulty > 0)
+
+
+def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
+    """Return the health of a unit with the check whether an encoder sees its contact."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from anytouch_jax.cli.embed import contact_of_rows
+    from anytouch_jax.encoder.embed import embed_rows, text_column
+    from anytouch_jax.encoder.encoder import load_encoder
+    from anytouch_jax.encoder.health import contact_visible
+
+    here = (text_column(table, "sensor") == unit.sensor) & (text_column(table, "unit") == unit.unit)
+    rows = np.flatnonzero(here & (text_column(table, "split") != "background"))
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, 96).astype(int))] if len(rows) else rows
+    touched = contact_of_rows(table, rows)
+    rows, touched = rows[~np.isnan(touched)], touched[~np.isnan(touched)] > 0
+    values = embed_rows(load_encoder(model), table, rows, log=log)[1] if len(rows) else np.zeros((0, 1))
+    return replace(unit, checks=(*unit.checks, contact_visible(values, touched)))
 
 
 def _lines(path: Path) -> list[str]:

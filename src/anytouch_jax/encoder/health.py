@@ -1,0 +1,437 @@
+"""Health of sensor units: orientation, colour order, exposure, focus, frozen frames, drift, wear, background, contact.
+
+A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were set on real
+recordings of units in good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels on the long side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows
+from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS, spread
+from anytouch_jax.data.prepare.untouched_gel import DOT_DEPTH, UntouchedGel, close_dots, has_dots, scale_picture
+from anytouch_jax.errors import UserError
+
+Array = npt.NDArray[Any]
+
+RECORDINGS, FRAMES = 24, 6  # that are read of a unit, and of a recording
+SIDE = 16  # of the layout of a picture
+LIMITS = {
+    "orientation": 0.10, "exposure": 0.25, "focus": 0.5, "detail": 0.7, "frozen": 0.02, "dropped": 0.01, "tint": 0.20,
+    "dead pixels": 0.0, "scratch": 12.0, "scratch length": 36.0, "background": 20.0, "two units": 16.0,
+}  # fmt: skip
+_OTHER_SIGN = -0.25  # share of a family's asymmetry; one good unit of eleven has -0.18
+_SHARE = 0.25  # of recordings that look like another unit
+_DOTS = 21  # pixels of the widest marker dots, at 160 pixels
+_LIKE, _FEWEST = 0.6, 4  # correlation of a unit with its family, and recordings from which a fixed pattern is judged
+_TURNS = ((0, False), (1, False), (2, False), (3, False), (0, True), (1, True), (2, True), (3, True))
+_NAMES = {(1, False): "turned by 90 degrees", (2, False): "upside down", (3, False): "turned by 270 degrees",
+          (0, True): "mirrored left to right", (2, True): "mirrored top to bottom", (1, True): "mirrored and turned",
+          (3, True): "mirrored and turned"}  # fmt: skip
+_OPTIONS = {(1, False): "--rotate 90", (2, False): "--rotate 180", (3, False): "--rotate 270",
+            (0, True): "--flip across", (2, True): "--flip down"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of a check: `ok` is None if it cannot be decided; `advice` is what to do if it failed."""
+
+    name: str
+    ok: bool | None
+    value: str
+    advice: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class UnitFrames:
+    """Frames of one sensor unit: `recordings` are lists of pictures RGB u8 (h, w, 3), in order, all of one size.
+
+    `background` is its untouched gel. `steps`: distances of neighbouring frame numbers in strides, (n,), of all its
+    recordings. `rows` counts all frames, of which those in `recordings` were read.
+    """
+
+    sensor: str
+    unit: str
+    recordings: Sequence[Sequence[Array]]
+    background: Array | None = None
+    steps: Array = field(default_factory=lambda: np.ones(0))
+    rows: int = 0
+
+    @property
+    def frames(self) -> list[Array]:
+        """All pictures that were read."""
+        return [frame for recording in self.recordings for frame in recording]
+
+    @cached_property
+    def small(self) -> list[Array]:
+        """The pictures of each recording at 160 pixels, u8 (n, h, w, 3)."""
+        return [np.stack([scale_picture(frame) for frame in recording]) for recording in self.recordings]
+
+    @cached_property
+    def middles(self) -> list[Array]:
+        """The median picture of each recording at 160 pixels."""
+        return [np.median(small, axis=0).astype(np.uint8) for small in self.small]
+
+    @cached_property
+    def usual(self) -> Array:
+        """The median of all recordings at 160 pixels: what never moves."""
+        return np.median(np.stack(self.middles), axis=0).astype(np.uint8)
+
+    @cached_property
+    def look(self) -> Array:
+        """The colours of the usual picture at a few places, f32 (n,)."""
+        return _look(self.usual)
+
+    def untouched(self) -> Array:
+        """Return the background, or the usual picture without one."""
+        return self.usual if self.background is None else self.background
+
+
+@dataclass(frozen=True, eq=False)
+class UnitHealth:
+    """The checks of a unit, and its usual picture."""
+
+    sensor: str
+    unit: str
+    rows: int
+    checks: tuple[Check, ...]
+    picture: Array
+
+    @property
+    def faults(self) -> tuple[Check, ...]:
+        """The checks that failed."""
+        return tuple(check for check in self.checks if check.ok is False)
+
+    @property
+    def verdict(self) -> str:
+        """Return "good", or the names of the faults."""
+        return ", ".join(check.name for check in self.faults) or "good"
+
+
+def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
+    """Yield the frames of each unit of a manifest, or of each dataset and sensor where no unit is named.
+
+    At most RECORDINGS evenly spaced recordings are read, and FRAMES of each. Pictures that cannot be read are left out.
+    """
+    names = ("dataset", "sensor", "unit")
+    codes = np.stack([manifest.codes(name) for name in names], 1)
+    sequence, split = manifest.codes("sequence", own=True), manifest.text_column("split")
+    number, stride = np.asarray(manifest.column("frame_index")), np.asarray(manifest.column("stride").fill_null(1))
+    for group in group_rows(np.arange(len(manifest)), codes):
+        rows = group[split[group] != "background"]
+        ordered = rows[np.lexsort((number[rows], sequence[rows]))]
+        same = np.diff(sequence[ordered]) == 0
+        steps = (np.diff(number[ordered]) / stride[ordered[1:]])[same]
+        starts = np.flatnonzero(np.r_[True, ~same]) if len(ordered) else np.zeros(0, int)
+        parts = np.split(ordered, starts[1:]) if len(ordered) else []
+        chosen = [parts[i] for i in spread(np.arange(len(parts)), RECORDINGS)]
+        recordings = [read for part in chosen if (read := _pictures(manifest, part[:FRAMES]))]
+        free = _background(manifest, rows, group[split[group] == "background"])
+        if not recordings and free is not None:
+            recordings = [[free]]
+        shapes = [recording[0].shape for recording in recordings]
+        recordings = [r for r in recordings if r[0].shape == max(set(shapes), key=shapes.count)]
+        if recordings:
+            sensor, unit = (str(manifest.column(name)[int(group[0])].as_py() or "") for name in names[1:])
+            yield UnitFrames(sensor, unit, recordings, free, steps, len(rows))
+
+
+def _pictures(manifest: Manifest, rows: Array) -> list[Array]:
+    pictures = []
+    for row in rows.tolist():
+        try:
+            pictures.append(decode(manifest.file(row)))
+        except UserError:
+            continue
+    return [picture for picture in pictures if picture.shape == pictures[0].shape]
+
+
+def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
+    """Return the commonest background picture of `rows`, or the first picture of the `free` rows."""
+    paths = [manifest.file(int(row), "background_path") for row in rows[manifest.present("background_path")[rows]]]
+    paths = [max(set(paths), key=paths.count)] if paths else [manifest.file(int(row)) for row in free]
+    for path in paths:
+        try:
+            return decode(path)
+        except UserError:
+            continue
+    return None
+
+
+def examine(
+    unit: UnitFrames, references: Sequence[Array] = (), others: Sequence[UnitFrames] = (), only: str | None = None
+) -> UnitHealth:
+    """Return the checks of a unit, or the one called `only`.
+
+    `references` are pictures of untouched gels of the same sensor family, upright and with colours in order. `others`
+    are the other units of the data, among which exchanged recordings are looked for.
+    """
+    checks: dict[str, Callable[[], Check]] = {
+        "orientation and colours": lambda: check_layout(unit, references), "one unit": lambda: _one_unit(unit, others),
+        "exposure": lambda: _exposure(unit), "focus": lambda: _focus(unit), "frozen frames": lambda: _frozen(unit),
+        "dropped frames": lambda: _dropped(unit), "tint drift": lambda: _tint(unit), "worn gel": lambda: _scratch(unit),
+        "dead pixels": lambda: _dead(unit), "background": lambda: _background_fits(unit),
+        "contact": lambda: _contact(unit),
+    }  # fmt: skip
+    chosen = checks.values() if only is None else (checks[only],)
+    return UnitHealth(unit.sensor, unit.unit, unit.rows, tuple(check() for check in chosen), unit.usual)
+
+
+def check_units(units: Sequence[UnitFrames], references: Mapping[str, Sequence[Array]]) -> list[UnitHealth]:
+    """Return the health of all units; `references` by sensor are joined by the other units of the same sensor."""
+    results = []
+    for unit in units:
+        others = [other for other in units if other.sensor == unit.sensor and other is not unit]
+        known = [*references.get(unit.sensor, ()), *(other.untouched() for other in others)]
+        results.append(examine(unit, known, others))
+    return results
+
+
+def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
+    """Compare orientation and colour order with the references: which turn and order of colours fits them best?
+
+    A sensor may look nearly the same when it is mirrored. Then the small part that changes sign decides, if it has the
+    same sign in the references.
+    """
+    name = "orientation and colours"
+    if not references:
+        return Check(name, None, "no reference of this sensor")
+    picture, known = unit.untouched(), np.stack([_layout(reference) for reference in references])
+    own, scores, signs = _layout(picture), dict[tuple[tuple[int, bool], bool], float](), list[float]()
+    shapes = np.log([reference.shape[1] / reference.shape[0] for reference in references])
+    shape = np.log(picture.shape[1] / picture.shape[0])
+    for turn, swap in product(_TURNS, (False, True)):
+        if abs((-shape if turn[0] % 2 else shape) - np.median(shapes)) > 0.2:
+            continue
+        scores[turn, swap] = float(np.mean(np.sort((known * _turned(own, turn, swap)).sum((1, 2, 3)))[-3:]))
+        change = known.mean(0) - np.mean([_turned(one, turn, swap) for one in known], axis=0)
+        along = float((known.mean(0) * change).sum())
+        agrees = len(known) >= _FEWEST and np.mean((known * change).sum((1, 2, 3)) > 0) >= 0.8
+        if agrees and along > 1e-3 and (own * change).sum() < _OTHER_SIGN * along:
+            signs.append(scores[turn, swap])
+    if not scores or max(scores.values()) < _LIKE:
+        return Check(name, None, f"unlike its family ({max(scores.values(), default=0):.2f})")
+    upright = scores.pop((_TURNS[0], False), -1.0)
+    best = max(scores, key=lambda key: scores[key])
+    margin = scores[best] - upright
+    if margin <= LIMITS["orientation"] and not signs:
+        return Check(name, True, f"fits ({upright:.2f})")
+    # The picture was turned by the inverse of what makes it fit.
+    (turns, mirrored), swap = best
+    done = (turns, True) if mirrored else (-turns % 4, False)
+    what = " and ".join(filter(None, (_NAMES.get(done, ""), "red and blue exchanged" if swap else "")))
+    cure = _OPTIONS.get(done, "a turn and a mirror") if done != _TURNS[0] else ""
+    advice = " and ".join(filter(None, (cure, "red and blue exchanged" if swap else "")))
+    return Check(name, False, f"{what} ({margin:+.2f})", f"Read it with {advice}.")
+
+
+def _layout(picture: Array) -> Array:
+    """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1, without brightness and contrast."""
+    small = scale_picture(np.ascontiguousarray(picture))
+    small = close_dots(small) if has_dots(small) else small
+    small = cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
+    small -= small.mean()
+    return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6))
+
+
+def _turned(layout: Array, turn: tuple[int, bool], swap: bool) -> Array:
+    layout = np.rot90(layout[:, ::-1] if turn[1] else layout, turn[0])
+    return layout[..., ::-1] if swap else layout
+
+
+def _exposure(unit: UnitFrames) -> Check:
+    frames = np.concatenate(unit.small)[:, ::2, ::2]
+    lit = frames[frames.max(axis=3) > 8].reshape(-1, 3)  # without the black rim of a round gel
+    burnt = float((lit >= 252).any(1).mean()) if len(lit) else 0.0
+    mean = float(lit.mean()) if len(lit) else 0.0
+    ok = burnt <= LIMITS["exposure"] and 25 <= mean <= 225 and len(lit) > 0.4 * frames[..., 0].size
+    return Check("exposure", ok, f"mean {mean:.0f}, {burnt:.0%} saturated", "Change exposure, gain or light.")
+
+
+def _focus(unit: UnitFrames) -> Check:
+    """Compare details of one pixel with those of two: blur removes the first."""
+    shares, details = [], []
+    for frame in (recording[len(recording) // 2] for recording in unit.recordings):
+        grey = scale_picture(frame, 320).mean(2).astype(np.float32)
+        one, two = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 2))
+        details.append(float(np.std(one - two)))
+        shares.append(float(np.std(grey - one)) / (details[-1] + 1e-6))
+    share, detail = float(np.median(shares)), float(np.median(details))
+    if detail < LIMITS["detail"]:
+        return Check("focus", None, f"too few details ({detail:.2f})")
+    return Check("focus", share >= LIMITS["focus"], f"{share:.2f}", "Focus the camera, or clean its lens.")
+
+
+def _frozen(unit: UnitFrames) -> Check:
+    pairs = [np.array_equal(a, b) for r in unit.recordings for a, b in pairwise(r)]
+    if not pairs:
+        return Check("frozen frames", None, "stills")
+    share = float(np.mean(pairs))
+    return Check("frozen frames", share <= LIMITS["frozen"], f"{share:.0%} repeat", "Check cable, driver and buffer.")
+
+
+def _dropped(unit: UnitFrames) -> Check:
+    near = unit.steps[(unit.steps > 0) & (unit.steps <= 4)]  # a longer gap separates clips
+    if not len(near):
+        return Check("dropped frames", None, "stills")
+    share = float((near > 1).mean())
+    return Check("dropped frames", share <= LIMITS["dropped"], f"{share:.1%} of steps", "Lower the load or the rate.")
+
+
+def _tint(unit: UnitFrames) -> Check:
+    """Measure the drift of colour from the first recordings to the last, in logarithms of red and blue over green."""
+    if len(unit.recordings) < _FEWEST:
+        return Check("tint drift", None, "too few recordings")
+    colours = np.stack([np.median(middle, axis=(0, 1)) + 4 for middle in unit.middles])
+    tint = np.log(colours[:, [0, 2]] / colours[:, 1:2])
+    part = max(1, len(tint) // 4)
+    drift = float(np.abs(np.median(tint[-part:], 0) - np.median(tint[:part], 0)).max())
+    return Check("tint drift", drift <= LIMITS["tint"], f"{drift:.2f}", "Fix white balance and exposure.")
+
+
+def _dead(unit: UnitFrames) -> Check:
+    frames = [frame for recording in unit.recordings for frame in recording[:1]]
+    away = None
+    for frame in frames:
+        peak = np.abs(frame.astype(np.int16) - cv2.medianBlur(frame, 3)).max(2)
+        away = peak if away is None else np.minimum(away, peak)
+    count = 0 if away is None or len(frames) < 3 else int((away > 40).sum())
+    ok = None if len(frames) < 3 else count <= LIMITS["dead pixels"]
+    return Check("dead pixels", ok, str(count), "Mask them, or exchange the camera.")
+
+
+def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
+    """Return the usual picture minus the background, f32 (h, w, 3) at 160 pixels without tint, and where dots are not.
+
+    Shear moves dots a little. None without a background, or where dots cover most of the picture.
+    """
+    if unit.background is None or unit.background.shape != unit.frames[0].shape:
+        return None
+    gel = scale_picture(unit.background)
+    change, clear = unit.usual.astype(np.float32) - gel, np.ones(gel.shape[:2], np.float32)
+    change -= np.median(change, axis=(0, 1))
+    if has_dots(gel):
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_DOTS, _DOTS))
+        dots = cv2.morphologyEx(gel, cv2.MORPH_BLACKHAT, kernel).min(2) > DOT_DEPTH
+        clear -= cv2.dilate(dots.astype(np.uint8), np.ones((5, 5)))
+    return None if clear.mean() < 0.3 else (change * clear[..., None], clear)
+
+
+def _blurred(change: Array, clear: Array, sigma: float) -> Array:
+    """Return the blurred change of the clear pixels alone."""
+    weight = cv2.GaussianBlur(clear, (0, 0), sigma)
+    return np.asarray(cv2.GaussianBlur(change, (0, 0), sigma) / np.maximum(weight, 0.1)[..., None])
+
+
+def _scratch(unit: UnitFrames) -> Check:
+    """Look for a long thin pattern that never moves and that the background lacks: a scratch, a tear, a hair."""
+    name, found = "worn gel", _difference(unit)
+    if found is None or len(unit.recordings) < _FEWEST:
+        return Check(name, None, "no background" if found is None else "too few recordings")
+    change, clear = found
+    thin = np.abs(_blurred(change, clear, 0.7) - _blurred(change, clear, 4)).max(2) * clear
+    lines = cv2.dilate((thin[4:-4, 4:-4] > LIMITS["scratch"]).astype(np.uint8), np.ones((3, 3)))
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(lines)
+    value = float(np.hypot(boxes[1:, 2], boxes[1:, 3]).max(initial=0))
+    advice = "Clean or exchange the gel, and record its background again."
+    return Check(name, value <= LIMITS["scratch length"], f"fixed line of {value:.0f} pixels", advice)
+
+
+def _background_fits(unit: UnitFrames) -> Check:
+    """Compare the background with the usual picture: a press in one of them is a broad difference."""
+    name, found = "background", _difference(unit)
+    if found is None or len(unit.recordings) < _FEWEST:
+        return Check(name, None, "no background" if found is None else "too few recordings")
+    value = float(np.percentile(np.abs(_blurred(*found, 3)).max(2)[4:-4, 4:-4], 98))
+    advice = "Record the background again, with nothing on the gel. Or the touch never ends."
+    return Check(name, value <= LIMITS["background"], f"differs by {value:.1f}", advice)
+
+
+def _contact(unit: UnitFrames) -> Check:
+    """Report the share of frames in contact. All or none of many recordings is a fault of the data."""
+    if unit.background is None or unit.background.shape != unit.frames[0].shape:
+        return Check("contact", None, "no background")
+    if len(unit.recordings) < _FEWEST:
+        return Check("contact", None, "too few recordings")
+    gel, limit = UntouchedGel(unit.background), THRESHOLDS.get(unit.sensor, DEFAULT_THRESHOLD)
+    frames, moves = np.concatenate(unit.small)[::3], UntouchedGel(unit.usual)
+    touched = np.array([gel.score(frame) > limit for frame in frames])
+    still = np.mean([moves.score(frame) < limit / 2 for frame in frames]) if touched.all() else 0.0
+    constant = touched.all() and still > 0.9
+    advice = "The touch never ends: check what rests on the gel, and the background."
+    return Check("contact", not constant, f"{touched.mean():.0%} of frames", advice)
+
+
+def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
+    """Look for recordings that look like another gel: two units in one folder, or left and right exchanged."""
+    name = "one unit"
+    if len(unit.recordings) < _FEWEST:
+        return Check(name, None, "too few recordings")
+    looks = np.stack([_look(middle) for middle in unit.middles])
+    middle = np.median(looks, axis=0)
+    own = np.sqrt(np.mean((looks - middle) ** 2, axis=1))
+    for other in others:
+        if other.frames[0].shape == unit.frames[0].shape and len(other.recordings) >= _FEWEST:
+            away = np.sqrt(np.mean((looks - other.look) ** 2, axis=1))
+            share = float(((own > LIMITS["two units"] / 2) & (away < 0.4 * own)).mean())
+            if share >= _SHARE:
+                advice = "Sort them by unit. Left and right may be exchanged."
+                return Check(name, False, f"{share:.0%} of recordings look like {other.unit or 'another'}", advice)
+    share, value = float((own > LIMITS["two units"]).mean()), float(np.percentile(own, 95))
+    return Check(name, share < _SHARE, f"looks differ by {value:.0f}", "The folder seems to have two units. Sort them.")
+
+
+def _look(picture: Array) -> Array:
+    small = scale_picture(picture)
+    small = close_dots(small) if has_dots(small) else small
+    return cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
+
+
+def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
+    """Return whether features (n, d) of frames in contact (n,) bool differ from the others more than by chance.
+
+    The value is the distance of the two means over the spread within them. The limit is the largest value of `draws`
+    random assignments but a twentieth.
+    """
+    if min(contact.sum(), (~contact).sum()) < _FEWEST:
+        return Check("contact visible to the encoder", None, "too few frames with or without contact")
+
+    def apart(touched: Array) -> float:
+        within = np.concatenate([features[side] - features[side].mean(0) for side in (touched, ~touched)])
+        gap = features[touched].mean(0) - features[~touched].mean(0)
+        return float(np.linalg.norm(gap) / np.sqrt(np.square(within).sum(1).mean() + 1e-12))
+
+    rng = np.random.default_rng(0)
+    chance = np.quantile([apart(rng.permutation(contact)) for _ in range(draws)], 0.95)
+    value = apart(contact)
+    advice = "This encoder does not see contact of this unit. Check the checks above, or adapt it."
+    return Check("contact visible to the encoder", bool(value > chance), f"{value:.2f} (chance {chance:.2f})", advice)
+
+
+def health_sheet(results: Sequence[UnitHealth], path: Path) -> None:
+    """Write a PNG with the usual picture of each unit, its name and its verdict."""
+    from anytouch_jax.files import atomic_write
+
+    bands = []
+    for unit in results:
+        band = np.full((132, 720, 3), 255, np.uint8)
+        tile = scale_picture(unit.picture, 124)[..., ::-1]
+        band[4 : 4 + tile.shape[0], 4 : 4 + tile.shape[1]] = tile
+        lines = [f"{unit.sensor} {unit.unit}: {unit.verdict}", *(f"{c.name}: {c.value}" for c in unit.faults)]
+        for place, line in enumerate(lines[:6]):
+            colour = (60, 60, 230) if unit.faults else (80, 150, 60)
+            text = line.encode("ascii", "replace").decode()[:80]
+            cv2.putText(band, text, (140, 20 + 20 * place), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+        bands.append(band)
+    atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())

@@ -3,7 +3,7 @@
     python -m experiments.compare.run
     python -m experiments.compare.run --encoders a=FILE b=FILE --data manifest.parquet --label material
 
-Each figure is a line of `experiments/results/compare.jsonl`, and the page is made from that file alone (`--page`).
+Each figure is a line of `experiments/results/compare.jsonl`, and the page is made from that file alone (`--render`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from anytouch_jax import load_encoder
 from anytouch_jax.cli.app import main
 from anytouch_jax.encoder.base import Encoder
 from anytouch_jax.errors import UserError
@@ -28,7 +29,8 @@ from experiments.benchmarks import machine
 from experiments.benchmarks.workloads import products
 from experiments.command import run_script
 from experiments.compare.families import FORMS, OURS, untrained
-from experiments.compare.page import page
+from experiments.compare.page import compare_encoders
+from experiments.pages import page
 from experiments.records import write_record
 
 PROTOCOLS = ("honest", "published")
@@ -44,7 +46,7 @@ class Options:
     only: tuple[str, ...] = ()  # Measure only these families (default: all, or none with --encoders).
     repeats: int = 5  # Timed calls of each family.
     out: Path = Path("experiments/results/compare.jsonl")  # The file of results.
-    page: bool = False  # Make the page from the file of results, and nothing else.
+    render: bool = False  # Make the page from the file of results, and nothing else.
 
 
 def costs(encoder: Encoder, repeats: int) -> dict[str, Any]:
@@ -97,7 +99,7 @@ def accuracy(name: str, file: str, data: tuple[Path, ...], label: str, protocol:
 def run(options: Options) -> int:
     """Measure, probe, and write the page."""
     wanted = options.only or (() if options.encoders else (*FORMS, *OURS))
-    if options.page:
+    if options.render:
         wanted = ()
     elif unknown := [name for name in wanted if name not in {*FORMS, *OURS}]:
         raise UserError(f"there is no family {unknown[0]!r}; choose from {', '.join((*FORMS, *OURS))}")
@@ -106,14 +108,18 @@ def run(options: Options) -> int:
     for name in wanted:
         write_record(options.out, f"cost/{name}", costs(untrained(name), options.repeats))
         print(name, flush=True)
-    for pair in () if options.page else options.encoders:
+    for pair in () if options.render else options.encoders:
         name, equals, file = pair.partition("=")
         if not (equals and name and file):
             raise UserError(f"{pair!r} is no NAME=FILE; write --encoders mine=runs/stage2")
+        encoder = load_encoder(file)
+        write_record(options.out, f"cost/{name}", costs(encoder, options.repeats))
         for protocol in PROTOCOLS:
             score = accuracy(name, file, options.data, options.label, protocol)
             write_record(options.out, f"accuracy/{name}/{options.label}/{protocol}", score)
-    atomic_write(options.out.with_suffix(".md"), page(options.out))
+    made = compare_encoders(options.out.parent, options.out.name)
+    page.draw(made, options.out.parent / "figures" / f"{made.name}.png")
+    atomic_write(options.out.with_suffix(".md"), page.text(made))
     return 0
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+from experiments.compare.page import NAME as COMPARED
+from experiments.compare.page import compare_encoders
 from experiments.pages import matrix, page, speed, studies
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -27,6 +29,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "memory": (speed.MEMORY, speed.memory),
     "photometry": (speed.SIMULATOR, speed.photometry),
     "contact": (speed.SIMULATOR, speed.contact),
+    "compare": (COMPARED, compare_encoders),
 }
 
 

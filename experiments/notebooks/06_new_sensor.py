@@ -5,6 +5,10 @@
 # everything else stays frozen.
 
 # %%
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pyarrow.compute as pc
@@ -12,17 +16,29 @@ import pyarrow.compute as pc
 import anytouch_jax as at
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import replace_column
-from anytouch_jax.encoder.adapt import adapt
+from anytouch_jax.encoder.adapt import adapt, save
 from anytouch_jax.encoder.embed import text_column
-from anytouch_jax.weights.registry import locate
-from experiments.notebooks.scenes import deepest, embed, scenes, show
+from experiments.notebooks.scenes import deepest, embed, scenes, show, small
 
-table = scenes()
-renamed = pc.replace_substring(table.table["sensor"].cast("string"), "duragel", "my_gel")
-table = replace_column(table, "sensor", renamed)
+files = scenes()
+renamed = pc.replace_substring(files.table["sensor"].cast("string"), "duragel", "my_gel")
+table = replace_column(files, "sensor", renamed)
 rows = np.concatenate([deepest(table, split, most) for split, most in (("train", 60), ("test", 40))])
 mine = rows[text_column(table, "sensor")[rows] == "my_gel"]
 show([decode(table.file(int(row))) for row in mine[:5]], ["my_gel"] * 5, across=5)
+
+# %% [markdown]
+# ## An encoder that never met the sensor
+#
+# We train a small stage 1 on the two other sensors. You would take your own run here.
+
+# %%
+work = Path(tempfile.mkdtemp())
+config = small(at.preset("tiny", stage=1), steps=60, batch=16)
+config = replace(config, model=replace(config.model, sensors=("gelsight_mini", "digit", "universal")))
+config = config.with_settings({"data.manifests": tuple(map(str, files.files)), "data.on_bad_sample": "skip"})
+done = at.pretrain(config, work / "stage1", log=lambda _: None)
+print(done.step, "steps")
 
 # %% [markdown]
 # ## Fit the tokens
@@ -31,7 +47,8 @@ show([decode(table.file(int(row))) for row in mine[:5]], ["my_gel"] * 5, across=
 # `anytouch adapt --frames 20` does.
 
 # %%
-fitted = adapt(locate("anytouch-tiny"), table, "my_gel", frames=20, labels="indenter", steps=40, log=lambda _: None)
+fitted = adapt(work / "stage1", table, "my_gel", frames=20, labels="label.indenter", steps=60, log=lambda _: None)
+save(fitted, work / "stage1", work / "my_gel")
 plt.figure(figsize=(6, 2.6))
 plt.plot(fitted.history)
 plt.xlabel("step")
@@ -45,8 +62,7 @@ plt.show()
 # A probe learns the indenter from frames of the known sensors, and names it on frames of `my_gel`.
 
 # %%
-universal = at.load_encoder("anytouch-tiny")
-adapted = universal.__class__(fitted.config, fitted.params, "my_gel fitted")
+universal, adapted = at.load_encoder(work / "stage1"), at.load_encoder(work / "my_gel")
 known = text_column(table, "sensor")[rows] != "my_gel"
 split = np.where(known, "train", "test")[known | (text_column(table, "split")[rows] == "test")]
 rows = rows[known | (text_column(table, "split")[rows] == "test")]

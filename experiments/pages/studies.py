@@ -231,7 +231,8 @@ def translation(folder: Path) -> Page:
         errors: dict[tuple[str, str], dict[str, dict[int, float]]] = {}
         for one in runs:
             about = one["settings"]
-            row = errors.setdefault((about["name"], about["fit"]["tune"]), {})
+            tune = "scratch" if about["name"] == PIXELS else about["fit"]["tune"]
+            row = errors.setdefault((about["name"], tune), {})
             row.setdefault(f"{about['from']}-{about['to']}", {})[about["fit"]["seed"]] = one["error"]
         for (encoder, tune), by_task in errors.items():
             values = [over_seeds([*by_task[task].values()]) if task in by_task else None for task in TRANSLATIONS]

@@ -88,7 +88,7 @@ def main() -> int:
         return 1
     venv.create(folder / "venv", with_pip=True)
     python = folder / "venv" / "bin" / "python"
-    ran(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel, cwd=folder)
+    ran(python, "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check", wheel, cwd=folder)
     print("installed into an empty environment", flush=True)
     (folder / "empty").mkdir()
     for code, shown in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8")):

@@ -48,7 +48,8 @@ show_file(work / "losses.png")
 # %% [markdown]
 # ## What was learned
 #
-# Features of the same press by three sensors, before and after: each row is compared with all others.
+# The cosine of each touch with all others: red is alike, blue is not. The first three are one press by three sensors,
+# the last three another. You want two red squares.
 
 # %%
 touches = at.example_touches()

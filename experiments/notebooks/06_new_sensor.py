@@ -23,7 +23,7 @@ from experiments.notebooks.scenes import deepest, embed, scenes, show, small
 files = scenes()
 renamed = pc.replace_substring(files.table["sensor"].cast("string"), "duragel", "my_gel")
 table = replace_column(files, "sensor", renamed)
-rows = np.concatenate([deepest(table, split, most) for split, most in (("train", 60), ("test", 40))])
+rows = np.concatenate([deepest(table, split, most) for split, most in (("train", 50), ("test", 40))])
 mine = rows[text_column(table, "sensor")[rows] == "my_gel"]
 show([decode(table.file(int(row))) for row in mine[:5]], ["my_gel"] * 5, across=5)
 
@@ -34,7 +34,7 @@ show([decode(table.file(int(row))) for row in mine[:5]], ["my_gel"] * 5, across=
 
 # %%
 work = Path(tempfile.mkdtemp())
-config = small(at.preset("tiny", stage=1), steps=60, batch=16)
+config = small(at.preset("tiny", stage=1), steps=40, batch=16)
 config = replace(config, model=replace(config.model, sensors=("gelsight_mini", "digit", "universal")))
 config = config.with_settings({"data.manifests": tuple(map(str, files.files)), "data.on_bad_sample": "skip"})
 done = at.pretrain(config, work / "stage1", log=lambda _: None)
@@ -47,10 +47,10 @@ print(done.step, "steps")
 # `anytouch adapt --frames 20` does.
 
 # %%
-fitted = adapt(work / "stage1", table, "my_gel", frames=20, labels="label.indenter", steps=60, log=lambda _: None)
+fitted = adapt(work / "stage1", table, "my_gel", frames=20, labels="label.indenter", steps=40, log=lambda _: None)
 save(fitted, work / "stage1", work / "my_gel")
 plt.figure(figsize=(6, 2.6))
-plt.plot(fitted.history)
+plt.plot(fitted.losses)
 plt.xlabel("step")
 plt.ylabel("loss of the twenty frames")
 plt.tight_layout()

@@ -11,13 +11,17 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from places import ROOT
 from tiny_models import tiny_config
 
 from anytouch_jax.cli.app import COMMANDS, GROUPS
 from anytouch_jax.config import preset
+from anytouch_jax.data.manifest.manifest import from_columns
 from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.encoder.export import export
+from anytouch_jax.encoder.novelty import Calibration
+from anytouch_jax.evaluate.heads import LinearHead, save_head
 from anytouch_jax.nn.functional import build
 
 MAKEFILE = (ROOT / "Makefile").read_text()
@@ -86,6 +90,16 @@ def test_the_python_of_a_page_runs_and_prints_what_it_shows(
         shutil.copy(golden / "anytouch2_checkpoint-4frames.pth", "anytouch2.pth")
         shutil.copytree(golden / "dinov2_registers_hf", "dinov2")
         Path("config.json").write_text('{"num_attention_heads": 3}')
+    if name.endswith(("retrieval.md", "trust.md", "health.md")):
+        names |= {"encoder": random_encoder(tiny_config()), "frames": np.zeros((2, 1, 28, 28, 3), np.uint8)}
+        width = names["encoder"].encode_touch(names["frames"]).shape[1]
+        np.savez("touches.npz", features=np.eye(width, dtype=np.float32), rows=np.arange(width))
+        known = Calibration(1.0, 0.9, 0.5, 0.05, 9.0, 20, np.eye(width), np.zeros((5, width)), np.full(5, "digit"))
+        arrays = (np.array(["ball", "cube"]), np.ones((width, 1)), np.zeros(1), np.zeros(width), np.ones(width))
+        save_head("head.npz", LinearHead(*arrays, "object", "class", 1, "f", known))
+        Image.fromarray(np.full((60, 80, 3), 90, np.uint8)).save("a.png")
+        row = {"path": ["a.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
+        names["manifest"] = from_columns(row, tmp_path / "m.parquet")
     for code, shown in BLOCK.findall(PAGES[name]):
         capsys.readouterr()
         exec(code, names)

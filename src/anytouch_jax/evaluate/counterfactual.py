@@ -150,7 +150,9 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
             points = f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to {100 * least['high']:.1f})"
             sentence = f"Touch matters for {key[0]}: it adds {points} to {least['control']}"
             late = own.get(SHIFTED)
-            if late is not None and late["low"] is not None:
+            if (
+                late is not None and late["low"] is not None and (late["low"], late["high"]) != (0, 0)
+            ):  # no other moment
                 sentence += ", and the moment matters" if late["low"] > 0 else ", and any moment of a recording serves"
         else:
             failed = ", ".join(gain["control"] for gain in without if gain not in above)

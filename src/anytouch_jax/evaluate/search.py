@@ -1,7 +1,7 @@
 """Search by touch: the nearest of many stored features to a frame, a clip or a sentence.
 
 The index is a features file of `anytouch embed`. Search is exact, by numpy. With `approximate`, usearch (an extra)
-builds a graph of neighbours, which pays for itself from about a million features on.
+builds a graph of neighbours. `experiments/benchmarks/search.py` measures both.
 """
 
 from __future__ import annotations

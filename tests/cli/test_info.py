@@ -65,6 +65,14 @@ def test_weights_report_whose_names_they_have(anytouch, tmp_path):
         other = touch_model(patch_encoder=kind)
         export_safetensors(theirs, build(other).init(jax.random.key(0)), {safetensors.MODEL_KEY: to_json(other)})
         assert f"{kind} patches of 7" in anytouch("info", theirs).out
+    whole = {safetensors.MODEL_KEY: to_json(model), safetensors.BACKGROUND_KEY: "either"}
+    export_safetensors(ours, params, whole)
+    assert "background: either" in anytouch("info", ours).out
+    export_safetensors(ours, params, whole | {safetensors.BACKGROUND_KEY: "no"})
+    assert "cannot be used: --data.background must be one of" in anytouch("info", ours).out
+    safetensors.write_safetensors(theirs, convert.to_release(params, model), {safetensors.MODEL_KEY: ""})
+    done = anytouch("info", theirs)  # an empty description is a damaged one
+    assert done.status == 2 and "not JSON" in done.err
     params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
     export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model)})
     assert "not finite" in anytouch("info", ours).out

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import sys
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -97,3 +99,45 @@ def test_a_broken_tiff_or_bmp_prints_nothing_of_opencv(capfd):
 def test_an_animation_gives_its_first_picture():
     moving = _saved("PNG", save_all=True, append_images=[Image.fromarray(255 - RGB)])
     np.testing.assert_array_equal(decode_bytes(moving, "x"), RGB)
+
+
+def test_decoders_print_nothing_and_no_thread_loses_a_line(capfd, tmp_path):
+    jpeg, png = _saved("JPEG"), _saved("PNG")
+    noisy = [jpeg[:-40] + b"\xff\xd9", jpeg[:-60] + b"\xff\x3a" + jpeg[-58:], png[:-20] + b"\0" + png[-19:]]
+    for data in noisy:  # today's decoders do print
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert len(capfd.readouterr().err.splitlines()) >= 2
+
+    def decode(_: int) -> None:
+        for data in noisy * 20:
+            with contextlib.suppress(ImageError):
+                decode_bytes(data, "x")
+
+    with ThreadPoolExecutor(4) as pool:
+        working = [pool.submit(decode, number) for number in range(4)]
+        for number in range(100):
+            print(f"our line {number}", file=sys.stderr, flush=True)
+        for one in working:
+            one.result()
+    assert capfd.readouterr().err.splitlines() == [f"our line {number}" for number in range(100)]
+    cv2.imdecode(np.frombuffer(noisy[0], np.uint8), cv2.IMREAD_UNCHANGED)
+    assert capfd.readouterr().err, "a decoder outside this library prints as before"
+
+
+@pytest.mark.parametrize(("code", "ending"), [("MJPG", "avi"), ("mp4v", "mp4")])
+def test_videos_print_nothing(capfd, tmp_path, code, ending):
+    path = tmp_path / f"film.{ending}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 10, (64, 48))
+    for _ in range(12):
+        writer.write(cv2.resize(RGB, (64, 48)))
+    writer.release()
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    capfd.readouterr()
+    for number in range(12):
+        bad = bytearray(data[: len(data) // 2] if number == 0 else data)
+        for at in rng.integers(12, len(bad), 4 * number):
+            bad[at] ^= 0x55
+        path.write_bytes(bad)
+        with contextlib.suppress(ImageError):
+            list(images.timed_frames(path))
+    assert capfd.readouterr() == ("", "")

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import pyarrow as pa
 import pytest
 from runs import run_config, train
 from touch_world import make_touches
@@ -14,6 +15,7 @@ from touch_world import make_touches
 from anytouch_jax.cli import app
 from anytouch_jax.config import baselines, from_json, to_json
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder import adapt as module
 from anytouch_jax.encoder.adapt import adapt, choose_frames, save
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
@@ -252,3 +254,39 @@ def test_the_command(run, data, tmp_path, capsys):
         del args[args.index(name) : args.index(name) + 2]
     assert app.main([str(arg) for arg in [*args, tmp_path / "none"]]) == 0
     assert "gelslim has the universal tokens" in capsys.readouterr().out
+
+
+def test_prototypes_of_features_of_any_length(run, table, monkeypatch):
+    labels = np.array(["hard", "soft"])[np.arange(len(table)) % 2]
+    table = manifests.replace_column(table, "label.hardness", pa.array(labels))
+    values = RNG.normal(size=(len(table), 12)).astype(np.float32)
+    values[0] = 0
+
+    def prototypes(scale):
+        monkeypatch.setattr(module, "embed_rows", lambda encoder, manifest, rows, log: (rows, values[rows] * scale))
+        return module._classes(run, table, "gelslim", "hardness", print)[1]
+
+    plain = prototypes(np.float32(1))
+    np.testing.assert_allclose(np.linalg.norm(plain, axis=1), 1, atol=1e-6)  # a row of zeros is no NaN
+    for power in (80, -80):
+        np.testing.assert_allclose(prototypes(np.float32(2.0**power)), plain, rtol=1e-6)
+
+
+def test_the_fit_does_not_depend_on_the_precision_of_jax(fitted, run, table):
+    with jax.enable_x64(True):
+        again = adapt(run, table, "gelslim", frames=8, labels="hardness", steps=40, log=lambda _: None)
+    assert again.losses == fitted[0].losses and (again.before, again.after) == (fitted[0].before, fitted[0].after)
+    tokens = [np.asarray(one.params["touch"]["sensor_tokens"]) for one in (again, fitted[0])]
+    np.testing.assert_array_equal(*tokens)
+    assert tokens[0].dtype == np.float32
+
+
+def test_a_run_whose_arrays_do_not_fit_is_refused_even_without_a_fit(run, table, data, tmp_path):
+    params, text, _ = checkpoint.load_params(run)
+    del params["touch"]["class_token"]
+    with pytest.raises(UserError, match="class_token"):
+        adapt(stored(tmp_path / "lost", from_json(text), params), table, "gelslim", frames=0)
+    params, text, _ = checkpoint.load_params(run)
+    params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
+    with pytest.raises(UserError, match="not finite"):
+        adapt(stored(tmp_path / "nan", from_json(text), params), table, "gelslim", frames=0)

@@ -388,3 +388,17 @@ def test_a_column_of_a_manifest_becomes_an_array_without_objects(tmp_path):
     assert force[0] == 1.5 and np.isnan(force[1]) and count.tolist() == [3, 4] and count.dtype.kind == "i"
     assert plain_column(table, "label.slip").tolist() == ["True", ""]
     assert plain_column(table, "label.pose").tolist() == ["[1.0, 2.0]", "[3.0]"]
+
+
+def test_features_do_not_depend_on_the_precision_of_jax(tiny_run):
+    def features():
+        encoder = load_encoder(tiny_run)
+        fresh = random_encoder(encoder.config, 3)
+        return [encoder.encode_touch(CLIPS[:, :3], "digit", pooling="both"), fresh.encode_touch(CLIPS[:, 0], "digit")]
+
+    plain = features()
+    with jax.enable_x64(True):
+        wide = features()
+    for one, other in zip(plain, wide, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert other.dtype == np.float32

@@ -201,3 +201,13 @@ def test_a_full_disk_is_one_sentence(encoder, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
         export(encoder, tmp_path / "file" / "m.bin", platforms=("cpu",))
+
+
+def test_an_artefact_does_not_depend_on_the_precision_of_jax(artefact, encoder, tmp_path):
+    path, about = artefact
+    plain = load(path)(CLIPS, ROWS)
+    with jax.enable_x64(True):
+        again = export(encoder, tmp_path / "model.bin", frames=3, platforms=("cpu", "cuda"))
+        np.testing.assert_array_equal(load(tmp_path / "model.bin")(CLIPS, ROWS), plain)
+        np.testing.assert_array_equal(load(path)(CLIPS, ROWS), plain)
+    assert again["worst_difference"] == about["worst_difference"]

@@ -122,3 +122,19 @@ def test_absent_towers_and_wrong_types_are_one_sentence(encoder, stored, tiny_ru
     object.__setattr__(other, "tokenizer_file", tmp_path / "tokenizer.json")
     with pytest.raises(UserError, match="tokens, the text tower"):
         other.encode_text(TEXTS)
+
+
+def test_towers_do_not_depend_on_the_precision_of_jax(stored):
+    touch = RNG.normal(size=(3, 12)).astype(np.float32)
+
+    def all_of_it():
+        encoder = load_encoder(stored.run)
+        texts = encoder.encode_text(TEXTS)
+        chances = encoder.similarity(touch, TEXTS, probabilities=True)
+        return [texts, encoder.encode_image(PHOTOS), chances, encoder.match(touch, touch[::-1])]
+
+    plain = all_of_it()
+    with jax.enable_x64(True):
+        wide = all_of_it()
+    for one, other in zip(plain, wide, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -26,10 +26,11 @@ from anytouch_jax.cli.app import guarded, main
 SECONDS = 60  # of one command
 MEMORY = 1 << 30  # bytes that a command may take more
 _LIMIT = 6 << 30  # bytes of address space that it gets, so that a bomb hurts nobody
+_TICK = 2  # seconds from one look at a command to the next
 LETTERS, LINES = 600, 60  # of one line of a message, of a message
 _ANSWERS = {0, 1, 2}
 # How `info` and `contact` report what they could not use, with status 0.
-_DAMAGE = re.compile("cannot be used|cannot embed|cannot be read|is damaged")
+_DAMAGE = re.compile("cannot be used|cannot embed|cannot be read|frames can be read|is damaged")
 _RULE = re.compile(r"[-|: ]*[╭╰─╮╯│]")  # the option parser draws boxes
 
 
@@ -141,32 +142,33 @@ def _memory(name: str) -> int:
     return int(line.split()[1]) << 10
 
 
-def _waited() -> float:
-    """Return the seconds that the thread which waited most has waited for a processor."""
-    files = Path("/proc/self/task").glob("*/schedstat")
-    waits = [0]
-    for file in files:
+def _waits() -> dict[str, float]:
+    """Return the seconds that each thread has waited for a processor."""
+    waits = {}
+    for file in Path("/proc/self/task").glob("*/schedstat"):
         with suppress(OSError, ValueError, IndexError):
-            waits.append(int(file.read_text().split()[1]))
-    return max(waits) / 1e9
+            waits[file.parent.name] = int(file.read_text().split()[1]) / 1e9
+    return waits
 
 
 @contextmanager
 def _bounded() -> Iterator[None]:
     """Raise `_HangError` after `SECONDS`, end the process long after that, and limit its memory."""
 
-    start, waited = time.monotonic(), _waited()
+    start, waited, before_tick = time.monotonic(), 0.0, _waits()
 
     def stop(*_: Any) -> None:
-        left = SECONDS + (_waited() - waited) - (time.monotonic() - start)  # a busy machine is no fault of the command
-        if left <= 0:
+        nonlocal waited, before_tick
+        waits = _waits()  # a busy machine is no fault of the command, nor of the threads that it starts one by one
+        waited += max((wait - before_tick.get(thread, 0.0) for thread, wait in waits.items()), default=0.0)
+        before_tick = waits
+        if time.monotonic() - start - waited >= SECONDS:
             raise _HangError
-        signal.setitimer(signal.ITIMER_REAL, max(left, 1))
 
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + _LIMIT, before[1]))
     handler = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, _TICK, _TICK)
     faulthandler.dump_traceback_later(20 * SECONDS, exit=True, file=sys.__stderr__)
     try:
         yield

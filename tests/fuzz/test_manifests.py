@@ -43,7 +43,7 @@ WRONG = {
     "image_path": ("../x.png", "missing.png", "/dev/zero", "C:\\x.png"),
 }
 # Values of these columns may be used by some commands, and refused by none.
-LENIENT = {"sensor": ("Digit ", "universal", "x" * 1_000_000, "dígit"), "frame_index": ("\u0661",)}
+LENIENT = {"sensor": ("Digit ", "universal", "x" * 1_000_000, "dígit"), "frame_index": ("\u0661",), "split": (" val",)}
 FILES_ONLY = ("path", "image_path")  # commands that open no file need not look at these
 
 

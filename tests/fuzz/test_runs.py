@@ -146,8 +146,9 @@ def metadata(rng, folder, record):
     rewritten(folder, record)
     wrong = (
         inner == "files"
-        or (name == "seen" and not isinstance(value, list))
-        or (name == "source" and not isinstance(value, dict))
+        or (inner == "metadata" and name == "seen" and not isinstance(value, list))
+        or (inner == "metadata" and name == "source" and not isinstance(value, dict))
+        or (inner == "metrics" and not (value is None or type(value) in (int, float)))
     )
     return kind, wrong, wrong  # most metadata are for the reader alone
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from anytouch_jax.cli.output import check_folder, log, print_table, refuse_unused
-from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, from_json
+from anytouch_jax.config import UNIVERSAL, Config, DataConfig, ModelConfig, from_json
 from anytouch_jax.errors import UserError, shorten
 
 if TYPE_CHECKING:
@@ -231,7 +231,9 @@ def _weights(path: Path, weights: Weights | None = None) -> list[str]:
     ]
     if layout not in ("clip", "openclip"):
         lines.append(_sensors(model, load.trained_sensors(metadata, model)))
+        background: Any = metadata.get(safetensors.BACKGROUND_KEY, "keep")
         try:
+            lines.append(f"background: {DataConfig(background=background).background}")
             to_params(weights, model)
         except UserError as error:
             lines.append(f"These weights cannot be used: {error}")
@@ -245,29 +247,26 @@ def _weights(path: Path, weights: Weights | None = None) -> list[str]:
 
 
 def _manifest(path: Path) -> list[str]:
-    import pyarrow.compute as pc
-
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.manifest.schema import listed
 
-    table = manifests.read(path)
-    columns = table.table.column_names
+    found = manifests.summarise_file(path)
 
     def counts(name: str) -> str:
-        entries = pc.value_counts(table.column(name)).to_pylist()
-        return listed(sorted(f"{entry['values'][:40]} {entry['counts']:,}" for entry in entries))
+        shown, distinct = found.counts[name]
+        return listed([f"{value[:40]} {rows:,}" for value, rows in shown], distinct)
 
     optional = ("image_path", "text", "background_path", "touch", "object", "field_path")
-    filled = [f"{name} {int(table.present(name).sum()):,}" for name in optional if name in columns]
-    labels = [name.removeprefix("label.") for name in columns if name.startswith("label.")]
+    filled = [f"{name} {found.filled[name]:,}" for name in optional if name in found.filled]
+    labels = [name.removeprefix("label.") for name in found.filled if name.startswith("label.")]
     return [
-        f"{path}: a manifest of {len(table):,} rows in {int(table.codes('sequence').max()) + 1:,} recordings, "
-        f"{len(table.clips(3)):,} clips of three frames",
+        f"{path}: a manifest of {found.rows:,} rows in {found.recordings:,} recordings, {found.clips:,} clips of three "
+        "frames",
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
         f"rows with {', '.join(filled) or 'no optional column'}",
         f"labels: {listed(labels) or 'none'}",
-        f"content {table.content_hash[:12]}",
+        f"content {found.digest[:12]}",
     ]
 
 

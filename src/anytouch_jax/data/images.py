@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
 import itertools
 import math
 import os
 import re
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -55,6 +57,42 @@ cv2.setNumThreads(1)  # the loader has threads already
 if "OPENCV_LOG_LEVEL" not in os.environ:  # our errors say what is wrong; OpenCV's log would hide them
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")
+
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # nothing; OpenCV reads it when a first video is opened
+
+
+class _Quiet:
+    """A context in which the C library's `stderr`, where libjpeg and libpng print, is /dev/null.
+
+    Python writes to descriptor 2, which does not change: no thread loses a sentence. Threads may be inside together. A
+    C library in which `stderr` is no variable is left alone.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._own, self._stream = threading.Lock(), 0, 0, None
+        if "CS_GNU_LIBC_VERSION" in getattr(os, "confstr_names", ()):
+            library = ctypes.CDLL(None)
+            library.fopen.restype = ctypes.c_size_t
+            self._null = library.fopen(os.devnull.encode(), b"w")
+            self._stream = ctypes.c_size_t.in_dll(library, "stderr") if self._null else None
+
+    def __enter__(self) -> None:
+        if self._stream is not None:
+            with self._lock:
+                if not self._inside:
+                    self._own, self._stream.value = self._stream.value, self._null
+                self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        if self._stream is not None:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside:
+                    self._stream.value = self._own
+
+
+QUIET = _Quiet()
 
 
 class Video(Protocol):
@@ -129,7 +167,8 @@ def _unpack(data: bytes) -> np.ndarray:
     orientation = _check_header(data)
     jpeg = data.startswith(_JPEG) and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
     try:
-        pixels = cv2.imdecode(np.frombuffer(chunks, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
+        with QUIET:
+            pixels = cv2.imdecode(np.frombuffer(chunks, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(error.err) from None
     if pixels is None:
@@ -276,7 +315,8 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     try:
         while True:
             try:
-                whole, frame = video.read()
+                with QUIET:
+                    whole, frame = video.read()
             except cv2.error as error:
                 raise ImageError(
                     f"frame {number} of {path} cannot be decoded: {' '.join(str(error).split())}"
@@ -315,7 +355,8 @@ def count_frames(path: str | Path) -> int:
 
 def open_video(path: str | Path) -> cv2.VideoCapture:
     """Open a video. FFmpeg takes the part of a relative name before a colon for a protocol."""
-    return cv2.VideoCapture(os.path.abspath(path))
+    with QUIET:
+        return cv2.VideoCapture(os.path.abspath(path))
 
 
 def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:

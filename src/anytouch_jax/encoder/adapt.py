@@ -21,6 +21,8 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.base import precision
 from anytouch_jax.encoder.embed import Log, embed_rows, text_column
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
@@ -30,6 +32,7 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
 from anytouch_jax.weights import checkpoint, compatible
+from anytouch_jax.weights.load import load_model
 
 Params = dict[str, Any]
 Loss = Callable[[Params, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32)
@@ -75,26 +78,30 @@ def adapt(
     metadata |= {"sensors": list(config.model.sensors), "source": source}
     metadata |= {"seen": [*stored["seen"], sensor]} if "seen" in stored else {}
     if labels is None or not frames:
+        load_model(run)  # refuses arrays that do not fit or are not finite, as the encoder below does
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", metadata)
-    classes, prototypes = _classes(run, manifest, sensor, labels, log)
-    fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
-    in_val = (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
-    rows, measured = fitted[:MEASURED], "fitted"
-    if count := min(int(in_val.sum()), MEASURED):
-        rows, measured = choose_frames(manifest, sensor, "val", count, classes, seed), "val"
-    net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
-    touch = {"touch": params["touch"]}
+    with precision(config):
+        classes, prototypes = _classes(run, manifest, sensor, labels, log)
+        fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
+        in_val = (
+            (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
+        )
+        rows, measured = fitted[:MEASURED], "fitted"
+        if count := min(int(in_val.sum()), MEASURED):
+            rows, measured = choose_frames(manifest, sensor, "val", count, classes, seed), "val"
+        net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
+        touch = {"touch": params["touch"]}
 
-    def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
-        z = net.encode_touch(params, normalise_touch(clip), jnp.full(clip.shape[0], row))
-        logits = losses.normalise(z) @ jnp.asarray(prototypes).T / net.model.temperature
-        return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, target))
+        def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
+            z = net.encode_touch(params, normalise_touch(clip), jnp.full(clip.shape[0], row))
+            logits = losses.normalise(z) @ jnp.asarray(prototypes).T / net.model.temperature
+            return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, target))
 
-    measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
-    clip = _read(manifest, config, fitted)
-    tokens, history = _fit(loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed)
-    before, after = float(measure(touch)), float(measure(_put(touch, row, tokens)))
-    return Adapted(config, _put(params, row, tokens), history, before, after, measured, metadata)
+        measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
+        clip = _read(manifest, config, fitted)
+        tokens, history = _fit(loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed)
+        before, after = float(measure(touch)), float(measure(_put(touch, row, tokens)))
+        return Adapted(config, _put(params, row, tokens), history, before, after, measured, metadata)
 
 
 def check_empty(out: Path) -> None:
@@ -196,11 +203,11 @@ def _classes(run: str | Path, manifest: Manifest, sensor: str, labels: str, log:
     names, class_ids = np.unique(value[rows], return_inverse=True)
     if len(names) < 2 or len(names) == len(rows):
         raise UserError(f"--labels {labels} must name classes: two values or more, each of several frames")
-    unit = values / np.linalg.norm(values, axis=1, keepdims=True)
+    unit = unit_rows(values)
     mean = np.stack([unit[class_ids == number].mean(axis=0) for number in range(len(names))])
     place = np.minimum(np.searchsorted(names, value), len(names) - 1)
     classes = np.where(names[place] == value, place, -1).astype(np.int32)
-    return classes, mean / np.linalg.norm(mean, axis=1, keepdims=True)
+    return classes, unit_rows(mean)
 
 
 def _read(manifest: Manifest, config: Config, rows: np.ndarray) -> np.ndarray:

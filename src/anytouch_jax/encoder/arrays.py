@@ -1,4 +1,4 @@
-"""Rows of sensors, and the spread of features. Only numpy is imported: `info` and an exported encoder need no more."""
+"""Unit rows, rows of sensors, and the spread of features. All in numpy, for `info` and an exported encoder."""
 
 from __future__ import annotations
 
@@ -12,6 +12,20 @@ from anytouch_jax.errors import UserError
 SPREAD_ROWS, SPREAD_LEAST = 2000, 0.99  # rows that are compared, and the mean cosine of nearly constant features
 
 
+def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, with the axes of `values`.
+
+    Float32 squares around 1e20 or 1e-25 are infinite or 0. Those of `np.ldexp(values, -e)` keep every digit.
+    """
+    return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
+
+
+def unit_rows(values: np.ndarray) -> np.ndarray:
+    """Return rows (n, d) divided by their Euclidean norms, of any magnitude; a row of zeros stays zero."""
+    values = np.ldexp(values, -binary_scale(values, 1))
+    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
+
+
 def spread_lines(values: np.ndarray) -> list[str]:
     """Return a line with the mean cosine of pairs of features (n, d), and a warning if they are nearly constant.
 
@@ -20,7 +34,7 @@ def spread_lines(values: np.ndarray) -> list[str]:
     rows = np.asarray(values[np.linspace(0, len(values) - 1, min(len(values), SPREAD_ROWS)).astype(int)], np.float64)
     if len(rows) < 2 or not np.isfinite(rows).all():
         return []
-    unit = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
+    unit = unit_rows(rows)
     count = len(unit)
     cosine = (np.square(unit.sum(axis=0)).sum() - np.square(unit).sum()) / (count * (count - 1))
     lines = [f"spread: the mean cosine of two features is {cosine:.4f}"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -166,7 +167,8 @@ class Encoder:
             self._compiled[key] = jax.jit(self.traceable(pooling, join))
         if not count:  # the network has no shape for nothing: embed one touch and return none
             frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
-        return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
+        with precision(self.config):
+            return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
 
     @cached_property
     def _placed(self) -> Params:
@@ -267,8 +269,15 @@ class Encoder:
         if method not in self._compiled:
             params |= {key: self.others[key] for key in more if key in self.others}
             net = build(usable(self.whole or self.config.model))
-            self._compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
-        return self._compiled[method]
+            with precision(self.config):
+                self._compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
+        compiled = self._compiled[method]
+
+        def call(*arguments: Any) -> jax.Array:
+            with precision(self.config):
+                return compiled(*arguments)
+
+        return call
 
     def part_params(self, name: str) -> Params:
         """Return the parameters of a part: image, text, decoder, matcher or logit_scale. Raises UserError."""
@@ -279,6 +288,11 @@ class Encoder:
 
 def _unit(values: npt.ArrayLike) -> np.ndarray:
     return np.asarray(losses.normalise(jnp.asarray(values, jnp.float32)))
+
+
+def precision(config: Config) -> AbstractContextManager[Any]:
+    """Return a context in which jax has 64 bits for a float64 model, and 32 for others, whatever JAX_ENABLE_X64 is."""
+    return jax.enable_x64(config.model.dtype == "float64")
 
 
 def check_frames(model: ModelConfig, frames: int) -> None:
@@ -304,7 +318,9 @@ def touch_features(
 def random_encoder(config: Config, seed: int = 0) -> Encoder:
     """Return an untrained encoder of the same form: the control of every probe."""
     config = touch_only(config)
-    return Encoder(config, {"touch": build(config.model).init(jax.random.key(seed))["touch"]}, f"random({seed})")
+    with precision(config):
+        params = {"touch": build(config.model).init(jax.random.key(seed))["touch"]}
+    return Encoder(config, params, f"random({seed})")
 
 
 def bare_model(model: ModelConfig) -> ModelConfig:

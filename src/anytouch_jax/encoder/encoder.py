@@ -14,7 +14,15 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from anytouch_jax.encoder.base import Encoder, bare_model, check_frames, random_encoder, touch_features, touch_only
+from anytouch_jax.encoder.base import (
+    Encoder,
+    bare_model,
+    check_frames,
+    precision,
+    random_encoder,
+    touch_features,
+    touch_only,
+)
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
@@ -83,6 +91,7 @@ def image_tower_encoder(path: str | Path) -> Encoder:
         raise UserError(f"{path} has no image tower; give a stage-2 run with one, or CLIP weights")
     tower = merge_lora(params, model.lora_alpha)["image"]
     bare = replace(bare_model(model), touch=model.image, sensor_tokens=0, patch_encoder="shared", pre_norm=True)
-    fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
+    with precision(loaded.config):
+        fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
     touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
     return Encoder(replace(loaded.config, model=bare), touch, f"{path} (image tower)")

@@ -64,7 +64,8 @@ class Exported:
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
         rows = rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
-        return np.asarray(self._run(frames, rows))
+        with jax.enable_x64(self.about["dtype"] == "float64"):
+            return np.asarray(self._run(frames, rows))
 
     def _row(self, name: str) -> int:
         sensors: dict[str, int] = self.about["sensors"]
@@ -119,9 +120,10 @@ def export(
         raise UserError(f"{path} is the name of the description; name the artefact .bin")
     # The only form of attention that every platform has and that takes any number of touches.
     plain = replace(encoder, config=replace(encoder.config, model=replace(model, attention="xla")))
-    data = _artefact(plain, frames, platforms, pooling, join)
     live = plain if model.attention == "cudnn" and _here() != "cuda" else encoder
-    differs, width = _worst(live, data, frames, pooling, join)
+    with jax.enable_x64(model.dtype == "float64"):
+        data = _artefact(plain, frames, platforms, pooling, join)
+        differs, width = _worst(live, data, frames, pooling, join)
     about = {
         "format": FORMAT,
         "file": path.name,

@@ -17,11 +17,12 @@ from PIL import Image
 from anytouch_jax.config import UNIVERSAL, Config, DataConfig, check_spelling
 from anytouch_jax.data.images import decode, to_rgb
 from anytouch_jax.encoder.arrays import rows_of_sensors
-from anytouch_jax.encoder.base import Encoder
+from anytouch_jax.encoder.base import Encoder, precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit, VitConfig, VitOutput
+from anytouch_jax.ops import losses
 from anytouch_jax.weights import families
 from anytouch_jax.weights.families import Family, FamilyModel, Preparation, Size
 from anytouch_jax.weights.tree import nest
@@ -74,8 +75,9 @@ class FamilyEncoder(Encoder):
 
     def untrained(self, seed: int = 0) -> Encoder:
         """Return an untrained encoder of the same form and preparation."""
-        fresh = self.part.init(jax.random.key(seed))
-        fresh = jax.tree.map(lambda x, trained: jnp.broadcast_to(x, trained.shape), fresh, self.params)
+        with precision(self.config):
+            fresh = self.part.init(jax.random.key(seed))
+            fresh = jax.tree.map(lambda x, trained: jnp.broadcast_to(x, trained.shape), fresh, self.params)
         computed = {name: self.params[name] for name in ("frequency",) if name in fresh}
         return replace(self, params=fresh | computed, source=f"random({seed})")
 
@@ -162,7 +164,8 @@ class FamilyEncoder(Encoder):
             self._compiled[key] = jax.jit(run)
         if not count:
             frames, rows = np.zeros((1, *frames.shape[1:]), np.float32), np.zeros(1, np.int32)
-        return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
+        with precision(self.config):
+            return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
 
     def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., jax.Array]:
         """Return the function from params, frames (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
@@ -240,7 +243,7 @@ def pooled(family: Family, form: VitConfig, found: VitOutput, pooling: Pooling) 
     mean = jnp.mean(patches[:, form.start :], axis=1)
     own = {"class": found.normed, "mean": found.normed}.get(family.feature, found.projected)[:, 0]
     if family.feature == "unit":
-        own = own * jax.lax.rsqrt(jnp.maximum(jnp.sum(own * own, axis=-1, keepdims=True), 1e-24))
+        own = losses.normalise(own)
     own = mean if family.feature == "mean" else own
     return {"class": own, "mean": mean}[pooling] if pooling != "both" else jnp.concatenate([own, mean], axis=-1)
 

@@ -21,7 +21,8 @@ import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.data.images import frame_time, open_video, to_rgb
+from anytouch_jax.data.images import QUIET, frame_time, open_video, to_rgb
+from anytouch_jax.encoder.base import precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
 from anytouch_jax.encoder.encoder import Encoder, check_frames
 from anytouch_jax.encoder.preprocess import Preprocess
@@ -138,7 +139,8 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
     live = str(name).isdecimal() and not Path(name).exists()
     if not live and not Path(name).is_file():
         raise UserError(f"there is no video {name}; give a video file, or the number of a camera, such as 0")
-    source = cv2.VideoCapture(int(str(name))) if live else open_video(name)
+    with QUIET:
+        source = cv2.VideoCapture(int(str(name))) if live else open_video(name)
     if not source.isOpened():
         raise UserError(
             f"camera {name} cannot be opened; check its number and its cable"
@@ -204,8 +206,9 @@ def compile_for_one(
     """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device."""
     run = jax.jit(encoder.traceable(pooling, join))
     touch = np.tile(encoder.blank, (1, frames, 1, 1, 1))
-    given = jax.device_put((encoder.params, touch, np.full(1, sensor, "i4")))
-    compiled = run.lower(*given).compile()
+    with precision(encoder.config):
+        given = jax.device_put((encoder.params, touch, np.full(1, sensor, "i4")))
+        compiled = run.lower(*given).compile()
     compiled(*given).block_until_ready()
     params, _, row = given
     return lambda clip: compiled(params, clip, row)
@@ -241,7 +244,8 @@ def _video_frames(source: Source) -> Iterator[Frame]:
     while True:
         begin = time.perf_counter()
         try:
-            whole, pixels = source.retrieve() if source.grab() else (False, None)
+            with QUIET:
+                whole, pixels = source.retrieve() if source.grab() else (False, None)
         except cv2.error as error:
             raise UserError(f"frame {number} of the video cannot be decoded: {' '.join(str(error).split())}") from None
         if not whole or pixels is None:
@@ -266,7 +270,8 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
         try:
             if source.grab():
                 grabbed = time.perf_counter()  # waiting for a camera is not decoding
-                whole, pixels = source.retrieve()
+                with QUIET:  # the decoder of a camera that sends JPEG
+                    whole, pixels = source.retrieve()
                 pixels = pixels if whole else None
         except cv2.error as error:
             reason = " ".join(str(error).split())

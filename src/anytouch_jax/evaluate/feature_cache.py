@@ -101,8 +101,7 @@ def encoder_features(
     def compute(rows: Array, frames: int) -> Array:
         sensor_row = encoder.config.model.universal_row if universal else None
         edit = partial(reorder_frames, order=order)
-        with jax.enable_x64(encoder.config.model.dtype == "float64"):  # JAX_ENABLE_X64 changes no feature
-            return embed_rows(encoder, table, rows, frames, pooling, join, sensor_row=sensor_row, edit=edit, log=log)[1]
+        return embed_rows(encoder, table, rows, frames, pooling, join, sensor_row=sensor_row, edit=edit, log=log)[1]
 
     return FeatureStore(compute, describe, folder)
 

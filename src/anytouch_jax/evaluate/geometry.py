@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.splits import subsample
-from anytouch_jax.evaluate.statistics import Array, unit_rows
+from anytouch_jax.evaluate.statistics import Array
 
 MOST = 4000  # rows that are compared in pairs
 

@@ -16,11 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.encoder import novelty
+from anytouch_jax.encoder.arrays import binary_scale, unit_rows
 from anytouch_jax.encoder.novelty import Assessment, Calibration
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import logistic
 from anytouch_jax.evaluate.logistic import Logistic
-from anytouch_jax.evaluate.statistics import Array, binary_scale, unit_rows
+from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.files import atomic_path, read_arrays
 
 if TYPE_CHECKING:
@@ -428,7 +429,9 @@ def _check_head(head: LinearHead) -> None:
             raise ValueError(f"{name} is {array.dtype} {array.shape}, not of shape {shape}")
         if name != "classes" and not np.isfinite(array).all():
             raise ValueError(f"{name} has values that are not finite")
-    if count < 2 or not width or not (head.scale > 0).all():
-        raise ValueError("it needs two classes, features, and scales above 0")
+    if count < 2 or not width or not (head.scale > 0).all() or not (head.label and head.fingerprint):
+        raise ValueError("it needs two classes, features, scales above 0, a label and the mark of an encoder")
+    if len(set(head.classes)) < count:
+        raise ValueError("it has a class twice")
     if head.pooling not in ("class", "mean", "both") or not 0 < head.frames < 1 << 20:
         raise ValueError(f"it has pooling {head.pooling[:40]} and {head.frames} frames")

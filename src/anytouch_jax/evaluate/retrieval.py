@@ -19,10 +19,11 @@ from sklearn.metrics import roc_auc_score
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.loading.matching import Matches, MatchKeys
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import Array, mean_interval, unit_rows
+from anytouch_jax.evaluate.statistics import Array, mean_interval
 from anytouch_jax.evaluate.tasks import best_rows, number_column
 
 Metric = Literal["cosine", "euclidean"]

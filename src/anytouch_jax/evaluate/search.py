@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import nearest
-from anytouch_jax.evaluate.statistics import Array, unit_rows
+from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.files import read_arrays
 
 SHOWN = ("path", "frame_index", "sensor", "unit", "sequence", "object")  # keys of a hit, besides labels
@@ -74,7 +75,7 @@ def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
     if any(array.shape != values.shape[:1] for array in keys.values()):
         raise UserError(f"{path}: its keys must be one for each of the {len(values)} rows. Embed again.")
     about = {name.removeprefix("about/"): str(array)[:200] for name, array in arrays.items() if name[:6] == "about/"}
-    unit = unit_rows(values.astype(np.float32)).astype(np.float32)
+    unit = unit_rows(values).astype(np.float32)
     return TouchIndex(unit, keys, about, str(path), _graph(unit) if approximate else None)
 
 

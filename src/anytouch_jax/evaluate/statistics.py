@@ -1,4 +1,4 @@
-"""Statistics of evaluations: bootstrap intervals over groups and seeds, unit rows, Markdown tables, plain JSON."""
+"""Statistics of evaluations: bootstrap intervals over groups and seeds, Markdown tables, plain JSON."""
 
 from __future__ import annotations
 
@@ -14,20 +14,6 @@ Array = npt.NDArray[Any]
 Protocol = Literal["honest", "published"]
 
 DRAWS = 10_000  # bootstraps of an interval: its ends are 0.03 standard errors off, with a tenth of the draws 0.09
-
-
-def binary_scale(values: Array, axis: int | None = None) -> Array:
-    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, with the axes of `values`.
-
-    Float32 squares around 1e20 or 1e-25 are infinite or 0. Those of `np.ldexp(values, -e)` keep every digit.
-    """
-    return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
-
-
-def unit_rows(values: Array) -> Array:
-    """Return rows (n, d) divided by their Euclidean norms, of any magnitude; a row of zeros stays zero."""
-    values = np.ldexp(values, -binary_scale(values, 1))
-    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
 
 
 class GroupSums(NamedTuple):

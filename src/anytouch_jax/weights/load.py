@@ -362,7 +362,7 @@ def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[
     It comes from the metadata if the file is ours, else from shapes and the configuration in the folder, which gives
     head counts and the activation. Raises WeightsError.
     """
-    if text := read_file_metadata(path).get(MODEL_KEY):
+    if (text := read_file_metadata(path).get(MODEL_KEY)) is not None:
         return from_json(text, ModelConfig), {}
     config, openclip = _folder_config(path)
     model, unknown = detect_form(weights, _stored_heads(path, config, openclip))
@@ -411,7 +411,7 @@ def clip_activation(path: str | Path) -> str | None:
     It stands in the metadata of our files, in HF's config.json, or in OpenCLIP's open_clip_config.json. Raises
     WeightsError for a file that is not JSON, and for an activation that this network does not have.
     """
-    if text := read_file_metadata(path).get(MODEL_KEY):
+    if (text := read_file_metadata(path).get(MODEL_KEY)) is not None:
         return str(from_json(text, ModelConfig).activation)
     config, openclip = _folder_config(path)
     towers = [tower for name in ("text_config", "vision_config") if isinstance(tower := config.get(name), dict)]

@@ -33,6 +33,7 @@ def test_windows_are_what_the_words_say(monkeypatch, start, shuffle, block):
     for length in (1, 2, 3):
         want = _brute(sequence, frame, stride, length)
         assert w.clip_windows(sequence, frame, stride, length).tolist() == want and len(want) > 20
+        assert w.count_windows(sequence, frame, stride, length) == len(want)
         ends = rng.random(540) < 0.5
         assert w.clip_windows(sequence, frame, stride, length, ends=ends).tolist() == [
             one for one in want if ends[one[-1]]
@@ -55,3 +56,5 @@ def test_a_clip_longer_than_every_recording_takes_no_memory():
     one = np.arange(4)
     assert w.clip_windows(0 * one, one, 0 * one + 1, 10**12).shape == (0, 10**12)
     assert w.clip_windows(0 * one, one, 0 * one + 1, 4).tolist() == [[0, 1, 2, 3]]
+    with pytest.raises(OverflowError, match="no clip has"):
+        w.clip_windows(0 * one, one, 0 * one + 1, 10**20)

@@ -6,9 +6,9 @@ import pyarrow.parquet
 import pytest
 
 from anytouch_jax.config import preset
+from anytouch_jax.data.manifest import content, schema
 from anytouch_jax.data.manifest import manifest as m
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest import schema
 from anytouch_jax.data.manifest.manifest import attach_text, replace_column
 from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.errors import UserError
@@ -86,6 +86,7 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
         (GOOD.replace("s,2,train", "s,2.5,train"), ["row 1", "'frame_index'", "'2.5'"]),
         (GOOD.replace("s,2,train", "s,1e30,train"), ["row 1", "'frame_index'", "'1e30'"]),
         (GOOD.replace("s,2,train", "s,1_0,train"), ["row 1", "'frame_index'", "'1_0'"]),
+        (GOOD.replace("s,2,train", "s,0x10,train"), ["row 1", "'frame_index'", "whole number", "'0x10'"]),
         (GOOD.replace("s,2,train", "s,,train"), ["row 1", "'frame_index' is empty"]),
         (GOOD.replace("c.png", "  "), ["row 2", "'path' is empty"]),
         (GOOD.replace("test", "tset"), ["row 2", "'split'", "'tset'", "background", "did you mean test?"]),
@@ -345,9 +346,10 @@ def test_a_label_column_of_a_csv_that_contradicts_itself_names_its_rows(tmp_path
 
 
 def test_labels_of_a_csv_keep_what_they_say(tmp_path):
-    head = "path,sensor,sequence,frame_index,split,label.object,label.force,label.stable,label.word"
-    rows = ["a.png,digit,s,0,train,001, 1.5 ,True,True", "b.png,digit,s,1,train,007, ,false,maybe"]
-    got = m.read(_file(tmp_path, "\n".join([head, *rows, "c.png,digit,s,2,train,100,2,,"]) + "\n"))
+    head = "path,sensor,sequence,frame_index,split,label.object,label.force,label.stable,label.word,label.serial"
+    rows = ["a.png,digit,s,0,train,001, 1.5 ,True,True,0x1A", "b.png,digit,s,1,train,007, ,false,maybe,0x10"]
+    got = m.read(_file(tmp_path, "\n".join([head, *rows, "c.png,digit,s,2,train,100,2,,,"]) + "\n"))
+    assert got.column("label.serial").to_pylist() == ["0x1A", "0x10", None]  # not 26 and 16
     assert got.column("label.object").to_pylist() == ["001", "007", "100"]  # names, whose zeros no number keeps
     assert got.column("label.force").to_pylist() == [1.5, None, 2]
     assert got.column("label.stable").to_pylist() == [True, False, None]  # as a Parquet manifest has it
@@ -491,3 +493,48 @@ def test_a_wide_table_is_read_in_few_parts_and_a_long_one_by_column(tmp_path, mo
     with pytest.raises(m.ManifestError, match=r"has no column 'gone'; it has path.* more") as error:
         m.read(tmp_path / "m.parquet").column("gone")
     assert len(str(error.value)) < 600
+
+
+def test_a_description_in_blocks_equals_the_whole_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(schema, "BLOCK", 7)
+    monkeypatch.setattr(content, "BLOCK", 5)
+    count, rng = 40, np.random.default_rng(0)
+    columns = {
+        "path": [f"{i}.png" for i in range(count)], "sensor": rng.choice(["digit", "taxim", "gelslim"], count).tolist(),
+        "sequence": [f"r{i // 9}" for i in range(count)], "frame_index": [i % 9 for i in range(count)],
+        "split": rng.choice(["train", "test"], count).tolist(), "stride": [1, 2] * (count // 2),
+        "object": [None if i % 3 else "ball" for i in range(count)], "label.b": [[i] for i in range(count)],
+        "label.a": [None if i == 9 else i / 7 for i in range(count)], "extra": [b"a", None] * (count // 2),
+    }  # fmt: skip
+    order = rng.permutation(count)
+    columns = {name: [values[i] for i in order] for name, values in columns.items()}
+    pa.parquet.write_table(pa.table(columns), tmp_path / "m.parquet", row_group_size=11)
+    table = m.read(tmp_path / "m.parquet")
+    for kept in (1 << 20, 3):  # bytes of text that are kept
+        monkeypatch.setattr(content, "_KEPT", kept)
+        got = m.summarise_file(tmp_path / "m.parquet")
+        assert got.digest == table.content_hash
+    assert (got.rows, got.recordings, got.clips) == (count, 5, len(table.clips(3)))
+    assert list(got.filled) == list(columns) and got.filled["object"] == table.present("object").sum()
+    for name in ("split", "sensor"):
+        values, rows = np.unique(columns[name], return_counts=True)
+        assert got.counts[name] == (list(zip(values.tolist(), rows.tolist(), strict=True)), len(values))
+    (tmp_path / "m.csv").write_text(GOOD)
+    assert m.summarise_file(tmp_path / "m.csv").digest == m.read(tmp_path / "m.csv").content_hash
+    columns["frame_index"][30] = columns["frame_index"][20]
+    columns["sequence"][30] = columns["sequence"][20]
+    columns["split"][30] = columns["split"][20]
+    for name, value, words in (
+        ("frame_index", None, r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d' \(row 20\)"),
+        ("split", "tset", r"m\.parquet, row 33: column 'split' .* did you mean test"),
+        ("path", None, r"m\.parquet, row 33: column 'path' is empty"),
+    ):
+        changed = columns | (
+            {} if value is None and name != "path" else {name: [*columns[name][:33], value, *columns[name][34:]]}
+        )
+        pa.parquet.write_table(pa.table(changed), tmp_path / "m.parquet", row_group_size=11)
+        with pytest.raises(m.ManifestError, match=words):
+            m.summarise_file(tmp_path / "m.parquet")
+    for name in ("gone.parquet", "gone.csv", "m.txt"):
+        with pytest.raises(m.ManifestError, match=name):
+            m.summarise_file(tmp_path / name)

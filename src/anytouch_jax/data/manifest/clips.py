@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 _MOST = 1 << 61
+_LONGEST = 10**12  # frames of a clip
 _BLOCK = 1 << 18  # rows at a time, so that the intermediate arrays of a block fit into the cache
 
 
@@ -22,29 +23,52 @@ def clip_windows(
 
     The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` are i64 (rows,); the stride of row t
     counts. A row whose window has a gap, or that is not in `ends` bool (rows,), has no window. Raises
-    `repeat_error(first row, second row)` if a sequence repeats a frame.
+    `repeat_error(first row, second row)` if a sequence repeats a frame, and OverflowError for a length above 10^12.
     """
+    order, key, blocks = _blocks(sequence, frame, stride, length, repeat_error, ends)
+    dtype = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # there can be millions of windows
+    if length > np.bincount(sequence, minlength=1).max():
+        return np.empty((0, length), dtype)
+    windows, count = np.empty((len(key), length), dtype), 0
+    for positions in blocks:
+        windows[count : count + len(positions)] = positions if order is None else order[positions]
+        count += len(positions)
+    windows = windows[:count]
+    return windows if order is None else windows[np.argsort(windows[:, -1], kind="stable")]
+
+
+def count_windows(
+    sequence: np.ndarray, frame: np.ndarray, stride: np.ndarray, length: int,
+    repeat_error: Callable[[int, int], Exception] | None = None,
+) -> int:  # fmt: skip
+    """Return the number of rows of `clip_windows`, which are not stored."""
+    return sum(map(len, _blocks(sequence, frame, stride, length, repeat_error)[2]))
+
+
+def _blocks(
+    sequence: np.ndarray, frame: np.ndarray, stride: np.ndarray, length: int,
+    repeat_error: Callable[[int, int], Exception] | None, ends: np.ndarray | None = None,
+) -> tuple[np.ndarray | None, np.ndarray, Iterator[np.ndarray]]:  # fmt: skip
+    """Return (order, key) of `_sorted_keys`, and windows as positions in them, in blocks. Raises as `clip_windows`."""
     if length < 1:
         raise ValueError(f"a clip has at least one frame, not {length}")
+    if length > _LONGEST:
+        raise OverflowError(f"no clip has {length} frames")
     order, key, spread = _sorted_keys(sequence, frame)
     repeats = np.flatnonzero(key[1:] == key[:-1])
     if repeats.size and length > 1:
         first, second = sorted(int(at if order is None else order[at]) for at in (repeats[0], repeats[0] + 1))
         raise repeat_error(first, second) if repeat_error else ValueError(f"rows {first}, {second}: the same frame")
-    dtype = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # there can be millions of windows
-    if length > np.bincount(sequence, minlength=1).max():
-        return np.empty((0, length), dtype)
-    windows, count = np.empty((len(key), length), dtype), 0
-    for start in range(0, len(key), _BLOCK):
-        last = np.arange(start, min(start + _BLOCK, len(key)))
-        rows = last if order is None else order[last]
-        if ends is not None:
-            last, rows = last[ends[rows]], rows[ends[rows]]
-        positions = _windows_ending_at(last, key, spread, stride[rows], length)
-        windows[count : count + len(positions)] = positions if order is None else order[positions]
-        count += len(positions)
-    windows = windows[:count]
-    return windows if order is None else windows[np.argsort(windows[:, -1], kind="stable")]
+
+    def blocks() -> Iterator[np.ndarray]:
+        for start in range(0, len(key), _BLOCK):
+            last = np.arange(start, min(start + _BLOCK, len(key)))
+            rows = last if order is None else order[last]
+            if ends is not None:
+                last, rows = last[ends[rows]], rows[ends[rows]]
+            yield _windows_ending_at(last, key, spread, stride[rows], length)
+
+    return order, key, blocks()
 
 
 def _windows_ending_at(last: np.ndarray, key: np.ndarray, spread: int, stride: np.ndarray, length: int) -> np.ndarray:

@@ -7,7 +7,6 @@ One row is one tactile frame (the columns are in `schema.py`), and row numbers c
 from __future__ import annotations
 
 import difflib
-import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, ModelConfig, SpellingError, check_spelling
 from anytouch_jax.data.manifest.clips import clip_windows
+from anytouch_jax.data.manifest.content import Summary, content_digest, summarise, table_blocks
 from anytouch_jax.data.manifest.remote import is_remote, local_copy
 from anytouch_jax.data.manifest.schema import (
     PATHS,
@@ -33,6 +33,7 @@ from anytouch_jax.data.manifest.schema import (
     is_text,
     listed,
     load_table,
+    parquet_blocks,
     read_text_csv,
     reading,
     shown,
@@ -135,19 +136,7 @@ class Manifest:
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 over every column's name and values: equal tables in CSV and Parquet have equal hashes."""
-        digest = hashlib.sha256()
-        for name, column in sorted(zip(self.table.column_names, self.table.columns, strict=True), key=lambda c: c[0]):
-            column = column.combine_chunks()
-            try:
-                text = pc.fill_null(column.cast(pa.large_string()), "")
-            except pa.ArrowException:  # nested or binary: as Python writes it
-                text = pa.array([repr(value) for value in column.to_pylist()], pa.large_string())
-            ends = np.frombuffer(text.buffers()[1], np.int64)[text.offset : text.offset + len(text) + 1]
-            digest.update(name.encode() + b"\0")
-            digest.update(np.packbits(np.asarray(pc.is_valid(column))).tobytes())
-            digest.update((ends - ends[0]).astype("<i8").tobytes())
-            digest.update(memoryview(text.buffers()[2] or b"")[ends[0] : ends[-1]])
-        return digest.hexdigest()
+        return content_digest(self.table.column_names, table_blocks(self.table))
 
     @cached_property
     def _cells(self) -> dict[str, Any]:
@@ -181,11 +170,14 @@ class Manifest:
         return np.asarray(self.table["stride"])
 
     def _repeat_error(self, first: int, second: int) -> ManifestError:
-        sequence, frame = self.value(second, "sequence"), self.value(second, "frame_index")
-        return ManifestError(
-            f"{self.where(second)} repeats frame_index {frame} of sequence {sequence!r} (row {self.number[first]}); "
-            "a sequence has one row a frame"
-        )
+        frame, sequence = self.value(second, "frame_index"), self.value(second, "sequence")
+        return _repeats(self.where(second), int(self.number[first]), frame, sequence)
+
+
+def _repeats(where: str, first: int, frame: int, sequence: str) -> ManifestError:
+    return ManifestError(
+        f"{where} repeats frame_index {frame} of sequence {sequence!r} (row {first}); a sequence has one row a frame"
+    )
 
 
 def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
@@ -200,6 +192,25 @@ def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
     if len(set(files)) != len(files):
         raise ManifestError(f"a manifest is given twice: {', '.join(map(str, files))}")
     return _join([load_table(file) for file in files], files)
+
+
+def summarise_file(path: str | Path, length: int = 3) -> Summary:
+    """Return numbers of one manifest, with its clips of `length` frames. Raises ManifestError as `read` and `clips`.
+
+    A Parquet file is read in blocks, so it may be larger than the memory.
+    """
+    file = _real_file(Path(path).expanduser())
+    if file.is_file() and file.suffix.lower() == ".parquet":
+        names, blocks = parquet_blocks(file)
+    else:
+        table = read(path).table
+        names, blocks = table.column_names, table_blocks(table)
+    try:
+        return summarise(
+            names, blocks, length, lambda first, second, *it: _repeats(f"row {second} of {file}", first, *it)
+        )
+    except OverflowError as error:
+        raise ManifestError(f"{file}: {error}") from None
 
 
 def _real_file(path: Path) -> Path:

@@ -31,6 +31,7 @@ _SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"
 _NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 _READERS = 2  # parts of a Parquet file that are read at once: more need more memory
 _PART = 1 << 22  # cells of a part: a large table is read column by column, so that it is never in memory twice
+BLOCK = 1 << 19  # rows that are read at once where a table is not needed whole
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
 _TEXT_COLUMNS = (*REQUIRED, *PATHS, "dataset", "unit", "touch", "object", "text", "license")
 _NAMES = ("dataset", "unit", "object", "license")  # text columns with values that a hand-written table may misspell
@@ -92,9 +93,10 @@ def shown(value: object) -> str:
     return text if len(text) <= 200 else f"{text[:197]}..."
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return the first twenty names for a message, each with at most 50 characters, and the number of the others."""
-    more = f" and {len(names) - 20:,} more" if len(names) > 20 else ""
+def listed(names: Sequence[str], count: int | None = None) -> str:
+    """Return the first twenty of `count` names for a message, each with 50 characters at most, and how many follow."""
+    count = len(names) if count is None else count
+    more = f" and {count - 20:,} more" if count > 20 else ""
     return ", ".join(name[:50] for name in names[:20]) + more
 
 
@@ -141,6 +143,27 @@ def _load_parquet(path: Path) -> pa.Table:
     return pa.table(columns, names)
 
 
+def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.Array]]]:
+    """Return the columns' names of a Parquet file, and a function that yields a column in checked blocks.
+
+    Raises ManifestError as `load_table`, for a value when its block is read.
+    """
+    with reading(path):
+        file = pa.parquet.ParquetFile(path, pre_buffer=False)
+        names = file.schema_arrow.names
+        _check_names(names, file.metadata.num_rows, str(path))
+
+    def blocks(name: str) -> Iterator[pa.Array]:
+        first = 0
+        with reading(path):
+            for batch in file.iter_batches(BLOCK, columns=[name], use_threads=False):
+                column = _checked(name, pa.chunked_array([batch.column(name)]), str(path), first)
+                first += len(column)
+                yield from column.chunks
+
+    return names, blocks
+
+
 def typed(table: pa.Table, where: str) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
@@ -157,9 +180,9 @@ def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
     column = clean_text(column)
     if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py():
         return column
-    for kind in (pa.int64(), pa.float64(), pa.bool_()):
+    for kind in (_WHOLE, pa.float64(), pa.bool_()):
         try:
-            return column.cast(kind)
+            return _decimal(column).cast(kind)
         except pa.ArrowInvalid:
             continue
     return column
@@ -222,13 +245,16 @@ def is_text(kind: pa.DataType) -> bool:
     return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
-def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
-    """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the row."""
+def _checked(name: str, column: pa.ChunkedArray, where: str, first: int = 0) -> pa.ChunkedArray:
+    """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the row.
+
+    `first` is the number of its first row.
+    """
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()
         if row >= 0:
-            raise ManifestError(f"{where}, row {row}: column {shown(name)} {problem(row)}")
+            raise ManifestError(f"{where}, row {first + row}: column {shown(name)} {problem(row)}")
 
     for cast, kind in ((_plain, "UTF-8 text"), _CASTS[SCHEMA.get(name)]):
         try:
@@ -236,7 +262,7 @@ def _checked(name: str, column: pa.ChunkedArray, where: str) -> pa.ChunkedArray:
         except pa.ArrowInvalid:
             row = _first_invalid(column, cast)
             value = "" if cast is _plain else f", is {shown(column[row].as_py())}"
-            raise ManifestError(f"{where}, row {row}: column {shown(name)} must be {kind}{value}") from None
+            raise ManifestError(f"{where}, row {first + row}: column {shown(name)} must be {kind}{value}") from None
         except pa.ArrowTypeError:
             raise ManifestError(f"{where}: column {name!r} must be {kind}, is {column.type}") from None
     if name in REQUIRED:
@@ -274,10 +300,17 @@ def _cast_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return pc.if_else(blank, pa.scalar(None, _TEXT), column) if pc.any(blank).as_py() else column
 
 
+def _decimal(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return a text column. Raises ArrowInvalid for a cell like 0x10, which a cast would take for 16."""
+    if pc.any(pc.match_substring_regex(column, r"^0[xX]")).as_py():
+        raise pa.ArrowInvalid("a number in hexadecimal")
+    return column
+
+
 def _cast_whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
     kind = column.type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        column = pc.utf8_trim_whitespace(_cast_text(column))
+        column = _decimal(pc.utf8_trim_whitespace(_cast_text(column)))
     try:
         return column.cast(_WHOLE)
     except pa.ArrowInvalid:  # a column of whole numbers with gaps is often stored as floats ("130.0")

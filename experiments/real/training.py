@@ -78,7 +78,7 @@ def fine_tuned_scores(encoder: Encoder, sensor: str = "gelsight_mini") -> Callab
             token, mean = net.encode_poolings(params["touch"], normalise_touch(touches[:, None]), rows)
             z = jnp.concatenate([token, mean], -1)
             z = (z - z.mean(-1, keepdims=True)) / (z.std(-1, keepdims=True) + 1e-6)
-            return jnp.asarray((z * params["scale"]) @ params["head"])
+            return jnp.asarray((z * params["scale"][None]) @ params["head"])
 
         return _train(logits, params, 2e-4, x, y, fit, weights)
 

@@ -1,0 +1,38 @@
+"""The head that tells which way an object turns or slides."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from experiments.encoders import motion
+
+RNG = np.random.default_rng(0)
+
+
+def test_two_frames_in_the_other_order_turn_the_other_way():
+    params = motion.init(8)
+    params |= {name: jax.random.normal(jax.random.key(1), params[name].shape) for name in ("place", "scale", "bias")}
+    tokens = RNG.standard_normal((5, 2, 16, 8)).astype(np.float32)
+    turn, slide = motion.head(params, tokens)
+    back, other = motion.head(params, tokens[:, ::-1])
+    np.testing.assert_allclose(back, -turn, atol=1e-5)
+    np.testing.assert_allclose(other, slide[:, [1, 0, 3, 2]], atol=1e-5)
+    assert np.abs(turn).max() > 0.01
+
+
+def test_it_learns_a_field_that_no_mean_shows():
+    """The first two values of a token change with the field of a turn, whose mean over the picture is zero."""
+    n, side = 300, 4
+    y, x = np.mgrid[:side, :side].reshape(2, -1) / side - 0.375
+    sign = RNG.choice([-1.0, 1.0], n)
+    tokens = RNG.standard_normal((n, 2, side * side, 6)).astype(np.float32)
+    tokens[:, 1] = tokens[:, 0] + 0.1 * RNG.standard_normal(tokens[:, 0].shape)
+    tokens[:, 1, :, :2] += sign[:, None, None] * np.stack([-y, x], -1)
+    turn = np.where(sign > 0, *motion.TURNS)
+    split = np.array(["train", "train", "val", "test"])[np.arange(n) % 4]
+    clips = motion.Clips(tokens, turn, np.full(n, "none"), np.full(n, "digit"), split, np.arange(n))
+    splits = {name: np.flatnonzero(split == name) for name in ("train", "val", "test")}
+    found = motion.score(motion.fit(clips, splits["train"], splits["val"]), clips, splits["test"])
+    assert found["turn"]["share"] > 0.95 and found["slide"]["clips"] == 0
+    assert motion.pooled_score(clips, splits) < 0.75

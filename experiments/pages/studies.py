@@ -284,6 +284,12 @@ def real(folder: Path) -> Page:
                         compare(f"`{name}`", words, change, task)
                         for words, change in zip(("pixels", "an untrained encoder"), changes, strict=True)
                     ]
+    for count in ("1", "2", "5"):
+        shares = {name: one["label_curve"][count] for name, one in records.items() if "label_curve" in one}
+        rows += [
+            (f"object, {count} recordings of each", "linear", name, Value(share).times(100), None, None)
+            for name, share in sorted(shares.items(), key=lambda item: -item[1])
+        ]
     times = [
         f"`{name}` takes {records[name]['milliseconds']:.0f} ms a frame on a CPU."
         for name in encoders
@@ -298,6 +304,32 @@ def real(folder: Path) -> Page:
         ("task", "head", "features", Measure("right, %"), Measure("minus pixels", "+.1f"),
          Measure("minus untrained", "+.1f")),
         rows, [*findings, *times], (path.name,), "python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny",
+    )  # fmt: skip
+
+
+def motion(folder: Path) -> Page:
+    """The sign of a turn and the direction of a slide, from frozen tokens."""
+    path = folder / "motion.jsonl"
+    rows, findings = [], []
+    for name, record in records_of(path).items():
+        for row, found in record["scores"].items():
+            values = [Value(one["share"], *one["interval"]).times(100) for one in (found["turn"], found["slide"])]
+            rows.append((name, row, *values))
+        every = record["scores"]["all sensors"]
+        findings += [
+            f"`{name}`: the head names {100 * every['turn']['share']:.0f} % of turns and "
+            f"{100 * every['slide']['share']:.0f} % of slides of new objects.",
+            f"`{name}`: a linear probe on the change of the mean token names {100 * record['pooled']:.0f} % of turns.",
+        ]
+    return Page(
+        "motion", "Can frozen features tell which way an object turns?",
+        "A small antisymmetric head reads the patch tokens of the first and the last touched frame of a clip. "
+        "Clips are simulated. Test clips are of objects that the head never met. "
+        "In the rows `without` a sensor, the head never met that "
+        "sensor either. Chance is half for a turn and a quarter for a slide. Intervals are over touches.",
+        ("encoder", "head", Measure("turns right, %"), Measure("slides right, %")),
+        rows, findings, (path.name,),
+        "python -m experiments.encoders.motion anytouch-tiny --data data/corpus/*/*.parquet",
     )  # fmt: skip
 
 

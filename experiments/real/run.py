@@ -28,7 +28,8 @@ CNN = "small CNN from scratch"
 
 
 def load(name: str) -> Encoder:
-    """Load an encoder by name or path; `untrained:` gives the same network without training."""
+    """Load an encoder by name, path or TITLE=PATH; `untrained:` gives the same network without training."""
+    name = name.rpartition("=")[2]
     if name.startswith(UNTRAINED):
         return random_encoder(load_encoder(name.removeprefix(UNTRAINED)).config)
     return load_encoder(name)
@@ -69,8 +70,8 @@ def trained_records(models: list[str], data: recordings.Recordings, common: dict
     }
     write_record(out, CNN, about | {"kind": "baseline", "tasks": tasks})
     print(CNN, flush=True)
-    for name in models:
-        encoder = load(name)
+    for word in models:
+        encoder, name = load(word), word.partition("=")[0]
         x = np.stack([
             encoder.preprocess(frame, data.backgrounds[place])
             for frame, place in zip(data.frames, data.background, strict=True)
@@ -93,8 +94,8 @@ def main() -> None:
     for name, compute in BASELINES.items():
         write_record(options.out, name, record_of(compute(data), data, common | {"kind": "baseline"}))
         print(name, flush=True)
-    for name in options.models:
-        encoder = load(name)
+    for word in options.models:
+        encoder, name = load(word), word.partition("=")[0]
         about = {"kind": "encoder", "config": json.loads(json.dumps(dataclasses.asdict(encoder.config))),
                  "fingerprint": encoder.fingerprint, "milliseconds": milliseconds(encoder, data)}  # fmt: skip
         x = features.encoder_features(encoder, data)

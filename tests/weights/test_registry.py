@@ -98,7 +98,7 @@ def test_a_folder_to_upload_has_a_card_and_what_zero_shot_questions_need(tmp_pat
     page = (folder / "README.md").read_text()
     assert page.startswith("---\nlibrary_name: anytouch_jax\n") and "## Limits" in page and "| digit |" in page
     encoder = at.load_encoder(folder)
-    assert set(encoder.others) == {"decoder", "text", "logit_scale"} and encoder.trained_sensors == ("digit",)
+    assert set(encoder.others) == {"text", "logit_scale"} and encoder.trained_sensors == ("digit",)
     assert encoder.config.model.match_head == "none"
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 DEFAULT = "anytouch-tiny"
 FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md
 WEIGHTS, CARD = "model.safetensors", "config.json"
-PARTS = ("touch", "decoder", "text", "logit_scale")  # for features, further training and zero-shot questions
+PARTS = ("touch", "text", "logit_scale")  # for features, zero-shot questions and the start of a run
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
 _FILES = ["*.safetensors", "*.safetensors.index.json", "*.pth", "*.pt", "*.bin", "config.json", "tokenizer.json"]
 

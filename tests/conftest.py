@@ -9,6 +9,8 @@ from pathlib import Path
 
 # Set before jax is imported; child processes of the tests inherit it. The four devices below they do not.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# As the command does: jaxlib 0.10.1 logs a spurious error for a program that it reads from the cache.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
 import pytest

@@ -92,7 +92,7 @@ def test_an_exported_family_gives_the_features_of_the_live_one(anytouch, family,
 def test_a_run_starts_from_a_family(anytouch, files, touches, tmp_path):
     size = "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 --model.touch.heads 2"
     size += " --model.touch.mlp 32 --model.norm-eps 1e-12 --model.decoder.width 8 --model.decoder.depth 1"
-    words = ["--run", tmp_path / "run", "--init", files["vit_mae"], "--batch", 2, "--steps", 2, "--stop-after", 1]
+    words = ["--run", tmp_path / "run", "--init", files["vit_mae"], "--batch", 4, "--steps", 2, "--stop-after", 1]
     words += [*size.split(), "--model.decoder.heads", "2", "--data.clip-share", "0"]
     done = anytouch("train", "--data", touches, *words)
     assert done.status == 2 and "--model.no-pre-norm" in done.err, done.err

@@ -18,6 +18,7 @@ from experiments.pages import matrix, page, speed, studies
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "real": ("real.jsonl", studies.real),
+    "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
     "motion": ("motion.jsonl", studies.motion),
     "teaching": ("teaching.jsonl", studies.teaching),
     "left_out": ("named.jsonl", studies.left_out),

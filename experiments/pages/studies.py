@@ -307,6 +307,34 @@ def real(folder: Path) -> Page:
     )  # fmt: skip
 
 
+def backgrounds(folder: Path) -> Page:
+    """An encoder on real recordings, by what is subtracted."""
+    path = folder / "backgrounds.jsonl"
+    records, rows, findings = records_of(path), [], []
+    words = {
+        "own": "the unit's own picture",
+        "estimated": "an estimate by `anytouch data contact`",
+        "first": "the first frame of the recording",
+    }
+    for task in TASKS:
+        for head in HEADS:
+            scores = {kind: _score(records[kind]["tasks"][f"{task}, {head}"]) for kind in words if kind in records}
+            for kind, score in scores.items():
+                change = None if kind == "own" else _minus(score, scores["own"])
+                rows.append((task, head, words[kind], Value(score.share, *score.interval()).times(100), change))
+                if change is not None and head == "linear":
+                    findings.append(compare(words[kind], "the unit's own picture", change, task))
+    return Page(
+        "backgrounds", "What if there is no picture of the untouched gel?",
+        f"The features are those of `{next(iter(records.values()))['encoder']}`, which subtracts the untouched gel. "
+        "The recordings begin in contact or near it, so the first frame is a hard case. "
+        "The first frame also stands in where no picture fits, or where no estimate is sure. "
+        "Scores are as on the page of real recordings.",
+        ("task", "head", "subtracted", Measure("right, %"), Measure("minus own picture", "+.1f")),
+        rows, findings, (path.name,), "python -m experiments.real.run anytouch-tiny --backgrounds",
+    )  # fmt: skip
+
+
 def motion(folder: Path) -> Page:
     """The sign of a turn and the direction of a slide, from frozen tokens."""
     path = folder / "motion.jsonl"

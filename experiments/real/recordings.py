@@ -5,21 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
+from anytouch_jax.data.prepare.contact import contact_scores
 
 SET = "incipient_slip-gelsight_mini_markers"
+Background = Literal["own", "estimated", "first"]
 
 
 @dataclass(frozen=True)
 class Recordings:
     """Frames u8 RGB (n, h, w, 3), a background for each, and one value of every column a frame.
 
-    `background` numbers a row of `backgrounds`. A frame without a background of its unit gets the first frame of its
-    sequence: that is what `Preprocess` does with a camera.
+    `background` numbers a row of `backgrounds` (see `read`).
     """
 
     frames: np.ndarray
@@ -39,31 +42,47 @@ class Recordings:
         return np.unique(self.object)
 
 
-def read(path: str | Path) -> Recordings:
-    """Read all frames of the gripper from the manifest of the pack. Raises UserError."""
+def read(path: str | Path, background: Background = "own") -> Recordings:
+    """Read all frames of the gripper from the manifest of the pack. Raises UserError.
+
+    `background`: what is taken for the untouched gel. It is the unit's own picture, what `anytouch data contact`
+    estimates without that picture, or the first frame of the recording. The first frame stands in where the others are
+    missing, as in `embed`.
+    """
     manifest = manifests.read(path)
     columns = {name: np.array(manifest.column(name).to_pylist(), object) for name in (
         "path", "dataset", "split", "sequence", "frame_index", "recording", "object_fold", "label.object", "label.slip",
         "unit", "background_path",
     )}  # fmt: skip
     rows = np.flatnonzero((columns["dataset"] == SET) & (columns["split"] != "background"))
-    root = Path(path).parent
-    pictures: dict[str, int] = {}
-    first: dict[str, str] = {}
-    for row in sorted(rows, key=lambda row: int(columns["frame_index"][row])):
-        first.setdefault(columns["sequence"][row], columns["path"][row])
-    background = []
-    for row in rows:
-        name = columns["background_path"][row] or first[columns["sequence"][row]]
-        background.append(pictures.setdefault(name, len(pictures)))
+    root, take = Path(path).parent, {name: values[rows] for name, values in columns.items()}
 
     def picture(name: str) -> np.ndarray:
         return cv2.cvtColor(cv2.imread(str(root / name), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
-    take = {name: values[rows] for name, values in columns.items()}
+    frames = np.stack([picture(name) for name in take["path"]])
+    order = np.lexsort((take["frame_index"].astype(int), take["sequence"].astype(str)))
+    sequence = np.unique(take["sequence"].astype(str), return_inverse=True)[1]
+    names = [f"frame {order[np.searchsorted(sequence[order], number)]}" for number in sequence]
+    pictures = {name: frames[int(name.split()[1])] for name in names}
+    if background == "own":
+        names = [own or name for own, name in zip(take["background_path"], names, strict=True)]
+        pictures |= {name: picture(name) for name in set(names) - set(pictures)}
+    elif background == "estimated":
+        for number, (some, gel) in enumerate(_estimated(manifest, rows)):
+            pictures[f"gel {number}"] = cv2.resize(gel, frames.shape[2:0:-1], interpolation=cv2.INTER_AREA)
+            for row in some:
+                names[row] = f"gel {number}"
+    several = sorted(set(names))
     return Recordings(
-        np.stack([picture(name) for name in take["path"]]), np.stack([picture(name) for name in pictures]),
-        np.array(background), take["recording"].astype(str), np.array([unit[:4] for unit in take["unit"]]),
+        frames, np.stack([pictures[name] for name in several]), np.searchsorted(several, names),
+        take["recording"].astype(str), np.array([unit[:4] for unit in take["unit"]]),
         take["split"].astype(str), take["object_fold"].astype(int), take["label.object"].astype(str),
         take["label.slip"].astype(int), manifest.content_hash,
     )  # fmt: skip
+
+
+def _estimated(manifest: Manifest, rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return row numbers within `rows`, and the untouched gel that is estimated for them without a given picture."""
+    bare = replace_column(select_rows(manifest, rows), "background_path", [None] * len(rows))
+    return [(some, gel.picture) for some, gel in contact_scores(bare).gels]

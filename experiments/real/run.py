@@ -1,9 +1,13 @@
 """What is an encoder worth on real recordings? Scores of encoders beside pixels and a classical baseline.
 
-    python -m experiments.real.run DATA=../shared/real_touch2/manifest.csv anytouch-tiny runs/weights/stage1
+    python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny "stage 1=runs/anytouch-tiny/stage1"
 
 Each model is a name, a run folder or a weights file; `untrained:MODEL` is the same network without training. Every row
 goes to `experiments/results/real.jsonl`. `make results` makes the page from that file alone.
+
+    python -m experiments.real.run anytouch-tiny --backgrounds
+
+scores one encoder with what may stand in for the picture of the untouched gel (`recordings.read`).
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -82,27 +86,41 @@ def trained_records(models: list[str], data: recordings.Recordings, common: dict
         print(f"{name}, fine-tuned", flush=True)
 
 
+def background_records(word: str, path: Path, out: Path) -> None:
+    """Score an encoder with each kind of background: a record each in `out`."""
+    encoder, name = load(word), word.partition("=")[0]
+    for kind in get_args(recordings.Background):
+        data = recordings.read(path, kind)
+        about = {"data": data.content_hash, "encoder": name, "fingerprint": encoder.fingerprint, "kind": kind}
+        write_record(out, kind, record_of(features.encoder_features(encoder, data), data, about))
+        print(kind, flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("models", nargs="*")
     parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"))
-    parser.add_argument("--out", type=Path, default=Path("experiments/results/real.jsonl"))
+    parser.add_argument("--out", type=Path, default=Path("experiments/results"), help="folder of the records")
+    parser.add_argument("--backgrounds", action="store_true", help="compare backgrounds with the first model instead")
     parser.add_argument("--trained", action="store_true", help="train a CNN and the encoders with labels too: an hour")
     options = parser.parse_args()
-    data = recordings.read(options.data)
+    if options.backgrounds:
+        background_records(options.models[0], options.data, options.out / "backgrounds.jsonl")
+        return
+    data, out = recordings.read(options.data), options.out / "real.jsonl"
     common = {"data": data.content_hash}
     for name, compute in BASELINES.items():
-        write_record(options.out, name, record_of(compute(data), data, common | {"kind": "baseline"}))
+        write_record(out, name, record_of(compute(data), data, common | {"kind": "baseline"}))
         print(name, flush=True)
     for word in options.models:
         encoder, name = load(word), word.partition("=")[0]
         about = {"kind": "encoder", "config": json.loads(json.dumps(dataclasses.asdict(encoder.config))),
                  "fingerprint": encoder.fingerprint, "milliseconds": milliseconds(encoder, data)}  # fmt: skip
         x = features.encoder_features(encoder, data)
-        write_record(options.out, name, record_of(x, data, common | about))
+        write_record(out, name, record_of(x, data, common | about))
         print(name, flush=True)
     if options.trained:
-        trained_records(options.models, data, common, options.out)
+        trained_records(options.models, data, common, out)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from experiments.pages.studies import real
+from experiments.pages.studies import backgrounds, real
 from experiments.real import features, run, scores, training
 from experiments.real.recordings import Recordings
 from experiments.records import write_record
@@ -118,3 +118,12 @@ def test_shifted_pictures_keep_their_size_and_values():
     assert moved.shape == pictures.shape
     assert all(np.isin(one, other).all() for one, other in zip(moved, pictures, strict=True))
     assert not np.array_equal(moved, pictures)
+
+
+def test_the_page_of_backgrounds_pairs_each_with_the_own_picture(data, tmp_path):
+    for kind, noise in (("own", 0.1), ("estimated", 0.1), ("first", 50.0)):
+        write_record(tmp_path / "backgrounds.jsonl", kind, run.record_of(planted(data, noise), data, {"encoder": "a"}))
+    made = backgrounds(tmp_path)
+    changes = {row[2]: row[4] for row in made.rows if row[:2] == ("object", "linear")}
+    assert changes["the unit's own picture"] is None and changes["the first frame of the recording"].high < 0
+    assert changes["an estimate by `anytouch data contact`"].mean == 0.0

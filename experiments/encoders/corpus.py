@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from anytouch_jax.files import atomic_path
 from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.train.mesh import enable_compilation_cache
 
 SENSORS = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
 SHARD = 850  # touches, each by every sensor
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--seed", type=int, default=41)
     options = parser.parse_args()
+    enable_compilation_cache()  # each shard compiles the same programs
     begun = time.monotonic()
     for first in range(0, options.touches, SHARD):
         scenes = Scenes(

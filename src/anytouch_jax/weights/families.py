@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -339,12 +339,9 @@ def form_of(
     frames, size = max(family.frames, tubelet), image_size or family.image_size
     grid: tuple[int, int, int] | None = None
     if not has("frequency"):
-        places = shape("position")[0] - has("class_token")
-        grid = _grid(places, frames // tubelet, family.name == "sparsh", image_size, patch)
+        grid = _grid(shape("position")[0] - has("class_token"), family, frames // tubelet, image_size, patch)
         frames, native = grid[0] * tubelet, (grid[1] * patch, grid[2] * patch)
         size = (image_size if family.resample == "none" else size) or native
-        if family.resample == "none" and size != native:
-            raise WeightsError(f"{family.title} has images of {native[0]} x {native[1]} pixels; leave image_size out")
     assert size is not None
     if size[0] % patch or size[1] % patch or min(size) < patch:
         raise WeightsError(f"image_size {size[0]} x {size[1]} is no multiple of the patches of {patch} pixels")
@@ -356,6 +353,8 @@ def form_of(
     eps = folder.get("layer_norm_eps", family.eps)
     if not isinstance(eps, float | int) or not 0 < eps < 1:
         raise WeightsError(f"layer_norm_eps of the config.json is {str(eps)[:40]}; correct it")
+    if (activation := folder.get("hidden_act", "gelu")) != "gelu":
+        raise WeightsError(f"hidden_act of the config.json is {str(activation)[:40]}; only gelu is computed here")
     return VitConfig(
         ModelConfig(
             image_size=max(size),
@@ -384,20 +383,23 @@ def form_of(
     ), size
 
 
-def _grid(places: int, time: int, portrait: bool, size: Size | None, patch: int) -> tuple[int, int, int]:
-    """Return (time, rows, columns) of a number of stored positions: of `size`, in Sparsh's shape of 4:3, or square."""
-    shapes: list[Callable[[int], Size]] = [lambda n: (math.isqrt(n), math.isqrt(n))]
-    if portrait:
-        shapes.insert(0, lambda n: (4 * math.isqrt(n // 12), 3 * math.isqrt(n // 12)))
-        if size is not None:
-            shapes = [lambda n: (size[0] // patch, size[1] // patch)]
-    for steps in dict.fromkeys((time, 1)):
-        for shape in shapes:
-            rows, columns = shape(places // steps)
-            if steps * rows * columns == places and places:
-                return steps, rows, columns
-    asked = "no grid of patches" if size is None else f"not those of {size[0]} x {size[1]} pixels"
-    raise WeightsError(f"its {places} positions are {asked}; give the image_size of its training")
+def _grid(places: int, family: Family, time: int, size: Size | None, patch: int) -> tuple[int, int, int]:
+    """Return (time, rows, columns) of a number of stored positions.
+
+    `size` gives it where positions are not resized. Else it is in Sparsh's shape of 4:3, or square, or of `size`.
+    """
+    rows, columns = (0, 0) if size is None else (size[0] // patch, size[1] // patch)
+    given = (places // max(rows * columns, 1) if family.video else 1, rows, columns)
+    grids = [given]
+    if size is None or family.resample != "none":
+        for steps in (1, time):
+            side, third = math.isqrt(places // steps), math.isqrt(places // steps // 12)
+            grids += [(steps, side, side), *([(steps, 4 * third, 3 * third)] if family.name == "sparsh" else [])]
+    found = next((grid for grid in reversed(grids) if math.prod(grid) == places > 0), None)
+    if found is None:
+        asked = "no grid of patches" if size is None else f"not those of {size[0]} x {size[1]} pixels"
+        raise WeightsError(f"its {places} positions are {asked}; give the image_size of its training")
+    return found
 
 
 def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:

@@ -48,6 +48,9 @@ def read_torch(path: str | Path) -> dict[str, np.ndarray]:
         with open(path, "rb") as file:
             zipped, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
             file.seek(0)
+            if not zipped and file.read(2) == b"PK":
+                raise WeightsError("it is cut short (its zip directory is missing); download it again")
+            file.seek(0)
             reader = _Zip(file, size) if zipped else _Legacy(file)
             tensors = _state(_unwrap(reader.content, path))
             if sum(math.prod(t.shape) * t.storage.dtype.itemsize for t in tensors.values()) > _GROWTH * size + _SPARE:

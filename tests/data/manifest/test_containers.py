@@ -102,9 +102,12 @@ def test_addresses_are_copied_by_shard_once_and_the_oldest_leave(store, tmp_path
     assert [file.name for file in kept] == ["5.parquet", "6.parquet", "7.parquet"]
 
 
-def test_a_missing_object_and_a_foreign_address_are_one_sentence(store):
+def test_a_missing_object_a_broken_store_and_a_foreign_address_are_one_sentence(store, monkeypatch):
     with pytest.raises(UserError, match=r"there is no memory://corpus/9\.parquet"):
         remote.local_copy(f"{store}/9.parquet/image/0")
+    monkeypatch.setattr(fsspec.filesystem("memory"), "size", lambda path: [][0])  # the error is none of a file
+    with pytest.raises(UserError, match=r"0\.parquet cannot be copied .*list index"):
+        remote.local_copy(f"{store}/0.parquet/image/0")
     for address in ("file:///etc/passwd", "s3://bucket/../x.png", "local://x"):
         with pytest.raises(ManifestError, match="is none of"):
             remote.local_copy(address)

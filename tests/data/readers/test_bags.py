@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -83,6 +84,51 @@ def write_mcap(file):
         writer.finish()
 
 
+def write_protobuf(file):
+    """Foxglove's protobuf: a topic of compressed pictures, one of raw pictures, a number, and a type of no picture."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+
+    stamp = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    types = {"TYPE_BYTES": 12, "TYPE_STRING": 9, "TYPE_FIXED32": 7, "TYPE_DOUBLE": 1, "TYPE_MESSAGE": 11}
+    ours = descriptor_pb2.FileDescriptorProto(
+        name="foxglove.proto", package="foxglove", dependency=[stamp.name], syntax="proto3"
+    )
+    for name, fields in {
+        "CompressedImage": {"data": "TYPE_BYTES", "format": "TYPE_STRING"},
+        "RawImage": {"width": "TYPE_FIXED32", "height": "TYPE_FIXED32", "encoding": "TYPE_STRING",
+                     "step": "TYPE_FIXED32", "data": "TYPE_BYTES"},
+        "Force": {"z": "TYPE_DOUBLE"},
+    }.items():  # fmt: skip
+        kind = ours.message_type.add(name=name)
+        kind.field.add(
+            name="timestamp", number=1, type=types["TYPE_MESSAGE"], label=1, type_name=".google.protobuf.Timestamp"
+        )
+        for number, (field, code) in enumerate(fields.items(), 2):
+            kind.field.add(name=field, number=number, type=types[code], label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(stamp)
+    pool.Add(ours)
+    content = descriptor_pb2.FileDescriptorSet(file=[stamp, ours]).SerializeToString()
+    row = bytes([0, 0, 200, 9])  # blue, green, red and a byte of padding
+    with file.open("wb") as stream:
+        writer = mcap.Writer(stream)
+        writer.start()
+        for topic, name, values in (
+            ("/gel", "CompressedImage", lambda i: {"data": png(i), "format": "png"}),
+            ("/raw", "RawImage", lambda i: {"width": 1, "height": 2, "encoding": "bgr8", "step": 4, "data": row * 2}),
+            ("/ft", "Force", lambda i: {"z": 1.5 * i}),
+        ):
+            kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+            channel = writer.register_channel(
+                topic, "protobuf", writer.register_schema(f"foxglove.{name}", "protobuf", content)
+            )
+            for i in range(3):
+                message = kind(timestamp={"seconds": 7, "nanos": i}, **values(i))
+                writer.add_message(channel, log_time=i, publish_time=0, data=message.SerializeToString())
+        writer.finish()
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_images_of_a_bag_have_their_times_and_the_nearest_force(read, tmp_path, version):
     write_ros(tmp_path, version)
@@ -107,6 +153,27 @@ def test_json_in_mcap_is_read_and_topics_are_chosen(read, tmp_path):
     for value, words in {"f=/force": "NAME=TOPIC:FIELD", "f=/force:g": "have no g", "f=/force:f": "no number"}.items():
         with pytest.raises(UserError, match=words):
             read("bags", sensor="digit", values=(value,), export=True)
+
+
+def test_protobuf_in_mcap_is_read(read, tmp_path):
+    pytest.importorskip("mcap_protobuf")
+    write_protobuf(tmp_path / "run.mcap")
+    table = read("bags", sensor="digit", values=("z=/ft:z",), export=True)
+    assert [row["time"] for row in table.rows.values()] == [7 * 10**9 + i for i in range(3)] * 2
+    assert table["label.z"] == [0, 1.5, 3] * 2
+    pictures = [decode(tmp_path / path) for path in table["path"]]
+    assert [picture[0, 0, 0] for picture in pictures[:3]] == [0, 1, 2]
+    assert pictures[3].tolist() == [[[200, 0, 0]]] * 2
+
+
+def test_without_the_package_for_protobuf_only_its_messages_are_an_error(read, tmp_path, monkeypatch):
+    write_mcap(tmp_path / "plain.mcap")
+    write_protobuf(tmp_path / "run.mcap")
+    monkeypatch.setitem(sys.modules, "mcap_protobuf.decoder", None)
+    with pytest.raises(UserError, match=r"run\.mcap needs a package.*anytouch_jax\[bags\]"):
+        read("bags", sensor="digit", export=True)
+    (tmp_path / "run.mcap").unlink()
+    assert len(read("bags", sensor="digit", export=True)["path"]) == 3
 
 
 def test_a_damaged_recording_is_one_sentence(read, tmp_path):

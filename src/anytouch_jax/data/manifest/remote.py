@@ -78,8 +78,9 @@ def _fetch(file: str, target: Path) -> None:
             shutil.copyfileobj(source, copy, 1 << 20)
     except FileNotFoundError:
         raise UserError(f"there is no {file}; correct the manifest, or put the file there") from None
-    except OSError as error:
-        raise UserError(f"{file} cannot be copied to {target.parent}: {error}; check access and free space") from None
+    except Exception as error:  # each store has its own kinds, as of httpx and botocore
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{file} cannot be copied to {target.parent}: {reason}; check access and free space") from None
 
 
 def _make_room(size: int, target: Path) -> None:

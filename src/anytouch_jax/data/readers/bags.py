@@ -45,7 +45,8 @@ def _bags(index: DatasetIndex) -> None:
         index.need_export(f"the recording {path}")
         frames: dict[str, list[tuple[int, str]]] = {}
         series: dict[str, list[tuple[int, Any]]] = {name: [] for name in places}
-        for message in read_messages(index.root / path):
+        wanted = {*index.options.keys, *(topic for topic, _ in places.values())} if index.options.keys else None
+        for message in read_messages(index.root / path, wanted):
             for name, (topic, field) in places.items():
                 if message.topic == topic:
                     series[name].append((_time(message), _field(message.content, field, message.topic)))
@@ -100,16 +101,17 @@ def _bag_files(index: DatasetIndex) -> Iterator[str]:
         yield from (f"{folder}/{name}".lstrip("/") for name in files if name.endswith((".mcap", ".bag")))
 
 
-def read_messages(path: Path) -> Iterator[Message]:
-    """Yield the messages of a recording in the order of their times. Raises DatasetError."""
+def read_messages(path: Path, topics: set[str] | None = None) -> Iterator[Message]:
+    """Yield the messages of a recording in the order of their times, of some topics or of all. Raises DatasetError."""
     try:
         if path.suffix == ".mcap":
-            yield from _mcap_messages(path)
+            yield from _mcap_messages(path, topics)
             return
         from rosbags.highlevel import AnyReader
 
         with AnyReader([path]) as reader:
-            for connection, time, data in reader.messages():
+            wanted = [one for one in reader.connections if topics is None or one.topic in topics]
+            for connection, time, data in reader.messages(wanted) if wanted else ():
                 yield Message(connection.topic, time, connection.msgtype, reader.deserialize(data, connection.msgtype))
     except ImportError as error:
         raise DatasetError(f"{path} needs a package: {error}; run pip install 'anytouch_jax[bags]'") from None
@@ -119,13 +121,14 @@ def read_messages(path: Path) -> Iterator[Message]:
         raise DatasetError(f"{path} cannot be read: {error}; record it again, or repair it with mcap recover") from None
 
 
-def _mcap_messages(path: Path) -> Iterator[Message]:
+def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
     from mcap.reader import make_reader
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     stores: dict[str, Any] = {}
+    protobuf: Any = None
     with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
+        for schema, channel, message in make_reader(file).iter_messages(topics):
             encoding, kind = channel.message_encoding, "" if schema is None else schema.name
             if encoding == "json":
                 content = json.loads(message.data, object_hook=lambda one: SimpleNamespace(**one))
@@ -136,8 +139,14 @@ def _mcap_messages(path: Path) -> Iterator[Message]:
                     stores[name].register(get_types_from_msg(schema.data.decode(), name))
                 read = stores[name].deserialize_cdr if encoding == "cdr" else stores[name].deserialize_ros1
                 content = read(message.data, name)
+            elif encoding == "protobuf" and schema is not None:
+                if protobuf is None:
+                    from mcap_protobuf.decoder import DecoderFactory
+
+                    protobuf = DecoderFactory()
+                content = protobuf.decoder_for(encoding, schema)(message.data)
             else:
-                continue  # protobuf and others
+                continue
             yield Message(channel.topic, message.log_time, kind, content)
 
 
@@ -167,9 +176,11 @@ def _time(message: Message) -> int:
     """Return the time of a message in nanoseconds: of its header, else when it was logged."""
     header = getattr(message.content, "header", message.content)
     stamp = getattr(header, "stamp", getattr(header, "timestamp", None))
-    seconds = getattr(stamp, "sec", getattr(stamp, "secs", 0))
-    rest = getattr(stamp, "nanosec", getattr(stamp, "nsec", getattr(stamp, "nsecs", 0)))
-    return int(seconds) * 1_000_000_000 + int(rest) if seconds or rest else int(message.time)
+    seconds, rest = (
+        next((int(getattr(stamp, name)) for name in names if hasattr(stamp, name)), 0)
+        for names in (("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos"))
+    )
+    return seconds * 1_000_000_000 + rest if seconds or rest else int(message.time)
 
 
 def _field(content: Any, field: str, topic: str) -> Any:

@@ -168,7 +168,11 @@ class DatasetIndex:
             return
         url = self.options.url.rstrip("/")
         system, base = open_store(url)
-        for path in sorted(system.find(base)):
+        try:
+            paths = sorted(system.find(base))
+        except Exception as error:  # each store has its own kinds
+            raise UserError(f"{url} cannot be listed: {' '.join(str(error).split())[:200]}; check access") from None
+        for path in paths:
             if path.endswith(suffix):
                 yield f"{url}{path.removeprefix(base.rstrip('/'))}", partial(system.open, path, "rb")
 

@@ -111,9 +111,15 @@ def each_layer(table: Iterable[Entry], shapes: Mapping[str, Shape]) -> list[Entr
 
 
 def find_depth(key: str, keys: Iterable[str]) -> int:
-    """Return the number of layers in a file, from the key of an array of each with "{}" for the layer."""
+    """Return the number of layers in a file, from the key of an array of each with "{}" for the layer.
+
+    Raises KeyError if one is missing: a number in a name must not decide how much memory is taken.
+    """
     pattern = re.compile(re.escape(key).replace(r"\{\}", r"(\d+)"))
-    return max(int(match[1]) for key in keys if (match := pattern.fullmatch(key))) + 1
+    layers = {int(match[1]) for name in keys if (match := pattern.fullmatch(name))}
+    if missing := set(range(max(len(layers), 1))) - layers:
+        raise KeyError(key.format(min(missing)))
+    return len(layers)
 
 
 @lru_cache(maxsize=8)

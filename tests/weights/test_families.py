@@ -1,0 +1,209 @@
+"""Files of other families of any size and in any form: the form follows the arrays, damaged files are one sentence."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack
+from anytouch_jax.encoder.family import family_encoder
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.vit import VitConfig
+from anytouch_jax.weights.convert import file_shapes
+from anytouch_jax.weights.families import FAMILIES, entries_of, load_family
+from tests.weights.conftest import Call, Global, tensor, zip_bytes
+
+BY_TITLE = {family.title: family for family in FAMILIES}
+SPARSH, VIDEO, TOUCH2, SITR, T3 = "Sparsh", "Sparsh V-JEPA", "AnyTouch 2", "SITR", "T3"
+HF, AUTHORS, TIMM = "DINOv2 (Hugging Face)", "DINOv2 (its authors' layout)", "ViT, DeiT or MAE (timm's layout)"
+MAE, VIT = "ViT-MAE (Hugging Face)", "ViT or DeiT (Hugging Face)"
+OUT = {"outputs": 7}
+PAIRS = OUT | {"tubelet": 2}
+# family, (width, depth, heads, mlp), patch, what else differs, size of the images, given to the loader
+FORMS = [
+    (SPARSH, (38, 3, 2, 50), 8, {"tubelet": 2, "frames": 2, "registers": 1}, (32, 24), True),
+    (SPARSH, (24, 1, 4, 96), 16, {"tubelet": 3, "frames": 3}, (320, 240), False),
+    (VIDEO, (20, 2, 2, 30), 8, {"tubelet": 2, "frames": 4, "axes": 3}, (40, 16), True),
+    (VIDEO, (20, 2, 5, 30), 8, {"tubelet": 2, "frames": 4, "grid": (2, 8, 6)}, (64, 48), False),
+    (VIDEO, (20, 2, 5, 30), 8, {"tubelet": 2, "frames": 4, "grid": (2, 5, 5)}, (40, 40), False),
+    (VIDEO, (20, 2, 5, 30), 4, {"tubelet": 2, "frames": 8, "grid": (4, 4, 3)}, (16, 12), True),
+    (TOUCH2, (24, 3, 3, 40), 8, PAIRS | {"frames": 4, "grid": (2, 5, 5), "tokens": (7, 3)}, (40, 40), False),
+    (TOUCH2, (8, 1, 2, 8), 8, OUT | {"tubelet": 4, "frames": 4, "grid": (1, 2, 2), "tokens": (2, 1)}, (16, 16), False),
+    (TOUCH2, (24, 1, 3, 40), 8, PAIRS | {"frames": 8, "grid": (4, 3, 3), "tokens": (9, 2)}, (24, 24), True),
+    (SITR, (18, 2, 3, 20), 8, {"grid": (1, 4, 4), "calibration": 9, "outputs": 11}, (32, 32), False),
+    (SITR, (18, 1, 3, 20), 8, {"grid": (1, 2, 3), "outputs": 5}, (16, 24), True),
+    (T3, (24, 1, 4, 48), 8, {"grid": (1, 5, 5), "trunk": 4}, (40, 40), False),
+    (T3, (24, 3, 4, 48), 8, {"grid": (1, 5, 5), "trunk": 1}, (24, 16), True),
+    (HF, (36, 2, 3, 72), 7, {"grid": (1, 6, 6), "registers": 3, "layer_scale": True}, (224, 224), False),
+    (HF, (36, 1, 3, 72), 7, {"grid": (1, 9, 9), "layer_scale": True}, (21, 35), True),
+    (AUTHORS, (30, 3, 5, 72), 14, {"grid": (1, 4, 4), "registers": 2, "layer_scale": True}, (224, 224), False),
+    (MAE, (16, 2, 2, 32), 32, {"grid": (1, 3, 3)}, (96, 96), False),
+    (VIT, (16, 2, 4, 32), 4, {"grid": (1, 7, 7)}, (12, 20), True),
+    (TIMM, (28, 2, 7, 60), 8, {"grid": (1, 6, 6)}, (48, 48), False),
+    (TIMM, (28, 2, 7, 60), 8, {"grid": (1, 3, 5)}, (24, 40), True),
+]  # fmt: skip
+
+
+def made(title, stack, patch, more, size):
+    """The family, the form of its network, and random arrays of a file of this form."""
+    family, more = BY_TITLE[title], dict(more)
+    rows, tokens = more.pop("tokens", (1, 0))
+    numbered = tuple(f"sensor{row}" for row in range(rows - 1))
+    names = (*family.names[: rows - 1], *numbered[len(family.names) :])
+    stack = Stack(*stack)
+    model = ModelConfig(
+        max(size), patch, more.get("outputs", 0) or stack.width, stack, Stack(512, 8, 16, 2048),
+        frames=more.pop("frames", 1), sensors=(*names, UNIVERSAL), sensor_tokens=tokens, norm_eps=family.eps,
+    )  # fmt: skip
+    plain = {"layer_scale": family.name == "sparsh", "class_token": family.name != "sparsh"}
+    plain |= {"patch_bias": title != TOUCH2, "pre_norm": title == TOUCH2, "output_bias": title == SITR}
+    plain["resample"] = "antialias" if family.name == "dinov2" and "registers" in more else family.resample
+    form = VitConfig(model, **(plain | more))
+    shapes, rng = file_shapes(*entries_of(family, form)), np.random.default_rng(0)
+    arrays = {f"{family.prefixes[0]}{key}": rng.normal(size=shape).astype("f4") for key, shape in shapes.items()}
+    return family, form, arrays | ({family.beside: np.zeros((1, 1, 8), "f4")} if family.beside else {})
+
+
+def write_t3(folder: Path, arrays) -> Path:
+    (folder / "encoders").mkdir(parents=True)
+    parts = {True: {}, False: {}}
+    for key, array in arrays.items():
+        parts[key.startswith("trunk.")][key.removeprefix("trunk.")] = tensor(array)
+    (folder / "trunk.pth").write_bytes(zip_bytes(parts[True]))
+    (folder / "encoders" / "digit.pth").write_bytes(zip_bytes(parts[False]))
+    return folder / "encoders" / "digit.pth"
+
+
+@pytest.mark.parametrize(("title", "stack", "patch", "more", "size", "given"), FORMS)
+def test_the_form_follows_the_arrays(title, stack, patch, more, size, given, tmp_path):
+    family, form, arrays = made(title, stack, patch, more, size)
+    file = tmp_path / "model.safetensors"
+    if title == T3:
+        file = write_t3(tmp_path, arrays)
+    else:
+        save_file(arrays, file)
+    model, _ = load_family(file, heads=stack[2], image_size=size if given else None)
+    assert model.family.title == title and model.image_size == size
+    sensors = model.form.model.sensors
+    assert model.form == form if title != T3 else sensors == ("digit", UNIVERSAL)
+    encoder = family_encoder(model, str(file), file)
+    if form.calibration:
+        gel = np.zeros((*size, 3), np.uint8)
+        encoder = encoder.calibrated([gel] * form.calibration, gel)
+    clip = jax.ShapeDtypeStruct((2, form.model.frames, *size, 3), np.float32)
+    row = jax.ShapeDtypeStruct((2,), np.int32)
+    assert jax.eval_shape(encoder.traceable(), encoder.params, clip, row).shape == (2, form.model.embed)
+    places = int(np.prod(size)) // patch**2 * (form.model.frames // form.tubelet)
+    start = 0 if family.tokens == "patches" else form.start
+    assert jax.eval_shape(encoder._tokens, encoder.params, clip, row).shape == (2, start + places, stack[0])
+
+
+def test_what_the_arrays_do_not_say_is_asked_for(tmp_path):
+    _, _, arrays = made(*FORMS[-1][:5])
+    save_file(arrays, tmp_path / "model.safetensors")
+    with pytest.raises(UserError, match="no grid of patches; give the image_size"):
+        load_family(tmp_path / "model.safetensors", heads=7)
+    with pytest.raises(UserError, match=r"number of attention heads of touch \(width 28\)"):
+        load_family(tmp_path / "model.safetensors", image_size=(24, 40))
+    with pytest.raises(UserError, match="no multiple of the patches of 8"):
+        load_family(tmp_path / "model.safetensors", heads=7, image_size=(24, 44))
+    (tmp_path / "config.json").write_text(json.dumps({"num_attention_heads": 7, "hidden_act": "quick_gelu"}))
+    with pytest.raises(UserError, match=r"hidden_act of the config\.json is quick_gelu"):
+        load_family(tmp_path / "model.safetensors", image_size=(24, 40))
+
+
+def test_the_number_of_a_layer_takes_no_memory(tmp_path):
+    _, _, arrays = made(*FORMS[-2][:5])
+    arrays["blocks.999999999.norm1.weight"] = arrays.pop("blocks.1.norm1.weight")
+    save_file(arrays, tmp_path / "model.safetensors")
+    with pytest.raises(UserError, match=r"'blocks\.1\.norm1\.weight' is missing"):
+        load_family(tmp_path / "model.safetensors", heads=7)
+
+
+# Files of every family in every form ----------------------------------------------------------------------------------
+
+KINDS = ("safetensors", "pth", "ckpt", "safetensors parts", "bin parts")
+SMALL = {form[0]: form for form in reversed(FORMS) if form[0] != T3}
+EVIL = Call(Global("os", "system"), ("touch hacked",))
+
+
+def write(folder: Path, kind: str, arrays, extra=None) -> tuple[Path, Path]:
+    """Write a file; return what is loaded and the file to damage, whose pickle may also hold `extra`."""
+    folder.mkdir()
+    suffix = kind.split()[0]
+    if kind.endswith("parts"):
+        names, where = sorted(arrays), {}
+        for part in (0, 1):
+            file = folder / f"model-{part + 1:05d}-of-00002.{suffix}"
+            own = {name: arrays[name] for name in names[part::2]}
+            where |= dict.fromkeys(own, file.name)
+            save(file, own, extra if part else None)
+        index = folder / f"model.{suffix}.index.json"
+        index.write_text(json.dumps({"weight_map": where}))
+        return index, file
+    file = folder / f"model.{suffix}"
+    save(file, arrays, extra)
+    return file, file
+
+
+def save(file: Path, arrays, extra) -> None:
+    if file.suffix == ".safetensors":
+        save_file(arrays, file)
+        return
+    content = {name: tensor(array) for name, array in arrays.items()}
+    if file.suffix == ".ckpt":
+        content = {"epoch": 3, "state_dict": content, "optimizer_states": [{"lr": 0.1}]}
+    file.write_bytes(zip_bytes(content | ({"extra": extra} if extra else {})))
+
+
+def refused(file: Path, named: Path, heads: int, words: str) -> None:
+    with pytest.raises(UserError, match=words) as raised:
+        load_family(file, heads=heads)
+    text = str(raised.value)
+    assert named.name in text and "\n" not in text and len(text) < 600
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("title", SMALL)
+def test_a_whole_file_is_read_and_a_damaged_one_is_one_sentence(title, kind, tmp_path, monkeypatch):
+    _, stack, patch, more, size, given = SMALL[title]
+    family, _, arrays = made(title, stack, patch, more, size)
+    monkeypatch.chdir(tmp_path)
+    file, damaged = write(tmp_path / "whole", kind, arrays)
+    model, _ = load_family(file, heads=stack[2], image_size=size if given else None)
+    assert model.family.title == title
+    data = damaged.read_bytes()
+    for length in (0, 5, len(data) // 3, len(data) - 1000):
+        damaged.write_bytes(data[:length])
+        refused(file, damaged, stack[2], "not a whole safetensors|damaged or not a torch|cut short")
+    damaged.write_bytes(b"<!DOCTYPE html><html>sign in</html>")
+    refused(file, damaged, stack[2], "(?i)html|web page|whole safetensors|not a torch")
+    needed = {f"{family.prefixes[0]}{key}" for key in family.needs}
+    blocks = re.compile(r".*(blocks|layers?)\.0\..*")
+    lost = next(key for key in sorted(arrays) if blocks.fullmatch(key) and key not in needed)
+    file, _ = write(tmp_path / "lost", kind, {key: array for key, array in arrays.items() if key != lost})
+    refused(file, file, stack[2], "missing")
+    if "safetensors" not in kind:
+        file, damaged = write(tmp_path / "evil", kind, arrays, EVIL)
+        refused(file, damaged, stack[2], r"'os\.system'.*nothing was run")
+        assert not (tmp_path / "hacked").exists()
+
+
+@pytest.mark.parametrize("part", ["trunk.pth", "encoders/digit.pth"])
+def test_a_damaged_part_of_t3_is_one_sentence(part, tmp_path):
+    _, stack, patch, more, size, _ = next(form for form in FORMS if form[0] == T3)
+    _, _, arrays = made(T3, stack, patch, more, size)
+    file = write_t3(tmp_path / "t3", arrays)
+    damaged = tmp_path / "t3" / part
+    data = damaged.read_bytes()
+    for length in (0, len(data) // 3, len(data) - 1000):
+        damaged.write_bytes(data[:length])
+        refused(file, damaged, stack[2], "damaged or not a torch file|cut short")
+    damaged.write_bytes(zip_bytes({"model": EVIL}))
+    refused(file, damaged, stack[2], "nothing was run")

@@ -20,6 +20,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "real": ("real.jsonl", studies.real),
     "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
     "motion": ("motion.jsonl", studies.motion),
+    "lookalikes": ("lookalikes.jsonl", studies.lookalikes),
     "teaching": ("teaching.jsonl", studies.teaching),
     "left_out": ("named.jsonl", studies.left_out),
     "named": ("named.jsonl", studies.named),

@@ -361,6 +361,29 @@ def motion(folder: Path) -> Page:
     )  # fmt: skip
 
 
+def lookalikes(folder: Path) -> Page:
+    """The same touch by another sensor, among 50 that resemble it."""
+    path = folder / "lookalikes.jsonl"
+    rows, findings = [], []
+    for grade, record in sorted(records_of(path).items(), reverse=True):
+        scores = record["scores"]
+        for name, one in sorted(scores.items(), key=lambda item: -item[1]["share"]):
+            rows.append((f"{grade} alignment", name, Value(one["share"], *one["interval"]).times(100)))
+        findings += [
+            f"{grade} alignment: `{name}` names {100 * scores[name]['share']:.0f} % of the touches, pixels "
+            f"{100 * scores['pixels']['share']:.0f} %."
+            for name in record["encoders"]
+        ]
+    return Page(
+        "lookalikes", "Does the encoder in the package find the same touch by another sensor?",
+        "Touches are simulated, of objects that training left out, by the six sensors of training. The right answer "
+        "stands among 50 touches that resemble it most in place, depth and force. With fine alignment all sensors "
+        "touch in the same way. With coarse alignment each touches as by hand. Intervals are over objects.",
+        ("touches", "features", Measure("recall@1, %")), rows, findings, (path.name,),
+        "python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/00000 --coarse data/corpus/01700",
+    )  # fmt: skip
+
+
 def _score(task: Record) -> Score:
     return Score(np.array(task["correct"], bool), np.array(task["groups"]), task["option"])
 

@@ -196,7 +196,9 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     if config.reconstructs and not has_decoder:
         notes.append(f"{path} has no decoder, so the decoder starts untrained")
     if dropped := sorted((fresh_parts & set(loaded.params)) - {"touch", "decoder"}):
-        notes.append(f"{path} gives the touch encoder{' and the decoder' * has_decoder}; {', '.join(dropped)} start untrained")
+        notes.append(
+            f"{path} gives the touch encoder{' and the decoder' * has_decoder}; {', '.join(dropped)} start untrained"
+        )
     if loaded.config.model.patches != config.model.patches:
         notes.append(f"the positions of {path} are resized for images of {config.model.image_size} pixels")
     return notes

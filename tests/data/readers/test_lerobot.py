@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pyarrow.parquet
 import pytest
 
 from anytouch_jax.cli.app import main
-from anytouch_jax.data.images import decode
+from anytouch_jax.data.images import decode, frames_from_video
 from anytouch_jax.data.readers import IndexOptions, index
 from anytouch_jax.errors import UserError
 from tests.data.manifest.test_containers import png
@@ -113,6 +114,24 @@ def test_frames_of_parquet_and_film_have_the_indices_and_times_of_the_data_set(r
     assert rows[0]["label.task"] == "press" and len(manifest.clips(3)) == 2 * (3 + 2 + 1)
 
 
+def test_films_in_av1_need_the_extra(root, monkeypatch):
+    av = pytest.importorskip("av")
+    for file in (root / "videos" / FILM / "chunk-000").glob("*.mp4"):
+        values = [int(frame.mean()) for frame in frames_from_video(file)]
+        with av.open(file, "w") as film:
+            stream = film.add_stream("libsvtav1", FPS)
+            stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+            for value in values:
+                film.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64, 3), value, np.uint8), "rgb24")))
+            film.mux(stream.encode())
+    with monkeypatch.context() as changed, pytest.raises(UserError, match=r"anytouch_jax\[lerobot\]"):
+        changed.setitem(sys.modules, "av", None)
+        rows_of(root, keys=(FILM,), export=True)
+    manifest, rows = rows_of(root, keys=(FILM,), export=True)
+    assert [row["index"] for row in rows] == list(range(12))
+    np.testing.assert_allclose([decode(manifest.file(at)).mean() for at in range(12)], 20 * np.arange(12), atol=6)
+
+
 def test_a_data_set_is_embedded_and_the_features_are_a_column(root, tmp_path, capsys):
     rows_of(root, keys=(GEL,))
     encoder, out = mae(tmp_path / "mae"), tmp_path / "features.npz"
@@ -140,7 +159,7 @@ def test_what_is_not_a_data_set_of_this_version_is_one_sentence(root, tmp_path):
         rows_of(root, keys=(GEL,), values=("effort",))
     film = root / "videos" / FILM / "chunk-000" / "file-001.mp4"
     film.write_bytes(film.read_bytes()[:50])
-    with pytest.raises(UserError, match="ffmpeg"):
+    with pytest.raises(UserError, match="download it again"):
         rows_of(root, export=True)
     info = json.loads((root / "meta" / "info.json").read_text())
     (root / "meta" / "info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))

@@ -118,16 +118,30 @@ def _export_films(index: DatasetIndex, info: dict[str, Any], key: str, episodes:
             continue
         try:
             count = 0
-            for count, picture in enumerate(frames_from_video(index.root / path), 1):
+            for count, picture in enumerate(_pictures(index.root / path), 1):
                 for first, length, number in parts:
                     if first <= count - 1 < first + length:
                         save_png(index.root / _frame_path(key, number, count - 1 - first), picture)
                 if count == last:
                     break
         except ImageError as error:
-            raise DatasetError(f"{error}; OpenCV reads H.264 and most AV1 films, else convert it with ffmpeg") from None
+            raise DatasetError(f"{error}; download it again, or for AV1 pip install 'anytouch_jax[lerobot]'") from None
         if count < last:
             raise DatasetError(f"{index.root / path} has {count} frames and the episodes {last}; download it again")
+
+
+def _pictures(path: Path) -> Iterator[np.ndarray]:
+    """Yield the pictures RGB u8 of a film. LeRobot writes AV1, which OpenCV cannot decode. Raises ImageError."""
+    try:
+        import av
+    except ImportError:
+        yield from frames_from_video(path)
+        return
+    try:
+        with av.open(path) as film:
+            yield from (frame.to_ndarray(format="rgb24") for frame in film.decode(video=0))
+    except (av.FFmpegError, OSError, ValueError, IndexError) as error:  # IndexError: a file without a film
+        raise ImageError(f"{path} is not a video that can be read: {error}") from None
 
 
 def _vector_labels(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[Any]]:

@@ -36,8 +36,8 @@ _ROOMS = {
 
 
 def help_of(command: str) -> str:
-    """Return the help text of a command, 100 columns wide, without the frames that a terminal draws."""
-    os.environ["COLUMNS"] = "100"
+    """Return the help text of a command, 80 columns wide, without the frames that a terminal draws."""
+    os.environ["COLUMNS"] = "80"
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
         main([*command.split(), "--help"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 
 import pytest
 
@@ -26,20 +27,20 @@ def screen_of(monkeypatch):
 def test_a_terminal_shows_a_bar_with_the_time_left(monkeypatch):
     screen = screen_of(monkeypatch)
     monkeypatch.setattr(bars, "WAIT", 0.0)
-    assert list(bars.tracked("abc", 3, "letters")) == ["a", "b", "c"]
+    assert list(bars.tracked("abc", "letters")) == ["a", "b", "c"]
     assert "letters" in screen.getvalue() and "3/3" in screen.getvalue() and "0:00:00" in screen.getvalue()
 
 
 def test_short_work_shows_nothing(monkeypatch):
     screen = screen_of(monkeypatch)
-    assert list(bars.tracked("abc", 3, "letters")) == ["a", "b", "c"]
+    assert list(bars.tracked("abc", "letters")) == ["a", "b", "c"]
     assert "letters" not in screen.getvalue()
 
 
 def test_elsewhere_nothing_is_shown(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     monkeypatch.setattr(bars, "WAIT", 0.0)
-    assert list(bars.tracked(iter("abc"), None, "letters")) == ["a", "b", "c"]
+    assert list(bars.tracked(iter("abc"), "letters")) == ["a", "b", "c"]
     assert sys.stderr.getvalue() == ""
 
 
@@ -50,3 +51,13 @@ def test_an_error_takes_the_bar_away(monkeypatch):
         advance(1)
         raise ZeroDivisionError
     assert screen.getvalue().endswith("\x1b[?25h")  # the cursor is back
+
+
+def test_a_long_first_item_has_a_bar_and_a_bar_inside_goes_when_it_is_done(monkeypatch):
+    screen = screen_of(monkeypatch)
+    monkeypatch.setattr(bars, "WAIT", 0.01)
+    with bars.bar(1, "folders"):  # never moved
+        assert list(bars.tracked("ab", "frames")) == ["a", "b"]
+        while "folders" not in screen.getvalue():
+            time.sleep(0.01)
+    assert bars._display is None

@@ -102,6 +102,8 @@ def test_the_python_of_a_page_runs_and_prints_what_it_shows(
         names["manifest"] = from_columns(row, tmp_path / "m.parquet")
     for code, shown in BLOCK.findall(PAGES[name]):
         capsys.readouterr()
+        if "runs/" in code:  # test_pages_run.py trains that run
+            continue
         exec(code, names)
         assert not shown or capsys.readouterr().out == shown
 

@@ -1,4 +1,4 @@
-"""Prose rules for pages and docstrings: `python -m tests.prose.check` prints file, line and reason.
+"""Prose rules for pages, docstrings and error messages: `python -m tests.prose.check` prints file, line and reason.
 
 A sentence has at most 30 words, and in a page at most three numbers and no semicolon. A table cell has at most 25
 words. Some phrases are not used anywhere. The README has at most 700 words. Code, links' addresses and tables' numbers
@@ -153,6 +153,22 @@ def docstring_faults(file: Path, text: str) -> Iterator[Fault]:
                     yield Fault(file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
 
 
+def message_faults(file: Path, text: str) -> Iterator[Fault]:
+    """Yield the faults of the messages of a module, which go to errors and logs: long sentences and phrases."""
+    for node in ast.walk(ast.parse(text)):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
+            continue
+        if not (node.func.id.endswith("Error") or node.func.id in ("log", "warn")):
+            continue
+        parts = node.args[0].values if isinstance(node.args[0], ast.JoinedStr) else [node.args[0]]
+        prose = "".join(str(part.value) if isinstance(part, ast.Constant) else "code" for part in parts)
+        if found := _FORBIDDEN.search(prose):
+            yield Fault(file, node.lineno, f"the phrase {found[0]!r}")
+        for sentence in sentences(prose.replace("; ", ". ")):
+            if len(words(sentence)) > WORDS:
+                yield Fault(file, node.lineno, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+
+
 def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
     """Yield the faults of the text cells of a notebook in the percent form, whose lines begin with a hash."""
     lines, inside = [], False
@@ -166,9 +182,10 @@ def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
 
 
 def faults(root: Path) -> list[Fault]:
-    """Return the faults of all pages and docstrings below `root`."""
+    """Return the faults of all pages, docstrings and messages below `root`."""
     result: list[Fault] = []
-    for patterns, check in ((PAGES, page_faults), (CODE, docstring_faults), (NOTEBOOKS, notebook_faults)):
+    rules = (PAGES, page_faults), (CODE, docstring_faults), (CODE, message_faults), (NOTEBOOKS, notebook_faults)
+    for patterns, check in rules:
         for file in sorted({file for pattern in patterns for file in root.glob(pattern)}):
             if file.relative_to(root).as_posix().startswith(MADE):
                 continue

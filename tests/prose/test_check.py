@@ -63,6 +63,12 @@ def test_docstrings_are_checked_and_code_is_not():
     assert [line for line, _ in found] == [1, 5] and "31 words" in found[0][1] and "'tells'" in found[1][1]
 
 
+def test_messages_of_errors_are_checked():
+    code = f'raise UserError(f"{{x}} is it. {LONG}")\nlog("It tells.")\nname("It tells.")\nraise OSError\n'
+    found = [(fault.line, fault.reason) for fault in check.message_faults(Path("a.py"), code)]
+    assert [line for line, _ in found] == [1, 2] and "words, at most" in found[0][1] and "'tells'" in found[1][1]
+
+
 def test_the_text_of_a_notebook_is_checked_and_its_code_is_not():
     text = f"# %% [markdown]\n# # Title?\n#\n# Fine.\n#\n# {LONG}\n\n# %%\n# a; b\nx = 1  # {LONG}\n"
     found = list(check.notebook_faults(Path("a.py"), text))

@@ -268,7 +268,7 @@ def _embed_frames(
             yield number, name, frame
 
     features = embed_frames(
-        encoder, tracked(frames(), _frame_count(data), "frames embedded"), row, preprocess, length=options.frames,
+        encoder, tracked(frames(), "frames embedded", _frame_count(data)), row, preprocess, length=options.frames,
         pooling=pooling, join=options.join, batch=options.batch,
     )  # fmt: skip
     features.predictions["contact"] = np.asarray(contact)[features.rows]

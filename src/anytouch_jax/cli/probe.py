@@ -7,15 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
-from anytouch_jax.cli.output import (
-    check_apart,
-    check_folder,
-    check_home,
-    log,
-    log_default,
-    print_table,
-    refuse_unused,
-)
+from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, log_default, print_table, refuse_unused
 from anytouch_jax.config.parsing import Count, NotNegative, Range
 from anytouch_jax.errors import UserError
 

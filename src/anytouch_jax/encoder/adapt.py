@@ -235,7 +235,7 @@ def _fit(
 
     tokens = jnp.asarray(params["touch"]["sensor_tokens"][row])
     state, root, history = tx.init(tokens), jax.random.key(seed), []
-    for number in tracked(range(steps), steps, "steps"):
+    for number in tracked(range(steps), "steps"):
         tokens, state, value = step(tokens, state, jax.random.fold_in(root, number), arrays)
         history.append(value)
     return np.asarray(tokens), tuple(float(value) for value in history)

@@ -106,7 +106,7 @@ def embed_rows(
         sensor = sensor if sensor_row is None else np.full_like(sensor, sensor_row)
         return encoder.encode_touch(clips, sensor, pooling=pooling, join=join)
 
-    values = run_in_batches(encode, tracked(touches(), len(rows), "frames embedded"), config.data.batch_size)
+    values = run_in_batches(encode, tracked(touches(), "frames embedded", len(rows)), config.data.batch_size)
     if not ids:
         raise UserError(f"none of the {len(rows)} rows can be read; check them with `anytouch data verify`")
     return np.concatenate(ids), values

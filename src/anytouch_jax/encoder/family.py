@@ -188,11 +188,9 @@ class FamilyEncoder(Encoder):
         if clips.shape[1] > 1:
             raise UserError(f"{self.family.title} gives the tokens of one frame, not of {clips.shape[1]}")
         found = self._run(params, clips[:, 0], rows)
-        return {
-            "hidden": found.hidden,
-            "normed": found.normed,
-            "patches": found.normed[:, self.form.start :],
-        }[self.family.tokens].astype(jnp.float32)
+        return {"hidden": found.hidden, "normed": found.normed, "patches": found.normed[:, self.form.start :]}[
+            self.family.tokens
+        ].astype(jnp.float32)
 
     def _clips(self, clips: jax.Array) -> jax.Array:
         """Return the network's clips (B, P, F, H, W, 3): P is 1 for a family of clips, and F is 1 for one of stills."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.arrays import binary_scale, unit_rows
 from anytouch_jax.encoder.novelty import Assessment, Calibration
@@ -148,7 +149,7 @@ def linear_path(
     classes, numbers = np.unique(y, return_inverse=True)
     first = start.fit if start is not None and np.array_equal(start.classes, classes) else None
     fits = logistic.path((x - mean) / scale, numbers, len(classes), penalties, first, weights)
-    return [LinearModel(mean, scale, classes, fit) for fit in fits]
+    return [LinearModel(mean, scale, classes, fit) for fit in tracked(fits, "penalties", len(penalties))]
 
 
 def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "column") -> tuple[Array, Array]:
@@ -233,7 +234,7 @@ def _fit_gradient(
     init, step = _gradient_step(recipe, classes)
     state, batch, epochs = init(params), min(recipe.batch, n), list[tuple[Array, Array]]()
     steps = n // batch  # the last, smaller batch of an epoch is left out
-    for epoch in range(recipe.epochs):
+    for epoch in tracked(range(recipe.epochs), "epochs"):
         for number, rows in enumerate(rng.permutation(n)[: steps * batch].reshape(steps, batch), epoch * steps):
             rate = recipe.rate * 0.5 * (1 + np.cos(np.pi * number / (steps * recipe.epochs)))
             params, state = step(params, state, x[rows], target[rows], np.float32(rate))

@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder import novelty
@@ -132,8 +133,9 @@ def probe_features(
     if model is not None and not model.fit.finished:
         notes += ("the fit stopped at its limit of iterations",)
     result = _result(name, protocol, data, rows, predicted, selected, notes, subsets)
+    bootstraps = tracked(list(splits.group_bootstraps(rows.fit, data.groups, 0 if measured else seeds)), "refits")
     refits, head = [], replace(head, options=(selected.option,))
-    for ids, weights in splits.group_bootstraps(rows.fit, data.groups, 0 if measured else seeds):
+    for ids, weights in bootstraps:
         (again,) = data.fit(head, ids, weights=weights, start=model).predict(data.x[rows.test])
         refits.append(float(np.mean(again == data.y[rows.test])))
     if refits:
@@ -164,7 +166,7 @@ def leave_groups_out(
     predicted, baseline = np.full(len(data.y), -1), np.full(len(data.y), -1)
     head = ProbeHead("linear", scaling, tuple(penalties))
     count = len(np.unique(data.groups[used])) if folds is None else folds
-    for fit, out in splits.group_folds(used, data.groups, data.y, count):
+    for fit, out in tracked(list(splits.group_folds(used, data.groups, data.y, count)), "folds"):
         cut = Split(fit, fit[:0], out)
         selected, _, predicted[out] = _predict(data, cut, head, "honest", refit=True)
         chosen.append(selected.option)
@@ -453,7 +455,7 @@ def probe_tasks(
     for source in sources:
         for length, ids in rows.items():
             source.store.add(ids, length)
-        for plan in plans:
+        for plan in tracked(plans, f"tasks with {source.name}"):
             labelled = _labelled(source, plan)
             notes, about = [*plan.notes, *source.notes(plan.rows.sensors)], {"frames": plan.frames, "order": order}
             about |= {"order": "right"} if plan.frames == 1 else {}
@@ -551,12 +553,12 @@ def _score(
     """Score a head on all splits of all seeds. Return the test rows of each seed, too."""
     roles, chosen, sizes, unfinished = plan.roles, list[float](), list[int](), 0
     runs, baselines = list[GroupSums](), list[GroupSums]()
-    for seed in range(seeds):
+    for seed in tracked(range(seeds), "splits"):
         cuts = splits.seeded_splits(roles, seed, protocol)
         if seed and protocol == "published" and len(cuts) == 1 and head.name != "gradient":
             runs.append(runs[0])  # nothing is drawn: every seed is the same fit
             continue
-        parts = [_predict(data, cut, replace(head, seed=seed), protocol) for cut in cuts]
+        parts = [_predict(data, cut, replace(head, seed=seed), protocol) for cut in tracked(cuts, "folds")]
         tested = np.concatenate([cut.test for cut in cuts])
         runs.append(_sums(data, np.concatenate([predicted for *_, predicted in parts]), tested))
         baselines.append(_sums(data, np.concatenate([_constant(data, cut) for cut in cuts]), tested))

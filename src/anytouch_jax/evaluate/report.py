@@ -15,6 +15,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.evaluation import evaluation
@@ -358,7 +359,7 @@ def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[geometry.
     drawn = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_T_SNE_ROWS])
     features = {name: study.test(values) for name, values in study.classes.items()}
     spaces = [geometry.describe(values, sensors, objects, touch, name=name) for name, values in features.items()]
-    points = {name: geometry.tsne(values[drawn], seed=seed) for name, values in features.items()}
+    points = {name: geometry.tsne(values[drawn], seed=seed) for name, values in tracked(features.items(), "t-SNE")}
     path = out / "figures" / "tsne.png"
     plots.tsne_panels(path, points, sensors[drawn], objects[drawn])
     lines = []

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.heads import FittedHead, ProbeHead
@@ -224,7 +225,7 @@ def select_option(head: ProbeHead, data: LabelledFeatures, split: Split, protoco
         chosen_on = "cross-validation"
         parts = list(group_folds(fit, data.groups, data.y if len(data.names) else None, FOLDS))
     totals: Any = 0
-    for inner, out in parts:
+    for inner, out in tracked(parts, "folds"):
         fitted = data.fit(head, inner)
         scores = [
             heads.head_score(predicted, data.y[out], len(data.names)) for predicted in fitted.predict(data.x[out])

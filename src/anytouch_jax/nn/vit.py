@@ -11,17 +11,7 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.nn.layers import (
-    Block,
-    Dense,
-    LayerNorm,
-    gelu,
-    lean,
-    rows_of,
-    run_blocks,
-    stacked_blocks,
-    table,
-)
+from anytouch_jax.nn.layers import Block, Dense, LayerNorm, gelu, lean, rows_of, run_blocks, stacked_blocks, table
 from anytouch_jax.nn.matmul import product
 from anytouch_jax.ops import tokens
 
@@ -204,9 +194,7 @@ def cubic(old: int, new: int, resample: Resample = "bicubic") -> np.ndarray:
     taps = np.floor(centre).astype(int) + np.arange(-int(2 * zoom) - 1, int(2 * zoom) + 3)
     far = np.abs(centre - taps) / zoom
     weight = np.where(
-        far <= 1,
-        ((a + 2) * far - (a + 3)) * far**2 + 1,
-        np.where(far < 2, a * (((far - 5) * far + 8) * far - 4), 0),
+        far <= 1, ((a + 2) * far - (a + 3)) * far**2 + 1, np.where(far < 2, a * (((far - 5) * far + 8) * far - 4), 0)
     )
     if wide:
         weight = np.where((taps >= 0) & (taps < old), weight, 0)

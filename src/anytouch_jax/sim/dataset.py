@@ -40,11 +40,7 @@ Row = dict[str, Any]
 
 
 def simulate(
-    scenes: Scenes,
-    out: str | Path,
-    *,
-    threads: int = 2,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    scenes: Scenes, out: str | Path, *, threads: int = 2, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> Path:
     """Simulate `scenes` into the folder `out`, or continue there, and return the manifest's path.
 

@@ -222,11 +222,7 @@ class Recorder:
             if SENSORS[name].kind == "image":
                 look(SENSORS[name])  # is fitted to real presses once, outside of the program
             one = partial(
-                simulate_clip,
-                sensor=SENSORS[name],
-                fidelity=scenes.fidelity,
-                size=scenes.size,
-                fields=scenes.fields,
+                simulate_clip, sensor=SENSORS[name], fidelity=scenes.fidelity, size=scenes.size, fields=scenes.fields
             )
             self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]

@@ -97,8 +97,8 @@ class Checkpoints:
         disk = shutil.disk_usage(self.folder)
         if disk.total and disk.free < needed and jax.process_count() == 1:
             raise CheckpointError(
-                f"cannot write a checkpoint in {self.folder}: the disk is full, {needed:,} bytes are needed and "
-                f"{disk.free:,} are free; free some space and run the same command again; older ones are untouched"
+                f"cannot write a checkpoint in {self.folder}: the disk is full. It needs {needed:,} bytes and has "
+                f"{disk.free:,}. Free some space and run the same command again. Older checkpoints are untouched."
             )
 
     def save(self, step: int, state: Tree, metrics: Mapping[str, Any]) -> None:

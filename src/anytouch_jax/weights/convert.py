@@ -66,9 +66,9 @@ def refuse_unknown(stacks: Mapping[str, int], start: str = "") -> None:
         names = " and ".join(f"{name} (width {width})" for name, width in stacks.items())
         example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
-            f"{start}the weights do not store the number of attention heads of {names}; write it to a config.json "
-            f'in its folder, as {{"model": {{{example}}}}}, or write the file by `anytouch export --to safetensors`, '
-            "which stores it"
+            f"{start}the weights do not store the number of attention heads of {names}. Write it to a config.json "
+            f'in its folder, as {{"model": {{{example}}}}}. Or write the file by `anytouch export --to safetensors`, '
+            "which stores it."
         )
 
 

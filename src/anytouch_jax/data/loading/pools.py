@@ -117,9 +117,8 @@ def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, 
     has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
     if config.stage == 2 and not (has_modality or any(match) or config.reconstructs):
         raise UserError(
-            f"stage 2 has nothing to learn from split {data.split!r}: it needs photographs (image_path), captions "
-            "(text), or places touched by two sensors (touch), with the tower or head for them; add one, or train "
-            "stage 1"
+            f"stage 2 has nothing to learn from split {data.split!r}. It needs photographs (image_path), captions "
+            "(text), or places touched by two sensors (touch). Add one with its tower or head, or train stage 1."
         )
     return Pools(touch, match, usable.sensor, tokenizer, notes)
 

@@ -128,7 +128,7 @@ def scan(
         return _judge(data, path, decode and not is_field) if data else _FileState("empty")
 
     with closing(bounded_map(inspect, range(count), threads, 8 * max(threads, 1))) as states:
-        for file, state in enumerate(tracked(states, count, "files checked")):
+        for file, state in enumerate(tracked(states, "files checked", count)):
             result.state[file] = STATES.index(state.state)
             result.size[file], result.digest[file] = state.size, state.digest
             if state.colours is not None:

@@ -215,7 +215,7 @@ def _write_shards(
         return _Piece(suffix.group() if suffix else "", data)
 
     with closing(bounded_map(fetch, ids[done:].tolist(), threads)) as every:
-        pieces = tracked(every, len(ids) - done, "files packed")
+        pieces = tracked(every, "files packed", len(ids) - done)
         piece = next(pieces, None)
         while piece is not None:
             path, rows, size = folder / f"{number:05d}.zip", 0, 0

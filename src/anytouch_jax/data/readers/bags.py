@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.data.images import decode_bytes
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, save_png
 from anytouch_jax.errors import UserError
@@ -111,7 +112,8 @@ def read_messages(path: Path, topics: set[str] | None = None) -> Iterator[Messag
 
         with AnyReader([path]) as reader:
             wanted = [one for one in reader.connections if topics is None or one.topic in topics]
-            for connection, time, data in reader.messages(wanted) if wanted else ():
+            total = sum(one.msgcount for one in wanted)
+            for connection, time, data in tracked(reader.messages(wanted) if wanted else (), "messages read", total):
                 yield Message(connection.topic, time, connection.msgtype, reader.deserialize(data, connection.msgtype))
     except ImportError as error:
         raise DatasetError(f"{path} needs a package: {error}; run pip install 'anytouch_jax[bags]'") from None
@@ -128,7 +130,11 @@ def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
     stores: dict[str, Any] = {}
     protobuf: Any = None
     with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages(topics):
+        reader = make_reader(file)
+        about = reader.get_summary()
+        counts = about.statistics.channel_message_counts if about and about.statistics else {}
+        total = sum(n for one, n in counts.items() if topics is None or about.channels[one].topic in topics) or None
+        for schema, channel, message in tracked(reader.iter_messages(topics), "messages read", total):
             encoding, kind = channel.message_encoding, "" if schema is None else schema.name
             if encoding == "json":
                 content = json.loads(message.data, object_hook=lambda one: SimpleNamespace(**one))

@@ -19,8 +19,9 @@ from typing import Any, BinaryIO, Literal
 import cv2
 import numpy as np
 
+from anytouch_jax.bars import Item, tracked
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
-from anytouch_jax.data.images import frames_from_video, natural
+from anytouch_jax.data.images import count_frames, frames_from_video, natural
 from anytouch_jax.data.manifest.remote import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.errors import UserError
@@ -107,6 +108,11 @@ class DatasetIndex:
         self._contact_rows = 0
         self.table: Columns = {name: [] for name in REQUIRED}
 
+    @staticmethod
+    def tracked(items: Iterable[Item], words: str = "folders read", total: int | None = None) -> Iterator[Item]:
+        """Yield items below a progress bar."""
+        return tracked(items, words, total)
+
     def skip(self, reason: str, example: str, count: int = 1) -> None:
         """Count `count` things left out for `reason`; the first `example` is reported."""
         if count:
@@ -154,27 +160,25 @@ class DatasetIndex:
         """Yield `base` and all folders below it, in order."""
         folders, files = self.listing(f"{base}{inside}", count=count)
         yield inside, folders, files
-        for folder in folders:
+        for folder in folders if inside else self.tracked(folders):
             yield from self.walk(base, f"{inside}/{folder}".lstrip("/"), count=count)
 
     def shards(self, suffix: str) -> Iterator[tuple[str, Callable[[], BinaryIO]]]:
         """Yield the path of every shard below ROOT, or its address below the option `url`, and how to open it."""
         if self.options.url is None:
-            for folder, _, files in self.walk():
-                for name in (name for name in files if name.endswith(suffix)):
-                    path = f"{folder}/{name}".lstrip("/")
-                    opened: Callable[[], Any] = partial((self.root / path).open, "rb")
-                    yield path, opened
+            found = [f"{folder}/{name}".lstrip("/") for folder, _, files in self.walk() for name in files]
+            for path in tracked([path for path in found if path.endswith(suffix)], "shards read"):
+                opened: Callable[[], Any] = partial((self.root / path).open, "rb")
+                yield path, opened
             return
         url = self.options.url.rstrip("/")
         system, base = open_store(url)
         try:
-            paths = sorted(system.find(base))
+            paths = sorted(path for path in system.find(base) if path.endswith(suffix))
         except Exception as error:  # each store has its own kinds
             raise UserError(f"{url} cannot be listed: {' '.join(str(error).split())[:200]}; check access") from None
-        for path in paths:
-            if path.endswith(suffix):
-                yield f"{url}{path.removeprefix(base.rstrip('/'))}", partial(system.open, path, "rb")
+        for path in self.tracked(paths, "shards read"):
+            yield f"{url}{path.removeprefix(base.rstrip('/'))}", partial(system.open, path, "rb")
 
     def need_sensor(self) -> str:
         """Return the sensor of the option. Raises UserError without one."""
@@ -293,7 +297,7 @@ def save_png(file: Path, picture: np.ndarray) -> None:
         atomic_write(file, cv2.imencode(".png", bgr)[1].tobytes(), sync=False)
 
 
-def export_video(video: Path, frames: Iterable[np.ndarray] | None = None) -> int:
+def export_video(video: Path) -> int:
     """Write the frames of a video as 000000.png, ... into a folder of its name, whole or not; return their number.
 
     Raises ImageError for a video that cannot be read, UserError if nothing can be written.
@@ -301,7 +305,7 @@ def export_video(video: Path, frames: Iterable[np.ndarray] | None = None) -> int
     count = 0
     try:
         with atomic_folder(video.with_suffix("")) as target:
-            for frame in frames_from_video(video) if frames is None else frames:
+            for frame in tracked(frames_from_video(video), "frames written", count_frames(video) or None):
                 save_png(target / f"{count:06d}.png", frame)
                 count += 1
     except OSError as error:

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.bars import tracked
 from anytouch_jax.data.images import natural
 from anytouch_jax.data.readers.common import (
     PARTS,
@@ -58,7 +59,7 @@ def read(index: DatasetIndex) -> None:
     splits = _splits_of_fold(index, base)
     table = index.root / base / "feel.csv"
     files: dict[str, set[str]] = {}
-    for line, row in read_lines(table):
+    for line, row in tracked(read_lines(table), "rows read"):
         if len(row) != 3 or not row[1].isdecimal() or row[2] not in ("0", "1"):
             raise DatasetError(f"{table}, line {line}: expected object,number,0 or 1, found {','.join(row)}")
         name = row[0]
@@ -155,7 +156,7 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
         raise DatasetError("the original files of Feel are HDF5; run pip install h5py") from None
     lines: list[list[Any]] = []
     numbers: dict[str, int] = {}
-    for name in sorted(names, key=natural):
+    for name in tracked(sorted(names, key=natural), "files read"):
         try:
             with h5py.File(root / name, "r") as file:
                 for grasp in _grasps(file):

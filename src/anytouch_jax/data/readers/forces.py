@@ -61,14 +61,15 @@ def _force(index: DatasetIndex) -> None:
     folders = [folder for folder, _, files in index.walk() if "dataset_slip_forces.pkl" in files]
     if folders:
         index.need_export(f"{len(folders)} batches of TacBench in pickles")
-    for folder in folders:
+    for folder in index.tracked(folders):
         files = [name for name in index.listing(folder)[1] if re.match(r"dataset_(digit|gelsight)_\d+\.pkl", name)]
         frames = [frame for name in files for frame in _list(index.root / folder / name)]
         content = read_pickle(index.root / folder / "dataset_slip_forces.pkl")
         slides = content.get("trajectories", content) if isinstance(content, dict) else None
         if not isinstance(slides, dict) or not files:
             raise DatasetError(f"{index.root / folder} has no slides or no frames; download it again")
-        names = [_picture(index, frame, f"{folder}/frames/{i:06d}") for i, frame in enumerate(frames)]
+        written = index.tracked(frames, "frames written")
+        names = [_picture(index, frame, f"{folder}/frames/{i:06d}") for i, frame in enumerate(written)]
         contact = np.ravel(content.get("in_contact", np.ones(len(names))))
         free = np.flatnonzero(contact == 0)
         gel = names[int(free[0])] if len(free) and free[0] < len(names) else None
@@ -105,7 +106,7 @@ def _pose(index: DatasetIndex) -> None:
             bags = [name for name in files if name.endswith(".pkl")]
             if bags:
                 index.need_export(f"{len(bags)} bags of TacBench in pickles")
-            for bag in bags:
+            for bag in index.tracked(bags, "files read"):
                 _add_bag(index, part, folder, bag)
 
 
@@ -120,7 +121,7 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise DatasetError(f"{path}: {error} is missing or of an odd shape; download it again") from None
         name = f"{part}/{folder}/{bag.removesuffix('.pkl')}/{finger}"
-        names = [_picture(index, frames[i], f"{name}/{i:06d}") for i in range(count)]
+        names = [_picture(index, frames[i], f"{name}/{i:06d}") for i in index.tracked(range(count), "frames written")]
         gel = f"bgs/digit_{finger}.png"
         yaw = np.degrees(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))  # the last of Euler's angles "xyz"
         index.add(
@@ -160,7 +161,7 @@ def _touchd(index: DatasetIndex) -> None:
     table = index.find_file(["all_data_direction.json"])
     if table is None:
         return
-    for folder, sensors in read_json(table, dict).items():
+    for folder, sensors in index.tracked(read_json(table, dict).items()):
         number = re.search(r"obj(\d+)", folder.split("_speed")[0])
         known = int(number[1]) if number else -1
         split = "test" if known in TEST_OBJECTS else "train" if known in TRAIN_OBJECTS else None
@@ -191,7 +192,7 @@ def _freetacman(index: DatasetIndex) -> None:
     Cameras called tactile are read, or those of the option `keys`. A demonstration is an object's recording.
     """
     wanted = index.options.keys or ("tactile",)
-    for folder, folders, files in list(index.walk()):
+    for folder, folders, files in index.tracked(list(index.walk())):
         for name in (name for name in files if name.endswith(".mp4")):
             stem = Path(name).stem
             if not any(key in stem for key in wanted):

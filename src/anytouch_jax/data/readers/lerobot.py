@@ -118,7 +118,8 @@ def _export_films(index: DatasetIndex, info: dict[str, Any], key: str, episodes:
             continue
         try:
             count = 0
-            for count, picture in enumerate(_pictures(index.root / path), 1):
+            pictures = index.tracked(_pictures(index.root / path), "frames written", last)
+            for count, picture in enumerate(pictures, 1):
                 for first, length, number in parts:
                     if first <= count - 1 < first + length:
                         save_png(index.root / _frame_path(key, number, count - 1 - first), picture)

@@ -37,7 +37,7 @@ def _rendered(index: DatasetIndex) -> None:
         return
     labels, splits = _lists(index)
     for place, names in ids.items():
-        for name in names:
+        for name in index.tracked(names):
             folder, number, first = f"{place}{name}", int(name), int(name) <= LAST_OF_1
             if (place.endswith("touch/") and first) or (place == "obj1.0/" and not first):
                 index.skip(f"id that does not belong to {place.rstrip('/')} (1.0 ends at {LAST_OF_1})", folder)

@@ -149,7 +149,7 @@ def _export_videos(index: DatasetIndex) -> None:
 
     A video that cannot be read is skipped. Raises UserError if nothing can be written.
     """
-    for folder, folders, files in list(index.walk(count=False)):  # before any folder is made
+    for folder, folders, files in index.tracked(list(index.walk(count=False))):  # before any is made
         for video in (index.root / folder / name for name in files if _is_video(name)):
             if video.stem in folders:
                 continue

@@ -63,7 +63,7 @@ def _cloth(index: DatasetIndex) -> None:
     if not properties:
         index.notes.append("no cloth_metadata.json: no labels of the cloth's properties")
     index.read_contact_list(("contact_yuan.csv", "Data_ICRA18/contact_yuan.csv"), "Data")
-    for cloth in index.listing(base)[0]:
+    for cloth in index.tracked(index.listing(base)[0]):
         labels = _cloth_labels(properties.get(cloth), table, cloth)
         if properties and not labels:
             index.skip("cloth without properties (kept without labels)", cloth)
@@ -98,7 +98,7 @@ def _ycb_slide(index: DatasetIndex) -> None:
     differ too little: a clip takes every third, as in AnyTouch, so every row has stride 3 and keeps its number.
     """
     base = index.find_folder("real", "dataset/real", "") or ""
-    for obj in index.listing(base)[0]:
+    for obj in index.tracked(index.listing(base)[0]):
         for name in index.listing(f"{base}{obj}")[0]:
             folder = f"{base}{obj}/{name}/frames"
             if not name.startswith("dataset_") or not (index.root / folder).is_dir():
@@ -126,7 +126,7 @@ def _octopi(index: DatasetIndex) -> None:
         splits = published_splits(paths[0][1].with_name("*_samples.json"), folders, name_of)
     else:
         index.notes.append("no train_, val_ and test_samples.json: split by hash of the object")
-    for sample in index.listing(base)[0]:
+    for sample in index.tracked(index.listing(base)[0]):
         files = index.listing(f"{base}{sample}")[1]
         if not files:
             index.skip("folder without files", f"{base}{sample}")

@@ -31,7 +31,7 @@ def read(index: DatasetIndex) -> None:
     index.notes += [f"no data_{subset}: that subset is left out" for subset in COARSE if subset not in subsets]
     for subset in subsets:
         contact = _contact_spans(index, subset)
-        for item in index.listing(f"data_{subset}")[0]:
+        for item in index.tracked(index.listing(f"data_{subset}")[0]):
             place = f"data_{subset}/{item}"
             listed = item if item in contact else ON_DISK.get(item, item)
             if listed not in contact:

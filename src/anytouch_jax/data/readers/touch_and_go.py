@@ -35,7 +35,7 @@ def read(index: DatasetIndex) -> None:
     if base is None:
         return
     listed = _lists(index)
-    for video in index.listing(base)[0]:
+    for video in index.tracked(index.listing(base)[0]):
         frames = listed.pop(video, {})
         on_disk = _add_video(index, f"{base}{video}", frames)
         index.skip("listed frame that is not on disk", video, len(frames) - on_disk)

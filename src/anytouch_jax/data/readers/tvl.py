@@ -64,7 +64,8 @@ def _tvl(index: DatasetIndex) -> None:
     base = index.find_folder("tvl_dataset/hct", "hct", "", inside=PARTS)
     parts = [part for part in PARTS if base is not None and (index.root / base / part).is_dir()]
     recordings: dict[str, Sides] = {}
-    for place in (f"{part}/{name}" for part in parts for name in index.listing(f"{base}{part}")[0]):
+    listed = [f"{part}/{name}" for part in parts for name in index.listing(f"{base}{part}")[0]]
+    for place in index.tracked(listed):
         if "tactile" in index.listing(f"{base}{place}")[0]:
             touch, vision = (index.frames(f"{base}{place}/{side}", FRAME) for side in ("tactile", "vision"))
             recordings[place] = touch, vision

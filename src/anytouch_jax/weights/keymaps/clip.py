@@ -69,11 +69,7 @@ _OPEN_TEXT = f"""
 OPENCLIP = KeyMap(
     "openclip",
     r"visual\.conv1\.weight",
-    (
-        *rows(_OPEN_VISION, "visual.", "image/"),
-        *rows(_OPEN_TEXT, "", "text/"),
-        *rows("same logit_scale logit_scale"),
-    ),
+    (*rows(_OPEN_VISION, "visual.", "image/"), *rows(_OPEN_TEXT, "", "text/"), *rows("same logit_scale logit_scale")),
     towers={
         "image": r"visual\..*",
         "text": r"text_projection|token_embedding\..*|positional_embedding|transformer\..*|ln_final\..*",

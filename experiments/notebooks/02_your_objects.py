@@ -54,11 +54,11 @@ answer = np.where(nearest > limit, "I do not know", answer)
 # %%
 figure, axis = plt.subplots(figsize=(7, 3))
 for place, name in enumerate((first, second, unknown)):
-    part = (labels == name) & ~train
-    axis.scatter(nearest[part], np.full(part.sum(), place), c=["C2" if one == name else "C3" for one in answer[part]])
+    part, right = (labels == name) & ~train, "I do not know" if name == unknown else name
+    axis.scatter(nearest[part], np.full(part.sum(), place), c=["C2" if one == right else "C3" for one in answer[part]])
 axis.axvline(limit, color="#222222", linestyle="--", label="limit")
 axis.set_yticks(range(3), [first, second, f"{unknown} (unknown)"])
-axis.set(xlabel="distance to the nearest training recording (green: named right)", ylim=(-0.5, 2.5))
+axis.set(xlabel="distance to the nearest training recording (green: a right answer)", ylim=(-0.5, 2.5))
 axis.legend()
 figure.tight_layout()
 plt.show()
@@ -68,7 +68,7 @@ plt.show()
 
 # %%
 known, strange = ~train & (labels != unknown), labels == unknown
-right = answer[known] == labels[known]
-refused = answer[strange] == "I do not know"
-print(f"Of {known.sum()} recordings of known things, {right.sum()} are named right.")
-print(f"Of {strange.sum()} recordings of the unknown thing, {refused.sum()} get 'I do not know'.")
+right, refused = answer == labels, answer == "I do not know"
+print(f"Of {known.sum()} recordings of known things, {right[known].sum()} are named right.")
+print(f"'I do not know' is the answer to {refused[known].sum()} of them.")
+print(f"It is the answer to {refused[strange].sum()} of {strange.sum()} recordings of the unknown thing.")

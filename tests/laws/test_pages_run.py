@@ -72,14 +72,14 @@ def run(line: str) -> str:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         status = main(words)
-    assert status == 0, f"{line}\n{printed.getvalue()}"
-    return printed.getvalue()
+    assert status == 0 or (status == 1 and "--health" in words), f"{line}\n{printed.getvalue()}"  # 1: a fault is found
+    return printed.getvalue().replace(f"{Path.cwd()}/", "")
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the files that the pages name."""
-    folder = tmp_path_factory.mktemp("base")
+    folder, rng = tmp_path_factory.mktemp("base"), np.random.default_rng(0)
     with contextlib.chdir(folder):
         make_touches(folder, touches={"train": 12, "val": 10, "test": 51}, sensors=("digit", "gelsight"), frames=4)
         columns: dict[str, Any] = manifests.read("manifest.parquet").table.to_pydict()
@@ -98,10 +98,10 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         manifests.write(manifests.from_columns(tac, Path("tacquad.parquet")), Path("tacquad.parquet"))
         for place in ("frames", *(f"mine/{thing}/pour_{i}" for thing in ("mug", "sponge") for i in (1, 2, 3))):
             Path(place).mkdir(parents=True)
-            for i in range(4):
-                cv2.imwrite(f"{place}/{i:03d}.png", press(20 * i))
-        for name, depth in (("gel", 0), ("press", 60)):
-            cv2.imwrite(f"{name}.png", press(depth))
+            for i in range(4):  # no two pictures are equal
+                cv2.imwrite(f"{place}/{i:03d}.png", press(20 * i) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8))
+        for name, depth in (("gel", 0), ("press", 60), ("mine/mug/background", 0), ("mine/sponge/background", 0)):
+            cv2.imwrite(f"{name}.png", press(depth) // 2)
         film = cv2.VideoWriter("film.avi", cv2.VideoWriter_fourcc(*"MJPG"), 10, (48, 48))
         for i in range(40):
             film.write(press(2 * i))

@@ -131,9 +131,10 @@ def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
     protobuf: Any = None
     with path.open("rb") as file:
         reader = make_reader(file)
-        about = reader.get_summary()
-        counts = about.statistics.channel_message_counts if about and about.statistics else {}
-        total = sum(n for one, n in counts.items() if topics is None or about.channels[one].topic in topics) or None
+        total = None
+        if (about := reader.get_summary()) is not None and about.statistics is not None:
+            known = [one for one, channel in about.channels.items() if topics is None or channel.topic in topics]
+            total = sum(about.statistics.channel_message_counts.get(one, 0) for one in known)
         for schema, channel, message in tracked(reader.iter_messages(topics), "messages read", total):
             encoding, kind = channel.message_encoding, "" if schema is None else schema.name
             if encoding == "json":

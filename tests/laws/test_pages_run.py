@@ -68,6 +68,7 @@ def run(line: str) -> str:
     """Run a command of a page in this process, and return what it prints."""
     for shown, typed in HERE.items():
         line = line.replace(shown, typed)
+    line = line.partition(" | ")[0]  # the other program is the user's
     words = small([str(Path(word).expanduser()) if "~" in word else word for word in shlex.split(line)[1:]])
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -98,8 +99,10 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         manifests.write(manifests.from_columns(tac, Path("tacquad.parquet")), Path("tacquad.parquet"))
         for place in ("frames", *(f"mine/{thing}/pour_{i}" for thing in ("mug", "sponge") for i in (1, 2, 3))):
             Path(place).mkdir(parents=True)
-            for i in range(4):  # no two pictures are equal
-                cv2.imwrite(f"{place}/{i:03d}.png", press(20 * i) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8))
+            for i in range(24 if place == "frames" else 4):  # no two pictures are equal
+                cv2.imwrite(
+                    f"{place}/{i:03d}.png", press(20 * i % 120) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8)
+                )
         for name, depth in (("gel", 0), ("press", 60), ("mine/mug/background", 0), ("mine/sponge/background", 0)):
             cv2.imwrite(f"{name}.png", press(depth) // 2)
         film = cv2.VideoWriter("film.avi", cv2.VideoWriter_fourcc(*"MJPG"), 10, (48, 48))

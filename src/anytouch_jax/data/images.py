@@ -55,7 +55,7 @@ _DECODED_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 
 cv2.setNumThreads(1)  # the loader has threads already
 if "OPENCV_LOG_LEVEL" not in os.environ:  # our errors say what is wrong; OpenCV's log would hide them
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)  # OpenCV 4, or 5
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")
 
 

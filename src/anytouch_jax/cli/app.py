@@ -32,6 +32,7 @@ from anytouch_jax.cli import (
     stream,
     train,
     verify,
+    view,
 )
 from anytouch_jax.cli.arguments import RENAMED, parse_options
 from anytouch_jax.errors import CheckError, UserError, shorten
@@ -69,6 +70,7 @@ COMMANDS = {
     "adapt": Command(adapt.AdaptOptions, adapt.run),
     "export": Command(export.ExportOptions, export.run),
     "info": Command(info.InfoOptions, info.run),
+    "view": Command(view.ViewOptions, view.run),
 }
 
 

@@ -65,6 +65,10 @@ class UntouchedGel:
 
     def score(self, frame: np.ndarray) -> float:
         """Return the difference, 0 to 255, of a frame u8 (h, w, 3) from the gel. Raises ValueError for its shape."""
+        return contact_score(self.difference(frame))
+
+    def difference(self, frame: np.ndarray) -> np.ndarray:
+        """Return the difference image f32 (h, w) of a frame at the gel's size. Raises ValueError as `score`."""
         frame = scale_picture(frame)
         if max(abs(a - b) for a, b in zip(frame.shape, self.picture.shape, strict=True)) > 2:
             raise ValueError("its background has other proportions")
@@ -72,7 +76,7 @@ class UntouchedGel:
             raise ValueError("it is too thin a strip")
         if frame.shape != self.picture.shape:
             frame = cv2.resize(frame, self.picture.shape[1::-1])
-        return _distance(close_dots(frame) if self.has_dots else frame, self._compared)
+        return difference_image(close_dots(frame) if self.has_dots else frame, self._compared)
 
 
 def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
@@ -153,8 +157,12 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
 
 
 def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float:
-    edge = round(EDGE * blur / BLUR)
-    return float(np.percentile(difference_image(frame, other, blur)[edge:-edge, edge:-edge], PERCENTILE))
+    return contact_score(difference_image(frame, other, blur), round(EDGE * blur / BLUR))
+
+
+def contact_score(difference: np.ndarray, edge: int = EDGE) -> float:
+    """Return the contact score of a difference image (h, w), without its edges."""
+    return float(np.percentile(difference[edge:-edge, edge:-edge], PERCENTILE))
 
 
 def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:

@@ -1,0 +1,1 @@
+"""The web page of `anytouch view`: recordings, features, runs and live touch."""

@@ -1,0 +1,270 @@
+"""The server of the page: an ASGI application with JSON, pictures and the live stream.
+
+It answers with what the given sources hold, as JSON and as pictures that it has decoded and encoded itself. No address
+names a file. Other web sites cannot read or change anything. The name of the host is checked, there are no CORS
+headers, and every change needs a header that another site cannot send.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from anytouch_jax.config import parse_json
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.schema import is_manifest
+from anytouch_jax.errors import UserError
+from anytouch_jax.view.live import Live
+from anytouch_jax.view.space import FeatureMap, Run
+from anytouch_jax.view.tables import Table, open_film, open_folder, scale_down
+
+LOCAL = ("127.0.0.1", "localhost", "::1")
+HEADER = "x-anytouch"  # of every request that changes something: another site would need CORS to send it
+_ASSETS = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob: data:"
+_SAFE = {
+    "Content-Security-Policy": f"{_POLICY}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}  # fmt: skip
+_LONGEST = 10_000  # bytes of a request body
+_TABLES = (".csv", ".parquet")
+
+Source = Table | FeatureMap | Run | Live
+
+
+def open_sources(paths: Sequence[Path]) -> list[Source]:
+    """Return what the page shows of each path: a manifest, a folder, a film, features or a run. Raises UserError.
+
+    Features show the pictures of a table among the paths, or of the manifest that they were made from if it lies in
+    their own folder.
+    """
+    tables: list[Table] = []
+    sources: list[Source] = []
+    features: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise UserError(f"There is nothing at {path}. Name a manifest, a folder, a film, features or a run.")
+        if path.suffix.lower() == ".npz":
+            features.append(path)
+        elif path.is_dir() and (path / "metrics.jsonl").is_file():
+            sources.append(Run(path))
+        else:
+            tables.append(_open_table(path))
+    numbered = list(tables)
+    for path in features:
+        space = FeatureMap(path, numbered)
+        if space.table is None and (own := _own_manifest(path, space)) is not None:
+            numbered.append(own)
+            space = FeatureMap(path, numbered)
+        sources.append(space)
+    return [*numbered, *sources]
+
+
+def _open_table(path: Path) -> Table:
+    if path.suffix.lower() in _TABLES:
+        return Table(manifests.read(path), path.name)
+    if not path.is_dir():
+        return open_film(path)
+    inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
+    inside.sort(key=lambda file: file.stem != "manifest")
+    return Table(manifests.read(inside[0]), inside[0].name) if inside else open_folder(path)
+
+
+def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
+    """Return the table that features were made from, if it lies in their folder."""
+    file = Path(space.index.about.get("input", ""))
+    inside = file.suffix.lower() in _TABLES and file.resolve().is_relative_to(features.resolve().parent)
+    return Table(manifests.read(file), file.name) if inside and file.is_file() else None
+
+
+def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
+    """Return the ASGI application of the page.
+
+    With a `token`, every request for data needs it. Requests to other names than `hosts` are refused.
+    """
+
+    def source(request: Request, kind: type[Any]) -> Any:
+        number = request.path_params["source"]
+        if number >= len(sources) or not isinstance(sources[number], kind):
+            raise UserError("There is no such source.")
+        return sources[number]
+
+    def listed(_: Request) -> Response:
+        about = [{"name": one.name, "kind": one.kind, "about": one.about()} for one in sources]
+        return _json(about)
+
+    def touch(request: Request) -> Response:
+        filters = parse_json(request.query_params.get("filters", "{}"))
+        if not isinstance(filters, dict) or not all(isinstance(value, str) for value in filters.values()):
+            raise UserError("Filters are texts by the name of their column.")
+        table: Table = source(request, Table)
+        row = request.query_params.get("row")
+        place = _number(request, "place") if row is None else table.place_of(_number(request, "row"))
+        return _json(table.touch(place, filters))
+
+    def frame(request: Request) -> Response:
+        strip, score = source(request, Table).panels(request.path_params["row"])
+        count = 1 if np.isnan(score) else 3
+        return _picture(strip, {"X-Panels": str(count), "X-Score": "" if np.isnan(score) else f"{score:.2f}"})
+
+    def photo(request: Request) -> Response:
+        return _picture(source(request, Table).photo(request.path_params["row"]))
+
+    def points(request: Request) -> Response:
+        return _json(source(request, FeatureMap).map(request.query_params.get("method", "pca")))
+
+    def colours(request: Request) -> Response:
+        query = request.query_params
+        return _json(source(request, FeatureMap).colours(query.get("method", "pca"), query.get("column", "")))
+
+    def neighbours(request: Request) -> Response:
+        others = request.query_params.get("others") == "1"
+        return _json(source(request, FeatureMap).neighbours(_number(request, "row"), others=others))
+
+    def losses(request: Request) -> Response:
+        return _json(source(request, Run).losses(_number(request, "after")))
+
+    def figure(request: Request) -> Response:
+        return _picture(source(request, Run).figure(request.path_params["name"]), side=4000)
+
+    def stream(request: Request) -> Response:
+        return StreamingResponse(source(request, Live).packets(), media_type="application/octet-stream")
+
+    async def control(request: Request) -> Response:
+        if request.headers.get(HEADER) is None:
+            return _json({"error": "This request did not come from the page."}, 403)
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > _LONGEST:
+                return _json({"error": "The request is too long."}, 413)
+        await run_in_threadpool(_control, source(request, Live), parse_json(body.decode()))
+        return _json({"done": True})
+
+    def page(request: Request) -> Response:
+        name = request.path_params.get("name", "")
+        if name not in _ASSETS:
+            return Response("not found", 404, _SAFE)
+        data = (files("anytouch_jax.view") / (name or "page.html")).read_bytes()
+        return Response(data, media_type=_ASSETS[name], headers=_SAFE | {"Cache-Control": "no-cache"})
+
+    each = "/api/{source:int}"
+    routes = [
+        Route("/", page),
+        Route("/{name:str}", page),
+        Route("/api/sources", listed),
+        Route(f"{each}/touch", touch),
+        Route(f"{each}/frame/{{row:int}}", frame),
+        Route(f"{each}/photo/{{row:int}}", photo),
+        Route(f"{each}/map", points),
+        Route(f"{each}/colours", colours),
+        Route(f"{each}/neighbours", neighbours),
+        Route(f"{each}/losses", losses),
+        Route(f"{each}/figure/{{name:str}}", figure),
+        Route(f"{each}/stream", stream),
+        Route(f"{each}/control", control, methods=["POST"]),
+    ]
+    guards = [Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)), Middleware(_Token, token=token)]
+    return Starlette(routes=routes, middleware=guards, exception_handlers={UserError: _refuse, ValueError: _refuse})
+
+
+def serve(sources: Sequence[Source], host: str, port: int, show: Callable[[str], None]) -> None:
+    """Serve the page until Ctrl-C. `show` gets its address. Raises UserError if the port is taken."""
+    is_local = host in LOCAL
+    token = "" if is_local else secrets.token_urlsafe(18)
+    config = uvicorn.Config(
+        app(sources, token=token, hosts=[*LOCAL, "[::1]"] if is_local else ["*"]), host=host, port=port,
+        log_level="error", server_header=False, timeout_graceful_shutdown=1, lifespan="off",
+    )  # fmt: skip
+    try:
+        listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise UserError(f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port.") from None
+    shown = f"[{host}]" if ":" in host else host
+    show(f"http://{shown}:{listener.getsockname()[1]}/{f'#token={token}' if token else ''}")
+    live = [source for source in sources if isinstance(source, Live)]
+    try:
+        for one in live:
+            one.start()
+        uvicorn.Server(config).run([listener])
+    finally:
+        for one in live:
+            one.stop()
+        listener.close()
+
+
+class _Token:
+    """Refuses requests for data without the token."""
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app, self._token = app, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if self._token and scope["type"] == "http" and scope["path"].startswith("/api"):
+            given = dict(scope["headers"]).get(b"authorization", b"")
+            if not hmac.compare_digest(given, f"Bearer {self._token}".encode()):
+                await _json({"error": "The token is missing or wrong."}, 401)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+
+def _control(live: Live, order: Any) -> None:
+    """Do what the page asks of a live source. Raises UserError for anything else."""
+    order = order if isinstance(order, dict) else {}
+    action, recorder = order.get("do"), live.recorder
+    if (
+        action == "orient"
+        and order.get("rotate") in (0, 90, 180, 270)
+        and order.get("flip") in ("none", "across", "down")
+    ):
+        live.orient(order["rotate"], order["flip"])
+    elif action == "background":
+        live.capture_background()
+    elif action == "no background":
+        live.drop_background()
+    elif action == "record" and recorder is not None and isinstance(order.get("object", ""), str):
+        recorder.start(order.get("object", ""), "train", live.background)
+    elif action == "stop" and recorder is not None:
+        recorder.stop()
+    else:
+        raise UserError("The page asked for something that this source cannot do.")
+
+
+def _refuse(_: Request, error: Exception) -> Response:
+    return _json({"error": str(error)}, 400)
+
+
+def _number(request: Request, name: str) -> int:
+    text = request.query_params.get(name, "0")
+    if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        raise UserError(f"{name} must be a whole number.")
+    return int(text)
+
+
+def _json(value: Any, status: int = 200) -> Response:
+    return JSONResponse(value, status, _SAFE | {"Cache-Control": "no-store"})
+
+
+def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = 3 * 320) -> Response:
+    data = cv2.imencode(".jpg", scale_down(picture, side)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+    return Response(
+        data, media_type="image/jpeg", headers=_SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
+    )

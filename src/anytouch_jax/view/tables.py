@@ -1,0 +1,261 @@
+"""Recordings for the page: a manifest, a folder of pictures or a film, as touches of one or more sensors.
+
+A touch is the recordings (sequences) that share a value of `touch`, by any sensors. A recording without one is a touch
+by itself. Pictures are read when they are shown.
+"""
+
+from __future__ import annotations
+
+import threading
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
+from anytouch_jax.data.prepare.untouched_gel import UntouchedGel, contact_score, scale_picture
+from anytouch_jax.data.transforms import subtract_background
+from anytouch_jax.errors import UserError
+
+Array = npt.NDArray[Any]
+UNKNOWN = "unknown"  # the sensor of a folder or a film
+SIDE = 320  # pixels of the long side of a picture on the page
+_MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
+_FILTERS = ("sensor", "object", "split", "dataset", "unit")
+_TINT = (255, 120, 0)  # of contact
+
+
+class Table:
+    """Touches of a manifest. `film` is a video whose frames are the rows."""
+
+    kind = "table"
+
+    def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
+        self.manifest, self.name = manifest, name
+        self._film = None if film is None else _Film(film)
+        self._background = lru_cache(32)(self._read_background)
+        self._chosen = lru_cache(8)(self._choose)
+
+    def about(self) -> dict[str, Any]:
+        """Return the number of rows and touches, and the columns that filter them with their values."""
+        return {"rows": len(self.manifest), "touches": len(self._touches(())), "filters": self._filters}
+
+    def touch(self, place: int, filters: dict[str, str]) -> dict[str, Any]:
+        """Return touch `place` among those that pass `filters` {column: value}: its clips, and how many there are.
+
+        Raises UserError for a column that is no filter.
+        """
+        if unknown := sorted(filters.keys() - self._filters.keys()):
+            raise UserError(f"{unknown[0][:50]} is no filter of this table.")
+        chosen = tuple(sorted(filters.items()))
+        touches = self._touches(chosen)
+        if not len(touches):
+            return {"count": 0, "place": 0, "clips": []}
+        place = min(max(place, 0), len(touches) - 1)
+        recordings = np.flatnonzero((self._touch_of == touches[place]) & self._chosen(chosen))
+        clips = [self._clip(int(one)) for one in recordings[:_MOST_CLIPS]]
+        name = self.manifest.value(clips[0]["rows"][0], "touch") or clips[0]["sequence"]
+        more = max(0, len(recordings) - _MOST_CLIPS)
+        return {"count": len(touches), "place": place, "name": name, "clips": clips, "more": more}
+
+    def place_of(self, row: int) -> int:
+        """Return the place of the touch of a row, without filters."""
+        at = int(np.searchsorted(self._starts, self._position(row), "right")) - 1
+        return int(np.searchsorted(self._touches(()), self._touch_of[at]))
+
+    def frame(self, row: int) -> Array:
+        """Return the picture of a row, RGB u8 (h, w, 3). Raises UserError."""
+        self._check(row)
+        if self._film is not None:
+            return self._film.read(int(self.manifest.value(row, "frame_index")))
+        return decode(self.manifest.file(row))
+
+    def photo(self, row: int) -> Array:
+        """Return the photograph of a row, RGB u8 (h, w, 3). Raises UserError if there is none."""
+        self._check(row)
+        return decode(self.manifest.file(row, "image_path"))
+
+    def panels(self, row: int) -> tuple[Array, float]:
+        """Return the panels of a row (see `touch_panels`) and its contact score, NaN without a background."""
+        frame, gel = self.frame(row), None
+        first = self._rows(int(np.searchsorted(self._starts, self._position(row), "right")) - 1)[0]
+        path = self.manifest.value(row, "background_path")
+        if path is not None or first != row:
+            gel = self._background(row if path is not None else int(first), path)
+        return touch_panels(frame, gel, self.threshold(row))
+
+    def threshold(self, row: int) -> float:
+        """Return the contact score above which a frame of the row's sensor shows contact."""
+        return THRESHOLDS.get(self.manifest.value(row, "sensor"), DEFAULT_THRESHOLD)
+
+    def _read_background(self, row: int, path: str | None) -> tuple[Array, UntouchedGel]:
+        picture = self.frame(row) if path is None else decode(self.manifest.file(row, "background_path"))
+        return picture, UntouchedGel(picture)
+
+    def _check(self, row: int) -> None:
+        if not 0 <= row < len(self.manifest):
+            raise UserError(f"The table has {len(self.manifest)} rows, no row {row}.")
+
+    @cached_property
+    def _order(self) -> tuple[Array, Array]:
+        """Row ids by recording and frame, and the first position of each recording."""
+        sequence, frame = self.manifest.codes("sequence", own=True), np.asarray(self.manifest.table["frame_index"])
+        step = np.diff(sequence)
+        if (step >= 0).all() and ((step > 0) | (np.diff(frame) >= 0)).all():  # as readers write
+            order = np.arange(len(sequence))
+        else:
+            order = np.lexsort((frame, sequence))
+        return order, np.flatnonzero(np.diff(sequence[order], prepend=-1))
+
+    @property
+    def _starts(self) -> Array:
+        return self._order[1]
+
+    @cached_property
+    def _touch_of(self) -> Array:
+        """The number of each recording's touch, by that of its first frame."""
+        order, starts = self._order
+        touch = self.manifest.codes("touch", own=True)[order[starts]]
+        alone = touch < 0
+        touch[alone] = touch.max(initial=-1) + 1 + np.arange(alone.sum())
+        return np.unique(touch, return_inverse=True)[1]
+
+    @cached_property
+    def _ranks(self) -> Array:
+        ranks = np.empty(len(self.manifest), np.int64)
+        ranks[self._order[0]] = np.arange(len(ranks))
+        return ranks
+
+    def _position(self, row: int) -> int:
+        self._check(row)
+        return int(self._ranks[row])
+
+    def _rows(self, recording: int) -> Array:
+        order, starts = self._order
+        end = starts[recording + 1] if recording + 1 < len(starts) else len(order)
+        return order[starts[recording] : end]
+
+    def _choose(self, filters: tuple[tuple[str, str], ...]) -> Array:
+        """Return which recordings have a row that passes all filters."""
+        order, starts = self._order
+        if not filters:
+            return np.ones(len(starts), bool)
+        passes = np.ones(len(self.manifest), bool)
+        for name, value in filters:
+            passes &= np.asarray(pc.fill_null(pc.equal(self.manifest.column(name).cast(pa.string()), value), False))
+        return np.logical_or.reduceat(passes[order], starts)
+
+    def _touches(self, filters: tuple[tuple[str, str], ...]) -> Array:
+        return np.unique(self._touch_of[self._chosen(filters)])
+
+    @cached_property
+    def _filters(self) -> dict[str, list[str]]:
+        names = [name for name in self.manifest.table.column_names if name in _FILTERS or name.startswith("label.")]
+        values = {}
+        for name in names:
+            column = self.manifest.table[name]
+            if name == "object" or not pa.types.is_floating(column.type):
+                distinct = column.unique().drop_null()
+                if 1 < len(distinct) <= _MOST_CHOICES or name == "object":
+                    values[name] = sorted(distinct.cast(pa.string()).to_pylist())[:_MOST_CHOICES]
+        return values
+
+    def _clip(self, recording: int) -> dict[str, Any]:
+        """Return what the page shows of a recording: its rows, keys, caption, labels and curves."""
+        rows = self._rows(recording)
+        whole, rows = len(rows), rows[:_MOST_ROWS]
+        table = self.manifest.table.take(pa.array(rows))
+        first = {name: table[name][0].as_py() for name in table.column_names}
+        labels, curves = {}, {}
+        for name in (name for name in table.column_names if name.startswith("label.")):
+            column = table[name]
+            if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+                curves[name] = [None if value != value else value for value in column.to_pylist()]
+            values = column.unique().drop_null().to_pylist()
+            labels[name] = values[0] if len(values) == 1 else None if not values else f"{len(values)} values"
+        keys = {name: first.get(name) for name in ("sensor", "unit", "sequence", "object", "split", "dataset", "text")}
+        return keys | {
+            "rows": rows.tolist(), "frames": table["frame_index"].to_pylist(), "whole": whole, "labels": labels,
+            "curves": {name: values for name, values in curves.items() if len(set(values)) > 1},
+            "photo": bool(first.get("image_path")), "background": bool(first.get("background_path")),
+            "threshold": self.threshold(int(rows[0])),
+        }  # fmt: skip
+
+
+class _Film:
+    """Frames of a video by number. The next frame is read without a search."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._lock, self._next = path, threading.Lock(), 0
+        self._video = open_video(path)
+        self.read = lru_cache(256)(self._read)
+
+    def _read(self, number: int) -> Array:
+        with self._lock, QUIET:
+            if number != self._next:
+                self._video.set(cv2.CAP_PROP_POS_FRAMES, number)
+            whole, frame = self._video.read()
+            self._next = number + 1 if whole else -1
+        if not whole or frame is None:
+            raise UserError(f"Frame {number} of {self._path} cannot be read.")
+        return np.ascontiguousarray(to_rgb(scale_down(frame), self._path)[..., ::-1])
+
+
+def scale_down(picture: Array, side: int = SIDE) -> Array:
+    """Return a picture whose long side has at most `side` pixels."""
+    return picture if max(picture.shape[:2]) <= side else scale_picture(picture, side)
+
+
+def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold: float) -> tuple[Array, float]:
+    """Return pictures side by side, RGB u8 (h, n w, 3), and the contact score.
+
+    They are the frame, its difference from the untouched gel as an encoder reads it, and its contact. Without a `gel`
+    (h, w, 3) of the same proportions, only the frame is shown, and the score is NaN.
+    """
+    view = scale_down(frame)
+    height, width = view.shape[:2]
+    try:
+        change = None if gel is None else gel[1].difference(frame)
+    except ValueError:
+        change = None
+    if gel is None or change is None:
+        return view, float("nan")
+    background = cv2.resize(gel[0], (width, height), interpolation=cv2.INTER_AREA)
+    (difference,) = subtract_background([view], background)
+    mask = cv2.resize(change, (width, height)) > threshold
+    contact = (view // 3 + 40).astype(np.uint8)
+    contact[mask] = (0.5 * view[mask] + 0.5 * np.array(_TINT)).astype(np.uint8)
+    return np.concatenate([view, difference, contact], axis=1), contact_score(change)
+
+
+def open_folder(folder: Path) -> Table:
+    """Return the pictures of a folder as one recording. Raises UserError if there are none."""
+    frames, named = list_images(folder)
+    return Table(_one_recording(folder, [file.name for file in frames], named.get("background")), folder.name)
+
+
+def open_film(film: Path) -> Table:
+    """Return the frames of a film as one recording. Raises UserError if it has none."""
+    count = count_frames(film)
+    if not count:
+        raise UserError(f"{film} is no film that can be read. Name a manifest, a folder of pictures or a film.")
+    return Table(_one_recording(film.parent, [film.name] * count, None), film.name, film)
+
+
+def _one_recording(folder: Path, names: list[str], background: Path | None) -> Manifest:
+    count = len(names)
+    columns: dict[str, Any] = {
+        "path": names, "sensor": [UNKNOWN] * count, "sequence": [folder.name or "/"] * count,
+        "frame_index": list(range(count)), "split": ["unused"] * count,
+    }  # fmt: skip
+    if background is not None:
+        columns["background_path"] = [background.name] * count
+    return manifests.from_columns(columns, folder / "manifest.parquet")

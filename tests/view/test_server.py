@@ -1,0 +1,231 @@
+"""The server of `anytouch view`: what it shows of files, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import re
+import shutil
+import socket
+from importlib.resources import files
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from view_world import SCRIPT
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.embed import Features, save_npz
+from anytouch_jax.errors import UserError
+from anytouch_jax.view import server
+from anytouch_jax.view.space import Run
+from anytouch_jax.view.tables import Table
+
+
+def client(*paths, **options) -> TestClient:
+    application = server.app(server.open_sources(paths), **options)
+    return TestClient(application, "http://127.0.0.1", raise_server_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def page(touches, features):
+    return client(touches, features)
+
+
+def picture(response) -> np.ndarray:
+    assert response.status_code == 200 and response.headers["content-type"] == "image/jpeg", response.text
+    return cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_a_touch_is_its_recordings_by_all_sensors(page):
+    about = page.get("/api/sources").json()[0]["about"]
+    assert about["rows"] == 12 and about["touches"] == 2 and about["filters"]["sensor"] == ["digit", "gelsight_mini"]
+    first = page.get("/api/0/touch?place=0").json()
+    assert first["count"] == 2 and [clip["sensor"] for clip in first["clips"]] == ["digit", "gelsight_mini"]
+    assert [clip["rows"] for clip in first["clips"]] == [[0, 1, 2], [3, 4, 5]]
+    assert first["clips"][0]["curves"]["label.force"] == [0, 6, 9] and first["clips"][0]["photo"]
+    assert page.get("/api/0/touch?place=7").json()["place"] == 1  # the last one
+    assert page.get("/api/0/touch?row=10").json()["place"] == 1
+
+
+@pytest.mark.parametrize(
+    "filters, count, clips",
+    [({"sensor": "digit"}, 2, 1), ({"split": "test"}, 1, 2), ({"object": SCRIPT}, 1, 2), ({"object": "no"}, 0, 0)],
+)
+def test_filters(page, filters, count, clips):
+    found = page.get("/api/0/touch", params={"filters": json.dumps(filters)}).json()
+    assert (found["count"], len(found["clips"])) == (count, clips)
+
+
+@pytest.mark.parametrize("filters", ['{"path": "x"}', '{"sensor": 3}', "[]", "{", '{"sensor'])
+def test_filters_that_are_none(page, filters):
+    assert page.get("/api/0/touch", params={"filters": filters}).status_code == 400
+
+
+def test_rows_in_any_order_make_the_same_touches(touches):
+    table = manifests.read(touches)
+    mixed = Table(manifests.select_rows(table, np.random.default_rng(0).permutation(len(table))), "mixed")
+    clips = mixed.touch(0, {})["clips"] + mixed.touch(1, {})["clips"]
+    paths = [[mixed.manifest.value(row, "path") for row in clip["rows"]] for clip in clips]
+    recordings = [f"{touch}_{sensor}" for touch in "01" for sensor in ("digit", "gelsight_mini")]
+    assert sorted(paths) == [[f"{recording}_{frame}.png" for frame in range(3)] for recording in recordings]
+
+
+def test_a_frame_shows_its_difference_and_contact(page):
+    free, pressed = page.get("/api/0/frame/0"), page.get("/api/0/frame/2")
+    assert picture(pressed).shape == (48, 144, 3) and pressed.headers["x-panels"] == "3"
+    assert float(free.headers["x-score"]) < 1 < 20 < float(pressed.headers["x-score"])
+    difference = picture(free)[:, 48:96]
+    assert abs(difference.astype(int) - 128).max() < 6  # an untouched gel is grey
+    blue, _, red = picture(pressed)[24, 96 + 24].astype(int)
+    assert red > blue + 60  # the middle of the press is marked
+    assert picture(page.get("/api/0/photo/0")).shape == (48, 48, 3)
+    for path in ("photo/1", "frame/12", "frame/99999999999999999999"):
+        assert page.get(f"/api/0/{path}").status_code == 400
+
+
+def test_without_a_background_the_first_frame_stands_in(film, tmp_path):
+    shutil.copy(film, tmp_path / "film.avi")
+    page = client(tmp_path / "film.avi")
+    assert page.get("/api/0/frame/0").headers["x-panels"] == "1"
+    grey = {row: picture(page.get(f"/api/0/frame/{row}"))[:, :48].mean() for row in (11, 3, 4, 0, 7)}
+    for row, value in grey.items():  # frames in any order
+        assert abs(value - 20 - 15 * row) < 4
+    assert page.get("/api/0/touch").json()["clips"][0]["rows"] == list(range(12))
+
+
+def test_a_folder_of_pictures(tmp_path):
+    for name, value in (("background", 40), ("2", 60), ("10", 80)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((32, 32, 3), value, np.uint8))
+    page = client(tmp_path)
+    assert page.get("/api/0/touch").json()["clips"][0]["rows"] == [0, 1]
+    assert abs(picture(page.get("/api/0/frame/0"))[:, :32].mean() - 60) < 2  # 2 before 10
+    assert page.get("/api/0/frame/0").headers["x-panels"] == "3"
+
+
+def test_nothing_outside_is_served(tmp_path, touches):
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    secret = tmp_path / "secret.png"
+    shutil.copy(touches.with_name("0_digit_0.png"), secret)
+    os.symlink(secret, inside / "link.png")
+    os.symlink(tmp_path, inside / "up")
+    paths = ["../secret.png", str(secret), "link.png", "up/secret.png"]
+    columns = {
+        "path": paths, "sensor": ["digit"] * 4, "sequence": list("abcd"), "frame_index": [0] * 4, "split": ["test"] * 4,
+        "image_path": paths, "background_path": paths,
+    }  # fmt: skip
+    manifests.write(manifests.from_columns(columns, inside / "m.csv"), inside / "m.csv")
+    page = client(inside / "m.csv")
+    for row in range(4):
+        for kind in ("frame", "photo"):
+            answer = page.get(f"/api/0/{kind}/{row}")
+            assert answer.status_code == 400 and "folder" in answer.json()["error"]
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    os.symlink(secret, folder / "0.png")
+    assert client(folder).get("/api/0/frame/0").status_code == 400
+    for path in ("/../secret.png", "/%2e%2e/secret.png", "/server.py", "//etc/passwd", "/__init__.py"):
+        assert page.get(path).status_code == 404
+
+
+def test_the_map_and_neighbours_across_sensors(page):
+    points = page.get("/api/1/map?method=pca").json()
+    assert points["rows"] == list(range(12)) and max(map(abs, points["x"] + points["y"])) <= 1
+    assert np.ptp(np.array(points["x"])[:6]) < 0.5 < abs(points["x"][0] - points["x"][6])
+    assert len(page.get("/api/1/map?method=tsne").json()["x"]) == 12
+    coloured = page.get("/api/1/colours?method=pca&column=sensor").json()
+    assert coloured["names"] == ["digit", "gelsight_mini"] and coloured["codes"] == [0, 0, 0, 1, 1, 1] * 2
+    found = page.get("/api/1/neighbours?row=1&others=1").json()
+    assert [hit["row"] for hit in found["hits"]] == [4, found["hits"][1]["row"]]  # a hit for each recording
+    assert {hit["about"]["sensor"] for hit in found["hits"]} == {"gelsight_mini"}
+    anywhere = page.get("/api/1/neighbours?row=1").json()["hits"]
+    assert [hit["about"]["sequence"] for hit in anywhere][:1] == ["0-gelsight_mini"] and len(anywhere) == 3
+    for path in ("map?method=x", "colours?column=x", "neighbours?row=12", "neighbours?row=-1"):
+        assert page.get(f"/api/1/{path}").status_code == 400
+
+
+def test_features_show_pictures_of_given_files_only(page, features, touches, tmp_path):
+    assert page.get("/api/sources").json()[1]["about"]["table"] == 0
+    alone = client(features).get("/api/sources").json()
+    assert [one["kind"] for one in alone] == ["table", "space"]  # its manifest lies in its folder
+    moved = Path(shutil.copy(features, tmp_path))  # its manifest does not
+    assert [one["kind"] for one in client(moved).get("/api/sources").json()] == ["space"]
+    assert client(moved, touches).get("/api/sources").json()[1]["about"]["table"] == 0
+    other = tmp_path / "other.csv"
+    columns = {"path": ["a.png"] * 12, "sensor": ["digit"] * 12, "sequence": ["s"] * 12, "split": ["test"] * 12}
+    manifests.write(manifests.from_columns(columns | {"frame_index": list(range(12))}, other), other)
+    assert client(moved, other).get("/api/sources").json()[1]["about"]["table"] is None
+
+
+def test_pickled_arrays_are_refused(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "sprung"),)
+
+    trap = np.array([Trap()], object)
+    np.savez(tmp_path / "a.npz", features=np.eye(2, dtype="f4"), rows=np.arange(2), **{"key/object": trap})
+    (tmp_path / "b.npz").write_bytes(pickle.dumps(Trap()))
+    for name in "ab":
+        with pytest.raises(UserError, match="features file"):
+            server.open_sources([tmp_path / f"{name}.npz"])
+    assert not (tmp_path / "sprung").exists()
+    save_npz(tmp_path / "c.npz", Features(np.eye(2, dtype="f4"), np.array([0.5, 1]), {}), {})
+    with pytest.raises(UserError, match="whole rows"):
+        server.open_sources([tmp_path / "c.npz"])
+
+
+def test_text_of_files_stays_text(page):
+    answer = page.get("/api/0/touch?place=1")
+    assert (
+        answer.headers["content-type"] == "application/json" and answer.headers["x-content-type-options"] == "nosniff"
+    )
+    assert answer.json()["clips"][0]["object"] == SCRIPT
+    policy = page.get("/").headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "script-src 'self';" in policy and "unsafe" not in policy
+    script = (files("anytouch_jax.view") / "page.js").read_text()
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc", script)
+    for name in ("page.html", "page.js", "page.css"):  # nothing from the network
+        assert not re.search(r"https?:|//cdn|@import|url\(", (files("anytouch_jax.view") / name).read_text())
+
+
+def test_a_token_and_the_name_of_the_host(touches):
+    page = client(touches, token="secret")
+    assert page.get("/").status_code == 200 and page.get("/page.js").status_code == 200
+    for headers in ({}, {"Authorization": "Bearer no"}, {"Authorization": "secret"}):
+        assert page.get("/api/sources", headers=headers).status_code == 401
+        assert page.get("/api/0/frame/0", headers=headers).status_code == 401
+    assert page.get("/api/sources", headers={"Authorization": "Bearer secret"}).status_code == 200
+    assert client(touches).get("/api/sources", headers={"Host": "evil.example"}).status_code == 400
+    assert "access-control-allow-origin" not in client(touches).get("/api/sources").headers
+
+
+def test_a_run_while_it_trains(tmp_path):
+    run = tmp_path / "run"
+    (run / "figures").mkdir(parents=True)
+    log = run / "metrics.jsonl"
+    log.write_text('{"step": 1, "loss": 2.0}\nnot json\n{"step": 2, "loss": NaN}\n{"step": 3, "lo')
+    cv2.imwrite(str(run / "figures" / "reconstruction_000001.png"), np.zeros((8, 8, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "secret.png"), np.zeros((8, 8, 3), np.uint8))
+    os.symlink(tmp_path / "secret.png", run / "figures" / "secret.png")
+    page = client(run)
+    assert isinstance(server.open_sources([run])[0], Run)
+    first = page.get("/api/0/losses").json()
+    assert first["lines"][0] == {"step": 1, "loss": 2.0} and first["figures"] == ["reconstruction_000001.png"]
+    with log.open("a") as file:
+        file.write('ss": 1.0}\n')
+    rest = page.get(f"/api/0/losses?after={first['next']}").json()
+    assert rest["lines"] == [{"step": 3, "loss": 1.0}]
+    assert page.get(f"/api/0/losses?after={rest['next']}").json()["lines"] == []
+    assert page.get("/api/0/losses?after=999").json()["lines"][0]["step"] == 1  # a file that was begun anew
+    assert picture(page.get("/api/0/figure/reconstruction_000001.png")).shape == (8, 8, 3)
+    for name in ("secret.png", "..%2f..%2fsecret.png", "no.png"):
+        assert page.get(f"/api/0/figure/{name}").status_code in (400, 404)
+
+
+def test_a_port_that_is_taken():
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(UserError, match="--port"):
+        server.serve([], "127.0.0.1", taken.getsockname()[1], print)

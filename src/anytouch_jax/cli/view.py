@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
@@ -74,7 +74,6 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     from anytouch_jax.evaluate.heads import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
     from anytouch_jax.view.live import Live
-    from anytouch_jax.view.space import FeatureMap
 
     enable_compilation_cache()
     if str(options.model) == DEFAULT:
@@ -83,7 +82,7 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     head = None if options.head is None else load_head(options.head)
     if head is not None:
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
-    spaces = [source for source in sources if isinstance(source, FeatureMap)]
+    spaces: list[Any] = [source for source in sources if source.kind == "space"]
     return Live(
         camera, encoder, sensor=options.sensor, head=head, space=spaces[0] if spaces else None, out=options.out, log=log
     )

@@ -45,7 +45,7 @@ const order = (source, body) => api(`${source}/control`, {
 });
 
 function option(label, values, value, change) {
-  const node = el("select", { onchange: () => change(node.value) });
+  const node = el("select", { ariaLabel: label, onchange: () => change(node.value) });
   for (const [key, text] of values) node.append(el("option", { value: key }, text));
   node.value = value;
   return el("label", {}, label, node);

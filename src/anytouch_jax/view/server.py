@@ -13,7 +13,7 @@ import socket
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -31,9 +31,12 @@ from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.live import Live
-from anytouch_jax.view.space import FeatureMap, Run
 from anytouch_jax.view.tables import Table, open_film, open_folder, scale_down
+from anytouch_jax.view.training import Run
+
+if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
+    from anytouch_jax.view.live import Live
+    from anytouch_jax.view.space import FeatureMap
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADER = "x-anytouch"  # of every request that changes something: another site would need CORS to send it
@@ -47,7 +50,7 @@ _SAFE = {
 _LONGEST = 10_000  # bytes of a request body
 _TABLES = (".csv", ".parquet")
 
-Source = Table | FeatureMap | Run | Live
+Source: TypeAlias = "Table | FeatureMap | Run | Live"
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
@@ -70,6 +73,8 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
             tables.append(_open_table(path))
     numbered = list(tables)
     for path in features:
+        from anytouch_jax.view.space import FeatureMap
+
         space = FeatureMap(path, numbered)
         if space.table is None and (own := _own_manifest(path, space)) is not None:
             numbered.append(own)
@@ -101,9 +106,9 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
     With a `token`, every request for data needs it. Requests to other names than `hosts` are refused.
     """
 
-    def source(request: Request, kind: type[Any]) -> Any:
+    def source(request: Request, kind: str) -> Any:
         number = request.path_params["source"]
-        if number >= len(sources) or not isinstance(sources[number], kind):
+        if number >= len(sources) or sources[number].kind != kind:
             raise UserError("There is no such source.")
         return sources[number]
 
@@ -115,38 +120,38 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
         filters = parse_json(request.query_params.get("filters", "{}"))
         if not isinstance(filters, dict) or not all(isinstance(value, str) for value in filters.values()):
             raise UserError("Filters are texts by the name of their column.")
-        table: Table = source(request, Table)
+        table: Table = source(request, "table")
         row = request.query_params.get("row")
         place = _number(request, "place") if row is None else table.place_of(_number(request, "row"))
         return _json(table.touch(place, filters))
 
     def frame(request: Request) -> Response:
-        strip, score = source(request, Table).panels(request.path_params["row"])
+        strip, score = source(request, "table").panels(request.path_params["row"])
         count = 1 if np.isnan(score) else 3
         return _picture(strip, {"X-Panels": str(count), "X-Score": "" if np.isnan(score) else f"{score:.2f}"})
 
     def photo(request: Request) -> Response:
-        return _picture(source(request, Table).photo(request.path_params["row"]))
+        return _picture(source(request, "table").photo(request.path_params["row"]))
 
     def points(request: Request) -> Response:
-        return _json(source(request, FeatureMap).map(request.query_params.get("method", "pca")))
+        return _json(source(request, "space").map(request.query_params.get("method", "pca")))
 
     def colours(request: Request) -> Response:
         query = request.query_params
-        return _json(source(request, FeatureMap).colours(query.get("method", "pca"), query.get("column", "")))
+        return _json(source(request, "space").colours(query.get("method", "pca"), query.get("column", "")))
 
     def neighbours(request: Request) -> Response:
         others = request.query_params.get("others") == "1"
-        return _json(source(request, FeatureMap).neighbours(_number(request, "row"), others=others))
+        return _json(source(request, "space").neighbours(_number(request, "row"), others=others))
 
     def losses(request: Request) -> Response:
-        return _json(source(request, Run).losses(_number(request, "after")))
+        return _json(source(request, "run").losses(_number(request, "after")))
 
     def figure(request: Request) -> Response:
-        return _picture(source(request, Run).figure(request.path_params["name"]), side=4000)
+        return _picture(source(request, "run").figure(request.path_params["name"]), side=4000)
 
     def stream(request: Request) -> Response:
-        return StreamingResponse(source(request, Live).packets(), media_type="application/octet-stream")
+        return StreamingResponse(source(request, "live").packets(), media_type="application/octet-stream")
 
     async def control(request: Request) -> Response:
         if request.headers.get(HEADER) is None:
@@ -156,7 +161,7 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
             body += part
             if len(body) > _LONGEST:
                 return _json({"error": "The request is too long."}, 413)
-        await run_in_threadpool(_control, source(request, Live), parse_json(body.decode()))
+        await run_in_threadpool(_control, source(request, "live"), parse_json(body.decode()))
         return _json({"done": True})
 
     def page(request: Request) -> Response:
@@ -200,7 +205,7 @@ def serve(sources: Sequence[Source], host: str, port: int, show: Callable[[str],
         raise UserError(f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port.") from None
     shown = f"[{host}]" if ":" in host else host
     show(f"http://{shown}:{listener.getsockname()[1]}/{f'#token={token}' if token else ''}")
-    live = [source for source in sources if isinstance(source, Live)]
+    live: list[Any] = [source for source in sources if source.kind == "live"]
     try:
         for one in live:
             one.start()

@@ -32,7 +32,7 @@ from anytouch_jax.encoder.stream import Embedded, open_source, stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import LinearHead
 from anytouch_jax.view.space import FeatureMap
-from anytouch_jax.view.tables import touch_panels
+from anytouch_jax.view.tables import scale_down, touch_panels
 
 Array = npt.NDArray[Any]
 _KEPT = 1000  # frames whose times make p50 and p99
@@ -94,6 +94,7 @@ class Live:
         self._row = encoder.sensor_row(sensor or UNIVERSAL, log)
         self._rotate = 0
         self._flip: Flip = "none"
+        self.background: Array | None = None  # the captured picture of the untouched gel, RGB u8 (h, w, 3)
         self._gel: tuple[Array, UntouchedGel] | None = None
         self._preprocess = Preprocess(encoder)
         self._raw: deque[tuple[int, Array]] = deque(maxlen=8)  # the last pictures by the number of their frame
@@ -153,14 +154,10 @@ class Live:
                 seen, packet = self._serial, self._packet
             yield packet
 
-    @property
-    def background(self) -> Array | None:
-        """The picture of the untouched gel RGB u8 (h, w, 3), if one was captured."""
-        return None if self._gel is None else self._gel[0]
-
     def _set_background(self, picture: Array | None) -> None:
         # Frames are turned before, so the encoder's preprocessing does not.
-        self._gel = None if picture is None else (picture, UntouchedGel(picture))
+        self.background = picture
+        self._gel = None if picture is None else (scale_down(picture), UntouchedGel(picture))
         self._preprocess = Preprocess(self._encoder, picture)
 
     def _oriented(self, picture: Array) -> Array:

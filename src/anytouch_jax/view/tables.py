@@ -98,7 +98,7 @@ class Table:
 
     def _read_background(self, row: int, path: str | None) -> tuple[Array, UntouchedGel]:
         picture = self.frame(row) if path is None else decode(self.manifest.file(row, "background_path"))
-        return picture, UntouchedGel(picture)
+        return scale_down(picture), UntouchedGel(picture)
 
     def _check(self, row: int) -> None:
         if not 0 <= row < len(self.manifest):
@@ -218,7 +218,7 @@ def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold
     """Return pictures side by side, RGB u8 (h, n w, 3), and the contact score.
 
     They are the frame, its difference from the untouched gel as an encoder reads it, and its contact. Without a `gel`
-    (h, w, 3) of the same proportions, only the frame is shown, and the score is NaN.
+    (scaled down) of the same proportions, only the frame is shown, and the score is NaN.
     """
     view = scale_down(frame)
     height, width = view.shape[:2]
@@ -228,11 +228,11 @@ def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold
         change = None
     if gel is None or change is None:
         return view, float("nan")
-    background = cv2.resize(gel[0], (width, height), interpolation=cv2.INTER_AREA)
+    background = gel[0] if gel[0].shape == view.shape else cv2.resize(gel[0], (width, height))
     (difference,) = subtract_background([view], background)
     mask = cv2.resize(change, (width, height)) > threshold
-    contact = (view // 3 + 40).astype(np.uint8)
-    contact[mask] = (0.5 * view[mask] + 0.5 * np.array(_TINT)).astype(np.uint8)
+    tinted = cv2.addWeighted(view, 0.5, np.full_like(view, _TINT), 0.5, 0)
+    contact = np.where(mask[..., None], tinted, cv2.convertScaleAbs(view, alpha=1 / 3, beta=40))
     return np.concatenate([view, difference, contact], axis=1), contact_score(change)
 
 

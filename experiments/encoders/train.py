@@ -1,8 +1,9 @@
-"""Training of the encoder in the package: both stages, then the folder with its card.
+"""Training of the encoder in the package: stage 1, stage 2 in two parts, then the folder with its card.
 
     python -m experiments.encoders.train --corpus data/corpus --real a.csv b.csv --out runs/anytouch-tiny
 
-The same command again continues. The recipe is the paper's two losses, with what a CPU needs: see README.md.
+The same command again continues. The recipe is the paper's two losses, with what a CPU needs: see README.md. The second
+part of stage 2 has stills only, and draws the pairs of two real fingers more often.
 """
 
 from __future__ import annotations
@@ -25,7 +26,19 @@ STAGE2 = [
     "--data.negatives", "same_sensor", "--model.text.stack.depth", "2",
     *(word for part in SMALL for word in (f"--model.image.{part.partition('=')[0]}", part.partition("=")[2])),
 ]  # fmt: skip
-REAL_SHARE = ["--data.weights", "incipient_slip-gelsight_mini_markers", "5", "gelslam-gelsight_mini", "10"]
+
+
+def real_share(slip: int, press: int) -> list[str]:
+    """Return the options that say how often an epoch draws each real recording."""
+    return ["--data.weights", "incipient_slip-gelsight_mini_markers", str(slip), "gelslam-gelsight_mini", str(press)]
+
+
+# Folder, stage, steps, options, and draws of real recordings. Each starts from the one before.
+PARTS = (
+    ("stage1", 1, 1651, STAGE1, real_share(5, 10)),
+    ("stage2-clips", 2, 2000, STAGE2, real_share(5, 10)),
+    ("stage2", 2, 1070, [*STAGE2, "--data.clip-share", "0"], real_share(10, 20)),
+)
 
 
 def main() -> None:
@@ -33,20 +46,16 @@ def main() -> None:
     parser.add_argument("--corpus", type=Path, required=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, nargs=2, default=(3200, 2000), help="steps of stage 1 and of stage 2")
     options = parser.parse_args()
     data = [str(path) for path in (*sorted(options.corpus.glob("*/manifest.parquet")), *options.real)]
-    weights = REAL_SHARE if options.real else []
-    stages = [str(options.out / f"stage{number}") for number in (1, 2)]
-    for number, run, recipe in zip((1, 2), stages, (STAGE1, STAGE2), strict=True):
-        init = ["--init", stages[0]] if number == 2 else []
-        steps = str(options.steps[number - 1])
-        status = anytouch(
-            ["train", "--stage", str(number), "--data", *data, "--run", run, *init, "--steps", steps, *recipe, *weights]
-        )
+    init: list[str] = []
+    for folder, stage, steps, recipe, share in PARTS:
+        run, more = str(options.out / folder), [*recipe, *(share if options.real else []), *init]
+        status = anytouch(["train", "--stage", str(stage), "--data", *data, "--run", run, "--steps", str(steps), *more])
         if status:
             raise SystemExit(status)
-    anytouch(["export", "--card", str(options.out / "anytouch-tiny"), "--model", stages[1], "--notes", str(NOTES)])
+        init = ["--init", run]
+    anytouch(["export", "--card", str(options.out / "anytouch-tiny"), "--model", run, "--notes", str(NOTES)])
 
 
 if __name__ == "__main__":

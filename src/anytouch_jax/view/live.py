@@ -217,7 +217,7 @@ class Live:
         return {
             "label": str(one.label[0]), "p": round(float(one.p.max()), 3), "novel": bool(one.novel[0]),
             "set": self._head.classes[one.in_set[0]].tolist(), "novelty": round(float(one.novelty[0]), 3),
-            "limit": round(float(min(self._head.calibration.novelty_limit, 1e9)), 3),
+            "limit": round(limit, 3) if (limit := self._head.calibration.novelty_limit) < 1e9 else None,
         }  # fmt: skip
 
     def _nearest(self, values: Array) -> list[dict[str, Any]]:

@@ -537,7 +537,7 @@ function showLive(source, about) {
     if (about.head) {
       fact(about.head, `${one.label} ${(100 * one.p).toFixed(0)} %`, one.novel || (one.set && one.set.length !== 1) ? "bad" : "good");
       if (one.set) fact("possible classes", one.set.slice(0, 4).join(", ") || "none");
-      if (one.novelty !== undefined) fact("novelty", `${one.novelty} (limit ${one.limit})`, one.novel ? "bad" : "");
+      if (one.novelty !== undefined) fact("novelty", `${one.novelty} (limit ${one.limit ?? "unknown"})`, one.novel ? "bad" : "");
     }
     fact("encoder p50, p99", `${one.encoder.map((value) => value.toFixed(1)).join(", ")} ms`);
     fact("frame to features", `${one.age.map((value) => value.toFixed(1)).join(", ")} ms`);

@@ -144,7 +144,10 @@ function chart(canvas, lines, { mark = null, level = null, log = false } = {}) {
   const left = lines.every((line) => line.x) ? Math.min(...lines.map((line) => line.x[0] ?? right)) : 0;
   const px = (x) => 44 + ((width - 50) * (x - left)) / Math.max(right - left, 1e-9);
   const py = (value) => 5 + (height - 20) * (1 - (value - low) / (high - low));
-  const text = (value) => Number((log ? 10 ** value : value).toPrecision(2)).toString();
+  const text = (value) => {
+    const number = log ? 10 ** value : value;
+    return number && Math.abs(number) < 0.01 ? number.toExponential(0) : Number(number.toPrecision(2)).toString();
+  };
   g.font = "11px system-ui, sans-serif";
   g.fillStyle = style.getPropertyValue("--soft");
   g.textAlign = "right";

@@ -39,7 +39,7 @@ HERE = {
     "s3://bucket/touches": "memory://tars", "--data 0": "--data film.avi", "verify FILE": "verify manifest.parquet",
     "only OUT": "only free.parquet", "--touches 400": "--touches 24", "tacquad.parquet": "tacquad.parquet --yes",
     "observation.images.tactile ": f"{test_lerobot.FILM} ",
-    " ...": "", "info FILE": "info runs/stage1",
+    "--out report": "--out report --touches 40", " ...": "", "info FILE": "info runs/stage1",
 }  # fmt: skip
 # These need files of the size of ViT-L or ViT-B. Tests of weights and of `train --init` run them with small ones.
 LARGE = ("--preset large", "--preset base")
@@ -191,12 +191,12 @@ def test_a_page_runs_from_top_to_bottom(name: str, place: Path) -> None:
             out = io.StringIO()
             with contextlib.redirect_stdout(out):
                 exec(block, names)
-            printed = out.getvalue()
+            printed += out.getvalue()
         elif not any(size in (line := next(filter(None, lines))) for size in LARGE):
             if "--run" in line and "--init" not in line:
                 shutil.rmtree(re.search(r"--run (\S+)", line)[1], ignore_errors=True)
-            printed = run(line)
-    assert not problems, f"{name} shows\n{problems}\nand the last command printed\n{printed}"
+            printed += run(line)
+    assert not problems, f"{name} shows\n{problems}\nand the page printed\n{printed}"
 
 
 def test_scripts_and_modules_of_the_pages_are_there() -> None:

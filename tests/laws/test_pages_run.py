@@ -41,8 +41,9 @@ HERE = {
     "observation.images.tactile ": f"{test_lerobot.FILM} ",
     "--out report": "--out report --touches 40", " ...": "", "info FILE": "info runs/stage1",
 }  # fmt: skip
-# These need files of the size of ViT-L or ViT-B. Tests of weights and of `train --init` run them with small ones.
-LARGE = ("--preset large", "--preset base")
+# Two need files of the size of ViT-L or ViT-B: tests of weights and of `train --init` run them with small ones.
+# The viewer serves until it is stopped: it has tests that stop it.
+ELSEWHERE = ("--preset large", "--preset base", "anytouch view")
 # Lines that need recordings that no test has. Tests of health and of novelty have them in parts.
 REAL = re.compile(r"^\S+ \S+: [\d,]+ frames, |^\| (check|orientation|focus) |^31 of 40 frames|^There is no sign")
 STAGE1 = {name: value for name, value in SIZES.items() if "clip-share" not in name} | {"batch": 8, "data.threads": 1}
@@ -192,7 +193,7 @@ def test_a_page_runs_from_top_to_bottom(name: str, place: Path) -> None:
             with contextlib.redirect_stdout(out):
                 exec(block, names)
             printed += out.getvalue()
-        elif not any(size in (line := next(filter(None, lines))) for size in LARGE):
+        elif not any(size in (line := next(filter(None, lines))) for size in ELSEWHERE):
             if "--run" in line and "--init" not in line:
                 shutil.rmtree(re.search(r"--run (\S+)", line)[1], ignore_errors=True)
             printed += run(line)
